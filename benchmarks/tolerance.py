@@ -47,8 +47,7 @@ SCENES: dict[str, Callable[[], SceneDict]] = {
     "cornell": lambda: tt.scenes.cornell_box(8, **AXIS),
     "fog": fog,
     "glass": lambda: tt.scenes.cornell_box(8, glass=True, **AXIS),
-    "nlos": lambda: tt.scenes.nlos_room(8, num_bins=60, bin_width_opl=0.1),
-    "wall": lambda: tt.scenes.moving_wall(resolution=8, num_bins=60, bin_width_opl=0.05),
+    "wall": lambda: tt.scenes.moving_wall(side_panel=True, start_opl=7.0, num_bins=60, bin_width_opl=0.05),
 }
 # Samples per pixel of a pass (None: the default) and tolerances of bins, or of the loss "energy".
 ROWS: list[tuple[int | None, str, tuple[float, ...]]] = [

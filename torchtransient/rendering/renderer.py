@@ -500,14 +500,14 @@ class TransientRenderer(CopiesParametrized):
         if number is None:
             raise UnitError(f"seed: expected one whole number, from which those of passes follow, got {shown(seed)}.")
         spp = checked_samples("batch_spp", batch_spp)
-        with active_variant(self.scene.variant):
+        # One switch of variant for all passes.
+        with torch.no_grad(), active_variant(self.scene.variant):
             sampler = sampler_plugin(self._sampler_in_use())
-        if spp is None:
-            spp = samples_of_pass(sampler, self._cube_shape[0] * self._cube_shape[1])
-        spp = self.samples_drawn(spp)
-        settings: dict[str, Any] = {"variant": self.scene.variant, "sampler": sampler, "sensors": self._sensors}
-        settings["temporal_filter"] = self.effective_filter
-        with torch.no_grad():
+            if spp is None:
+                spp = samples_of_pass(sampler, self._cube_shape[0] * self._cube_shape[1])
+            spp = self.samples_drawn(spp)
+            settings: dict[str, Any] = {"variant": self.scene.variant, "sampler": sampler, "sensors": self._sensors}
+            settings["temporal_filter"] = self.effective_filter
             tensors, _, _ = self._collect(values)
             kept = {key: tensor.detach().clone() for key, tensor in zip(self._keys, tensors, strict=True)}
             return render_to_tolerance(

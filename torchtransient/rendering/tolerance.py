@@ -2,12 +2,15 @@
 
 Estimate of the error, of ``n`` passes with mean ``x`` and sample variance ``s^2`` in each bin, channels averaged::
 
-    V = ((n - 1) s^2 + 8 <s^2>) / (n + 7)                  <.>: mean over 3 x 3 pixels, and 3 bins of time
+    V = (f s^2 + 8 <s^2>) / (f + 8)                        <.>: mean over 3 x 3 pixels, and 3 bins of time
+    f = 2 <(a + b)^2> / <(a - b)^2>, from 1 to n - 1       a, b: s^2 of the passes of even, and of odd number
     r = quantile over bins of sqrt(V / n) / <|x|>          never of the mean of a single bin, which may be dark
 
-Rare and bright light is missing from most bins, and their ``V`` with it. Of the even and the odd passes, bins with a
-small ``V`` in the one half then have a large one in the other: a tail is heavy where it is more than twice as large in
-the mean. A loss has one value for each pass, whose tail is seen as in ``accuracy``.
+``f`` are the degrees of freedom that ``s^2`` has: ``n - 1`` of normal values, the number of events where light is rare,
+and most bins have not seen theirs (with ``f = n - 1`` the error behind glass is half of what it is).
+
+Where rarer light has been found by few bins only, those with a small variance in the one half of the passes have a
+large one in the other: six times larger in the mean is a heavy tail.
 """
 
 from __future__ import annotations
@@ -42,8 +45,9 @@ _NEIGHBORS, _ONE_SIDED = 8, 1.645
 _RECENT = 15
 # Without a mask, bins count whose local mean is at least this share of the mean over all bins.
 _LIT = 0.02
-# Variance of bins in one half of the passes over that in the half which they were found to be good in.
-_MOST_IN_OTHER_HALF = 2.0
+# Variance of bins in one half of the passes over that in the half which they were found to be good in, and passes that
+# tell it.
+_MOST_IN_OTHER_HALF, _ENOUGH_FOR_HALVES = 6.0, 16
 # Tail of a loss (see `Tail` of `accuracy`): squared distances before one is looked at, the largest share of one,
 # distances before Hill's index is estimated, those that it is estimated from, and its least value.
 _FEW_PASSES, _MOST_OF_ONE, _MANY_PASSES, _FURTHEST, _LEAST_INDEX = 24, 1 / 3, 88, 8, 2.0
@@ -103,10 +107,20 @@ def local_mean(values: torch.Tensor, dims: tuple[int, ...]) -> torch.Tensor:
     return values
 
 
-def moderated_variance(variance: torch.Tensor, passes: int, dims: tuple[int, ...]) -> torch.Tensor:
-    """Return sample variances of ``passes`` passes, drawn to the mean of their neighbours along ``dims``."""
-    near = local_mean(variance, dims)
-    return variance.mul(passes - 1).add_(near, alpha=_NEIGHBORS).div_(passes + _NEIGHBORS - 1)
+def moderated_variance(variance: torch.Tensor, freedom: torch.Tensor | float, dims: tuple[int, ...]) -> torch.Tensor:
+    """Return sample variances, of so many degrees of freedom, drawn to the mean of neighbours along ``dims``."""
+    moderated: torch.Tensor = (variance * freedom).add_(local_mean(variance, dims), alpha=_NEIGHBORS)
+    return moderated.div_(freedom + _NEIGHBORS)
+
+
+def freedom_of_halves(even: torch.Tensor, odd: torch.Tensor, passes: int, dims: tuple[int, ...]) -> torch.Tensor:
+    """Return the degrees of freedom of sample variances, of which two halves of the passes have ``even`` and ``odd``.
+
+    The variance of a sample variance over its square is 2 / freedom.
+    """
+    apart, both = local_mean((even - odd).square_(), dims), local_mean((even + odd).square_(), dims)
+    found: torch.Tensor = both.mul_(2.0).div_(apart)
+    return found.nan_to_num_(nan=passes - 1.0, posinf=passes - 1.0).clamp_(1.0, max(passes - 1.0, 1.0))
 
 
 def quantile_of(values: torch.Tensor, quantile: float) -> float:
@@ -308,21 +322,20 @@ class PassSums:
     def variance(self) -> torch.Tensor:
         """Return the moderated variance of one pass in each bin; infinite after a single pass."""
         even, odd = _filled(self.squares)
-        return self._variance(self.mean_bins(), even + odd, self.passes)
+        n = self.passes
+        if n < 2:
+            return torch.full_like(even, math.inf)
+        freedom: torch.Tensor | float = n - 1.0
+        if n >= 4:
+            freedom = freedom_of_halves(*self.variances_of_halves(), n, self.near)
+        return moderated_variance(_sample_variance(self.mean_bins(), even + odd, n), freedom, self.near)
 
     def variances_of_halves(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the moderated variance of one pass as even and as odd passes have it, of four passes and more."""
+        """Return the sample variances of a pass of even and of odd number in each bin, of four passes and more."""
         (even, odd), n = _filled(self.squares), self.passes // 2
         of_odd = _filled(self.odd)
         of_even = self.mean_bins().mul_(self.passes).sub_(of_odd).div_(self.passes - n)
-        return self._variance(of_even, even, self.passes - n), self._variance(of_odd / n, odd, n)
-
-    def _variance(self, mean: torch.Tensor, squares: torch.Tensor, passes: int) -> torch.Tensor:
-        if passes < 2:
-            return torch.full_like(squares, math.inf)
-        deviations: torch.Tensor = squares - mean.abs().square_().mul_(passes)
-        variance: torch.Tensor = deviations.clamp_(min=0.0).div_(passes - 1)
-        return moderated_variance(variance, passes, self.near)
+        return _sample_variance(of_even, even, self.passes - n), _sample_variance(of_odd / n, odd, n)
 
     def output(self) -> RenderOutput:
         """Return the mean of the passes as a render."""
@@ -339,6 +352,11 @@ def _filled(value: _Filled | None) -> _Filled:
     """Return what the first pass has made."""
     assert value is not None
     return value
+
+
+def _sample_variance(mean: torch.Tensor, squares: torch.Tensor, passes: int) -> torch.Tensor:
+    deviations: torch.Tensor = squares - mean.abs().square_().mul_(passes)
+    return deviations.clamp_(min=0.0).div_(passes - 1)
 
 
 def _wide(tensor: torch.Tensor) -> torch.Tensor:
@@ -418,15 +436,17 @@ def look(sums: PassSums, request: Request) -> Look:
     errors = (sums.variance()[counted] / sums.passes).sqrt_().div_(mean[counted])
     error = quantile_of(errors, request.quantile)
     aim = request.rtol * share_to_aim_at((sums.passes - 1.0) * errors.numel())
-    return Look(sums.passes, error, aim, _ratio_of_halves(sums, mean, counted, request.quantile) > _MOST_IN_OTHER_HALF)
+    heavy = _ratio_of_halves(sums, mean, counted, request.quantile) > _MOST_IN_OTHER_HALF
+    return Look(sums.passes, error, aim, heavy)
 
 
 def _ratio_of_halves(sums: PassSums, mean: torch.Tensor, counted: torch.Tensor, quantile: float) -> float:
     """Return the relative variance of a half of the passes, in bins that are good in the other half, over theirs."""
-    if sums.passes < _FIRST_LOOK or not bool(counted.any()):
+    if sums.passes < _ENOUGH_FOR_HALVES or not bool(counted.any()):
         return 1.0
-    power = mean[counted].square_()
-    halves = [variance[counted] / power for variance in sums.variances_of_halves()]
+    power, freedom = mean[counted].square_(), sums.passes / 2 - 1
+    variances = [moderated_variance(half, freedom, sums.near) for half in sums.variances_of_halves()]
+    halves = [variance[counted] / power for variance in variances]
     good = [half <= quantile_of(half, quantile) for half in halves]
     own = sum(float(half[mask].mean()) for half, mask in zip(halves, good, strict=True))
     other = sum(float(half[mask].mean()) for half, mask in zip(halves, reversed(good), strict=True))
@@ -705,7 +725,7 @@ class _Loop:
             output=sums.output(),
             error=found.error,
             reached=reached,
-            reason=_reason("reached" if reached else kind, found, request, sums, self._seconds_per_pass),
+            reason=_reason("reached" if reached else kind, found, request, sums),
             passes=sums.passes,
             spp=_filled(sums.stats).spp,
             seconds=sums.seconds,
@@ -730,24 +750,25 @@ def _number_of(loss: Loss, out: RenderOutput) -> float:
     return number
 
 
-def _reason(kind: str, found: Look, request: Request, sums: PassSums, seconds: Callable[[], float]) -> str:
+def _reason(kind: str, found: Look, request: Request, sums: PassSums) -> str:
     """Return the reason of an end as a sentence."""
     error = f"error {found.error:.3g} after {found.passes} passes"
     if kind == "reached":
         return f"{error}, tolerance {request.rtol:g}"
-    if kind == "heavy tailed" or (found.small and found.heavy):
-        return (
-            f"heavy tailed: few of the passes hold most of the deviations, so that the {error} is not to be trusted: "
-            "rare light is still missing, or was found by chance. More samples, or a sampling that finds it, help"
-        )
     if kind == "no light":
         return f"no light in what was asked for in {found.passes} passes: nothing to be relative to"
-    head = {"max_spp": f"max_spp={request.max_spp}", "max_seconds": f"max_seconds={request.max_seconds:g}"
-            if request.max_seconds else ""}.get(kind, kind)  # fmt: skip
+    named = {"max_spp": request.max_spp, "max_seconds": request.max_seconds}
+    limit = f"{kind}={named[kind]:g}" if named.get(kind) else kind
+    if found.heavy:
+        said = "" if kind == "heavy tailed" else ", heavy tailed"
+        return (
+            f"{limit}: {error} is not to be trusted{said}: few bins, or few passes, hold most of the deviations, and rare "
+            "light is still missing in the others. More samples help, or a sampling that finds it"
+        )
     if not math.isfinite(found.forecast):
-        return f"{head}: {error}"
+        return f"{limit}: {error}"
     more = max(math.ceil(found.forecast) - found.passes, 1)
-    return f"{head}: {error}, about {more * sums.batch_spp} samples per pixel more for {request.rtol:g}"
+    return f"{limit}: {error}, about {more * sums.batch_spp} samples per pixel more for {request.rtol:g}"
 
 
 def _duration(seconds: float) -> str:
