@@ -132,11 +132,9 @@ def quantile_of(values: torch.Tensor, quantile: float) -> float:
     return float(values.reshape(-1).kthvalue(place).values)
 
 
-def next_look(passes: int, error: float, aim: float) -> int:
-    """Return the number of passes at the next look: what the error asks for, an eighth to as many more."""
-    ratio = error / aim
-    wanted = 1.05 * passes * ratio * ratio if math.isfinite(ratio) else math.inf
-    return math.ceil(min(max(wanted, passes + passes / 8), 2.0 * passes))
+def next_look(passes: int, forecast: float) -> int:
+    """Return the number of passes at the next look: those of the forecast, an eighth to as many more."""
+    return math.ceil(min(max(1.05 * forecast, passes + passes / 8), 2.0 * passes))
 
 
 def share_to_aim_at(freedom: float) -> float:
@@ -407,14 +405,21 @@ class Look:
     Args:
         passes: number of passes.
         error: relative error; infinite where it is not known, NaN where no bin that counts has light.
-        aim: error to reach: below the tolerance by what chance can hide.
-        heavy: few passes decide about the error.
+        rtol: tolerance.
+        freedom: degrees of freedom of the error.
+        heavy: few passes or bins decide about the error.
     """
 
     passes: int
     error: float
-    aim: float
+    rtol: float
+    freedom: float
     heavy: bool
+
+    @property
+    def aim(self) -> float:
+        """Error to reach: below the tolerance by what chance can hide."""
+        return self.rtol * share_to_aim_at(self.freedom)
 
     @property
     def small(self) -> bool:
@@ -423,8 +428,14 @@ class Look:
 
     @property
     def forecast(self) -> float:
-        """Number of passes that the aim takes."""
-        return self.passes * (self.error / self.aim) ** 2 if math.isfinite(self.error) else math.inf
+        """Number of passes that the aim takes, infinite where it is not known."""
+        if not math.isfinite(self.error):
+            return math.inf
+        wanted = float(self.passes)
+        for _ in range(4):  # the aim is higher after more passes
+            aim = self.rtol * share_to_aim_at(self.freedom * wanted / self.passes)
+            wanted = max(self.passes * (self.error / aim) ** 2, 2.0)
+        return wanted
 
 
 def look(sums: PassSums, request: Request) -> Look:
@@ -435,9 +446,9 @@ def look(sums: PassSums, request: Request) -> Look:
     counted = counted_bins(mean, request.on, sums)
     errors = (sums.variance()[counted] / sums.passes).sqrt_().div_(mean[counted])
     error = quantile_of(errors, request.quantile)
-    aim = request.rtol * share_to_aim_at((sums.passes - 1.0) * errors.numel())
+    freedom = (sums.passes - 1.0) * errors.numel()
     heavy = _ratio_of_halves(sums, mean, counted, request.quantile) > _MOST_IN_OTHER_HALF
-    return Look(sums.passes, error, aim, heavy)
+    return Look(sums.passes, error, request.rtol, freedom, heavy)
 
 
 def _ratio_of_halves(sums: PassSums, mean: torch.Tensor, counted: torch.Tensor, quantile: float) -> float:
@@ -459,12 +470,12 @@ def _look_at_loss(sums: PassSums, rtol: float) -> Look:
     squared = [(value - mean) ** 2 for value in values]
     power = math.fsum(squared)
     if n < 2 or mean == 0:
-        return Look(n, math.inf, rtol * share_to_aim_at(n), False)
+        return Look(n, math.inf, rtol, n - 1.0, False)
     error = math.sqrt(power / (n - 1) / n) / abs(mean)
     # Variance of a sample variance over its square: 2 / (n - 1) of normal values, more by their excess kurtosis.
     excess = max(n * math.fsum(x * x for x in squared) / power**2 - 3.0, 0.0) if power > 0 else 0.0
     freedom = 2.0 / (2.0 / (n - 1) + excess / n)
-    return Look(n, error, rtol * share_to_aim_at(freedom), is_heavy(squared))
+    return Look(n, error, rtol, freedom, is_heavy(squared))
 
 
 def counted_bins(mean: torch.Tensor, on: Any, sums: PassSums) -> torch.Tensor:
@@ -670,7 +681,7 @@ class _Loop:
         n = found.passes
         if not self.looks or self.looks[-1].passes != n:
             self.looks.append(found)
-        self.next_look = next_look(n, found.error, found.aim)
+        self.next_look = next_look(n, found.forecast)
         if found.small and not found.heavy:
             return "reached"
         if found.small:
@@ -762,8 +773,8 @@ def _reason(kind: str, found: Look, request: Request, sums: PassSums) -> str:
     if found.heavy:
         said = "" if kind == "heavy tailed" else ", heavy tailed"
         return (
-            f"{limit}: {error} is not to be trusted{said}: few bins, or few passes, hold most of the deviations, and rare "
-            "light is still missing in the others. More samples help, or a sampling that finds it"
+            f"{limit}: {error} is not to be trusted{said}: few bins, or few passes, hold most of the deviations, and "
+            "rare light is still missing in the others. More samples help, or a sampling that finds it"
         )
     if not math.isfinite(found.forecast):
         return f"{limit}: {error}"
