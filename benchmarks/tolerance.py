@@ -152,7 +152,8 @@ def printed(name: str, on: str, rtol: float, x: dict[str, Any]) -> str:
     return (
         f"{name:8} {on:6} {x['spp']:4} {rtol:6g} {x['needed']:7.1f} {passes:>14} {x['met']:6.1%} "
         f"{x['met within 1.1']:6.1%} {x['reached']:6.1%} {x['heavy']:6.1%} {forecast:>14} "
-        f"{x['forecast within 25 %']:6.1%} {x['forecast at half within 25 %']:6.1%} {100 * x['energy bias']:+7.3f} {x['energy bias z']:+5.1f} "
+        f"{x['forecast within 25 %']:6.1%} {x['forecast at half within 25 %']:6.1%} "
+        f"{100 * x['energy bias']:+7.3f} {x['energy bias z']:+5.1f} "
         f"{x['calibration']:5.2f} {x['looks']:5.1f} {x['ms of a pass']:6.1f} {x['ms of adding']:6.2f}"
     )
 
@@ -171,8 +172,8 @@ def main(arguments_of_line: Sequence[str] | None = None) -> None:
     results: dict[str, Any] = {}
     print(
         f"{'scene':8} {'on':6} {'spp':>4} {'rtol':>6} {'needed':>7} {'passes':>14} {'met':>6} {'x 1.1':>6} "
-        f"{'reach':>6} {'heavy':>6} {'forecast':>14} {'25 %':>6} {'half':>6} {'energy%':>7} {'z':>5} {'calib':>5} {'looks':>5} "
-        f"{'pass':>6} {'add':>6}"
+        f"{'reach':>6} {'heavy':>6} {'forecast':>14} {'25 %':>6} {'half':>6} {'energy%':>7} {'z':>5} "
+        f"{'calib':>5} {'looks':>5} {'pass':>6} {'add':>6}"
     )
     for name in options.scenes.split(","):
         scene = tt.load(SCENES[name](), variant=options.variant)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,10 @@ def command(scene: Path, **options: Any) -> None:
     else:
         found = _render_to_tolerance(described, values, film, options)
         output, said = found.output, "reached" if found.reached else "not reached"
-        metadata["tolerance"] = {name: getattr(found, name) for name in ("rtol", "quantile", "error", "reached")}
+        error = found.error if math.isfinite(found.error) else None  # JSON has no infinity
+        metadata["tolerance"] = {
+            "rtol": found.rtol, "quantile": found.quantile, "error": error, "reached": found.reached,
+        }  # fmt: skip
         click.echo(f"relative error {found.error:.3g} of {found.quantile:.0%} of the bins with light, {said}: "
                    f"{found.reason}")  # fmt: skip
     write_result(target, output, metadata)
