@@ -19,13 +19,14 @@ The rows `energy` are for a loss, the sum over all bins.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from _runner import arguments, environment, report
+from _runner import arguments, environment
 
 import torchtransient as tt
 
@@ -189,7 +190,8 @@ def main(arguments_of_line: Sequence[str] | None = None) -> None:
                     print(printed(name, on, rtol, found), flush=True)
     settings = {"runs": runs, "pool": size, "quick": options.quick, "environment": environment(options.variant)}
     if options.json is not None:
-        report("tolerance", settings, {"rows": results}, options.json)
+        data = {"benchmark": "tolerance", "settings": settings, "rows": results}
+        options.json.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

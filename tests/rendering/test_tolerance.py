@@ -113,6 +113,11 @@ def test_more_accurate_afterwards(renderer, result):
     assert to_tolerance(renderer, seed=3, resume=finer).passes == finer.passes
 
 
+def test_numbers_of_other_libraries(renderer):
+    numbers = {"rtol": torch.tensor(0.5), "max_spp": np.int64(SPP * 3), "batch_spp": torch.tensor(SPP)}
+    assert to_tolerance(renderer, quantile=np.float32(0.9), max_seconds=np.array(60), **numbers).passes == 3
+
+
 def test_time_ends_it(renderer):
     begin = time.perf_counter()
     part = to_tolerance(renderer, rtol=1e-4, max_seconds=0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,7 @@ class SamplesNeeded:
     error against log spp. `extrapolated`: `spp` lies outside of the samples that were measured.
     """
 
+    _: KW_ONLY
     spp: float
     low: float
     high: float
@@ -243,7 +244,8 @@ def _samples_needed(points: list[CostPoint], error: float) -> SamplesNeeded:
     last = points[-1]
     spp, low, high = (_exp(x) for x in (at, at - width, at + width))
     measured = last.spp >= spp >= points[0].spp
-    return SamplesNeeded(spp, low, high, last.seconds * spp / last.spp, line, not measured)
+    seconds = last.seconds * spp / last.spp
+    return SamplesNeeded(spp=spp, low=low, high=high, seconds=seconds, slope=line, extrapolated=not measured)
 
 
 def _exp(x: float) -> float:

@@ -34,12 +34,14 @@ from torchtransient.rendering.arguments import (
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import (
+    SEED_RANGE,
     Item,
     RenderJob,
     Seeding,
     draw_seed,
     rounded_count,
     samples_drawn,
+    warn_of_range,
     whole_number,
 )
 from torchtransient.rendering.output import RenderOutput, RenderStats
@@ -499,6 +501,7 @@ class TransientRenderer(CopiesParametrized):
         number = whole_number(seed)
         if number is None:
             raise UnitError(f"seed: expected one whole number, from which those of passes follow, got {shown(seed)}.")
+        warn_of_range([number])
         spp = checked_samples("batch_spp", batch_spp)
         # One switch of variant for all passes.
         with torch.no_grad(), active_variant(self.scene.variant):
@@ -512,7 +515,7 @@ class TransientRenderer(CopiesParametrized):
             kept = {key: tensor.detach().clone() for key, tensor in zip(self._keys, tensors, strict=True)}
             return render_to_tolerance(
                 lambda seed: self.forward(values, seed=seed, spp=spp),
-                PassSums(number, spp, self.film, settings, kept),
+                PassSums(number % SEED_RANGE, spp, self.film, settings, kept),
                 request,
                 resume=resume,
                 progress=progress,
