@@ -259,6 +259,32 @@ def test_heavy_tails_are_said():
     assert "heavy tailed" in result.reason
 
 
+def test_a_loss_with_a_heavy_tail(renderer):
+    """One pass with most of the squared deviations: twice as many do not help, and it ends by itself."""
+
+    def outlier(out):
+        return next(numbers)
+
+    numbers = iter([1.0, 1.01, 0.99, 1.0, 3.0] + [1.0, 1.01, 0.99] * 200)
+    result = to_tolerance(renderer, rtol=0.1, on=outlier, max_spp=SPP * 500)
+    met = next(look.passes for look in result.looks if look.small)
+    assert result.error < 0.1 and result.heavy_tailed and not result.reached
+    assert result.reason.startswith("heavy tailed") and 2 * met <= result.passes < 4 * met
+    # Asked again, it goes on.
+    again = to_tolerance(renderer, rtol=0.1, on=outlier, resume=result, max_spp=result.spp + 40 * SPP)
+    assert again.passes > result.passes
+
+
+def test_going_on_for_other_bins(renderer, result):
+    """Sums are of all bins: another mask, or all bins after a loss, need no new passes."""
+    late = torch.arange(60).reshape(60, 1, 1) > 25
+    other = to_tolerance(renderer, seed=3, resume=result, on=late, max_spp=result.spp)
+    assert other.passes == result.passes and other.error != result.error and same_mean(other, result)
+    of_loss = to_tolerance(renderer, seed=3, on=energy, max_spp=SPP * result.passes, rtol=0.001)
+    assert of_loss.passes == result.passes
+    assert to_tolerance(renderer, seed=3, resume=of_loss).error == pytest.approx(result.error, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
