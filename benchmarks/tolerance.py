@@ -63,7 +63,7 @@ class Pool:
     """Passes of a scene, all in memory, and what is true of them."""
 
     def __init__(self, scene: tt.Scene, spp: int | None, size: int) -> None:
-        from torchtransient.rendering.tolerance import samples_of_pass
+        from torchtransient.rendering.passes import samples_of_pass
 
         self.renderer = tt.TransientRenderer(scene, physics="ignore")
         self.spp = spp or samples_of_pass("owen", 64)
@@ -79,7 +79,7 @@ class Pool:
         """Passes after which the true error is the tolerance."""
         import torch
 
-        from torchtransient.rendering.tolerance import local_mean
+        from torchtransient.rendering.passes import local_mean
 
         if on == "energy":
             return float(self.energies.var(ddof=1) / self.energies.mean() ** 2 / rtol**2)
@@ -89,7 +89,8 @@ class Pool:
 
     def run(self, on: str, rtol: float, rng: np.random.Generator) -> dict[str, float]:
         """One run of passes in random order."""
-        from torchtransient.rendering.tolerance import PassSums, Request, render_to_tolerance
+        from torchtransient.rendering.passes import PassSums
+        from torchtransient.rendering.tolerance import Request, render_to_tolerance
 
         order = rng.permutation(len(self.passes))
         taken = iter(order)

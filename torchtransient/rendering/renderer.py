@@ -45,15 +45,9 @@ from torchtransient.rendering.job import (
     whole_number,
 )
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.rendering.passes import PassSums, samples_of_pass
 from torchtransient.rendering.progress import Bar
-from torchtransient.rendering.tolerance import (
-    Loss,
-    PassSums,
-    Request,
-    ToleranceResult,
-    render_to_tolerance,
-    samples_of_pass,
-)
+from torchtransient.rendering.tolerance import Loss, Request, ToleranceResult, render_to_tolerance
 from torchtransient.scene.edits import BuildOptions, checked_pulse
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import sampler_plugin
