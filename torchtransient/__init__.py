@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from torchtransient.rendering.plan import plan as plan
     from torchtransient.rendering.renderer import TransientRenderer as TransientRenderer
     from torchtransient.rendering.threads import threads as threads
+    from torchtransient.rendering.tolerance import ToleranceResult as ToleranceResult
     from torchtransient.rendering.wrap import wrap as wrap
     from torchtransient.scene.load import Scene as Scene
     from torchtransient.scene.load import load as load
@@ -59,6 +60,7 @@ _LAZY = {
     "RenderStats": "torchtransient.rendering.output",
     "Scene": "torchtransient.scene.load",
     "TimeAxis": "torchtransient.axes",
+    "ToleranceResult": "torchtransient.rendering.tolerance",
     "TransientRenderer": "torchtransient.rendering.renderer",
     "accuracy": "torchtransient.accuracy",
     "cost_of_accuracy": "torchtransient.accuracy.cost",

@@ -9,8 +9,8 @@ import torch
 
 import torchtransient as tt
 from torchtransient.accuracy.cost import cosine_over_the_window
-from torchtransient.accuracy.report import Choice
-from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.scenes import transforms
 
 VARIANT = "llvm_ad_mono"
@@ -69,6 +69,48 @@ def test_independent_samples_converge_as_one_over_spp(report):
     for name in ("box", "tent"):
         slope = report.slope("transient", Choice("independent", name))
         assert abs(slope.slope + 1) < max(4 * slope.standard_error, 0.1)
+
+
+def test_samples_for_an_error(report):
+    """Independent samples: a quarter of the error takes sixteen times the samples, and a render has that error then."""
+    choice = Choice("independent", "box")
+    curve = next(points for _, found, points in report.curves() if found == choice)
+    inside = report.spp_for(curve[1].relative_error, choice=choice)
+    assert inside.low < curve[1].spp < inside.high and not inside.extrapolated
+    coarse, fine = (report.spp_for(curve[-1].relative_error / k, quantity="transient", choice=choice) for k in (1, 4))
+    assert 10 < fine.spp / coarse.spp < 26 and fine.extrapolated
+    assert fine.high / fine.low > coarse.high / coarse.low > 1
+    assert fine.seconds > coarse.seconds and f"{fine.spp:.3g} spp" in str(fine)
+    first = report.spp_for(0.01)
+    assert first == report.spp_for(0.01, quantity="transient", choice=choice)
+
+
+def test_samples_of_curves_that_are_not_there(report):
+    few = replace(report, points=[p for p in report.points if p.spp < 100])
+    flat = replace(report, points=[replace(p, relative_error=0.1 + p.spp / 1e4) for p in report.points])
+    for call, error in (
+        (lambda: report.spp_for(0), UnitError), (lambda: report.spp_for(0.1, quantity="phasor"), ArgumentError),
+        (lambda: report.spp_for(0.1, choice=Choice("owen", "box")), ArgumentError),
+        (lambda: few.spp_for(0.1), ArgumentError), (lambda: flat.spp_for(0.1), ArgumentError),
+    ):  # fmt: skip
+        with pytest.raises(error, match="spp_for"):
+            call()
+
+
+@pytest.mark.slow
+def test_the_interval_holds_the_samples():
+    """Of artificial curves with the scatter that they say, 95 of 100."""
+    generator, held = np.random.default_rng(0), 0
+    for _ in range(400):
+        noise = generator.normal(0, 0.1, 4)
+        points = [
+            CostPoint(Choice("independent", "box"), "transient", n, 0.1, np.exp(e) / n, 0.1 * np.exp(e) / n,
+                      np.sqrt(np.exp(e) / n), 0.1, 4)
+            for n, e in zip((16, 64, 256, 1024), noise, strict=True)
+        ]  # fmt: skip
+        needed = AccuracyReport(points, "").spp_for(0.005)
+        held += needed.low < 1 / 0.005**2 < needed.high
+    assert held / 400 > 0.92
 
 
 def test_stratified_samples_do_better(report):

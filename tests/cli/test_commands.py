@@ -47,6 +47,23 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
+def test_render_to_a_tolerance(folder):
+    result = run("render", "box.xml", "-o", "out.npz", "--rtol", 0.1, "--seed", 3, "--quiet", "--set",
+                 "grey.reflectance.value=0.5,0.5,0.5")  # fmt: skip
+    assert result.exit_code == 0, result.output
+    renderer = tt.TransientRenderer("box.xml", ["grey.reflectance.value"])
+    expected = renderer.to_tolerance({"grey.reflectance.value": [0.5] * 3}, rtol=0.1, seed=3, progress=False)
+    stored = read_result(folder / "out.npz")
+    assert torch.allclose(stored.transient, expected.output.transient, rtol=1e-5, atol=1e-9)
+    assert stored.metadata["stats"]["spp"] == expected.spp and stored.metadata["tolerance"]["reached"] is True
+    assert "of 90% of the bins with light, reached" in result.output and f"{expected.error:.3g}" in result.output
+    short = run("render", "box.xml", "-o", "out.npz", "--rtol", 1e-5, "--max-seconds", 0.2, "--quiet")
+    assert short.exit_code == 0 and "not reached" in short.output and "max_seconds" in short.output
+    for options in (("--max-seconds", 1), ("--rtol", 0.1, "--spp", 4), ("--rtol", 2)):
+        wrong = run("render", "box.xml", *options)
+        assert wrong.exit_code == 2 and options[0] in wrong.output
+
+
 @pytest.mark.parametrize("ending", long(["h5", "npz"], ["h5"]))
 def test_render_writes_what_the_library_renders(folder, ending):
     result = run("render", "box.xml", "-o", f"out.{ending}", "--overview", "out.png", "--seed", 3, "--quiet")

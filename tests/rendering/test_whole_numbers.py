@@ -31,9 +31,15 @@ CALLS = {
     "grad_seed": lambda n: tt.TransientRenderer(make_room(), grad_seed=n).grad_seed,
     "seed": lambda n: tt.render(make_room(), spp=1, seed=n).stats.seeds[0],
     "one seed of several": lambda n: tt.render(make_room(), spp=1, seed=[n]).stats.seeds[0],
+    "batch_spp": lambda n: tolerance(batch_spp=n).spp,
+    "seed of passes": lambda n: tolerance(seed=n, batch_spp=1).state.sums.seed,
     "sensor": lambda n: tt.TransientRenderer(room_of_four(), sensors=n)._sensors[0],
     "one sensor of several": lambda n: tt.TransientRenderer(room_of_four(), sensors=[n])._sensors[0],
 }
+
+
+def tolerance(**settings):
+    return tt.TransientRenderer(make_room()).to_tolerance(rtol=0.5, max_seconds=1e-9, progress=False, **settings)
 
 
 def room_of_four():

@@ -23,6 +23,7 @@ from support.number_case import (
     until,
 )
 from tools.small_room import make_room
+from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
 from torchtransient.errors import TorchTransientError
 
 AXIS, LIGHT = tt.TimeAxis(1.0, 0.05, 8), 0.1 + torch.rand(1, 8, 16, 16, generator=torch.Generator().manual_seed(0))
@@ -219,11 +220,18 @@ def _of_a_folder() -> dict[str, Case]:
 DATA = "torchtransient.data"
 
 
+def _report() -> AccuracyReport:
+    choice = Choice("owen", "box")
+    points = [CostPoint(choice, "transient", n, 0.1, 1 / n, 0.1 / n, n**-0.5, 0.1, 4) for n in (4, 16, 64)]
+    return AccuracyReport(points, "")
+
+
 def _runs() -> dict[str, Case]:
     """Of data sets and training."""
     d, t = tt.data, tt.training
     batches, table = t.Batches(4, 2), Table()
     return {
+        "accuracy.AccuracyReport.spp_for": Case(_report().spp_for, error=0.1),
         "data.first_return": Case(d.first_return, LIGHT, AXIS, threshold=0.5),
         "data.Augmented": Case(d.Augmented, table, d.Augment(d.Flip()), seed=3),
         "data.Augmented.sample": Case(
@@ -348,7 +356,7 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview)\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult|accuracy\.SamplesNeeded)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
     r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",

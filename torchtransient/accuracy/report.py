@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,11 @@ import numpy as np
 from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
 from torchtransient.accuracy.statistics import Slope, log_log_slope
 from torchtransient.array_files.part_files import write_text
+from torchtransient.checks import positive, shown
+from torchtransient.errors import ArgumentError
+
+# Two-sided 95 % of a normal deviate.
+_DEVIATE = 1.96
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,28 @@ class CostPoint:
     tail: Tail | None = None
 
 
+@dataclass(frozen=True)
+class SamplesNeeded:
+    """Samples per pixel that a relative error takes, from a line through measured errors.
+
+    `spp`: estimate. `low`, `high`: its 95 % interval, for errors that scatter about the line as those measured do.
+    `seconds`: time of one run of `spp`, from the last measured one in proportion. `slope`: of log squared relative
+    error against log spp. `extrapolated`: `spp` lies outside of the samples that were measured.
+    """
+
+    _: KW_ONLY
+    spp: float
+    low: float
+    high: float
+    seconds: float
+    slope: Slope
+    extrapolated: bool
+
+    def __str__(self) -> str:
+        where = ", extrapolated" if self.extrapolated else ""
+        return f"{self.spp:.3g} spp ({self.low:.3g} to {self.high:.3g}{where}), about {self.seconds:.3g} s"
+
+
 @dataclass
 class AccuracyReport:
     """Error against seconds and samples for every quantity and choice. Made by `cost_of_accuracy`."""
@@ -76,6 +103,34 @@ class AccuracyReport:
                 if len(good) >= 3:
                     return log_log_slope([p.spp for p in good], [p.squared_error for p in good])
         return None
+
+    def spp_for(self, error: float, *, quantity: str | None = None, choice: Choice | None = None) -> SamplesNeeded:
+        """Samples per pixel for a relative error (`CostPoint.relative_error`, 0.05 for 5 %), by the line through the
+        logarithms of the squared relative errors of one curve.
+
+        The curve is that of `quantity` and `choice`, None for the first one of the report. Its interval holds the
+        scatter of the points about the line, or their own standard errors where those are larger, and grows with the
+        distance from what was measured. A curve that flattens out, as against a reference with a bias, is not seen
+        beyond its end.
+
+        Raises UnitError for an error that is not positive, ArgumentError for a curve that the report does not have,
+        and for one with less than three points of known error, or whose error does not fall.
+        """
+        wanted = positive("spp_for: error", error)
+        quantity = self.quantities()[0] if quantity is None else quantity
+        curves = {found: points for name, found, points in self.curves() if name == quantity}
+        if not curves:
+            raise ArgumentError(f"spp_for: quantity: expected one of {self.quantities()}, got {shown(quantity)}.")
+        choice = next(iter(curves)) if choice is None else choice
+        if choice not in curves:
+            raise ArgumentError(f"spp_for: choice: expected one of {list(map(str, curves))}, got {shown(choice)}.")
+        points = [p for p in curves[choice] if p.relative_error > 0]
+        if len(points) < 3:
+            raise ArgumentError(
+                f"spp_for: expected at least three points of known error of {quantity} [{choice}], got {len(points)}; "
+                "measure more of them, cost_of_accuracy(spp=...)."
+            )
+        return _samples_needed(points, wanted)
 
     def gain(self, quantity: str, choice: Choice) -> float:
         """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal
@@ -166,6 +221,36 @@ class AccuracyReport:
             for quantity, choice, curve in self.curves()
         ]
         plot_accuracy(curves, path)
+
+
+def _samples_needed(points: list[CostPoint], error: float) -> SamplesNeeded:
+    """Invert the line of at least three points: u = (log error^2 - offset) / slope, and its variance."""
+    u = np.log([float(p.spp) for p in points])
+    v = 2.0 * np.log([p.relative_error for p in points])
+    line = log_log_slope(np.exp(u), np.exp(v))
+    if line.slope >= 0:
+        raise ArgumentError(
+            f"spp_for: expected an error that falls with the samples, got slope {line.slope:+.2f} +- "
+            f"{line.standard_error:.2f}; measure with more repeats, or samples further apart."
+        )
+    at = (2.0 * math.log(error) - math.log(line.factor)) / line.slope
+    spread = float(((u - u.mean()) ** 2).sum())
+    known = [(p.squared_error_standard_error / p.squared_error) ** 2 for p in points if p.squared_error > 0]
+    of_points = float(np.mean([x for x in known if math.isfinite(x)] or [0.0]))
+    # Of few points the scatter is known by chance alone: what their own repeats say counts as well.
+    scatter = max(line.standard_error**2 * spread, of_points)
+    deviation = math.sqrt(scatter * (1.0 / len(points) + (at - float(u.mean())) ** 2 / spread)) / abs(line.slope)
+    width = _DEVIATE * deviation
+    last = points[-1]
+    spp, low, high = (_exp(x) for x in (at, at - width, at + width))
+    measured = last.spp >= spp >= points[0].spp
+    seconds = last.seconds * spp / last.spp
+    return SamplesNeeded(spp=spp, low=low, high=high, seconds=seconds, slope=line, extrapolated=not measured)
+
+
+def _exp(x: float) -> float:
+    """The exponential, infinite where a float does not hold it."""
+    return math.exp(x) if x < 700.0 else math.inf
 
 
 def _percent(value: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,13 @@ from torchtransient.rendering.films import layout_of_output
 @picture_options
 @click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
 @click.option("--spp", type=click.IntRange(1, 2**32 - 1), help="Samples per pixel.  [default: the scene's]")
+@click.option(
+    "--rtol", type=click.FloatRange(0, 1, min_open=True, max_open=True), metavar="ERROR",
+    help="Render until 90 % of the bins with light have this relative error: 0.05.",
+)
+@click.option(
+    "--max-seconds", type=click.FloatRange(min=0, min_open=True), metavar="SECONDS", help="With --rtol: the most time."
+)
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
 @click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
@@ -37,6 +45,7 @@ def command(scene: Path, **options: Any) -> None:
     from torchtransient.files.result_file import check_target, write_result
 
     assignments(options["params"], "--param")
+    _check_tolerance(options)
     film = film_of_options(options)
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
@@ -46,8 +55,19 @@ def command(scene: Path, **options: Any) -> None:
     if options["list_parameters"]:
         click.echo(described.parameters())
         return
-    output = _render(described, values, film, options)
-    write_result(target, output, {"scene": scene.name, "parameters": options["params"], "set": options["values"]})
+    metadata = {"scene": scene.name, "parameters": options["params"], "set": options["values"]}
+    if options["rtol"] is None:
+        output = _render(described, values, film, options)
+    else:
+        found = _render_to_tolerance(described, values, film, options)
+        output, said = found.output, "reached" if found.reached else "not reached"
+        error = found.error if math.isfinite(found.error) else None  # JSON has no infinity
+        metadata["tolerance"] = {
+            "rtol": found.rtol, "quantile": found.quantile, "error": error, "reached": found.reached,
+        }  # fmt: skip
+        click.echo(f"relative error {found.error:.3g} of {found.quantile:.0%} of the bins with light, {said}: "
+                   f"{found.reason}")  # fmt: skip
+    write_result(target, output, metadata)
     stats, film = output.stats, layout_of_output(output)
     assert film is not None  # a steady film was refused before the render
     what, how = summary(film, output)
@@ -76,6 +96,35 @@ def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str
             max_depth=options["max_depth"],
             temporal_filter=options["temporal_filter"],
             sensors=options["sensor"],
+        )
+
+
+def _check_tolerance(options: dict[str, Any]) -> None:
+    if options["rtol"] is None and options["max_seconds"] is not None:
+        raise click.UsageError("--max-seconds is for --rtol: a render of a given --spp ends with its last sample.")
+    if options["rtol"] is not None and options["spp"] is not None:
+        raise click.UsageError("--rtol, --spp: give one of them; --rtol finds the samples, --max-seconds bounds them.")
+
+
+def _render_to_tolerance(described: Any, values: dict[str, Any], film: Any, options: dict[str, Any]) -> Any:
+    import torchtransient as tt
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the window misses", PhysicsWarning)
+        renderer = tt.TransientRenderer(
+            described,
+            list(values),
+            film=film,
+            max_depth=options["max_depth"],
+            temporal_filter=options["temporal_filter"],
+            sensors=options["sensor"],
+        )
+        return renderer.to_tolerance(
+            values,
+            rtol=options["rtol"],
+            max_seconds=options["max_seconds"],
+            seed=options["seed"],
+            progress=not options["quiet"],
         )
 
 

@@ -49,7 +49,7 @@ class Seeding:
         """Return one item for each entry and sensor; ``seed`` is a whole number, or one for each entry."""
         per_entry = len(self.sensors)
         if (number := whole_number(seed)) is not None:
-            _warn_of_range([number])
+            warn_of_range([number])
             seeds = [mix_seed(number, n) for n in range(self.entries * per_entry)]
         else:
             given = [_each_number(one) for one in seed]
@@ -58,7 +58,7 @@ class Seeding:
                     f"seed: expected one integer, or one for each of {self.entries} batch entries, got {len(given)}."
                 )
             _check_distinct(given)
-            _warn_of_range(given)
+            warn_of_range(given)
             seeds = [mix_seed(s, n) for s in given for n in range(per_entry)]
         return tuple(
             Item(n // per_entry, self.sensors[n % per_entry], value, self._of_gradient(value, n))
@@ -155,7 +155,7 @@ class RenderJob:
 # ------------------------------------------------------------------------------------------------------------ seeds
 
 
-def _warn_of_range(seeds: list[int]) -> None:
+def warn_of_range(seeds: list[int]) -> None:
     """Warn of seeds that count as others."""
     beyond = [seed for seed in seeds if not 0 <= seed < SEED_RANGE]
     if beyond:

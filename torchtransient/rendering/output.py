@@ -30,7 +30,7 @@ class RenderStats:
         samples_per_second: camera paths per second.
         variant, integrator: names.
         temporal_filter: of the film; empty for films without one.
-        seeds: one per item (entry of the batch and sensor).
+        seeds: one per item (entry of the batch and sensor); of a mean of passes those of all, in turn.
         energy_before, energy_after: light outside of the time axis, per item: sum over pixels of the mean over
             channels; zero for films without a window (phasors, gates). ``RenderOutput.outside`` has the shares.
         energy_total: likewise, all light of ``steady``.

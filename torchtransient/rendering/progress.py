@@ -26,6 +26,26 @@ class Bar:
         self._bar.close()
 
 
+class ForecastBar:
+    """Progress bar whose end is a forecast: its text says what is left."""
+
+    def __init__(self, name: str) -> None:
+        from tqdm.auto import tqdm
+
+        self._name = name
+        form = "{desc} |{bar}| {percentage:3.0f}% {elapsed}"
+        self._bar: Any = tqdm(total=1.0, desc=name, bar_format=form, miniters=0)
+
+    def show(self, fraction: float, text: str) -> None:
+        """Show the fraction that is done, which may shrink, and a text."""
+        self._bar.set_description_str(f"{self._name}: {text}", refresh=False)
+        self._bar.update(min(fraction, 1.0) - self._bar.n)
+
+    def close(self) -> None:
+        """Finish the bar."""
+        self._bar.close()
+
+
 def with_bar(things: Sequence[_T], name: str, progress: bool) -> Iterator[_T]:
     """Yield the entries of a sequence; show a bar called ``name`` if ``progress``."""
     bar = Bar(name) if progress else None

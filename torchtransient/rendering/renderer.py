@@ -11,7 +11,7 @@ from torch import nn
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.checks import Numbers, flag, is_one_of, shown
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.modules import CopiesParametrized
 from torchtransient.plugins.parameters import check_slope, sun_axes
@@ -33,9 +33,21 @@ from torchtransient.rendering.arguments import (
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.error_bars import CELL_BINS, CELL_PIXELS, BatchErrors, ErrorCells
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
-from torchtransient.rendering.job import Item, RenderJob, Seeding, draw_seed, rounded_count, samples_drawn
+from torchtransient.rendering.job import (
+    SEED_RANGE,
+    Item,
+    RenderJob,
+    Seeding,
+    draw_seed,
+    rounded_count,
+    samples_drawn,
+    warn_of_range,
+    whole_number,
+)
 from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.rendering.passes import PassSums, samples_of_pass
 from torchtransient.rendering.progress import Bar
+from torchtransient.rendering.tolerance import Loss, Request, ToleranceResult, render_to_tolerance
 from torchtransient.scene.edits import BuildOptions, checked_pulse
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import sampler_plugin
@@ -348,9 +360,12 @@ class TransientRenderer(CopiesParametrized):
             UnitError: if ``spp`` is no positive integer.
         """
         with active_variant(self.scene.variant):
-            scene = self.scene.built(self._options).scene
-            sampler = engine.sampler_of(scene, scene.sensors()[self._sensors[0]], self.sampler)
-            return samples_drawn(sampler, checked_samples("spp", spp))
+            return samples_drawn(self._sampler_in_use(), checked_samples("spp", spp))
+
+    def _sampler_in_use(self) -> Any:
+        """Return a copy of the sampler that draws, under the scene's variant."""
+        scene = self.scene.built(self._options).scene
+        return engine.sampler_of(scene, scene.sensors()[self._sensors[0]], self.sampler)
 
     @opaque
     def forward(
@@ -450,6 +465,78 @@ class TransientRenderer(CopiesParametrized):
         bins, pixels = (CELL_BINS if self.film.has_bins else 1, CELL_PIXELS) if errors is True else (1, 1)
         cells = ErrorCells(bins, pixels, pixels, shared)
         return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex)
+
+    @opaque
+    def to_tolerance(
+        self,
+        values: Mapping[str, Any] | None = None,
+        *,
+        rtol: float,
+        quantile: float = 0.9,
+        on: torch.Tensor | Loss | None = None,
+        max_seconds: float | None = None,
+        max_spp: int | None = None,
+        seed: int = 0,
+        batch_spp: int | None = None,
+        resume: ToleranceResult | None = None,
+        progress: bool = True,
+    ) -> ToleranceResult:
+        """Render passes, without gradients, until the relative error of their mean is small enough.
+
+        The error of a bin is the standard error of the mean over passes, channels averaged, relative to the mean of the
+        bin and its neighbours (3 x 3 pixels, and 3 bins of time). Pass ``i`` has the seed ``pass_seed(seed, i)``: the
+        mean depends on the number of passes alone, not on interruptions. Without ``max_seconds`` and ``max_spp`` the
+        render may take arbitrarily long; Ctrl-C ends it with what there is.
+
+        Args:
+            values: as of a call.
+            rtol: relative error, 0.05 for 5 %.
+            quantile: share of the bins with light whose error is to be at most that.
+            on: None for bins whose local mean is at least 2 % of the mean over all bins; a mask of truth values that
+                broadcasts to (T, H, W) or (C, T, H, W) for the bins that count, of phasors and gated films frequencies
+                and gates in place of bins (those without any light never count); or a loss, a function of a
+                ``RenderOutput`` that returns one number, whose relative error is meant then. It must be linear in the
+                render: the mean of another loss over passes is not the loss of their mean.
+            max_seconds: wall time of this call, after which it ends with what there is; a pass is made in any case.
+            max_spp: samples per pixel, those of ``resume`` included.
+            seed: seed of the passes; of ``resume`` the same.
+            batch_spp: samples per pixel of a pass. None for at least 16 with the sampler ``owen``, 8 with others, and
+                up to 256 of small films, to make 2^16 paths.
+            resume: result of an earlier call with the same values, to go on from: its passes count.
+            progress: show error, target and remaining time.
+
+        Returns:
+            A :class:`ToleranceResult`: the mean as ``output``, ``error``, ``reached``, ``reason``, and
+            ``standard_error`` of each bin. ``reached`` is False where the time was over before, and where few of the
+            passes hold most of the deviations: the error of a heavy tail is not known.
+
+        Raises:
+            UnitError, ArgumentError, ShapeError: for other arguments, and a ``resume`` of another render.
+            SceneError, DeviceError, StorageError: as of a call.
+        """
+        request = Request(rtol, quantile, on, max_seconds, max_spp)
+        number = whole_number(seed)
+        if number is None:
+            raise UnitError(f"seed: expected one whole number, from which those of passes follow, got {shown(seed)}.")
+        warn_of_range([number])
+        spp = checked_samples("batch_spp", batch_spp)
+        # One switch of variant for all passes.
+        with torch.no_grad(), active_variant(self.scene.variant):
+            sampler = sampler_plugin(self._sampler_in_use())
+            if spp is None:
+                spp = samples_of_pass(sampler, self._cube_shape[0] * self._cube_shape[1])
+            spp = self.samples_drawn(spp)
+            settings: dict[str, Any] = {"variant": self.scene.variant, "sampler": sampler, "sensors": self._sensors}
+            settings["temporal_filter"] = self.effective_filter
+            tensors, _, _ = self._collect(values)
+            kept = {key: tensor.detach().clone() for key, tensor in zip(self._keys, tensors, strict=True)}
+            return render_to_tolerance(
+                lambda seed: self.forward(values, seed=seed, spp=spp),
+                PassSums(number % SEED_RANGE, spp, self.film, settings, kept),
+                request,
+                resume=resume,
+                progress=progress,
+            )
 
     def _collect(self, values: Mapping[str, Any] | None) -> tuple[list[torch.Tensor], list[bool], int | None]:
         """Return the tensors of a call in the order of the keys, which of them are batched, and the batch size."""
