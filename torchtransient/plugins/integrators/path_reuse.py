@@ -202,7 +202,7 @@ class TransientPathReuse(path.TransientPath):
         lanes = dr.width(part.order)
         turn = dr.zeros(mi.UInt32, lanes) + dr.opaque(mi.UInt32, part.round)
         if mi.is_spectral:  # a group has one set of wavelengths
-            group = dr.gather(mi.UInt32, part.order, dr.arange(mi.UInt32, lanes) & mi.UInt32(~(self.group_size - 1)))
+            group = dr.gather(mi.UInt32, part.order, dr.arange(mi.UInt32, lanes) & mi.UInt32(2**32 - self.group_size))
             sampler.seed_sets(seed_of(part.pixel_seed, 1), group, turn)
             wavelength = sampler.next_1d()
         sampler.seed_sets(part.pixel_seed, part.order, turn)
