@@ -79,8 +79,8 @@ class TransientPathReuse(path.TransientPath):
             return f"the variant {mi.variant()} is polarized"
         if self.max_depth == UNLIMITED:
             return "max_depth is -1 (no limit), and lists of events need one"
-        if film.measures == "phasor":
-            return "the film keeps phasors"
+        if film.measures not in ("transient", "gated"):
+            return f"the film ({film.plugin}) sums over all times, where the noise of direct light remains"
         if len(film.band_layout()) > 1:
             return "the film has several storage bands (more than 2^32 values); crop it, or use fewer bins"
         if delays is not None and delays.shifts:
@@ -162,7 +162,7 @@ class TransientPathReuse(path.TransientPath):
                 ))  # fmt: skip
                 if packed is not None and (i + 1 == rounds or (i + 1) % MOST_ROUNDS == 0):
                     packed.add_to_film(base, real)
-                dr.eval(film.bands[0][2], film.steady, film.outside)
+                    dr.eval(film.bands[0][2])
                 if job.progress:
                     dr.sync_thread()
                     job.progress(number / (launches * rounds))
@@ -182,18 +182,16 @@ class TransientPathReuse(path.TransientPath):
         if part.packed is not None:
             block, sink = None, PackedSink(part.packed, match, group.first)
         else:
-            most = sharing.size * sharing.suffixes * events.slots
+            most = group.size * sharing.suffixes * events.slots
             block = film.create_event_block(launch, base, match, most, exclusive=True, origin=group.first)
             sink = FilmSink(block)
         state = bring(group, events, sharing.suffixes, sink, sink.begin(context))
         sink.end(state)
-        light = [dr.select(part.real, c, 0) for c in match.to_channels(state["L"])]
-        film.add_steady(pixel, light)
+        film.add_steady(pixel, [dr.select(part.real, c, 0) for c in match.to_channels(state["L"])])
         film.add_outside(pixel, *(dr.select(part.real, state[side], 0) for side in ("before", "after")))
         if block is not None:
             block.finish()
-        else:
-            dr.eval(part.packed.flat)
+        dr.eval(film.bands[0][2], film.steady, film.outside, None if part.packed is None else part.packed.flat)
         return base
 
     def _rays(self, context, sensor, film, part):
