@@ -1,11 +1,11 @@
 """Error times CPU time of `transient_path_reuse` over `transient_path`, scene by scene, and tests of its means.
 
-All render the same scenes in one process and take turns: `transient_path` with the samplers `independent` (the baseline)
+All render the same scenes in one process and take turns: `transient_path` with the samplers `independent` (baseline)
 and `owen`, and `transient_path_reuse` with `owen`. Per scene: the relative error of single bins (variance between runs
 over the squared mean of the 3 x 3 pixels x 3 bins around, 15 bins of 2048, plus the square of 1 % of the mean over the
-cube), times CPU seconds, over the same of the baseline; that for the first, second and last third of the time axis;
-without the worst 0.1 % of the bins; and of the squared error. Energy and Student's t of blocks of 8 x 8 pixels x 10 bins
-are those of reuse against `owen`: mean 0, deviation 1 once divided by that of t.
+cube) times CPU seconds, of the baseline over that of reuse: over all bins, the first, second and last third of the time
+axis, without the worst 0.1 % of the bins; and of the squared error. Energy and Student's t of blocks of 8 x 8 pixels x
+10 bins are those of reuse against `owen`: mean 0, deviation 1 once divided by that of t.
 
     python benchmarks/path_reuse.py [--scenes cornell,glass] [--runs 12] [--json FILE]
 """

@@ -25,12 +25,12 @@ from torchtransient.plugins.transport.walk import start, walk
 
 # Light that too few vertices are left for is not shared.
 LEAST_DEPTH = 3
-# Memory of the lists of one launch, and of its histograms, bytes.
+# Memory of the pairs and lists of one launch, and of its histograms, bytes.
 MAX_BYTES = 2**27
+# That of all launches of a recorded call, which keeps it until the last one is done. Tracing costs little beside more.
+MAX_RECORDED_BYTES = 2**28
 # Pixels of a launch: more would lie beyond the caches of a processor.
-PIXELS = {"llvm": 2**12, "cuda": 2**15}
-# Launches of shared light that are recorded at most.
-MOST_RECORDED = 64
+PIXELS = {"llvm": 2**14, "cuda": 2**16}
 # Rounds that are summed up in single precision.
 MOST_ROUNDS = 2**10
 
@@ -69,22 +69,25 @@ class TransientPathReuse(path.TransientPath):
         sensor, film = super().resolve(scene, sensor)
         reason = self._why_not(scene, sensor, film)
         if reason is not None:
-            raise SceneError(f"transient_path_reuse: {reason}, expected otherwise. Use transient_path.")
+            raise SceneError(f"transient_path_reuse: {reason}, or use transient_path.")
         return sensor, film
 
     def _why_not(self, scene, sensor, film):
-        """Return why light cannot be shared, None if it can."""
+        """Return why light cannot be shared and what to do, None if it can."""
         delays = self.contents(scene, sensor).delays
         if mi.is_polarized:
-            return f"the variant {mi.variant()} is polarized"
+            return f"the variant {mi.variant()} is polarized; load the scene in one without"
         if self.max_depth == UNLIMITED:
-            return "max_depth is -1 (no limit), and lists of events need one"
+            return "max_depth is -1 (no limit), and lists of events need one; set it"
         if film.measures not in ("transient", "gated"):
-            return f"the film ({film.plugin}) sums over all times, where the noise of direct light remains"
+            return (
+                f"expected a film of histograms or gates, got {film.plugin}, which sums over all times, where noise is "
+                "that of direct light; take a transient_hdr_film"
+            )
         if len(film.band_layout()) > 1:
-            return "the film has several storage bands (more than 2^32 values); crop it, or use fewer bins"
+            return f"the film {film.cube_shape()} exceeds one storage band of 2^32 values; crop it, use fewer bins"
         if delays is not None and delays.shifts:
-            return "a surface shifts wavelengths, of which a group has one set"
+            return "a surface shifts wavelengths, and a group has one set of them; take it out"
         return None
 
     # --------------------------------------------------------------------------------------------- preparation
@@ -118,19 +121,24 @@ class TransientPathReuse(path.TransientPath):
 
     def refusal_of(self, job):
         sharing = job.context.sharing
-        if sharing is not None and self._launches(job.film, sharing) * self._rounds(job.samples) > MOST_RECORDED:
-            return "shared light takes many kernel launches, beside which tracing costs little"
+        if sharing is not None:
+            taken = self._bytes_per_pixel(sharing) * dr.width(sharing.order) * self._rounds(job.samples)
+            if taken > MAX_RECORDED_BYTES:
+                return "a recording of the shared light would take much memory, and tracing costs little beside it"
         return super().refusal_of(job)
 
     def _rounds(self, samples):
         return max(1, round(samples / self.samples_per_round))
 
-    def _launches(self, film, sharing):
-        return -(-dr.width(sharing.order) // self._pixels(film, sharing))
+    @staticmethod
+    def _bytes_per_pixel(sharing):
+        """Return the memory of pairs and lists of a pixel, bytes."""
+        floats = len(mi.UnpolarizedSpectrum(0)) + 1
+        return 4 * (sharing.size * (floats + 1) + sharing.suffixes * (sharing.behind.most_events() + 2) * floats)
 
     def _pixels(self, film, sharing):
         """Return the number of pixels of a launch: whole groups."""
-        per_pixel = sharing.suffixes * sharing.behind.most_events() * 4 * 4
+        per_pixel = self._bytes_per_pixel(sharing)
         if PackedCube.fits(film):
             per_pixel = max(per_pixel, film.temporal_bins * 16)
         most = PIXELS["cuda" if mi.variant().startswith("cuda") else "llvm"]

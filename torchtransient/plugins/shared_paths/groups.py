@@ -22,12 +22,14 @@ from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.kernel_arrays import PointerTable, host_numbers, whole_numbers
 from torchtransient.plugins.node_walk import bsdfs_of_scene, shapes_of_scene
-from torchtransient.plugins.sampling.area_elements import has_shading_normals, morton_order
+from torchtransient.plugins.sampling.area_elements import morton_order
 from torchtransient.plugins.sampling.point_sets import hashed
 from torchtransient.plugins.shared_paths.lists import Rows
 
 # Indices of refraction that rounding tells apart are one.
 _SAME_INDEX = 1e-4
+# Shapes that shade by the normals of their geometry.
+_GEOMETRIC_NORMALS = ("Rectangle", "Disk", "Sphere", "Cylinder")
 
 
 class Sharing:
@@ -46,17 +48,16 @@ class Sharing:
         behind: :class:`~..transport.context.RenderContext` of the paths behind shared points.
         order: numbers of the pixels, sorted by their groups and filled up to whole groups (UInt32).
         real: mask of those that are no filling.
-        smooth: some surface has other normals than those of its triangles.
+        possible: some surface is Lambertian.
+        diffuse: table of the Lambertian BSDFs, None if all are.
+        smooth: some surface may have other normals than those of its geometry.
     """
 
     def __init__(self, scene: Any, contents: Any, size: int, suffixes: int) -> None:
         self.size, self.suffixes = size, suffixes
-        bsdfs = bsdfs_of_scene(scene)
-        diffuse = [bsdf for bsdf in bsdfs if is_lambertian(bsdf)]
-        self.possible = bool(diffuse)
-        self.diffuse = PointerTable.marking(diffuse) if len(diffuse) < len(bsdfs) else None
+        found = contents.memory.get("surfaces that share light", 0, lambda: _surfaces(scene))
+        self.possible, self.diffuse, self.smooth = found
         self.index_changes = contents.refraction is not None or contents.surroundings is not None
-        self.smooth = any(has_shading_normals(shape) for shape in shapes_of_scene(scene))
         self.behind = self.order = self.real = None
 
     def takes_over(self, path: Any, vertex: Any) -> Any:
@@ -72,6 +73,18 @@ class Sharing:
     def in_vacuum(η: Any) -> Any:
         """Return a mask of indices of refraction that are one."""
         return dr.abs(η - 1) < _SAME_INDEX
+
+
+def _surfaces(scene: Any) -> tuple[bool, Any, bool]:
+    """Return ``possible``, ``diffuse`` and ``smooth`` of :class:`Sharing`."""
+    bsdfs = bsdfs_of_scene(scene)
+    diffuse = [bsdf for bsdf in bsdfs if is_lambertian(bsdf)]
+    table = PointerTable.marking(diffuse) if len(diffuse) < len(bsdfs) else None
+    return bool(diffuse), table, any(map(_may_be_smooth, shapes_of_scene(scene)))
+
+
+def _may_be_smooth(shape: Any) -> bool:
+    return shape.has_vertex_normals() if shape.is_mesh() else shape.class_name() not in _GEOMETRIC_NORMALS
 
 
 class Group:
