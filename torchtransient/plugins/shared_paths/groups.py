@@ -22,7 +22,7 @@ from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.kernel_arrays import PointerTable, host_numbers, whole_numbers
 from torchtransient.plugins.node_walk import bsdfs_of_scene, shapes_of_scene
-from torchtransient.plugins.sampling.area_elements import morton_order
+from torchtransient.plugins.sampling.area_elements import has_shading_normals, morton_order
 from torchtransient.plugins.sampling.point_sets import hashed
 from torchtransient.plugins.shared_paths.lists import Rows
 
@@ -55,8 +55,8 @@ class Sharing:
 
     def __init__(self, scene: Any, contents: Any, size: int, suffixes: int) -> None:
         self.size, self.suffixes = size, suffixes
-        found = contents.memory.get("surfaces that share light", 0, lambda: _surfaces(scene))
-        self.possible, self.diffuse, self.smooth = found
+        self.possible, self.diffuse = contents.memory.get("diffuse surfaces", 0, lambda: _diffuse(scene))
+        self.smooth = _as_they_stand(scene, contents).get("smooth", 0, lambda: _is_smooth(scene))
         self.index_changes = contents.refraction is not None or contents.surroundings is not None
         self.behind = self.order = self.real = None
 
@@ -75,16 +75,26 @@ class Sharing:
         return dr.abs(η - 1) < _SAME_INDEX
 
 
-def _surfaces(scene: Any) -> tuple[bool, Any, bool]:
-    """Return ``possible``, ``diffuse`` and ``smooth`` of :class:`Sharing`."""
+def _diffuse(scene: Any) -> tuple[bool, Any]:
+    """Return whether some surface is Lambertian, and the table of those, None if all are."""
     bsdfs = bsdfs_of_scene(scene)
     diffuse = [bsdf for bsdf in bsdfs if is_lambertian(bsdf)]
-    table = PointerTable.marking(diffuse) if len(diffuse) < len(bsdfs) else None
-    return bool(diffuse), table, any(map(_may_be_smooth, shapes_of_scene(scene)))
+    return bool(diffuse), PointerTable.marking(diffuse) if len(diffuse) < len(bsdfs) else None
 
 
-def _may_be_smooth(shape: Any) -> bool:
-    return shape.has_vertex_normals() if shape.is_mesh() else shape.class_name() not in _GEOMETRIC_NORMALS
+def _is_smooth(scene: Any) -> bool:
+    """Return True if some surface may have other normals than those of its geometry."""
+
+    def may_be(shape):
+        return has_shading_normals(shape) if shape.is_mesh() else shape.class_name() not in _GEOMETRIC_NORMALS
+
+    return any(map(may_be, shapes_of_scene(scene)))
+
+
+def _as_they_stand(scene: Any, contents: Any) -> Cache:
+    """Return the memory of what was found of the sensor and the shapes, emptied when one of them moves."""
+    nodes = [contents.sensor, *shapes_of_scene(scene)]
+    return contents.memory.get("memory of sharing", 0, lambda: Cache(nodes))
 
 
 class Group:
@@ -253,8 +263,7 @@ def pixel_order(scene: Any, contents: Any, sensor: Any, film: Any, size: int) ->
         filling).
     """
     width, height = (int(n) for n in film.crop_size())
-    key = width, height, size
-    memory = contents.memory.get("memory of pixel orders", 0, lambda: Cache([sensor, *shapes_of_scene(scene)]))
+    key, memory = (width, height, size), _as_they_stand(scene, contents)
     return memory.get("pixel order", key, lambda: _pixel_order(scene, sensor, width, height, size))
 
 
