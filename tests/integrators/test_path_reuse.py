@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from support.marks import long
+from torchtransient import plugins
 from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.errors import SceneError
 from torchtransient.scene.variant import active_variant
@@ -285,15 +287,25 @@ def phasors():
         (room, "llvm_ad_mono_polarized", "polarized; load the scene in one without, or use transient_path"),
         (fog, VARIANT, "participating media.*transient_prbvolpath"),
         (lambda: room(max_depth=-1), VARIANT, "no limit.*set it, or use transient_path"),
-        (lambda: room(group_size=48), VARIANT, "group_size: expected a power of two, got 48"),
-        (lambda: room(suffixes=3), VARIANT, "suffixes: expected a power of two, got 3"),
-        (lambda: room(samples_per_round=0), VARIANT, "samples_per_round"),
         (phasors, VARIANT, "expected a film of histograms or gates, got phasor_hdr_film"),
     ],
 )
 def test_what_is_not_shared_is_refused(make, variant, message):
     with pytest.raises(SceneError, match=message):
         renderer(make(), variant=variant, spp=1)(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("group_size", 48, "group_size: expected a power of two, got 48"),
+        ("suffixes", 3, "suffixes: expected a power of two, got 3"),
+        ("samples_per_round", 0, "samples_per_round"),
+    ],
+)
+def test_parameters_are_checked(name, value, message):
+    with pytest.raises(SceneError, match=message), plugins.plugin_errors():
+        mi.load_dict({"type": REUSE, name: value})
 
 
 def test_films_of_several_bands_are_refused(monkeypatch):
