@@ -15,6 +15,7 @@ from torchtransient import plugins
 from torchtransient.accuracy.statistics import two_sample_z_test
 from torchtransient.errors import SceneError
 from torchtransient.scene.variant import active_variant
+from torchtransient.scenes.transforms import rotate, scale, translate
 
 VARIANT = "llvm_ad_rgb"
 PATH, REUSE = "transient_path", "transient_path_reuse"
@@ -60,6 +61,35 @@ def ball_of_triangles():
     return with_object(ball={**mesh, "bsdf": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.7}}})
 
 
+def instance():
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": DIFFUSE}}
+    pose = translate([0.4, 0.3, 0.2]) @ scale(0.15)
+    one = {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}, "to_world": pose}
+    return with_object(group=group, one=one)
+
+
+def in_glass():
+    """A camera in a ball of glass: all that it sees lies behind a refraction."""
+    eye = room()["sensor"]["to_world"][:3, 3].tolist()
+    return with_object(bowl={"type": "sphere", "center": eye, "radius": 0.3, "bsdf": {"type": "dielectric"}})
+
+
+def meter():
+    """Pixels that see all directions."""
+    film = room()["sensor"]["film"] | {"width": 8, "height": 8}
+    sensor = {"type": "irradiancemeter", "film": film, "sampler": {"type": "independent"}}
+    pose = translate([0, -0.9, 0.3]) @ rotate([1, 0, 0], -90) @ scale(0.2)
+    scene = with_object(plate={"type": "rectangle", "to_world": pose, "bsdf": DIFFUSE, "sensor": sensor})
+    del scene["sensor"]
+    return scene
+
+
+def bumps():
+    heights = np.random.default_rng(0).random((16, 16, 1)).astype(np.float32)
+    texture = {"type": "bitmap", "raw": True, "data": heights}
+    return box_of({"type": "bumpmap", "heights": texture, "scale": 0.05, "paint": DIFFUSE})
+
+
 DIFFUSE = {"type": "diffuse", "reflectance": 0.8}
 METAL = {"type": "roughconductor", "alpha": 0.3}
 SCENES = {
@@ -82,6 +112,10 @@ SCENES = {
     "blend": lambda: box_of({"type": "blendbsdf", "weight": 0.4, "a": DIFFUSE, "b": METAL}),
     "delayed": lambda: box_of({"type": "delayed", "lifetime": 1.0, "nested": DIFFUSE}),
     "ball": ball_of_triangles,
+    "bumps": bumps,
+    "instance": instance,
+    "in glass": in_glass,
+    "meter": meter,
     "sky": lambda: with_object(sky={"type": "constant", "radiance": 0.3}),
     "bulb": lambda: with_object(bulb={"type": "point", "position": [0, 0, 0.5], "intensity": 1.0}),
     "unwarped": lambda: room(camera_unwarp=True),

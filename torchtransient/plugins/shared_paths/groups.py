@@ -24,6 +24,7 @@ from torchtransient.plugins.kernel_arrays import PointerTable, host_numbers, who
 from torchtransient.plugins.node_walk import bsdfs_of_scene, shapes_of_scene
 from torchtransient.plugins.sampling.area_elements import has_shading_normals, morton_order
 from torchtransient.plugins.sampling.point_sets import hashed
+from torchtransient.plugins.sensors.origin import sample_rays, sensors_of, views
 from torchtransient.plugins.shared_paths.lists import Rows
 
 # Indices of refraction that rounding tells apart are one.
@@ -93,7 +94,7 @@ def _is_smooth(scene: Any) -> bool:
 
 def _as_they_stand(scene: Any, contents: Any) -> Cache:
     """Return the memory of what was found of the sensor and the shapes, emptied when one of them moves."""
-    nodes = [contents.sensor, *shapes_of_scene(scene)]
+    nodes = [*sensors_of(contents.sensor), *shapes_of_scene(scene)]
     return contents.memory.get("memory of sharing", 0, lambda: Cache(nodes))
 
 
@@ -270,8 +271,9 @@ def pixel_order(scene: Any, contents: Any, sensor: Any, film: Any, size: int) ->
 def _pixel_order(scene: Any, sensor: Any, width: int, height: int, size: int) -> tuple[Any, Any]:
     lane = dr.arange(mi.UInt32, width * height)
     place = mi.Point2f(mi.Float(lane % width), mi.Float(lane // width)) + 0.5
-    half = mi.Float(0.5)
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), half, place / mi.ScalarVector2f(width, height), mi.Point2f(0.5))
+    position = place / mi.ScalarVector2f(width, height)
+    seen = views(sensor, position, lambda: None)
+    ray, _ = sample_rays(sensor, seen, sensor.shutter_open(), mi.Float(0.5), position, mi.Point2f(0.5))
     si = scene.ray_intersect(dr.detach(ray), mi.RayFlags.All, coherent=True)
     found = dr.detach(si.is_valid())
     p, n = (host_numbers(dr.select(found, dr.detach(v), 0)).T for v in (si.p, si.n))
