@@ -99,6 +99,7 @@ def walked(connection, most, vertices=False, leg=None, window=lambda active, τ,
     world = SimpleNamespace(
         segment=Line(), scattering=Turning(), connections=[connection], max_depth=most, in_time=window,
         finds_light=connection.finds_light, dark_at_first=connection.dark_at_first, plays_roulette=False,
+        taken_over=lambda path, vertex: None,
     )  # fmt: skip
     ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float([0] * 4)), mi.Vector3f(0, 0, 1))
     sink = Numbers(vertices)

@@ -157,6 +157,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
         "torchtransient.plugins.integrators.volpath",
         (("integrator", "transient_prbvolpath"), ("integrator", "transient_volpath")),
     ),
+    PluginModule("torchtransient.plugins.integrators.path_reuse", (("integrator", "transient_path_reuse"),)),
     PluginModule("torchtransient.plugins.sensors.nlos_capture_meter", (("sensor", "nlos_capture_meter"),)),
     PluginModule("torchtransient.plugins.integrators.nlos_path", (("integrator", "transient_nlos_path"),)),
     PluginModule("torchtransient.plugins.emitters.laser_beam", (("emitter", "laser_beam"),)),

@@ -291,6 +291,11 @@ class TimeResolvedFilm(mi.Film):
         """Return the :class:`~.block.ArrivalWindow` of a film without a steady image, None where all light counts."""
         return
 
+    def last_arrival(self) -> float | None:
+        """Return the path length, minus ``start_opl``, behind which the array counts no light; None for no end."""
+        window = self.arrivals()
+        return None if window is None else window.last
+
     def lanes_at_most(self, most_events: int) -> int | None:
         """Return the largest number of paths of up to ``most_events`` events in a launch, None for no limit."""
         return None

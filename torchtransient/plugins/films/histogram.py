@@ -182,8 +182,10 @@ class TransientHDRFilm(TimeResolvedFilm):
     def arrivals(self):
         if self.keeps_steady:
             return None
-        first, last = self.filter.reach
-        return ArrivalWindow(-last * self.bin_width_opl, (self.temporal_bins - first) * self.bin_width_opl)
+        return ArrivalWindow(-self.filter.reach[1] * self.bin_width_opl, self.last_arrival())
+
+    def last_arrival(self):
+        return (self.temporal_bins - self.filter.reach[0]) * self.bin_width_opl
 
     def traverse(self, cb):
         super().traverse(cb)

@@ -234,7 +234,25 @@ class TransientIntegrator(mi.CppADIntegrator):
         row = index // width
         column = dr.fma(mi.UInt32(mi.Int32(-width)), row, index)
         row += dr.opaque(mi.UInt32, job.first_row)
+        rays = self.rays_through(scene, contents, sensor, film, sampler, (row, column), job.total)
+        rays.laser, rays.strata = laser, (stratum, spp)
+        return rays
 
+    def rays_through(self, scene, contents, sensor, film, sampler, pixel, total, wavelength=None):
+        """Draw a primary ray through each of some pixels.
+
+        Args:
+            contents: :class:`~..transport.scene_contents.SceneContents`.
+            sensor, film: sensor and its film.
+            sampler: seeded sampler of the lanes.
+            pixel: (row, column) of each ray, UInt32.
+            total: samples of a pixel that are added up.
+            wavelength: number that chooses the wavelengths, None to draw one.
+
+        Returns:
+            :class:`~..sensors.origin.PrimaryRays`, attached to the sensor.
+        """
+        row, column = pixel
         offset, weight = self.offset_in_pixel(film, sensor, sampler)
         position = mi.Point2f(mi.Float(column), mi.Float(row)) + 0.5 + offset
         # The same map to [0, 1]^2 as Mitsuba's integrators use: relative to the crop window.
@@ -243,7 +261,8 @@ class TransientIntegrator(mi.CppADIntegrator):
         time = sensor.shutter_open()
         if sensor.shutter_open_time() > 0:
             time += sampler.next_1d() * sensor.shutter_open_time()
-        wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
+        if wavelength is None:
+            wavelength = sampler.next_1d() if mi.is_spectral else mi.Float(0)
         seen = views(sensor, position, lambda: self.reference(scene))
         with dr.resume_grad():
             ray, ray_weight = sample_rays(sensor, seen, time, wavelength, position, aperture)
@@ -252,10 +271,10 @@ class TransientIntegrator(mi.CppADIntegrator):
             η, clip = index_at_sensor(seen, contents.surroundings, scene), None
             if contents.media is not None and contents.media.at_sensor is not None:
                 ray, clip = start_at_sensor(seen, ray)
-        scale = dr.opaque(mi.Float, 1 / job.total)
+        scale = dr.opaque(mi.Float, 1 / total)
         if weight is not None:
             scale *= weight
-        rays = PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, laser, (stratum, spp), clip)
+        rays = PrimaryRays(sampler, ray, ray_weight, scale, row, column, seen, η, clip=clip)
         rays.meter_normal = meter_normal(sensor, rays.ray, position)
         return rays
 

@@ -59,7 +59,18 @@ class OwenSampler(mi.Sampler):
             self._size = wavefront_size
         lane, count = dr.arange(mi.UInt32, self._size), dr.opaque(mi.UInt32, self._per_wavefront)
         pixel = lane // count
-        self.index = lane - pixel * count
+        self.seed_sets(seed, pixel, lane - pixel * count)
+
+    def seed_sets(self, seed, pixel, index):
+        """Seed lanes that are in any order.
+
+        Args:
+            seed: UInt32.
+            pixel: number of each lane's set of samples, UInt32.
+            index: number of its sample in the set, UInt32.
+        """
+        self._size = dr.width(index)
+        self.index = index
         seed = hashed(mi.UInt32(seed) + hashed(dr.opaque(mi.UInt32, self._props_seed)))
         self.key = hashed(seed ^ hashed(pixel + 0x51ED270B))
         self.dimension = mi.UInt32(0)

@@ -26,6 +26,7 @@ class PathSettings:
     Attributes:
         min_depth: smallest depth of events that count.
         division: :class:`~..around_corner.division.Division` of depths among estimators, None if paths find all light.
+        sharing: :class:`~..shared_paths.groups.Sharing` of light between pixels, None if no path hands over its light.
     """
 
     max_depth: int
@@ -35,6 +36,7 @@ class PathSettings:
     camera_unwarp: bool
     min_depth: int = 0
     division: Any = None
+    sharing: Any = None
 
 
 class RenderContext:
@@ -63,7 +65,7 @@ class RenderContext:
     def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
         self.scene, self.contents, self.wanted = scene, contents, wanted
         self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
-        self.division = settings.division
+        self.division, self.sharing = settings.division, settings.sharing
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
@@ -150,6 +152,13 @@ class RenderContext:
             return active
         least = τ if self._light_box is None else τ + mi.Float64(self._light_box.distance(p))
         return active & ~self.window.over(least)
+
+    def taken_over(self, path: Any, vertex: Any) -> Any:
+        """Return a mask of vertices behind which another estimator finds the light, None where there is none.
+
+        A property of the path up to ``vertex`` alone, so that nothing is counted twice.
+        """
+        return None if self.sharing is None else self.sharing.takes_over(path, vertex)
 
     def counted(self, active: Any, τ: Any) -> Any:
         """Return a mask of arrivals at ``τ`` (Float64) that lie in the film's window."""

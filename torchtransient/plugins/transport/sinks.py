@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.plugins.films.colour import mean_of
 from torchtransient.plugins.polarized import light_type
 from torchtransient.plugins.transport.carry import total_of
 
@@ -40,6 +41,9 @@ class Sink:
                 ``walk``: those of the loop.
         """
 
+    def too_late(self, state: dict[str, Any], value: Any) -> None:
+        """Receive light that arrives behind the window of the film, whenever that is."""
+
     def end(self, state: dict[str, Any]) -> None:
         """Finish the loop state."""
 
@@ -69,6 +73,10 @@ class FilmSink(Sink):
         before, after = self.block.put(state["block"], event.opl, event.value, event.active, event.crowded)
         state["before"] = state["before"] + before
         state["after"] = state["after"] + after
+
+    def too_late(self, state, value):
+        state["L"] = state["L"] + value
+        state["after"] = state["after"] + mean_of(self.block.match.to_channels(value))
 
     def end(self, state):
         self.block.end(state["block"])

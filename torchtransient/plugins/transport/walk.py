@@ -144,6 +144,8 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     vertex.goes_on = path.active & (path.depth + 1 < context.max_depth) & vertex.valid
     vertex.goes_on = context.in_time(vertex.goes_on, vertex.τ, vertex.at.p)
     context.scattering.arrive(context, path, vertex, sampler)
+    if (taken_over := context.taken_over(path, vertex)) is not None:
+        vertex.goes_on &= ~taken_over
     vertex.scattered_τ = vertex.delay.after(vertex.τ)
 
     # ------------------------------------------------------------------------- events

@@ -1,0 +1,137 @@
+"""Error times CPU time of `transient_path_reuse` over `transient_path`, scene by scene, and tests of its means.
+
+All render the same scenes in one process and take turns: `transient_path` with the samplers `independent` (baseline)
+and `owen`, and `transient_path_reuse` with `owen`. Per scene: the relative error of single bins (variance between runs
+over the squared mean of the 3 x 3 pixels x 3 bins around, 15 bins of 2048, plus the square of 1 % of the mean over the
+cube) times CPU seconds, of the baseline over that of reuse: over all bins, the first, second and last third of the time
+axis, without the worst 0.1 % of the bins; and of the squared error. Energy and Student's t of blocks of 8 x 8 pixels x
+10 bins are those of reuse against `owen`: mean 0, deviation 1 once divided by that of t.
+
+    python benchmarks/path_reuse.py [--scenes cornell,glass] [--runs 12] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from _runner import arguments
+from sampler_gain import Moments, cornell, small_lamp, with_box_of
+
+import torchtransient as tt
+
+SceneDict = dict[str, Any]
+PATH, REUSE = "transient_path", "transient_path_reuse"
+CASES = {"independent": (PATH, "independent"), "owen": (PATH, "owen"), "reuse": (REUSE, "owen")}
+SCENES: dict[str, tuple[Callable[[], SceneDict], int]] = {
+    "cornell": (cornell, 256),
+    "cornell 16": (lambda: cornell(16), 256),
+    "cornell 16 spp": (cornell, 16),
+    "cornell 64 spp": (cornell, 64),
+    "cornell 128": (lambda: cornell(128), 64),
+    "2048 bins": (lambda: cornell(num_bins=2048, bin_width_opl=6 / 2048), 256),
+    "6 cm lamp": (small_lamp, 256),
+    "mirror": (lambda: with_box_of({"type": "conductor", "material": "none"}), 256),
+    "glass": (lambda: with_box_of({"type": "dielectric"}), 256),
+}
+
+
+def nearby(mean: np.ndarray) -> np.ndarray:
+    """Mean over the 3 x 3 pixels x 3 bins around each bin, (C, T, H, W); 15 bins of long axes."""
+    around = (3 if mean.shape[1] < 1000 else 15, 3, 3)
+    padding = [half for size in reversed(around) for half in (size // 2, size // 2)]
+    padded = torch.nn.functional.pad(torch.from_numpy(mean)[None], padding, mode="replicate")
+    return torch.nn.functional.avg_pool3d(padded, around, stride=1)[0].numpy()
+
+
+def errors(variance: np.ndarray, near: np.ndarray) -> dict[str, float]:
+    """Figures of one case: relative error of all bins, of thirds, without the worst; squared error."""
+    relative = variance / (near**2 + (1e-2 * near.mean()) ** 2)
+    third = relative.shape[1] // 3
+    parts = {name: relative[:, third * i : third * (i + 1)].mean() for i, name in enumerate(("early", "mid", "late"))}
+    trimmed = np.sort(relative.ravel())[: int(0.999 * relative.size)].mean()
+    figures = {"relative": relative.mean(), **parts, "trimmed": trimmed, "squared": variance.mean()}
+    return {name: float(value) for name, value in figures.items()}
+
+
+def measure(scene: SceneDict, spp: int, runs: int, variant: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """Errors, gains, time and means of every case."""
+    renderers, moments, seconds = {}, {name: Moments() for name in CASES}, {name: [] for name in CASES}
+    for name, (plugin, sampler) in CASES.items():
+        described = {**scene, "integrator": {**scene["integrator"], "type": plugin}}
+        if plugin == REUSE:
+            described["integrator"] |= settings
+        loaded = tt.load(described, variant=variant)
+        renderers[name] = tt.TransientRenderer(loaded, spp=spp, sampler=sampler, physics="ignore")
+    with torch.no_grad():
+        for renderer in renderers.values():
+            for seed in range(2):
+                renderer(seed=seed)
+        for run in range(runs):
+            for name, renderer in renderers.items():
+                begin = time.process_time()
+                out = renderer(seed=1000 + run)
+                seconds[name].append(time.process_time() - begin)
+                moments[name].add(out.transient.double().numpy(), out.steady.double().numpy())
+    near = nearby(np.mean([m.mean[0] for m in moments.values()], 0))
+    found = {name: errors(moments[name].variance(0), near) for name in CASES}
+    cost = {name: float(np.median(seconds[name])) for name in CASES}
+    result: dict[str, Any] = {"spp": spp, "runs": runs}
+    for name in CASES:
+        result[name] = {"cpu_seconds": cost[name], "error": found[name]}
+        base = found["independent"]
+        scale = cost["independent"] / cost[name]
+        result[name]["gain"] = {key: scale * base[key] / value for key, value in found[name].items()}
+    result["reuse"] |= agreement(moments["reuse"], moments["owen"], runs)
+    return result
+
+
+def agreement(one: Moments, other: Moments, runs: int) -> dict[str, float]:
+    """Energy over that of others, and Student's t of blocks."""
+    n = 2 * runs - 2
+    bars = np.sqrt((one.variance(2) + other.variance(2)) / runs)
+    lit = bars > 0
+    t = (one.mean[2] - other.mean[2])[lit] / bars[lit]
+    error = float(np.sqrt(one.variance(3)[0] + other.variance(3)[0]) / math.sqrt(runs) / other.mean[3][0])
+    return {
+        "block_t_mean": float(t.mean()),
+        "block_t_deviation": float(t.std() / math.sqrt(n / (n - 2))),
+        "energy": float(one.mean[3][0] / other.mean[3][0] - 1),
+        "energy_standard_error": error,
+    }
+
+
+def main() -> None:
+    parser = arguments(__doc__, peer=False)
+    parser.add_argument("--scenes", default=",".join(SCENES))
+    parser.add_argument("--runs", type=int, default=12)
+    parser.add_argument("--settings", default="{}", help="parameters of transient_path_reuse, JSON")
+    options = parser.parse_args()
+    runs = 3 if options.quick else options.runs
+    report = {}
+    heads = ("gain", "early", "mid", "late", "trimmed", "squared", "owen", "CPU", "t mean", "t dev", "energy", "+-")
+    print(f"{'scene':16}" + "".join(f"{head:>9}" for head in heads))
+    for name in options.scenes.split(","):
+        make, spp = SCENES[name]
+        x = report[name] = measure(
+            make(), 4 if options.quick else spp, runs, options.variant, json.loads(options.settings)
+        )
+        reuse = x["reuse"]
+        gains = "".join(f"{value:9.2f}" for value in reuse["gain"].values())
+        cpu = reuse["cpu_seconds"] / x["independent"]["cpu_seconds"]
+        print(
+            f"{name:16}{gains}{x['owen']['gain']['relative']:9.2f}{cpu:9.3f}{reuse['block_t_mean']:9.3f}"
+            f"{reuse['block_t_deviation']:9.3f}{reuse['energy']:9.5f}{reuse['energy_standard_error']:9.5f}",
+            flush=True,
+        )
+    if options.json:
+        options.json.write_text(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()

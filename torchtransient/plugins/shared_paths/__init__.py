@@ -1,0 +1,1 @@
+"""Light that the paths of neighbouring pixels share."""
