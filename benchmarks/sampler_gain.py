@@ -33,8 +33,8 @@ import torchtransient as tt
 
 SceneDict = dict[str, Any]
 HEADS = ("gain", "steady", "CPU", "t mean", "t dev", "energy", "+-")
-# Samples of all runs of a scene of few samples, which take milliseconds and have rare outliers.
-MOST_SAMPLES = 4800
+# Samples and number of all runs of a scene of few samples, which take milliseconds and have rare outliers.
+MOST_SAMPLES, MOST_RUNS = 4800, 600
 # Training steps that are timed.
 STEPS = 400
 # By which scenes are differentiated.
@@ -254,7 +254,7 @@ def main() -> None:
             more = 4 * runs if options.quick or name.startswith("gradient") else STEPS
             rows = measure_gradients(make(), spp, samplers, more, options.variant)
         else:
-            more = 0 if options.quick else MOST_SAMPLES // spp if spp <= 64 else runs
+            more = 0 if options.quick or spp > 64 else min(MOST_SAMPLES // spp, MOST_RUNS)
             rows = measure(make(), spp, samplers, max(runs, more), options.variant)
         for sampler, row in rows.items():
             print(f"{name:20}{sampler:12}{_line(row)}", flush=True)

@@ -59,7 +59,11 @@ def test_slope_at_zero(kind, name):
 
 
 def compare(scene, key, spp, step=0.1):
-    """The slope at a value of zero, from above; of four seeds, which agree to 5 % and mostly to float32."""
+    """The slope at a value of zero, from above; of four seeds where they agree to float32, else of sixteen.
+
+    Four are too few to know their own spread: the differences of a bumpy plastic have a deviation of 0.23, four of them
+    had one of 0.03. Of sixteen Student's t is above 4 once in 900 tests.
+    """
     renderer = tt.TransientRenderer(scene, parameters=[key], spp=spp, grad_seed="same")
     zero = torch.zeros_like(renderer.values[key])
 
@@ -67,15 +71,17 @@ def compare(scene, key, spp, step=0.1):
         return renderer(values={key: x}, seed=seed).steady.double().sum()
 
     found, expected = [], []
-    for seed in range(4):
+    for seed in range(16):
         x = zero.clone().requires_grad_()
         brightness(x, seed).backward()
         found.append(float(x.grad.sum()))
         with torch.no_grad():
             here, near, far = (brightness(zero + step * k, seed) for k in range(3))
         expected.append(float(4 * near - 3 * here - far) / (2 * step))
+        if seed == 3 and np.std(np.subtract(found, expected)) < 1e-3 * abs(np.mean(expected)):
+            break
     found, expected = np.array(found), np.array(expected)
-    error = (found - expected).std(ddof=1) / np.sqrt(4)
+    error = (found - expected).std(ddof=1) / np.sqrt(len(found))
     assert abs(found.mean() - expected.mean()) < 4 * error + 0.02 * abs(expected.mean())
     assert error < 0.1 * abs(expected.mean())
 

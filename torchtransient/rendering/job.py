@@ -111,12 +111,12 @@ class RenderJob:
         batched: for each value, whether it has a leading batch dimension.
         spp, spp_grad: samples per pixel of the render and of its derivatives.
         temporal_filter: of the films; None for the scene's.
-        sampler: plugin name; None for the integrator's, or "auto".
         watch: warns of unphysical values.
         needs: for each value, whether it wants a derivative.
         bound: on the depth; None for the scene's.
         boundary, spp_boundary: whether derivatives have the boundary term, and its samples per pixel; None for the
             integrator's.
+        sampler: plugin name, "scene" or "auto"; None for the integrator's, or "auto".
         progress: called with the fraction that is done.
         freeze: whether calls are recorded.
         errors: request for error bars, and where they are put; None for none.
@@ -134,12 +134,12 @@ class RenderJob:
     spp: int
     spp_grad: int
     temporal_filter: str | None
-    sampler: str | None
     watch: PhysicsWatch
     needs: tuple[bool, ...] = ()
     bound: DepthBound | None = None
     boundary: bool = True
     spp_boundary: int | None = None
+    sampler: str | None = None
     progress: Callable[[float], None] | None = None
     freeze: bool = True
     errors: BatchErrors | None = None
