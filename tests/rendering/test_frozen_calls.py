@@ -395,16 +395,16 @@ def test_a_class_made_out_of_a_plugin_is_not_recorded():
 
 
 def test_numbers_of_a_plugin_in_python_count(room_scene):
-    """What is no array becomes part of the kernels: another number is another recording."""
+    """What is no array becomes part of the kernels: another number is another recording. Deeper light is 0.5 %."""
     scene = tt.load(make_room(), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
+    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=64)
     before = [renderer(seed=0) for _ in range(3)][-1]
     integrator = scene_integrator(renderer)
     integrator.max_depth = 2
     after = [renderer(seed=0) for _ in range(3)]
     assert before.stats.recorded == (LAUNCHED,)
     assert [out.stats.recorded[0] for out in after] == [FIRST, RECORDED, LAUNCHED]
-    assert float(after[0].steady.detach().sum()) < 0.999 * float(before.steady.detach().sum())
+    assert float(after[0].steady.detach().sum()) < 0.998 * float(before.steady.detach().sum())
     for out in after[1:]:
         same(after[0].transient, out.transient)
 

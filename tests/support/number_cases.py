@@ -356,12 +356,13 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult|accuracy\.SamplesNeeded)\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult|accuracy\.(SamplesNeeded|GradientError))\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
     r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",
     r"nlos\.PlanarScan\(.*\)": "what is found of a scan",
     r"(TransientRenderer|plan|render|cost_of_accuracy)\b.*": "rendering/test_whole_numbers.py",
+    r"accuracy\.gradient_errors\b.*": "accuracy/test_gradient_errors.py",
     r"(Gate|Pulse)\((opl|values)\)": "rows of a table, which `tabulated` checks",
     r"nlos\.(CaptureRenderer|simulate|forecast)\b.*": "nlos/test_arguments.py",
     r"nlos\.read_capture\(.*\)": "files/captures",

@@ -14,7 +14,7 @@ import numpy as np
 from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
 from torchtransient.accuracy.statistics import Slope, log_log_slope
 from torchtransient.array_files.part_files import write_text
-from torchtransient.checks import positive, shown
+from torchtransient.checks import is_one_of, positive, shown
 from torchtransient.errors import ArgumentError
 
 # Two-sided 95 % of a normal deviate.
@@ -118,9 +118,9 @@ class AccuracyReport:
         """
         wanted = positive("spp_for: error", error)
         quantity = self.quantities()[0] if quantity is None else quantity
-        curves = {found: points for name, found, points in self.curves() if name == quantity}
-        if not curves:
+        if not is_one_of(quantity, self.quantities()):
             raise ArgumentError(f"spp_for: quantity: expected one of {self.quantities()}, got {shown(quantity)}.")
+        curves = {found: points for name, found, points in self.curves() if name == quantity}
         choice = next(iter(curves)) if choice is None else choice
         if choice not in curves:
             raise ArgumentError(f"spp_for: choice: expected one of {list(map(str, curves))}, got {shown(choice)}.")

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import torch
 
+from torchtransient.errors import ArgumentError
 from torchtransient.interfaces import RENDER
 from torchtransient.rendering import engine
-from torchtransient.rendering.error_bars import RunningMean, differences_of, in_cells
+from torchtransient.rendering.error_bars import BatchErrors, RunningMean, differences_of, in_cells
 from torchtransient.rendering.job import RenderJob, RunLog, mix_seed
+from torchtransient.rendering.output import RenderOutput
 
 _BATCH = 0xBA7C4
 
@@ -47,6 +49,30 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
     request.squares.append(in_cells(running.squared_error(), request.cells))
     request.steady.append(differences_of(steady_sums, numbers))
     return steady, response
+
+
+def with_differences(output: RenderOutput, request: BatchErrors, leading: tuple[int, ...]) -> RenderOutput:
+    """Return an output with what its batches differ by.
+
+    Args:
+        output: mean of the batches.
+        request: request of the call that made it.
+        leading: sizes of the dimensions of items.
+    """
+    if len(request.differences) != 1:
+        raise ArgumentError(
+            "errors: expected a call outside of torch.func.vmap, which takes the batches of samples apart. Give "
+            "the values a batch dimension instead."
+        )
+    measured = request.differences[0].movedim(-1, -3).movedim(0, -1)
+    squares, steady = request.squares[0].movedim(-1, -3), request.steady[0].movedim(0, -1)
+    return replace(
+        output,
+        differences=measured.reshape(*leading, *measured.shape[1:]),
+        squares=squares.reshape(*leading, *squares.shape[1:]),
+        steady_differences=steady.reshape(*leading, *steady.shape[1:]),
+        cells=request.cells,
+    )
 
 
 def joined(job: RenderJob, runs: Sequence[RunLog], weights: Sequence[float]) -> RunLog:

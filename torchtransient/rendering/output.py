@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
-from torchtransient.rendering.error_bars import BatchErrors, ErrorBars, ErrorCells
+from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
 from torchtransient.rendering.films import FilmLayout
 from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
@@ -171,28 +171,6 @@ class RenderOutput(ErrorBars, TensorRecord):
         """
         before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
         return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)
-
-    def with_differences(self, request: BatchErrors, leading: tuple[int, ...]) -> RenderOutput:
-        """Return the output with what its batches differ by.
-
-        Args:
-            request: request of the call that made it.
-            leading: sizes of the dimensions of items.
-        """
-        if len(request.differences) != 1:
-            raise ArgumentError(
-                "errors: expected a call outside of torch.func.vmap, which takes the batches of samples apart. Give "
-                "the values a batch dimension instead."
-            )
-        measured = request.differences[0].movedim(-1, -3).movedim(0, -1)
-        squares, steady = request.squares[0].movedim(-1, -3), request.steady[0].movedim(0, -1)
-        return replace(
-            self,
-            differences=measured.reshape(*leading, *measured.shape[1:]),
-            squares=squares.reshape(*leading, *squares.shape[1:]),
-            steady_differences=steady.reshape(*leading, *steady.shape[1:]),
-            cells=request.cells,
-        )
 
     @classmethod
     def merged_notes(cls, records: Sequence[RenderOutput]) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from torchtransient.rendering.arguments import (
     torch_names,
 )
 from torchtransient.rendering.autograd import RenderCall, run
+from torchtransient.rendering.batches import with_differences
 from torchtransient.rendering.error_bars import CELL_BINS, CELL_PIXELS, BatchErrors, ErrorCells
 from torchtransient.rendering.films import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import (
@@ -449,7 +450,7 @@ class TransientRenderer(CopiesParametrized):
         response = self.film.channels_first(response, leading, components)
         stats = RenderStats.of_job(job, pixels)
         out = RenderOutput.of(self.film, steady, response, stats=stats, channels=self._channels)
-        return out if request is None else out.with_differences(request, leading)
+        return out if request is None else with_differences(out, request, leading)
 
     def _error_request(self, errors: bool | str) -> BatchErrors | None:
         """Return the request for error bars of a call, None for none."""

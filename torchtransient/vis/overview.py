@@ -176,7 +176,7 @@ def _draw_peak_time(figure: Any, panel: Any, transient: Tensor, axis: TimeAxis) 
 
 
 def _draw_histogram(
-    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None
+    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None = None
 ) -> None:
     values = transient[:, :, pixel[0], pixel[1]].detach().cpu().numpy()
     if errors is not None:
