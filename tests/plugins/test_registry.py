@@ -350,3 +350,23 @@ def test_a_scene_may_be_freed_before_its_render_is_read():
             print(np.isfinite(np.array(steady)).all())
         """
     ) == ["True"] * 6
+
+
+def test_a_scene_that_was_refused_takes_part_in_no_later_kernel():
+    """Its integrator is refused when its lights are made already; the error is kept."""
+    assert run(
+        """
+        import torchtransient as tt
+        kept = []
+        for _ in range(3):
+            scene = tt.scenes.cornell_box(resolution=4, num_bins=20)
+            scene["integrator"] |= {"rr_depth": 0}
+            try:
+                tt.TransientRenderer(scene)
+            except tt.errors.SceneError as error:
+                kept.append(error)
+            scene["integrator"] |= {"rr_depth": 5}
+            tt.render(scene, spp=1, seed=0)
+        print(len(kept))
+        """
+    ) == ["3"]

@@ -141,7 +141,13 @@ def _instantiated(description: Plain, variant: str, options: BuildOptions) -> Bu
         forget_queries(state)
         textures = texture_names(state)
         mi.parser.transform_all(config, state)
-        scene = mi.parser.instantiate(config, state)
+        try:
+            scene = mi.parser.instantiate(config, state)
+        except BaseException:
+            # It holds lights whose shapes are gone, and whoever keeps the error keeps it: every later kernel would
+            # call them.
+            state.nodes.clear()
+            raise
         if not isinstance(scene, mi.Scene):
             raise SceneError(f"expected one <scene>, got {type(scene).__name__}.")
         restore_texture_names(scene, textures)
