@@ -192,7 +192,7 @@ def test_a_result_file_keeps_them(tmp_path):
     again = read_result(write_result(tmp_path / "a.npz", out))
     assert torch.equal(again.standard_error(), out.standard_error())
     assert torch.equal(again.error_map(), out.error_map()) and again.relative_error() == out.relative_error()
-    assert f"known to {out.relative_error():.2g}" in repr(out)
+    assert f"sum known to {out.relative_error():.2%}" in repr(out)
 
 
 def test_a_picture_shows_them(tmp_path):

@@ -89,6 +89,8 @@ def gradient_errors(
     number = count("gradient_errors: passes", passes, 2, UnitError)
     known = tuple(renderer.values)
     asked = known if keys is None else tuple(several("gradient_errors: keys", keys, "names of parameters"))
+    if not known:
+        raise ArgumentError("gradient_errors: the renderer has no parameters; make it with parameters=[...].")
     if not asked or not set(asked) <= set(known):
         raise ArgumentError(f"gradient_errors: expected some of the renderer's parameters {list(known)}, got {asked}.")
     given = {} if values is None else dict(mapping("gradient_errors: values", values, "values by key"))

@@ -274,7 +274,7 @@ class ErrorBars:
         except RuntimeError as error:
             raise ShapeError(
                 f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
-                f"{tuple(given.shape)}."
+                f"{tuple(given.shape)}. Weights of times are weights[:, None, None]."
             ) from error
         return variance(differences, given, cells).sqrt()
 

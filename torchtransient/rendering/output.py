@@ -183,7 +183,7 @@ class RenderOutput(ErrorBars, TensorRecord):
         outside = sum(self.outside)
         made += f", {outside:.2%} of the light outside of the window" if outside else ""
         if self.cells is not None and (found := self.relative_error()) is not None:
-            made += f", sum known to {found:.2g}"
+            made += f", sum known to {found:.2%}"
         if stats.light_beyond is not None:
             made += f", max_depth {stats.max_depth} with {stats.light_beyond:.2g} of the light beyond"
         return {"stats": made}

@@ -182,7 +182,9 @@ def _draw_histogram(
     if errors is not None:
         band, mean = 2 * errors[:, pixel[0], pixel[1]].detach().cpu().numpy(), values.mean(0)
         edges = axis.edges_opl.numpy()
-        panel.stairs(mean + band, edges, baseline=mean - band, fill=True, color="0.8", label="mean, 2 standard errors")
+        panel.stairs(mean + band, edges, baseline=mean - band, fill=True, color="0.85")
+        label = "mean over channels, 2 standard errors of its cell"
+        panel.stairs(mean, edges, color="0.4", linewidth=0.8, label=label)
         panel.legend(fontsize=8, frameon=False)
     colours = ("tab:red", "tab:green", "tab:blue") if len(values) == 3 else ("black",)
     for curve, colour in zip(values, colours, strict=True):
