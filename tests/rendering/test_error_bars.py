@@ -204,3 +204,23 @@ def test_a_picture_shows_them(tmp_path):
     assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()
     with pytest.raises(ShapeError, match="errors"):
         tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "x.png", errors=torch.ones(3, 8, 8))
+
+
+@pytest.mark.parametrize("size, bins", [(1, 40), (1, 1), (3, 5), (5, 9)])
+@pytest.mark.parametrize("errors", [True, "bins"])
+def test_small_films(size, bins, errors):
+    scene = tt.load(tt.scenes.cornell_box(resolution=size, num_bins=bins, bin_width_opl=9 / bins))
+    with torch.no_grad():
+        out = tt.TransientRenderer(scene, spp=16, physics="ignore")(seed=0, errors=errors)
+    assert out.error_map().shape == (bins, size, size) and float(out.standard_error()) > 0
+
+
+def test_parts_of_a_capture():
+    """Confocal points: noise of pixels is not their share of the noise of a cell. 40 runs against 8 batches each."""
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), 4, kind="confocal")
+    capture = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan, time_axis=tt.TimeAxis(1.5, 0.05, 40), spp=16)
+    rows = (torch.arange(4) < 2).float()[:, None]
+    with torch.no_grad():
+        outs = [capture.renderer(seed=seed, spp=64, errors=True) for seed in range(40)]
+    found = torch.stack([(out.transient.mean(-4) * rows).sum() for out in outs]).var()
+    assert 0.3 < float(found / torch.stack([out.standard_error(rows) ** 2 for out in outs]).mean()) < 2.5

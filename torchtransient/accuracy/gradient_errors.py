@@ -41,10 +41,11 @@ class GradientError:
     spp: int
 
     def __str__(self) -> str:
-        shown = f"{float(self.value):.4g}" if self.value.numel() == 1 else f"norm {float(self.value.norm()):.4g}"
+        size = float(self.value.double().norm())
+        shown = f"{float(self.value):.4g}" if self.value.numel() == 1 else f"norm {size:.4g}"
         if self.tail is not None and self.tail.heavy:
             return f"{shown}, heavy tailed: no error"
-        return f"{shown} +- {float(self.standard_error.norm()):.2g}"
+        return f"{shown} +- {float(self.standard_error.double().norm()):.2g}"
 
 
 def gradient_errors(
@@ -94,9 +95,11 @@ def gradient_errors(
     if not asked or not set(asked) <= set(known):
         raise ArgumentError(f"gradient_errors: expected some of the renderer's parameters {list(known)}, got {asked}.")
     given = {} if values is None else dict(mapping("gradient_errors: values", values, "values by key"))
+    if not set(given) <= set(known):
+        raise ArgumentError(f"gradient_errors: expected values of {list(known)}, got some of {sorted(given)}.")
 
     def gradients(own_seed: int, samples: int | None) -> tuple[list[torch.Tensor], int]:
-        leaves = {key: torch.as_tensor(given.get(key, renderer.values[key])).detach().clone() for key in known}
+        leaves = {key: torch.as_tensor(given.get(key, renderer.values[key])).detach().float().clone() for key in known}
         for key in asked:
             leaves[key].requires_grad_()
         with torch.enable_grad():

@@ -122,7 +122,8 @@ def in_cells(values: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     if values.is_complex():
         return torch.complex(in_cells(values.real, cells), in_cells(values.imag, cells))
     flat = values.reshape(-1, *values.shape[-3:])
-    found = torch.nn.functional.avg_pool3d(flat, size, ceil_mode=True, divisor_override=1)
+    kernel = [min(pair) for pair in zip(size, flat.shape[-3:], strict=True)]
+    found = torch.nn.functional.avg_pool3d(flat, kernel, ceil_mode=True, divisor_override=1)
     return found.reshape(*values.shape[:-3], *found.shape[-3:])
 
 
@@ -251,8 +252,8 @@ class ErrorBars:
     def standard_error(self, weights: Any = None, *, steady: bool = False) -> torch.Tensor:
         """Return the standard error of a weighted sum of what was measured, mean over channels.
 
-        That of one pixel rests on one number, and is as uncertain; sums over some ten pixels and more are known to some
-        20 %. See ``docs/accuracy.md``.
+        It is right on average, and known as well as many cells of light were added up: that of one cell of 4 x 4 pixels
+        and 8 bins rests on one number (of one pixel with ``errors="bins"``). See ``docs/accuracy.md``.
 
         Args:
             weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
@@ -267,7 +268,9 @@ class ErrorBars:
             ShapeError: for weights of another shape.
         """
         differences, shape, cells = self._error_layout(steady)
-        given = torch.ones((), device=differences.device) if weights is None else torch.as_tensor(weights)
+        given = torch.ones((), device=differences.device) if weights is None else torch.as_tensor(weights).detach()
+        if given.is_complex():
+            raise ArgumentError("standard_error: expected real weights, got complex ones.")
         real = differences.real if differences.is_complex() else differences
         try:
             given = given.to(real).broadcast_to(*differences.shape[:-4], *shape)
@@ -301,7 +304,9 @@ class ErrorBars:
         error = self.standard_error()
         tensor = self._measured()
         assert tensor is not None
-        total = tensor.mean(-4).sum((-3, -2, -1)).abs()
+        total = tensor.detach().mean(-4).sum((-3, -2, -1)).abs()
+        if getattr(self, "polarized", False):  # the others may sum to nothing
+            error, total = error[..., 0], total[..., 0]
         found = (error / total)[total > 0]
         return float(found.max()) if found.numel() else None
 

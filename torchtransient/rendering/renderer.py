@@ -49,7 +49,7 @@ from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.rendering.passes import PassSums, samples_of_pass
 from torchtransient.rendering.progress import Bar
 from torchtransient.rendering.tolerance import Loss, Request, ToleranceResult, render_to_tolerance
-from torchtransient.scene.edits import BuildOptions, checked_pulse
+from torchtransient.scene.edits import BuildOptions, built_depth, checked_pulse
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import sampler_plugin
 from torchtransient.scene.opaque import opaque
@@ -464,6 +464,8 @@ class TransientRenderer(CopiesParametrized):
             integrator = self.scene.built(self._options).scene.integrator()
         shared = not getattr(integrator, "pixels_are_independent", False)
         bins, pixels = (CELL_BINS if self.film.has_bins else 1, CELL_PIXELS) if errors is True else (1, 1)
+        # Noise that pixels share adds up or cancels: a cell of several would not tell that of one.
+        pixels = 1 if shared else pixels
         cells = ErrorCells(bins, pixels, pixels, shared)
         return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex)
 
@@ -529,6 +531,9 @@ class TransientRenderer(CopiesParametrized):
             spp = self.samples_drawn(spp)
             settings: dict[str, Any] = {"variant": self.scene.variant, "sampler": sampler, "sensors": self._sensors}
             settings["temporal_filter"] = self.effective_filter
+            built = self.scene.built(self._options)
+            settings |= {"integrator": built.integrator, "max_depth": built_depth(built.scene.integrator())}
+            settings["build of the scene"] = repr(self._options)
             tensors, _, _ = self._collect(values)
             kept = {key: tensor.detach().clone() for key, tensor in zip(self._keys, tensors, strict=True)}
             return render_to_tolerance(

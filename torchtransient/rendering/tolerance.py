@@ -242,7 +242,7 @@ def _look_at_loss(sums: PassSums, rtol: float) -> Look:
         return Look(n, math.inf, rtol, n - 1.0, False)
     error = math.sqrt(power / (n - 1) / n) / abs(mean)
     # Variance of a sample variance over its square: 2 / (n - 1) of normal values, more by their excess kurtosis.
-    excess = max(n * math.fsum(x * x for x in squared) / power**2 - 3.0, 0.0) if power > 0 else 0.0
+    excess = max(n * math.fsum((x / power) ** 2 for x in squared) - 3.0, 0.0) if power > 0 else 0.0
     freedom = 2.0 / (2.0 / (n - 1) + excess / n)
     return Look(n, error, rtol, freedom, is_heavy(squared))
 

@@ -52,7 +52,8 @@ class TransientPathReuse(path.TransientPath):
     Samples per pixel are those of the paths; use the sampler ``owen``, which the shared part draws from as well. Films,
     filters, pulses and gates as in ``transient_path``; monochromatic, RGB and spectral variants.
 
-    Derivatives, in both modes, are those of ``transient_path``, with its noise.
+    Derivatives, in both modes, are those of ``transient_path``, with its noise. The same seed gives the same light up
+    to the order in which the events of a list are added (1e-7 of a value).
 
     Not supported: polarized variants, media, an unlimited ``max_depth``, phasor films, films of several storage bands,
     surfaces that shift wavelengths (all ``SceneError``). Light that refracts at rough surfaces, and light seen from
