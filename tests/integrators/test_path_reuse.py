@@ -182,7 +182,9 @@ def test_response_curves():
 
 @pytest.mark.slow
 def test_means_are_those_of_plain_paths_to_a_thousandth():
-    """Energy to 1e-3, Student's t of blocks with mean 0 and deviation 1."""
+    """Energy to 1e-3, Student's t of blocks with deviation 1. Blocks share noise: their mean t deviates by .08 between
+    sets of seeds.
+    """
     count = 40
     plain, shared = (runs(renderer(room(32), kind, spp=256), count, seed) for kind, seed in ((PATH, 0), (REUSE, 999)))
     ratio = shared.sum() / plain.sum()
@@ -191,7 +193,7 @@ def test_means_are_those_of_plain_paths_to_a_thousandth():
     assert error < 1e-3 and abs(ratio - 1) < 3 * error
     bars = np.sqrt((plain.var(0, ddof=1) + shared.var(0, ddof=1)) / count)
     t = (shared.mean(0) - plain.mean(0))[bars > 0] / bars[bars > 0]
-    assert abs(t.mean()) < 0.1 and abs(t.std() - 1) < 0.1
+    assert abs(t.mean()) < 0.3 and abs(t.std() - 1) < 0.1
 
 
 @pytest.mark.parametrize("film", [{}, {"temporal_filter": "tent"}, {"start_opl": 6.5, "temporal_bins": 10}])

@@ -92,10 +92,12 @@ def test_polarization(folder):
 
 @pytest.mark.slow
 def test_gradients(folder):
-    """The box that is fitted: from 0.2 radians and 7 cm to what the page says."""
+    """The box that is fitted: from 0.2 radians and 7 cm to what the page says, twice. With 128 samples the angle was
+    off by .009, .002 and .001 for three sets of seeds (independent numbers: .0005, .011, .019).
+    """
     found = Page("docs/gradients.md").names()
     turn, x, z = found["x"].detach()[[1, 3, 5]].tolist()
-    assert abs(turn) < 0.003 and max(abs(x), abs(z)) < 0.004
+    assert abs(turn) < 0.008 and max(abs(x), abs(z)) < 0.002
 
 
 @pytest.mark.slow

@@ -33,8 +33,10 @@ ROUGHNESSES = [
 
 def activate(variant: str) -> None:
     mi.set_variant(variant)
-    for name in ("dielectric", "rough_dielectric"):
-        importlib.reload(importlib.import_module(f"torchtransient.plugins.bsdfs.{name}"))
+    for name, plugin in (("dielectric", "DiffDielectric"), ("rough_dielectric", "DiffRoughDielectric")):
+        module = importlib.reload(importlib.import_module(f"torchtransient.plugins.bsdfs.{name}"))
+        # Scalar variants have no plugins of the library; these two work there, one ray at a time.
+        mi.register_bsdf(f"diff_{name}", getattr(module, plugin))
 
 
 def directions(count: int, seed: int) -> np.ndarray:

@@ -259,8 +259,8 @@ def test_standard_error_falls_with_samples():
     """As the square root; of renders that are little but noise it is close to one."""
     plane = tt.scenes.light_over_plane()
     few, many = (
-        np.mean([D.Recipe(plane, variant=VARIANT, spp=spp)._maker.standard_error(i) for i in range(3)])
-        for spp in (256, 4096)
+        np.mean([one._maker.standard_error(i) for i in range(3)])
+        for one in (D.Recipe(plane, variant=VARIANT, spp=spp, sampler="independent") for spp in (256, 4096))
     )
     # By the power of the light instead of that of light and noise.
     assert (few / np.sqrt(1 - few**2)) / (many / np.sqrt(1 - many**2)) == pytest.approx(4, rel=0.2)

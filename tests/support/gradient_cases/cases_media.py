@@ -271,7 +271,7 @@ CASES = [
     lengths("wall_behind_ball_grid", "ball of clouds", move("wall.to_world", FORWARD), spp=4096, tags=SLOW),
     lengths("wall_under_the_sky", "ball under the sky", move("wall.to_world", FORWARD), spp=8192, tags=SLOW),
     lengths("wall_from_a_ball", "inside a ball", move("wall.to_world", FORWARD), spp=4096, tags=SLOW),
-    lengths("camera_in_ball", "inside a ball", move("sensor.to_world", FORWARD), spp=4096, tags=SLOW),
+    lengths("camera_in_ball", "inside a ball", move("sensor.to_world", FORWARD), spp=4096, seeds=24, tags=SLOW),
     lengths("ball", "ball", move("block.to_world", FORWARD), step=8e-3, spp=16384, tags=SLOW),
     lengths("ball_sideways", "ball", move("block.to_world", (1, 0, 0)), step=8e-3, spp=16384, tags=SLOW),
     lengths("light_in_fog", "fog", move_point("light.position", FORWARD)),
