@@ -79,7 +79,7 @@ class Pool:
         """Passes after which the true error is the tolerance."""
         import torch
 
-        from torchtransient.rendering.passes import local_mean
+        from torchtransient.rendering.error_bars import local_mean
 
         if on == "energy":
             return float(self.energies.var(ddof=1) / self.energies.mean() ** 2 / rtol**2)

@@ -215,6 +215,25 @@ def test_small_films(size, bins, errors):
     assert out.error_map().shape == (bins, size, size) and float(out.standard_error()) > 0
 
 
+def test_a_capture_of_few_bins():
+    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), 2, kind="confocal")
+    capture = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan, time_axis=tt.TimeAxis(1.5, 0.3, 7), spp=16)
+    with torch.no_grad():
+        out = capture.renderer(seed=0, errors=True)
+    assert out.error_map().shape == (7, 2, 2) and float(out.standard_error()) > 0
+
+
+@pytest.mark.parametrize("power", [-24, 18])
+def test_light_that_is_far_from_one(power):
+    """Sums scale with the radiance; squares of it have no room in single precision."""
+    key = "light.emitter.radiance.value"
+    renderer = tt.TransientRenderer(room(), [key], spp=8, physics="ignore")
+    plain = renderer.values[key].detach()
+    with torch.no_grad():
+        one, far = (renderer({key: plain * 10.0**n}, seed=0, errors=True).standard_error() for n in (0, power))
+    assert float(far) == pytest.approx(float(one) * 10.0**power, rel=1e-4)
+
+
 def test_parts_of_a_capture():
     """Confocal points: noise of pixels is not their share of the noise of a cell. 40 runs against 8 batches each."""
     scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), 4, kind="confocal")

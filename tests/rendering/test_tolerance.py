@@ -253,8 +253,9 @@ def fireflies():
 
 
 def test_heavy_tails_are_said():
+    """Of 12 seeds all are said to be heavy tailed after 256 passes, 7 after 64: a spark has to be found first."""
     renderer = tt.TransientRenderer(tt.load(fireflies(), variant=VARIANT), physics="ignore")
-    result = to_tolerance(renderer, rtol=0.05, max_spp=SPP * 64)
+    result = to_tolerance(renderer, rtol=0.05, max_spp=SPP * 256)
     assert result.heavy_tailed and not result.reached
     assert "heavy tailed" in result.reason
 

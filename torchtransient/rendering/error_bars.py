@@ -208,26 +208,43 @@ def variance(differences: torch.Tensor, weights: torch.Tensor, cells: ErrorCells
     return (sums.abs().square().sum(-1) / number).sum((-2, -1))
 
 
-def local_errors(squares: torch.Tensor, cells: ErrorCells, shape: Sequence[int]) -> torch.Tensor:
-    """Return the standard error of every bin: of its cell, or of the 3 x 3 x 3 bins around it.
+def local_mean(values: torch.Tensor, dims: tuple[int, ...]) -> torch.Tensor:
+    """Return the mean over each entry and its neighbours along ``dims``; at rims over those that exist."""
+    for dim in dims:
+        size = values.shape[dim]
+        if size == 1:
+            continue
+        total, number = values.clone(), torch.full((size,), 3.0, dtype=values.dtype, device=values.device)
+        total.narrow(dim, 1, size - 1).add_(values.narrow(dim, 0, size - 1))
+        total.narrow(dim, 0, size - 1).add_(values.narrow(dim, 1, size - 1))
+        number[0] -= 1
+        number[-1] -= 1
+        shape = [1] * values.ndim
+        shape[dim] = size
+        values = total.div_(number.reshape(shape))
+    return values
+
+
+def local_errors(
+    squares: torch.Tensor, cells: ErrorCells, shape: Sequence[int], near: tuple[int, ...]
+) -> torch.Tensor:
+    """Return the standard error of every bin: of its cell, or where cells hold one pixel of those around it, too.
 
     Args:
         squares: (..., T', H', W') in cells.
         cells: layout.
         shape: (T, H, W).
+        near: dimensions along which neighbours are alike.
 
     Returns:
         (..., T, H, W).
     """
-    lengths = zip(shape, (cells.bins, cells.rows, cells.columns), strict=True)
-    t, h, w = (_sizes(length, size, squares) for length, size in lengths)
+    sides = list(zip((-3, -2, -1), shape, (cells.bins, cells.rows, cells.columns), strict=True))
+    t, h, w = (_sizes(length, size, squares) for _, length, size in sides)
     mean = squares / (t[:, None, None] * h[:, None] * w)
     if cells.rows == 1:
-        flat, kernel = mean.reshape(-1, 1, *mean.shape[-3:]), [3 if length >= 3 else 1 for length in shape]
-        padding = [size // 2 for size in kernel]
-        near = torch.nn.functional.avg_pool3d(flat, kernel, stride=1, padding=padding, count_include_pad=False)
-        mean = near.reshape(mean.shape)
-    for dim, length, size in zip((-3, -2, -1), shape, (cells.bins, cells.rows, cells.columns), strict=True):
+        mean = local_mean(mean, near)
+    for dim, length, size in sides:
         mean = mean.repeat_interleave(size, dim).narrow(dim, 0, length)
     return mean.sqrt()
 
@@ -272,27 +289,31 @@ class ErrorBars:
         if given.is_complex():
             raise ArgumentError("standard_error: expected real weights, got complex ones.")
         real = differences.real if differences.is_complex() else differences
+        # Squares of bright light have no room in single precision.
+        differences = differences.to(torch.complex128 if differences.is_complex() else torch.float64)
         try:
-            given = given.to(real).broadcast_to(*differences.shape[:-4], *shape)
+            given = given.to(differences.device, torch.float64).broadcast_to(*differences.shape[:-4], *shape)
         except RuntimeError as error:
             raise ShapeError(
                 f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
                 f"{tuple(given.shape)}. Weights of times are weights[:, None, None]."
             ) from error
-        return variance(differences, given, cells).sqrt()
+        return variance(differences, given, cells).sqrt().to(real.dtype)
 
     def error_map(self, *, steady: bool = False) -> torch.Tensor:
         """Return the standard error of every bin, (..., T, H, W), (..., H, W) with ``steady``.
 
-        It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``:
-        single dark bins have seen too few events to know their own.
+        It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``
+        (3 x 3 pixels of gates and frequencies): single dark bins have seen too few events to know their own.
 
         Raises:
             ArgumentError: for a render without ``errors=``.
         """
         differences, shape, cells = self._error_layout(steady)
         squares = differences.abs().square().sum(-1) if steady or self.squares is None else self.squares
-        found = local_errors(squares, cells, shape)
+        layout = layout_of_output(self)
+        in_order = not steady and layout is not None and layout.has_bins
+        found = local_errors(squares, cells, shape, (-3, -2, -1) if in_order else (-2, -1))
         return found.squeeze(-3) if steady else found
 
     def relative_error(self) -> float | None:

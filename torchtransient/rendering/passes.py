@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import torch
 
 from torchtransient.plugins.guards import interrupts_wait
+from torchtransient.rendering.error_bars import local_mean
 from torchtransient.rendering.films import FilmLayout
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.scene.variant import stokes_components
@@ -29,26 +30,6 @@ _NEIGHBORS = 8
 _SMALLEST_BATCH, _LARGEST_BATCH, _PATHS = {"owen": 16}, 256, 2**16
 
 
-def pass_seed(seed: int, number: int) -> int:
-    """Return the seed of a pass: a 32-bit hash, different for all passes of one render.
-
-    Args:
-        seed: seed of the render; counts modulo 2^32.
-        number: number of the pass, from 0 on.
-
-    Two rounds of a permutation of 32 bits (Wellons 2018, lowbias32), with keys that are made of the seed.
-    """
-    key = _mixed(seed + 0x9E3779B9)
-    return _mixed(_mixed(number ^ key) + _mixed(key ^ 0x7F4A7C15))
-
-
-def _mixed(x: int) -> int:
-    x &= 0xFFFFFFFF
-    x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
-    x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
-    return x ^ (x >> 16)
-
-
 def samples_of_pass(sampler: str, pixels: int) -> int:
     """Return the samples per pixel of a pass, a power of two.
 
@@ -58,23 +39,6 @@ def samples_of_pass(sampler: str, pixels: int) -> int:
     """
     least = _SMALLEST_BATCH.get(sampler, 8)
     return max(least, min(_LARGEST_BATCH, 2 ** round(math.log2(_PATHS / pixels)) if pixels < _PATHS else 1))
-
-
-def local_mean(values: torch.Tensor, dims: tuple[int, ...]) -> torch.Tensor:
-    """Return the mean over each entry and its neighbours along ``dims``; at rims over those that exist."""
-    for dim in dims:
-        size = values.shape[dim]
-        if size == 1:
-            continue
-        total, number = values.clone(), torch.full((size,), 3.0, dtype=values.dtype, device=values.device)
-        total.narrow(dim, 1, size - 1).add_(values.narrow(dim, 0, size - 1))
-        total.narrow(dim, 0, size - 1).add_(values.narrow(dim, 1, size - 1))
-        number[0] -= 1
-        number[-1] -= 1
-        shape = [1] * values.ndim
-        shape[dim] = size
-        values = total.div_(number.reshape(shape))
-    return values
 
 
 def moderated_variance(variance: torch.Tensor, freedom: torch.Tensor | float, dims: tuple[int, ...]) -> torch.Tensor:

@@ -487,9 +487,9 @@ class TransientRenderer(CopiesParametrized):
         """Render passes, without gradients, until the relative error of their mean is small enough.
 
         The error of a bin is the standard error of the mean over passes, channels averaged, relative to the mean of the
-        bin and its neighbours (3 x 3 pixels, and 3 bins of time). Pass ``i`` has the seed ``pass_seed(seed, i)``: the
-        mean depends on the number of passes alone, not on interruptions. Without ``max_seconds`` and ``max_spp`` the
-        render may take arbitrarily long; Ctrl-C ends it with what there is.
+        bin and its neighbours (3 x 3 pixels, and 3 bins of time). The seed of a pass follows from ``seed`` and its
+        number: the mean depends on the number of passes alone, not on interruptions. Without ``max_seconds`` and
+        ``max_spp`` the render may take arbitrarily long; Ctrl-C ends it with what there is.
 
         Args:
             values: as of a call.

@@ -21,13 +21,16 @@ import torch
 
 from torchtransient.checks import as_number, count, of_class, positive, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.rendering.error_bars import local_mean
+from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.output import RenderOutput
-from torchtransient.rendering.passes import PassSums, local_mean, moderated_variance, pass_seed
+from torchtransient.rendering.passes import PassSums, moderated_variance
 from torchtransient.rendering.progress import ForecastBar
 from torchtransient.tensor_record import same
 
 Loss: TypeAlias = "Callable[[RenderOutput], torch.Tensor]"
 
+_PASS = 0x9A55
 # Passes before the first look, and before a look without any light ends the render.
 _FIRST_LOOK, _DARK_PASSES = 8, 64
 # Aim at this share of the tolerance at most: looking at an estimate until it is small favours those that are too small.
@@ -438,7 +441,7 @@ class _Loop:
 
     def _one_pass(self) -> None:
         sums, start = self.sums, time.perf_counter()
-        out = self.render(pass_seed(sums.seed, sums.passes))
+        out = self.render(mix_seed(sums.seed, _PASS + sums.passes))
         sums.add(out, None if self.request.loss is None else _number_of(self.request.loss, out))
         if sums.passes == 1 and self.request.loss is None:
             counted_bins(sums.mean_bins().abs(), self.request.on, sums)  # a mask of another shape ends here
