@@ -115,10 +115,10 @@ def test_staircase_with_a_floor_in_place_of_the_house(tmp_path: Path, capsys: py
 def test_bottle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mi.set_variant("llvm_ad_rgb")
     module = example("bottle")
-    out = module.main(["--height", "24", "--spp", "1024", "--max-depth", "6", "--output", str(tmp_path)])
+    out = module.main(["--height", "24", "--spp", "8192", "--max-depth", "6", "--output", str(tmp_path)])
     assert capsys.readouterr().out.splitlines()[-1].startswith("bottle: the pulse rises at 0.")
     for name in ("bottle.mp4", "bottle_frames.png", "bottle_peak.png"):
         assert (tmp_path / name).stat().st_size > 2_000  # one panel, with --smoke
-    # Slower than in vacuum: the index of water, and what scatters stays behind. So coarse a picture says .76 to .84,
-    # with 16 times the samples too.
-    assert 0.6 < module.speed_of_rise(out) < 0.9
+    # Slower than in vacuum: the index of water, and what scatters stays behind. The mean of 12 such renders is .775, one
+    # deviates by .033: four times that.
+    assert 0.64 < module.speed_of_rise(out) < 0.91
