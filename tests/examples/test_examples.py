@@ -119,6 +119,6 @@ def test_bottle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.splitlines()[-1].startswith("bottle: the pulse rises at 0.")
     for name in ("bottle.mp4", "bottle_frames.png", "bottle_peak.png"):
         assert (tmp_path / name).stat().st_size > 2_000  # one panel, with --smoke
-    # Slower than in vacuum: the index of water, and what scatters stays behind. The mean of 12 such renders is .775, one
-    # deviates by .033: four times that.
+    # Slower than in vacuum: the index of water, and what scatters stays behind. The mean of 12 such renders is .775,
+    # one deviates by .033: four times that.
     assert 0.64 < module.speed_of_rise(out) < 0.91
