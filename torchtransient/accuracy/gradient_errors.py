@@ -23,7 +23,7 @@ _TAIL_SPP = 16
 
 
 @dataclass(frozen=True)
-class GradientError:
+class GradientEstimate:
     """Gradient of a loss by one key.
 
     Attributes:
@@ -59,7 +59,7 @@ def gradient_errors(
     seed: int = 0,
     tails: bool = True,
     progress: bool = True,
-) -> dict[str, GradientError]:
+) -> dict[str, GradientEstimate]:
     """Measure the gradient of a loss and its standard error.
 
     The gradient is the mean over ``passes``, each a render and a backward pass with seeds of its own. Few passes of
@@ -79,7 +79,7 @@ def gradient_errors(
         progress: show a progress bar.
 
     Returns:
-        By key, the :class:`GradientError`.
+        By key, the :class:`GradientEstimate`.
 
     Raises:
         ArgumentError: for a renderer without parameters, and a loss that does not depend on them.
@@ -137,7 +137,7 @@ def gradient_errors(
         error = all_runs.std(0) / number**0.5
         if tail is not None and tail.heavy:
             error = torch.full_like(error, torch.nan)
-        results[key] = GradientError(
+        results[key] = GradientEstimate(
             value=all_runs.mean(0), standard_error=error, tail=tail, passes=number, spp=drawn
         )
     return results
