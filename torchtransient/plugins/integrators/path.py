@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
+from torchtransient.plugins.transport.context import RenderContext
+from torchtransient.plugins.transport.ellipsoidal_connections import Ellipsoidal, OrdinarySampled
 from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
 from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.vacuum import Vacuum
+
+CONNECTIONS = ("ordinary", "ellipsoidal")
 
 
 class TransientPath(TransientIntegrator):
@@ -42,7 +47,21 @@ class TransientPath(TransientIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.boundary = truth(props, "boundary", default=True)
+        self.connections = str(props.get("connections", "ordinary"))
+        if self.connections not in CONNECTIONS:
+            raise SceneError(
+                f"{props.plugin_name()}: connections: expected one of {', '.join(CONNECTIONS)}, got {self.connections!r}."
+            )
         self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
+
+    def render_context(self, scene, contents, wanted=None, window=None, settings=None):
+        if self.connections == "ordinary" or wanted is not None or settings is not None:
+            return super().render_context(scene, contents, wanted, window, settings)
+        segment, scattering, _ = self.strategies(contents)
+        ordinary = OrdinarySampled()
+        ordinary.beside = Ellipsoidal(contents.sensor.film(), ordinary)
+        connections = [EmitterFound(), ordinary, ordinary.beside]
+        return RenderContext(scene, contents, self.settings(), (segment, scattering, connections), None, window)
 
     def silhouettes(self, scene, sensors=None):
         if not self.boundary:

@@ -262,6 +262,19 @@ class Surface(Scattering):
         value = self.correct_two_sided(context, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, out)), pdf
 
+    def value_at(self, context, si, out, ray, active):
+        """Return the scattering at a surface that no path has walked to, unpolarized.
+
+        Args:
+            si: SurfaceInteraction3f.
+            out: direction of the light in world space.
+            ray: Ray3f that found it.
+
+        Returns:
+            (value, density).
+        """
+        return si.bsdf(ray).eval_pdf(mi.BSDFContext(), si, si.to_local(out), active)
+
     # ---------------------------------------------------------------------------------------- scene contents
 
     @staticmethod
@@ -477,6 +490,12 @@ class Lambertian(Surface):
     def value_towards(self, context, path, vertex, out, active):
         answer = self._towards(vertex, out)
         return answer.value, answer.pdf
+
+    def value_at(self, context, si, out, ray, active):
+        bsdf = si.bsdf(ray)
+        vertex = Local(si=si, side=_side(bsdf, si), ρ=_albedo(bsdf, si, active))
+        answer = self._towards(vertex, out)
+        return dr.select(active, answer.value, 0), answer.pdf
 
     # ----------------------------------------------------------------------------------------------- attached
 

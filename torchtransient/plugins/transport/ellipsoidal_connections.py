@@ -1,0 +1,351 @@
+"""Ellipsoidal connections: the vertex between a path and a light, drawn where a gate or a window looks.
+
+From a vertex x, at the optical length l of the path so far, a point e of a light and an arrival tau in the window are
+drawn. The vertex w between them lies where |xw| + |we| = s = (tau - l) / eta: on an ellipsoid with the foci x and e. A
+half-plane that begins at the axis of the foci, at the angle psi around it, cuts the ellipsoid in half an ellipse, and
+that meets the flat faces of the scene in few points, in closed form. One of them is chosen, by what light it would
+bring without occlusion. Faces are areas, so that the density of w is
+
+    p(w) = p(s) p(psi) |n . (grad s x grad psi)|,    grad s = u_x + u_e,    grad psi = a x (w - x) / |a x (w - x)|^2,
+
+with the unit vectors u from the foci to w, that of the axis a, and the normal n of the face.
+
+Source: Pediredla, Veeraraghavan, Gkioulekas, "Ellipsoidal path connections for time-gated rendering", 2019; the
+half-plane in place of their ellipse in the plane of a triangle makes the density of a vertex a function of x, w, e and
+n alone, so that the ordinary connections at w know it without looking for the triangle.
+
+Both techniques share what connections to lights have of a path (:class:`EmitterSampled`): ordinary ones keep the share
+``a^2 / (a^2 + p^2)`` with the density ``a`` with which scattering at x finds w, ellipsoidal ones take the rest. Light
+that is run into keeps its weight.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from torchtransient.plugins.kernel_arrays import PointerTable
+from torchtransient.plugins.polarized import product
+from torchtransient.plugins.sampling.area_elements import AreaElements
+from torchtransient.plugins.sampling.hidden_elements import packed
+from torchtransient.plugins.transport.emitter_connections import EmitterSampled
+from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
+
+# Faces that are looked through at every vertex.
+MOST_FACES = 64
+# Numbers of a face in its table.
+_ROW = 16
+# Relative distance within which a ray has found a point.
+_FOUND = 1e-3
+# Excess of the length over the distance of the foci, relative, below which nothing is connected.
+_LEAST = 1e-5
+
+
+class Faces:
+    """Parallelograms and triangles of meshes, in a table that kernels look through.
+
+    Args:
+        shapes: shapes of the scene.
+
+    Attributes:
+        count: number of faces.
+    """
+
+    def __init__(self, shapes):
+        parts, rows = [], []
+        for shape in shapes:
+            if shape.is_mesh():
+                elements = AreaElements.from_shapes([shape])
+                found = faces_of(elements)
+                parts.append((elements.area.sum() / len(found), shape, found))
+        self.shapes = []
+        for _, shape, found in sorted(parts, key=lambda part: -part[0]):
+            if len(rows) + len(found) <= MOST_FACES:
+                self.shapes.append(shape)
+                rows += found
+        self.count = len(rows)
+        self._listed = PointerTable.marking(self.shapes)
+        self._table = packed(np.array(rows).reshape(-1, _ROW)) if rows else None
+
+    def lists(self, shape):
+        """Return a mask of pointers to shapes in the table."""
+        return self._listed.lists(shape)
+
+    def face(self, i):
+        """Return face number ``i``: corner ``o``, normal ``n``, dual edges ``U``, ``V`` and the reach of ``u + v``."""
+        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k) for k in range(4)]
+        return Local(
+            o=mi.Point3f(r[0].x, r[0].y, r[0].z), n=mi.Normal3f(r[1].x, r[1].y, r[1].z),
+            U=mi.Vector3f(r[2].x, r[2].y, r[2].z), V=mi.Vector3f(r[3].x, r[3].y, r[3].z), most=r[0].w,
+        )  # fmt: skip
+
+
+def faces_of(elements):
+    """Return the faces of a mesh as rows of numbers; pairs of triangles that make up a parallelogram are one."""
+    rows, i = [], 0
+    o, e1, e2 = (elements.axes[:, k] for k in range(3))
+    while i < len(elements):
+        face, step = (o[i], e1[i], e2[i], 1.0), 1
+        if i + 1 < len(elements):
+            whole = parallelogram([o[i], o[i] + e1[i], o[i] + e2[i]], [o[i + 1], o[i + 1] + e1[i + 1], o[i + 1] + e2[i + 1]])
+            if whole is not None:
+                face, step = (*whole, 2.0), 2
+        if elements.area[i] > 0:
+            rows.append(_row(*face))
+        i += step
+    return rows
+
+
+def parallelogram(one, other):
+    """Return (corner, edge, edge) of the parallelogram of two triangles, None if they are none."""
+    size = np.abs(np.subtract(one[1:], one[0])).max()
+    shared = [(i, k) for i in range(3) for k in range(3) if np.abs(one[i] - other[k]).max() < 1e-5 * size]
+    if len(shared) != 2:
+        return None
+    apex = one[3 - shared[0][0] - shared[1][0]]
+    far = other[3 - shared[0][1] - shared[1][1]]
+    a, b = (one[i] - apex for i, _ in shared)
+    return (apex, a, b) if np.abs(apex + a + b - far).max() < 1e-5 * size else None
+
+
+def _row(o, e1, e2, most):
+    n = np.cross(e1, e2)
+    n /= np.linalg.norm(n)
+    U, V = np.cross(e2, n), np.cross(n, e1)
+    U, V = U / (U @ e1), V / (V @ e2)
+    return [*o, most, *n, 0.0, *U, 0.0, *V, 0.0]
+
+
+class LightPoints:
+    """Points on the area lights of the listed shapes, uniform over area by the weights of the lights.
+
+    Args:
+        shapes: shapes of the scene.
+    """
+
+    def __init__(self, shapes):
+        lit = [shape for shape in shapes if shape.is_emitter() and shape.is_mesh()]
+        elements = AreaElements.from_shapes(lit)
+        weight = elements.area * np.array([lit[int(s)].emitter().sampling_weight() for s in elements.shape])
+        kept = np.flatnonzero(weight > 0)
+        elements, weight = elements.take(kept), weight[kept]
+        self.emitters = PointerTable.marking([shape.emitter() for shape in lit])
+        self.count = len(weight)
+        if self.count:
+            rows = np.zeros((self.count, 4, 4))
+            rows[:, 0, :3], rows[:, 1, :3], rows[:, 2, :3] = (elements.axes[:, k] for k in range(3))
+            rows[:, 3, :3] = elements.normal
+            rows[:, 0, 3] = weight / weight.sum() / elements.area
+            self._table = packed(rows)
+            self._choice = mi.DiscreteDistribution(mi.Float(weight.astype(np.float32)))
+
+    def sample(self, u, active):
+        """Draw a point: ``p``, its normal ``n`` and its density ``pdf`` per area."""
+        i, x = self._choice.sample_reuse(u.x, active)
+        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k, active) for k in range(4)]
+        s = dr.sqrt(x)
+        a, b = s * (1 - u.y), s * u.y
+        o, e1, e2, n = (mi.Vector3f(q.x, q.y, q.z) for q in r)
+        return Local(p=mi.Point3f(o + e1 * a + e2 * b), n=mi.Normal3f(n), pdf=r[0].w)
+
+
+def area_density(x, e, w, n):
+    """Return ``|n . (grad s x grad psi)|``, see the head of the module."""
+    x_w, e_w = w - x, w - e
+    around = dr.cross(dr.normalize(e - x), x_w)
+    across = dr.cross(dr.normalize(x_w) + dr.normalize(e_w), around)
+    return dr.abs_dot(n, across) * dr.rcp(dr.squared_norm(around))
+
+
+def same_side(x, e, w, n):
+    """Return a mask of foci on one side of the plane through ``w``."""
+    return dr.dot(n, x - w) * dr.dot(n, e - w) > 0
+
+
+class Ellipsoidal(Connection):
+    """Connection over a vertex that is drawn where the window of the film looks."""
+
+    name = "ellipsoidal"
+    light_of_scene_alone = True
+    finds_light = False
+
+    def __init__(self, film, lights):
+        self.film, self.lights = film, lights
+
+    def prepare(self, context):
+        self.first, self.last = self.film.window()
+        shapes = context.scene.shapes()
+        self.faces, self.points = Faces(shapes), LightPoints(shapes)
+        self.works = self.faces.count > 0 and self.points.count > 0
+
+    # ------------------------------------------------------------------------------------------------- density
+
+    def density_of(self, x, e, w, n):
+        """Return the density per area with which ``w`` is drawn, times that of its choice, for given x and e."""
+        return area_density(x, e, w, n) * (dr.inv_two_pi / (self.last - self.first))
+
+    def share_of_others(self, context, path, vertex, ds, opl):
+        """Return the share that an ordinary connection at ``vertex`` keeps."""
+        x, w, n, e = path.prev_p, vertex.si.p, vertex.si.n, ds.p
+        drawn = ~path.prev_unconnected & vertex.si.is_valid() & (opl >= self.first) & (opl < self.last)
+        drawn &= self.points.emitters.lists(ds.emitter) & self.faces.lists(vertex.si.shape) & same_side(x, e, w, n)
+        r = dr.norm(w - x)
+        drawn &= r + dr.norm(w - e) > dr.norm(e - x) * (1 + _LEAST)
+        a = path.prev_pdf * dr.abs_dot(n, w - x) / (r * r * r)
+        p = self.density_of(x, e, w, n) * path.η
+        return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
+
+    # ------------------------------------------------------------------------------------------------- primal
+
+    def propose(self, context, path, vertex, sampler):
+        if not self.works:
+            return None
+        active = vertex.goes_on & vertex.connectable & (path.depth + 2 < context.max_depth)
+        active = context.deep_enough(active, path.depth + 3)
+        u, at = sampler.next_2d(), sampler.next_2d()
+        e = self.points.sample(u, active)
+        x = mi.Point3f(vertex.at.p)
+        opl = mi.Float64(self.first) + mi.Float64(at.x) * (self.last - self.first)
+        s = mi.Float(opl - vertex.scattered_τ) / vertex.η
+        d = dr.norm(e.p - x)
+        active &= s > d * (1 + _LEAST)
+        n = mi.Normal3f(vertex.si.n)
+        n = dr.mulsign(n, -dr.dot(n, path.ray.d))
+        w, normal, t, total = choose(self, x, n, e, s, at.y, sampler.next_1d(), mi.Mask(active))
+        active &= total > 0
+        ray = vertex.at.spawn_ray_to(w)
+        ds = Local(p=w, emitter=None)
+        return Proposal(
+            d=dr.select(active, ray.d, mi.Vector3f(0, 0, 1)), active=active, ds=ds, ray=ray, e=e, w=w, n=normal, opl=opl, s=s,
+            choice=dr.select(active, total / t, 0),
+        )  # fmt: skip
+
+    def connect(self, context, path, vertex, proposal, answer, zeros):
+        if proposal is None:
+            return Event(value=mi.UnpolarizedSpectrum(0), opl=vertex.τ, active=mi.Bool(False), depth=path.depth)
+        x, w, e = mi.Point3f(vertex.at.p), proposal.w, proposal.e
+        active = proposal.active & (dr.max(mi.unpolarized_spectrum(answer.value)) > 0)
+        active = context.counted(active, proposal.opl)
+        # ------------------------------------------------------------------------- to the vertex between
+        ray = vertex.at.spawn_ray(proposal.d)
+        pi = context.scene.ray_intersect_preliminary(ray, active=active)
+        r = dr.norm(w - x)
+        active &= dr.abs(pi.t - r) < _FOUND * (1 + r)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, proposal.n) > 0.999) & self.faces.lists(si.shape)
+        # ------------------------------------------------------------------------- to the light
+        shadow = si.spawn_ray_to(e.p)
+        length = dr.norm(e.p - w)
+        value, pdf = context.scattering.value_at(context, si, shadow.d, ray, active)
+        active &= dr.max(mi.unpolarized_spectrum(value)) > 0
+        ray = si.spawn_ray(shadow.d)
+        end = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        active &= end.is_valid() & (dr.norm(end.p - e.p) < _FOUND * length)
+        emitter = end.emitter(context.scene, active)
+        active &= emitter != None  # noqa: E711 (a Dr.Jit comparison)
+        Le = mi.unpolarized_spectrum(emitter.eval(end, active))
+        # ------------------------------------------------------------------------- weight
+        ds = mi.DirectionSample3f(context.scene, si=end, ref=si)
+        share = self.lights.weight(context, si, ds, self.lights.density(context, si, ds, active), pdf, active)
+        p = self.density_of(x, e.p, w, proposal.n) * vertex.η
+        cos_w = dr.abs_dot(proposal.n, w - x) / (r * r * r)
+        a = answer.pdf * cos_w
+        share *= dr.square(p) / (dr.square(a) + dr.square(p))
+        cos_e = dr.abs_dot(end.n, ray.d) / dr.square(length)
+        factor = share * cos_w * cos_e * proposal.choice / (p * e.pdf)
+        value = product(vertex.β, answer.value) * value * Le * dr.select(active, factor, 0)
+        return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 3, crowded=True)
+
+
+@dr.syntax
+def choose(connection, x, n_x, e, s, u_psi, u, active):
+    """Choose a point of the faces on half an ellipse.
+
+    Args:
+        connection: :class:`Ellipsoidal`.
+        x, n_x: first focus and the normal there, on the side of the sensor.
+        e: second focus, with its normal.
+        s: sum of the distances to the foci.
+        u_psi, u: uniform numbers for the angle around the axis and the choice.
+
+    Returns:
+        (point, normal of its face, its weight, sum of the weights of all).
+    """
+    axis = e.p - x
+    d = dr.norm(axis)
+    axis = axis / d
+    frame = mi.Frame3f(axis)
+    sin_psi, cos_psi = dr.sincos(dr.two_pi * u_psi)
+    rho = frame.s * cos_psi + frame.t * sin_psi
+    K = (s - d) * (s + d)
+    w, normal, best, total = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Float(0), mi.Float(0)
+    i = mi.UInt32(0)
+    going = mi.Mask(active)
+    while dr.hint(going, label="faces"):
+        face = connection.faces.face(i)
+        w, normal, best, total, u = among(connection, face, x, n_x, e, s, d, K, axis, rho, w, normal, best, total, u)
+        i += 1
+        going = active & (i < connection.faces.count)
+    return w, normal, best, total
+
+
+def among(connection, face, x, n_x, e, s, d, K, axis, rho, w, normal, best, total, u):
+    """Return the choice with the points of one more face."""
+    h = dr.dot(face.n, face.o - x)
+    h_e = dr.dot(face.n, face.o - e.p)
+    A = dr.fma(K, dr.dot(face.n, axis), 2 * h * d)
+    B, C = K * dr.dot(face.n, rho), 2 * h * s
+    square = dr.fma(A, A, B * B)
+    root = dr.sqrt(dr.maximum(square - C * C, 0))
+    meets = (square > C * C) & (h * h_e > 0)
+    inverse = dr.rcp(square)
+    for sign in (-1, 1):
+        cos, sin = (A * C + sign * (B * root)) * inverse, (B * C - sign * (A * root)) * inverse
+        r = K / (2 * (s - d * cos))
+        ω = axis * cos + rho * sin
+        p = x + ω * r
+        local = p - face.o
+        a, b = dr.dot(local, face.U), dr.dot(local, face.V)
+        inside = meets & (sin > 0) & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
+        weight = dr.select(inside, connection_weight(connection, face.n, x, n_x, e, s, r, p, ω, axis, rho, sin), 0)
+        weight = dr.select(dr.isfinite(weight), weight, 0)
+        total = total + weight
+        share = dr.select(weight > 0, weight / total, 0)
+        taken = u < share
+        u = dr.select(taken, u / share, (u - share) / (1 - share))
+        w, normal = dr.select(taken, p, w), dr.select(taken, face.n, normal)
+        best = dr.select(taken, weight, best)
+    return w, normal, best, total, u
+
+
+def connection_weight(connection, n, x, n_x, e, s, r, p, ω, axis, rho, sin):
+    """Return what light a point would bring over its density, without occlusion and colour, by Lambertian surfaces."""
+    length = s - r
+    to_e = (p - e.p) / length
+    cos_x, cos_e = facing(dr.dot(n_x, ω)), facing(dr.dot(e.n, to_e))
+    cos_w = dr.abs_dot(n, ω)
+    # grad psi along (axis x rho) / (r sin)
+    across = dr.cross(ω + to_e, dr.cross(axis, rho))
+    p_w = dr.abs_dot(n, across) / (r * sin) * (dr.inv_two_pi / (connection.last - connection.first))
+    square = dr.square(r)
+    a = dr.abs(cos_x) * dr.inv_pi * cos_w / square
+    share = dr.square(p_w) / (dr.square(a) + dr.square(p_w))
+    return share * cos_x * cos_w * dr.abs_dot(n, to_e) * cos_e / (square * dr.square(length) * p_w)
+
+
+def facing(cos):
+    """Return a cosine, and little on the side that is dark unless a surface is translucent."""
+    return dr.select(cos > 0, cos, -1e-3 * cos)
+
+
+class OrdinarySampled(EmitterSampled):
+    """:class:`EmitterSampled` beside :class:`Ellipsoidal`, which takes a share of its light."""
+
+    beside = None
+
+    def connect(self, context, path, vertex, proposal, answer, zeros):
+        event = super().connect(context, path, vertex, proposal, answer, zeros)
+        if self.beside is not None and self.beside.works:
+            event.value = event.value * self.beside.share_of_others(context, path, vertex, proposal.ds, event.opl)
+        return event
