@@ -150,12 +150,44 @@ class LightPoints:
         return Local(p=mi.Point3f(o + e1 * a + e2 * b), n=mi.Normal3f(n), pdf=r[0].w)
 
 
-def area_density(x, e, w, n):
-    """Return ``|n . (grad s x grad psi)|``, see the head of the module."""
-    x_w, e_w = w - x, w - e
-    around = dr.cross(dr.normalize(e - x), x_w)
-    across = dr.cross(dr.normalize(x_w) + dr.normalize(e_w), around)
-    return dr.abs_dot(n, across) * dr.rcp(dr.squared_norm(around))
+class Section:
+    """Ellipse in which an ellipsoid of revolution meets a plane: ``center + p cos(phi) + q sin(phi)``.
+
+    Args:
+        x, e: foci.
+        s: sum of the distances to the foci.
+        n: normal of the plane.
+        o: point of the plane.
+    """
+
+    def __init__(self, x, e, s, n, o):
+        D = e - x
+        d = dr.norm(D)
+        axis = D / d
+        m = x + D * 0.5
+        n_a = dr.dot(n, axis)
+        # Squares of the half axes of the ellipsoid.
+        α2, β2 = 0.25 * dr.square(s), 0.25 * (s - d) * (s + d)
+        E2 = β2 + 0.25 * dr.square(d * n_a)
+        δ = dr.dot(n, o - m)
+        λ2 = 1 - dr.square(δ) / E2
+        self.exists = λ2 > 0
+        self.center = m + (n * β2 + axis * (0.25 * dr.square(d) * n_a)) * (δ / E2)
+        across = dr.cross(n, axis)
+        size = dr.norm(across)
+        across = dr.select(size > 1e-4, across / size, mi.Frame3f(n).s)
+        reach = dr.sqrt(dr.maximum(λ2 * β2, 0))
+        self.p, self.q = across * reach, dr.cross(n, across) * (reach * dr.sqrt(α2 / E2))
+
+    def point(self, sin, cos):
+        """Return the point at an angle phi, and its derivative by phi."""
+        return self.center + self.p * cos + self.q * sin, self.q * cos - self.p * sin
+
+    def derivative_at(self, w):
+        """Return the derivative of the point by phi at the point ``w``."""
+        away = w - self.center
+        p2, q2 = dr.squared_norm(self.p), dr.squared_norm(self.q)
+        return self.q * (dr.dot(away, self.p) / p2) - self.p * (dr.dot(away, self.q) / q2)
 
 
 def same_side(x, e, w, n):
@@ -174,6 +206,7 @@ class Ellipsoidal(Connection):
         self.film, self.lights = film, lights
 
     def prepare(self, context):
+        import os; self.M = int(os.environ.get("MM", 1)); self.c = float(os.environ.get("CC", 1))
         self.first, self.last = self.film.window()
         shapes = context.scene.shapes()
         self.faces, self.points = Faces(shapes), LightPoints(shapes)
@@ -181,9 +214,15 @@ class Ellipsoidal(Connection):
 
     # ------------------------------------------------------------------------------------------------- density
 
-    def density_of(self, x, e, w, n):
-        """Return the density per area with which ``w`` is drawn, times that of its choice, for given x and e."""
-        return area_density(x, e, w, n) * (dr.inv_two_pi / (self.last - self.first))
+    def density_of(self, x, e, w, n, along):
+        """Return the density per area with which ``w`` is drawn, for given x and e.
+
+        Args:
+            along: derivative of w by the angle.
+        """
+        gradient = dr.normalize(w - x) + dr.normalize(w - e)
+        gradient -= n * dr.dot(n, gradient)
+        return self.c * dr.norm(gradient) / dr.norm(along) * (dr.inv_two_pi / (self.last - self.first))
 
     def share_of_others(self, context, path, vertex, ds, opl):
         """Return the share that an ordinary connection at ``vertex`` keeps."""
@@ -191,10 +230,12 @@ class Ellipsoidal(Connection):
         drawn = ~path.prev_unconnected & vertex.si.is_valid() & (opl >= self.first) & (opl < self.last)
         drawn &= self.points.emitters.lists(ds.emitter) & self.faces.lists(vertex.si.shape) & same_side(x, e, w, n)
         r = dr.norm(w - x)
-        drawn &= r + dr.norm(w - e) > dr.norm(e - x) * (1 + _LEAST)
+        s = r + dr.norm(w - e)
+        drawn &= s > dr.norm(e - x) * (1 + _LEAST)
         a = path.prev_pdf * dr.abs_dot(n, w - x) / (r * r * r)
-        p = self.density_of(x, e, w, n) * path.η
-        return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
+        p = self.density_of(x, e, w, n, Section(x, e, s, n, w).derivative_at(w)) * path.η
+        share = dr.square(a) / (dr.square(a) + dr.square(p))
+        return dr.select(drawn & dr.isfinite(share), share, 1)
 
     # ------------------------------------------------------------------------------------------------- primal
 
@@ -212,13 +253,13 @@ class Ellipsoidal(Connection):
         active &= s > d * (1 + _LEAST)
         n = mi.Normal3f(vertex.si.n)
         n = dr.mulsign(n, -dr.dot(n, path.ray.d))
-        w, normal, t, total = choose(self, x, n, e, s, at.y, sampler.next_1d(), mi.Mask(active))
+        w, normal, along, t, total = choose(self, x, n, e, s, at.y, sampler.next_1d(), mi.Mask(active))
         active &= total > 0
         ray = vertex.at.spawn_ray_to(w)
         ds = Local(p=w, emitter=None)
         return Proposal(
-            d=dr.select(active, ray.d, mi.Vector3f(0, 0, 1)), active=active, ds=ds, ray=ray, e=e, w=w, n=normal, opl=opl, s=s,
-            choice=dr.select(active, total / t, 0),
+            d=dr.select(active, ray.d, mi.Vector3f(0, 0, 1)), active=active, ds=ds, ray=ray, e=e, w=w, n=normal, along=along, opl=opl, s=s,
+            choice=dr.select(active, total / (t * self.M), 0),
         )  # fmt: skip
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
@@ -248,90 +289,82 @@ class Ellipsoidal(Connection):
         # ------------------------------------------------------------------------- weight
         ds = mi.DirectionSample3f(context.scene, si=end, ref=si)
         share = self.lights.weight(context, si, ds, self.lights.density(context, si, ds, active), pdf, active)
-        p = self.density_of(x, e.p, w, proposal.n) * vertex.η
+        p = self.density_of(x, e.p, w, proposal.n, proposal.along) * vertex.η
         cos_w = dr.abs_dot(proposal.n, w - x) / (r * r * r)
         a = answer.pdf * cos_w
         share *= dr.square(p) / (dr.square(a) + dr.square(p))
         cos_e = dr.abs_dot(end.n, ray.d) / dr.square(length)
-        factor = share * cos_w * cos_e * proposal.choice / (p * e.pdf)
+        factor = share * cos_w * cos_e * proposal.choice * self.c / (p * e.pdf)
         value = product(vertex.β, answer.value) * value * Le * dr.select(active, factor, 0)
         return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 3, crowded=True)
 
 
 @dr.syntax
-def choose(connection, x, n_x, e, s, u_psi, u, active):
-    """Choose a point of the faces on half an ellipse.
+def choose(connection, x, n_x, e, s, u_phi, u, active):
+    """Choose a point of the faces where the sum of the distances to the foci is ``s``.
 
     Args:
         connection: :class:`Ellipsoidal`.
         x, n_x: first focus and the normal there, on the side of the sensor.
         e: second focus, with its normal.
         s: sum of the distances to the foci.
-        u_psi, u: uniform numbers for the angle around the axis and the choice.
+        u_phi, u: uniform numbers for the angle and the choice.
 
     Returns:
-        (point, normal of its face, its weight, sum of the weights of all).
+        (point, normal of its face, derivative by the angle, its weight, sum of the weights of all).
     """
-    axis = e.p - x
-    d = dr.norm(axis)
-    axis = axis / d
-    frame = mi.Frame3f(axis)
-    sin_psi, cos_psi = dr.sincos(dr.two_pi * u_psi)
-    rho = frame.s * cos_psi + frame.t * sin_psi
-    K = (s - d) * (s + d)
-    w, normal, best, total = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Float(0), mi.Float(0)
+    w, normal, along = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0)
+    best, total = mi.Float(0), mi.Float(0)
+    angles = [dr.sincos(dr.two_pi / connection.M * (u_phi + m)) for m in range(connection.M)]
     i = mi.UInt32(0)
     going = mi.Mask(active)
     while dr.hint(going, label="faces"):
         face = connection.faces.face(i)
-        w, normal, best, total, u = among(connection, face, x, n_x, e, s, d, K, axis, rho, w, normal, best, total, u)
+        w, normal, along, best, total, u = among(connection, face, x, n_x, e, s, angles, w, normal, along, best, total, u)
         i += 1
         going = active & (i < connection.faces.count)
-    return w, normal, best, total
+    return w, normal, along, best, total
 
 
-def among(connection, face, x, n_x, e, s, d, K, axis, rho, w, normal, best, total, u):
+def among(connection, face, x, n_x, e, s, angles, w, normal, along, best, total, u):
     """Return the choice with the points of one more face."""
-    h = dr.dot(face.n, face.o - x)
-    h_e = dr.dot(face.n, face.o - e.p)
-    A = dr.fma(K, dr.dot(face.n, axis), 2 * h * d)
-    B, C = K * dr.dot(face.n, rho), 2 * h * s
-    square = dr.fma(A, A, B * B)
-    root = dr.sqrt(dr.maximum(square - C * C, 0))
-    meets = (square > C * C) & (h * h_e > 0)
-    inverse = dr.rcp(square)
-    for sign in (-1, 1):
-        cos, sin = (A * C + sign * (B * root)) * inverse, (B * C - sign * (A * root)) * inverse
-        r = K / (2 * (s - d * cos))
-        ω = axis * cos + rho * sin
-        p = x + ω * r
+    n = face.n
+    section = Section(x, e.p, s, n, face.o)
+    h, h_e = dr.dot(n, face.o - x), dr.dot(n, face.o - e.p)
+    meets = section.exists & (h * h_e > 0)
+    for sin, cos in angles:
+        p, dp = section.point(sin, cos)
         local = p - face.o
         a, b = dr.dot(local, face.U), dr.dot(local, face.V)
-        inside = meets & (sin > 0) & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
-        weight = dr.select(inside, connection_weight(connection, face.n, x, n_x, e, s, r, p, ω, axis, rho, sin), 0)
+        inside = meets & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
+        weight = dr.select(inside, connection_weight(connection, n, x, n_x, e, s, p, dp, h, h_e), 0)
         weight = dr.select(dr.isfinite(weight), weight, 0)
         total = total + weight
         share = dr.select(weight > 0, weight / total, 0)
         taken = u < share
         u = dr.select(taken, u / share, (u - share) / (1 - share))
-        w, normal = dr.select(taken, p, w), dr.select(taken, face.n, normal)
+        w, normal, along = dr.select(taken, p, w), dr.select(taken, n, normal), dr.select(taken, dp, along)
         best = dr.select(taken, weight, best)
-    return w, normal, best, total, u
+    return w, normal, along, best, total, u
 
 
-def connection_weight(connection, n, x, n_x, e, s, r, p, ω, axis, rho, sin):
+def connection_weight(connection, n, x, n_x, e, s, p, dp, h, h_e):
     """Return what light a point would bring over its density, without occlusion and colour, by Lambertian surfaces."""
-    length = s - r
-    to_e = (p - e.p) / length
+    to = p - x
+    r2 = dr.squared_norm(to)
+    inv_r = dr.rsqrt(r2)
+    length = s - r2 * inv_r
+    inv = dr.rcp(length)
+    ω, to_e = to * inv_r, (p - e.p) * inv
     cos_x, cos_e = facing(dr.dot(n_x, ω)), facing(dr.dot(e.n, to_e))
-    cos_w = dr.abs_dot(n, ω)
-    # grad psi along (axis x rho) / (r sin)
-    across = dr.cross(ω + to_e, dr.cross(axis, rho))
-    p_w = dr.abs_dot(n, across) / (r * sin) * (dr.inv_two_pi / (connection.last - connection.first))
-    square = dr.square(r)
-    a = dr.abs(cos_x) * dr.inv_pi * cos_w / square
-    share = dr.square(p_w) / (dr.square(a) + dr.square(p_w))
-    return share * cos_x * cos_w * dr.abs_dot(n, to_e) * cos_e / (square * dr.square(length) * p_w)
+    cos_w = dr.abs(h) * inv_r
+    gradient = ω + to_e
+    # Its length in the plane, since both directions have known cosines.
+    g2 = dr.squared_norm(gradient) - dr.square(h * inv_r + h_e * inv)
+    p_w = dr.sqrt(dr.maximum(g2, 0) * dr.rcp(dr.squared_norm(dp))) * (connection.c * dr.inv_two_pi / (connection.last - connection.first))
+    inv_r2 = dr.square(inv_r)
+    a = cos_x * dr.inv_pi * cos_w * inv_r2
+    return cos_x * cos_w * dr.abs(h_e) * inv * cos_e * inv_r2 * dr.square(inv) * p_w / (dr.square(a) + dr.square(p_w))
 
 
 def facing(cos):
