@@ -59,7 +59,7 @@ class TransientPath(TransientIntegrator):
             return super().render_context(scene, contents, wanted, window, settings)
         segment, scattering, _ = self.strategies(contents)
         ordinary = OrdinarySampled()
-        ordinary.beside = Ellipsoidal(contents.sensor.film(), ordinary)
+        ordinary.beside = Ellipsoidal(ordinary)
         connections = [EmitterFound(), ordinary, ordinary.beside]
         return RenderContext(scene, contents, self.settings(), (segment, scattering, connections), None, window)
 

@@ -25,11 +25,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.kernel_arrays import PointerTable
+from torchtransient.plugins.kernel_arrays import PointerTable, floats, registry_number, whole_numbers
+from torchtransient.plugins.mitsuba_compat import has_smooth_shape, lacks_directions
 from torchtransient.plugins.polarized import product
 from torchtransient.plugins.sampling.area_elements import AreaElements
 from torchtransient.plugins.sampling.hidden_elements import packed
 from torchtransient.plugins.transport.emitter_connections import EmitterSampled
+from torchtransient.plugins.transport.scene_contents import emits_by_place
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
 
 # Faces that are looked through at every vertex.
@@ -63,7 +65,7 @@ class Faces:
         for _, shape, found in sorted(parts, key=lambda part: -part[0]):
             if len(rows) + len(found) <= MOST_FACES:
                 self.shapes.append(shape)
-                rows += found
+                rows += [_row(*face) for face, _ in found]
         self.count = len(rows)
         self._listed = PointerTable.marking(self.shapes)
         self._table = packed(np.array(rows).reshape(-1, _ROW)) if rows else None
@@ -82,8 +84,11 @@ class Faces:
 
 
 def faces_of(elements):
-    """Return the faces of a mesh as rows of numbers; pairs of triangles that make up a parallelogram are one."""
-    rows, i = [], 0
+    """Return ((corner, edge, edge, most of the sum of coordinates), number of an element) of the faces of a mesh.
+
+    Pairs of triangles that make up a parallelogram are one face.
+    """
+    faces, i = [], 0
     o, e1, e2 = (elements.axes[:, k] for k in range(3))
     while i < len(elements):
         face, step = (o[i], e1[i], e2[i], 1.0), 1
@@ -92,9 +97,9 @@ def faces_of(elements):
             if whole is not None:
                 face, step = (*whole, 2.0), 2
         if elements.area[i] > 0:
-            rows.append(_row(*face))
+            faces.append((face, i))
         i += step
-    return rows
+    return faces
 
 
 def parallelogram(one, other):
@@ -117,37 +122,124 @@ def _row(o, e1, e2, most):
     return [*o, most, *n, 0.0, *U, 0.0, *V, 0.0]
 
 
-class LightPoints:
-    """Points on the area lights of the listed shapes, uniform over area by the weights of the lights.
+class LightFaces:
+    """Faces of the area lights that are alike everywhere: points of them, anywhere or at a given distance.
 
     Args:
-        shapes: shapes of the scene.
+        context: :class:`.context.RenderContext` of the job.
+
+    Attributes:
+        count: number of faces.
+        holds_all: the scene has no other lights.
     """
 
-    def __init__(self, shapes):
-        lit = [shape for shape in shapes if shape.is_emitter() and shape.is_mesh()]
-        elements = AreaElements.from_shapes(lit)
-        weight = elements.area * np.array([lit[int(s)].emitter().sampling_weight() for s in elements.shape])
-        kept = np.flatnonzero(weight > 0)
-        elements, weight = elements.take(kept), weight[kept]
-        self.emitters = PointerTable.marking([shape.emitter() for shape in lit])
-        self.count = len(weight)
+    def __init__(self, context):
+        emitters = context.scene.emitters()
+        lit = [e for e in emitters if _is_listed(e, context.contents)]
+        self.emitters, self.holds_all = PointerTable.marking(lit), len(lit) == len(emitters)
+        total = sum(e.sampling_weight() for e in emitters)
+        rows, chances, owners = [], [], []
+        for emitter in lit:
+            elements = AreaElements.from_shapes([emitter.get_shape()])
+            found = faces_of(elements)
+            areas = np.array([_area(face) for face, _ in found])
+            for (face, i), area in zip(found, areas, strict=True):
+                chance = emitter.sampling_weight() / total * area / areas.sum()
+                o, e1, e2, most = face
+                rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], 0.0])
+                chances.append(chance)
+                owners.append(emitter)
+        self.count = len(rows)
         if self.count:
-            rows = np.zeros((self.count, 4, 4))
-            rows[:, 0, :3], rows[:, 1, :3], rows[:, 2, :3] = (elements.axes[:, k] for k in range(3))
-            rows[:, 3, :3] = elements.normal
-            rows[:, 0, 3] = weight / weight.sum() / elements.area
-            self._table = packed(rows)
-            self._choice = mi.DiscreteDistribution(mi.Float(weight.astype(np.float32)))
+            self._table = packed(np.array(rows))
+            self._choice = mi.DiscreteDistribution(floats(np.array(chances)))
+            self._numbers = whole_numbers(np.array([registry_number(owner) for owner in owners]))
+
+    def face(self, u, active):
+        """Choose a face by a number ``u``, which is returned as one that is uniform again."""
+        i, u = self._choice.sample_reuse(u, active)
+        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k, active) for k in range(4)]
+        o, e1, e2, n = (mi.Vector3f(q.x, q.y, q.z) for q in r)
+        emitter = dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._numbers, i, active))
+        return Local(o=o, e1=e1, e2=e2, n=n, pdf=r[0].w, most=r[1].w, chance=r[2].w, emitter=emitter), u
 
     def sample(self, u, active):
-        """Draw a point: ``p``, its normal ``n`` and its density ``pdf`` per area."""
-        i, x = self._choice.sample_reuse(u.x, active)
-        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k, active) for k in range(4)]
-        s = dr.sqrt(x)
-        a, b = s * (1 - u.y), s * u.y
-        o, e1, e2, n = (mi.Vector3f(q.x, q.y, q.z) for q in r)
-        return Local(p=mi.Point3f(o + e1 * a + e2 * b), n=mi.Normal3f(n), pdf=r[0].w)
+        """Draw a point: ``p``, ``n``, its ``emitter`` and its density ``pdf`` per area."""
+        face, x = self.face(u.x, active)
+        # Beyond the diagonal of a triangle, points are mirrored.
+        a, b = x, u.y
+        over = a + b > face.most
+        a, b = dr.select(over, 1 - a, a), dr.select(over, 1 - b, b)
+        return Local(p=mi.Point3f(face.o + face.e1 * a + face.e2 * b), n=mi.Normal3f(face.n), emitter=face.emitter, pdf=face.pdf)
+
+    def sample_between(self, x, first, last, u, active):
+        """Draw a point at a distance between ``first`` and ``last`` from ``x``; ``pdf`` is 0 where that misses the light.
+
+        In the plane of a face these are the points between two circles around the foot of x. The box of the face in
+        the square of the radius and the angle is cut by those of the circles, and drawn from evenly.
+        """
+        face, v = self.face(u.x, active)
+        n = face.n
+        h = dr.dot(n, x - face.o)
+        foot = x - n * h
+        corners = [face.o, face.o + face.e1, face.o + face.e2]
+        corners.append(dr.select(face.most > 1.5, corners[1] + face.e2, corners[1]))
+        middle = dr.select(face.most > 1.5, face.e1 + face.e2, (face.e1 + face.e2) * (2 / 3)) * 0.5 + face.o
+        around = [c - foot for c in corners]
+        g = dr.normalize(middle - foot)
+        t = dr.cross(n, g)
+        angles = [dr.atan2(dr.dot(c, t), dr.dot(c, g)) for c in around]
+        low, high = (f(f(angles[0], angles[1]), f(angles[2], angles[3])) for f in (dr.minimum, dr.maximum))
+        squares = [dr.squared_norm(c) for c in around]
+        outer = dr.maximum(dr.maximum(squares[0], squares[1]), dr.maximum(squares[2], squares[3]))
+        # Edges in a ring: of a parallelogram o, o + e1, o + e1 + e2, o + e2.
+        ring = [around[0], around[1], around[3], around[2]]
+        inner = mi.Float(dr.inf)
+        crosses = []
+        for i in range(4):
+            p, edge = ring[i], ring[(i + 1) % 4] - ring[i]
+            size = dr.squared_norm(edge)
+            along = dr.clip(-dr.dot(p, edge) / dr.maximum(size, 1e-30), 0, 1)
+            inner = dr.minimum(inner, dr.squared_norm(p + edge * along))
+            crosses.append(dr.dot(n, dr.cross(p, edge)))
+        within = mi.Mask(True)
+        left, right = mi.Mask(True), mi.Mask(True)
+        for c in crosses:
+            left, right = left & (c >= 0), right & (c <= 0)
+        within = left | right
+        inner = dr.select(within, 0, inner)
+        low, high = dr.select(within, -dr.pi, low), dr.select(within, dr.pi, high)
+        h2 = dr.square(h)
+        begin = dr.maximum(inner * (1 - _LEAST), dr.select(first > 0, dr.square(first), 0) - h2)
+        end = dr.minimum(outer * (1 + _LEAST), dr.select(last > 0, dr.square(last), 0) - h2)
+        square = dr.fma(v, end - begin, begin)
+        sin, cos = dr.sincos(dr.fma(u.y, high - low, low))
+        p = foot + (g * cos + t * sin) * dr.sqrt(dr.maximum(square, 0))
+        local = p - face.o
+        a, b = _coordinates(local, face.e1, face.e2)
+        hit = (end > begin) & (a >= 0) & (b >= 0) & (a <= 1) & (b <= 1) & (a + b <= face.most)
+        pdf = 2 * face.chance / ((end - begin) * (high - low))
+        return Local(p=mi.Point3f(p), n=mi.Normal3f(n), emitter=face.emitter, pdf=dr.select(active & hit, pdf, 0))
+
+
+def _coordinates(p, e1, e2):
+    """Return the coordinates of a vector along two edges."""
+    a, b, c = dr.squared_norm(e1), dr.dot(e1, e2), dr.squared_norm(e2)
+    u, v, det = dr.dot(p, e1), dr.dot(p, e2), a * c - b * b
+    return (u * c - v * b) / det, (v * a - u * b) / det
+
+
+def _is_listed(emitter, contents):
+    """Return True for lights on meshes whose emission is the same everywhere and known by the direction."""
+    shape = emitter.get_shape()
+    if shape is None or not shape.is_mesh() or emits_by_place(emitter) or lacks_directions(emitter):
+        return False
+    return not (has_smooth_shape(emitter) or mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta))
+
+
+def _area(face):
+    o, e1, e2, most = face
+    return float(np.linalg.norm(np.cross(e1, e2))) * most / 2
 
 
 class Section:
@@ -202,14 +294,14 @@ class Ellipsoidal(Connection):
     light_of_scene_alone = True
     finds_light = False
 
-    def __init__(self, film, lights):
-        self.film, self.lights = film, lights
+    def __init__(self, lights):
+        self.lights = lights
 
     def prepare(self, context):
-        import os; self.M = int(os.environ.get("MM", 1)); self.c = float(os.environ.get("CC", 1))
-        self.first, self.last = self.film.window()
-        shapes = context.scene.shapes()
-        self.faces, self.points = Faces(shapes), LightPoints(shapes)
+        import os
+        self.M, self.c = int(os.environ.get("MM", 2)), float(os.environ.get("CC", 1))
+        self.first, self.last = context.window.first, context.window.last
+        self.faces, self.points = Faces(context.scene.shapes()), self.lights.faces
         self.works = self.faces.count > 0 and self.points.count > 0
 
     # ------------------------------------------------------------------------------------------------- density
@@ -228,7 +320,7 @@ class Ellipsoidal(Connection):
         """Return the share that an ordinary connection at ``vertex`` keeps."""
         x, w, n, e = path.prev_p, vertex.si.p, vertex.si.n, ds.p
         drawn = ~path.prev_unconnected & vertex.si.is_valid() & (opl >= self.first) & (opl < self.last)
-        drawn &= self.points.emitters.lists(ds.emitter) & self.faces.lists(vertex.si.shape) & same_side(x, e, w, n)
+        drawn &= self.lights.windowed(ds.emitter) & self.faces.lists(vertex.si.shape) & same_side(x, e, w, n)
         r = dr.norm(w - x)
         s = r + dr.norm(w - e)
         drawn &= s > dr.norm(e - x) * (1 + _LEAST)
@@ -276,24 +368,18 @@ class Ellipsoidal(Connection):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, proposal.n) > 0.999) & self.faces.lists(si.shape)
         # ------------------------------------------------------------------------- to the light
-        shadow = si.spawn_ray_to(e.p)
-        length = dr.norm(e.p - w)
-        value, pdf = context.scattering.value_at(context, si, shadow.d, ray, active)
+        ds = towards(si, e)
+        value, pdf = context.scattering.value_at(context, si, ds.d, ray, active)
         active &= dr.max(mi.unpolarized_spectrum(value)) > 0
-        ray = si.spawn_ray(shadow.d)
-        end = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
-        active &= end.is_valid() & (dr.norm(end.p - e.p) < _FOUND * length)
-        emitter = end.emitter(context.scene, active)
-        active &= emitter != None  # noqa: E711 (a Dr.Jit comparison)
-        Le = mi.unpolarized_spectrum(emitter.eval(end, active))
+        active &= ~context.scene.ray_test(si.spawn_ray_to(e.p), active)
+        Le = mi.unpolarized_spectrum(e.emitter.eval_direction(si, ds, active))
         # ------------------------------------------------------------------------- weight
-        ds = mi.DirectionSample3f(context.scene, si=end, ref=si)
         share = self.lights.weight(context, si, ds, self.lights.density(context, si, ds, active), pdf, active)
         p = self.density_of(x, e.p, w, proposal.n, proposal.along) * vertex.η
         cos_w = dr.abs_dot(proposal.n, w - x) / (r * r * r)
         a = answer.pdf * cos_w
         share *= dr.square(p) / (dr.square(a) + dr.square(p))
-        cos_e = dr.abs_dot(end.n, ray.d) / dr.square(length)
+        cos_e = dr.abs_dot(e.n, ds.d) / dr.square(ds.dist)
         factor = share * cos_w * cos_e * proposal.choice * self.c / (p * e.pdf)
         value = product(vertex.β, answer.value) * value * Le * dr.select(active, factor, 0)
         return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 3, crowded=True)
@@ -372,10 +458,49 @@ def facing(cos):
     return dr.select(cos > 0, cos, -1e-3 * cos)
 
 
+def towards(ref, e):
+    """Return the DirectionSample3f of a point of a light, seen from ``ref``."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.time, ds.emitter = mi.Point3f(e.p), e.n, ref.time, e.emitter
+    away = e.p - ref.p
+    ds.dist = dr.norm(away)
+    ds.d = away / ds.dist
+    return ds
+
+
 class OrdinarySampled(EmitterSampled):
-    """:class:`EmitterSampled` beside :class:`Ellipsoidal`, which takes a share of its light."""
+    """Connection to a point of a light that the window sees, beside :class:`Ellipsoidal`."""
 
     beside = None
+
+    def prepare(self, context):
+        super().prepare(context)
+        self.faces = LightFaces(context)
+
+    def windowed(self, emitter):
+        """Return a mask of the lights that are sampled where the window sees them."""
+        return mi.Mask(True) if self.faces.holds_all else self.faces.emitters.lists(emitter)
+
+    def propose(self, context, path, vertex, sampler):
+        if not self.faces.count:
+            return super().propose(context, path, vertex, sampler)
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+        u, window = sampler.next_2d(), context.window
+        first, last = (mi.Float(mi.Float64(end) - vertex.scattered_τ) / vertex.η for end in (window.first, window.last))
+        e = self.faces.sample_between(mi.Point3f(vertex.at.p), first, last, u, active)
+        ds = towards(vertex.at, e)
+        cos = -dr.dot(e.n, ds.d)
+        lit = active & (e.pdf > 0) & (dr.abs(cos) > 0)
+        # By the density of any point of the light, which the weights of others go by.
+        ds.pdf = dr.select(lit, self.density(context, vertex.at, ds, lit), 0)
+        inverse = dr.select(lit, dr.abs(cos) / (e.pdf * dr.square(ds.dist)), 0)
+        weight = e.emitter.eval_direction(vertex.at, ds, lit) * inverse
+        if not self.faces.holds_all:
+            other, other_weight = self.sample(context, vertex.at, u, active)
+            listed = self.windowed(other.emitter)
+            ...
+        active &= lit & (ds.pdf > 0)
+        return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
         event = super().connect(context, path, vertex, proposal, answer, zeros)
