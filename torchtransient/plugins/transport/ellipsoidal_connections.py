@@ -165,12 +165,15 @@ class LightFaces:
 
     def sample(self, u, active):
         """Draw a point: ``p``, ``n``, its ``emitter`` and its density ``pdf`` per area."""
-        face, x = self.face(u.x, active)
-        # Beyond the diagonal of a triangle, points are mirrored.
-        a, b = x, u.y
+        face, v = self.face(u.x, active)
+        return Local(p=self.point(face, v, u.y), n=mi.Normal3f(face.n), emitter=face.emitter, pdf=face.pdf)
+
+    @staticmethod
+    def point(face, a, b):
+        """Return a point of a face, uniformly by two numbers; those beyond the diagonal of a triangle are mirrored."""
         over = a + b > face.most
         a, b = dr.select(over, 1 - a, a), dr.select(over, 1 - b, b)
-        return Local(p=mi.Point3f(face.o + face.e1 * a + face.e2 * b), n=mi.Normal3f(face.n), emitter=face.emitter, pdf=face.pdf)
+        return mi.Point3f(face.o + face.e1 * a + face.e2 * b)
 
     def sample_between(self, x, first, last, u, active):
         """Draw a point at a distance between ``first`` and ``last`` from ``x``; ``pdf`` is 0 where that misses the light.
@@ -215,11 +218,14 @@ class LightFaces:
         square = dr.fma(v, end - begin, begin)
         sin, cos = dr.sincos(dr.fma(u.y, high - low, low))
         p = foot + (g * cos + t * sin) * dr.sqrt(dr.maximum(square, 0))
-        local = p - face.o
-        a, b = _coordinates(local, face.e1, face.e2)
+        a, b = _coordinates(p - face.o, face.e1, face.e2)
         hit = (end > begin) & (a >= 0) & (b >= 0) & (a <= 1) & (b <= 1) & (a + b <= face.most)
-        pdf = 2 * face.chance / ((end - begin) * (high - low))
-        return Local(p=mi.Point3f(p), n=mi.Normal3f(n), emitter=face.emitter, pdf=dr.select(active & hit, pdf, 0))
+        ring = 0.5 * (end - begin) * (high - low)
+        pdf = dr.select(hit, face.chance / ring, 0)
+        # A part that is hardly smaller than the face is drawn from as the face.
+        whole = ring * face.pdf > face.chance
+        p, pdf = dr.select(whole, self.point(face, v, u.y), p), dr.select(whole, face.pdf, pdf)
+        return Local(p=mi.Point3f(p), n=mi.Normal3f(n), emitter=face.emitter, pdf=dr.select(active, pdf, 0))
 
 
 def _coordinates(p, e1, e2):
