@@ -9,7 +9,7 @@ from torchtransient.plugins.properties import truth, whole_number
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.context import RenderContext
-from torchtransient.plugins.transport.ellipsoidal_connections import Ellipsoidal, OrdinarySampled
+from torchtransient.plugins.transport.ellipsoidal_connections import connections_in_window, why_not
 from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
 from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.vacuum import Vacuum
@@ -33,6 +33,11 @@ class TransientPath(TransientIntegrator):
 
     Parameters beside those of :class:`TransientIntegrator`:
 
+    ``connections`` ("ordinary")
+        "ellipsoidal" also draws vertices by when their light arrives, for gates and narrow windows
+        (:mod:`..transport.ellipsoidal_connections`). For films that count light of a window alone, area lights on
+        meshes without textures, unpolarized variants; not with surfaces that scatter late or refract roughly
+        (``SceneError``). Derivatives are those of ordinary connections.
     ``boundary`` (true)
         False leaves the boundary term out of derivatives.
     ``spp_boundary`` (half of the samples of the derivative)
@@ -50,18 +55,25 @@ class TransientPath(TransientIntegrator):
         self.connections = str(props.get("connections", "ordinary"))
         if self.connections not in CONNECTIONS:
             raise SceneError(
-                f"{props.plugin_name()}: connections: expected one of {', '.join(CONNECTIONS)}, got {self.connections!r}."
+                f"{props.plugin_name()}: connections: expected one of {', '.join(CONNECTIONS)}, got "
+                f"{self.connections!r}."
             )
         self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
+
+    def resolve(self, scene, sensor):
+        sensor, film = super().resolve(scene, sensor)
+        reason = None if self.connections == "ordinary" else why_not(self.contents(scene, sensor), film)
+        if reason is not None:
+            raise SceneError(f"connections='ellipsoidal': {reason}, or leave the ordinary connections.")
+        return sensor, film
 
     def render_context(self, scene, contents, wanted=None, window=None, settings=None):
         if self.connections == "ordinary" or wanted is not None or settings is not None:
             return super().render_context(scene, contents, wanted, window, settings)
-        segment, scattering, _ = self.strategies(contents)
-        ordinary = OrdinarySampled()
-        ordinary.beside = Ellipsoidal(ordinary)
-        connections = [EmitterFound(), ordinary, ordinary.beside]
-        return RenderContext(scene, contents, self.settings(), (segment, scattering, connections), None, window)
+        segment, scattering, (found, _) = self.strategies(contents)
+        segment.keeps_begin = True
+        strategies = segment, scattering, connections_in_window(contents, found)
+        return RenderContext(scene, contents, self.settings(), strategies, None, window)
 
     def silhouettes(self, scene, sensors=None):
         if not self.boundary:

@@ -78,6 +78,8 @@ class TransientPathReuse(path.TransientPath):
     def _why_not(self, scene, sensor, film):
         """Return why light cannot be shared and what to do, None if it can."""
         delays = self.contents(scene, sensor).delays
+        if self.connections != "ordinary":
+            return f"expected connections='ordinary', got {self.connections!r}, which is of one pixel"
         if mi.is_polarized:
             return f"the variant {mi.variant()} is polarized; load the scene in one without"
         if self.max_depth == UNLIMITED:

@@ -1,302 +1,144 @@
-"""Ellipsoidal connections: the vertex between a path and a light, drawn where a gate or a window looks.
+"""Ellipsoidal connections: light that arrives while a gate is open, drawn by when it arrives.
 
-From a vertex x, at the optical length l of the path so far, a point e of a light and an arrival tau in the window are
-drawn. The vertex w between them lies where |xw| + |we| = s = (tau - l) / eta: on an ellipsoid with the foci x and e. A
-half-plane that begins at the axis of the foci, at the angle psi around it, cuts the ellipsoid in half an ellipse, and
-that meets the flat faces of the scene in few points, in closed form. One of them is chosen, by what light it would
-bring without occlusion. Faces are areas, so that the density of w is
+From a vertex x, at the optical length l of the path so far, a point e of a light and an arrival τ in the window are
+drawn. The vertex w between them lies where ``|xw| + |we| = s = (τ - l) / η``, on an ellipsoid with the foci x and e.
 
-    p(w) = p(s) p(psi) |n . (grad s x grad psi)|,    grad s = u_x + u_e,    grad psi = a x (w - x) / |a x (w - x)|^2,
+- Surfaces (:class:`EllipsoidalSurface`). The plane of each face of the scene meets the ellipsoid in an ellipse, on
+  which an angle φ is drawn. Of the points within faces one is chosen, by the light that it would bring if nothing were
+  in the way. With the gradient of s in the plane, the density per area is ``p(τ) η / 2π |grad s| / |dw / dφ|``.
+- Media (:class:`EllipsoidalMedium`). Along the ray that left x in the direction ω, the ellipsoid lies at
+  ``t = (s^2 - d^2) / (2 (s - ω.(e - x)))`` with ``d = |e - x|``, and the density of t is ``p(τ) η ds/dt``.
+- The last segment (:class:`WindowedEmitterSampled`). Points of lights are drawn from the part that the window sees.
 
-with the unit vectors u from the foci to w, that of the axis a, and the normal n of the face.
+Paths find the same vertices w. Of the light that is connected to at w they keep the share ``a^2 / (a^2 + p^2)``, with
+the densities ``a`` of their own and ``p`` of ellipsoidal connections, which take the rest. The choice among faces is
+not part of ``p``: any weights that sum to one are right. Light that is run into keeps its weight.
 
-Source: Pediredla, Veeraraghavan, Gkioulekas, "Ellipsoidal path connections for time-gated rendering", 2019; the
-half-plane in place of their ellipse in the plane of a triangle makes the density of a vertex a function of x, w, e and
-n alone, so that the ordinary connections at w know it without looking for the triangle.
-
-Both techniques share what connections to lights have of a path (:class:`EmitterSampled`): ordinary ones keep the share
-``a^2 / (a^2 + p^2)`` with the density ``a`` with which scattering at x finds w, ellipsoidal ones take the rest. Light
-that is run into keeps its weight.
+Source: Pediredla, Veeraraghavan, Gkioulekas, "Ellipsoidal path connections for time-gated rendering", 2019, who choose
+triangles by a hierarchy. Arguments that all methods share are explained in :mod:`.strategy`.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from torchtransient.plugins.kernel_arrays import PointerTable, floats, registry_number, whole_numbers
-from torchtransient.plugins.mitsuba_compat import has_smooth_shape, lacks_directions
+from torchtransient.errors import SceneError
 from torchtransient.plugins.polarized import product
-from torchtransient.plugins.sampling.area_elements import AreaElements
-from torchtransient.plugins.sampling.hidden_elements import packed
-from torchtransient.plugins.transport.emitter_connections import EmitterSampled
+from torchtransient.plugins.sampling.flat_faces import FlatFaces, LightFaces
+from torchtransient.plugins.transport.emitter_connections import EmitterSampled, is_light
+from torchtransient.plugins.transport.free_flight import medium_interaction, transmittance
+from torchtransient.plugins.transport.media import lane_numbers, medium_behind
 from torchtransient.plugins.transport.scene_contents import emits_by_place
 from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
 
-# Faces that are looked through at every vertex.
-MOST_FACES = 64
-# Numbers of a face in its table.
-_ROW = 16
-# Relative distance within which a ray has found a point.
+# Angles that are drawn on each ellipse.
+ANGLES = 2
+# Distance, relative to the length of a ray, within which it has found a point.
 _FOUND = 1e-3
-# Excess of the length over the distance of the foci, relative, below which nothing is connected.
+# Excess of s over the distance of the foci, relative to it, below which nothing is connected.
 _LEAST = 1e-5
+# Weight in the choice among faces of what only translucent surfaces and lights on both sides would bring.
+_BEHIND = 1e-3
 
 
-class Faces:
-    """Parallelograms and triangles of meshes, in a table that kernels look through.
-
-    Args:
-        shapes: shapes of the scene.
-
-    Attributes:
-        count: number of faces.
-    """
-
-    def __init__(self, shapes):
-        parts, rows = [], []
-        for shape in shapes:
-            if shape.is_mesh():
-                elements = AreaElements.from_shapes([shape])
-                found = faces_of(elements)
-                parts.append((elements.area.sum() / len(found), shape, found))
-        self.shapes = []
-        for _, shape, found in sorted(parts, key=lambda part: -part[0]):
-            if len(rows) + len(found) <= MOST_FACES:
-                self.shapes.append(shape)
-                rows += [_row(*face) for face, _ in found]
-        self.count = len(rows)
-        self._listed = PointerTable.marking(self.shapes)
-        self._table = packed(np.array(rows).reshape(-1, _ROW)) if rows else None
-
-    def lists(self, shape):
-        """Return a mask of pointers to shapes in the table."""
-        return self._listed.lists(shape)
-
-    def face(self, i):
-        """Return face number ``i``: corner ``o``, normal ``n``, dual edges ``U``, ``V`` and the reach of ``u + v``."""
-        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k) for k in range(4)]
-        return Local(
-            o=mi.Point3f(r[0].x, r[0].y, r[0].z), n=mi.Normal3f(r[1].x, r[1].y, r[1].z),
-            U=mi.Vector3f(r[2].x, r[2].y, r[2].z), V=mi.Vector3f(r[3].x, r[3].y, r[3].z), most=r[0].w,
-        )  # fmt: skip
-
-
-def faces_of(elements):
-    """Return ((corner, edge, edge, most of the sum of coordinates), number of an element) of the faces of a mesh.
-
-    Pairs of triangles that make up a parallelogram are one face.
-    """
-    faces, i = [], 0
-    o, e1, e2 = (elements.axes[:, k] for k in range(3))
-    while i < len(elements):
-        face, step = (o[i], e1[i], e2[i], 1.0), 1
-        if i + 1 < len(elements):
-            whole = parallelogram([o[i], o[i] + e1[i], o[i] + e2[i]], [o[i + 1], o[i + 1] + e1[i + 1], o[i + 1] + e2[i + 1]])
-            if whole is not None:
-                face, step = (*whole, 2.0), 2
-        if elements.area[i] > 0:
-            faces.append((face, i))
-        i += step
-    return faces
-
-
-def parallelogram(one, other):
-    """Return (corner, edge, edge) of the parallelogram of two triangles, None if they are none."""
-    size = np.abs(np.subtract(one[1:], one[0])).max()
-    shared = [(i, k) for i in range(3) for k in range(3) if np.abs(one[i] - other[k]).max() < 1e-5 * size]
-    if len(shared) != 2:
-        return None
-    apex = one[3 - shared[0][0] - shared[1][0]]
-    far = other[3 - shared[0][1] - shared[1][1]]
-    a, b = (one[i] - apex for i, _ in shared)
-    return (apex, a, b) if np.abs(apex + a + b - far).max() < 1e-5 * size else None
-
-
-def _row(o, e1, e2, most):
-    n = np.cross(e1, e2)
-    n /= np.linalg.norm(n)
-    U, V = np.cross(e2, n), np.cross(n, e1)
-    U, V = U / (U @ e1), V / (V @ e2)
-    return [*o, most, *n, 0.0, *U, 0.0, *V, 0.0]
-
-
-class LightFaces:
-    """Faces of the area lights that are alike everywhere: points of them, anywhere or at a given distance.
+def connections_in_window(contents, found):
+    """Return the connections of a walk: ``found`` (emission that is run into) and those of this module.
 
     Args:
-        context: :class:`.context.RenderContext` of the job.
+        contents: :class:`.scene_contents.SceneContents`.
+        found: :class:`.emitter_connections.EmitterFound`.
+    """
+    lights = WindowedEmitterSampled()
+    kinds = [EllipsoidalSurface] if contents.media is None else [EllipsoidalSurface, EllipsoidalMedium]
+    lights.beside = tuple(kind(lights) for kind in kinds)
+    return [found, lights, *lights.beside]
 
-    Attributes:
-        count: number of faces.
-        holds_all: the scene has no other lights.
+
+def why_not(contents, film):
+    """Return why ellipsoidal connections cannot be made in a scene and what to do, None if they can."""
+    if mi.is_polarized:
+        return f"the variant {mi.variant()} is polarized; load the scene in one without"
+    if film.arrivals() is None:
+        return (
+            f"expected a film that counts light of a window alone, got {film.plugin} which counts light of all times; "
+            "take gates, or a histogram with steady=False"
+        )
+    if contents.delays is not None:
+        return "a surface scatters late, and when depends on a number that is drawn there; take it out"
+    if contents.refraction is not None:
+        return "a rough surface refracts, behind which paths run in another index of refraction; make it smooth"
+    if contents.media is not None and not contents.media.emitter_sampling:
+        return "a medium has sample_emitters = false; set it to true"
+    return None
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# The last segment.
+
+class WindowedEmitterSampled(EmitterSampled):
+    """Connection to a point of a light that the window sees, where ellipsoidal connections leave it light.
+
+    Lights that are not flat or not alike everywhere are sampled as without a window.
     """
 
-    def __init__(self, context):
-        emitters = context.scene.emitters()
-        lit = [e for e in emitters if _is_listed(e, context.contents)]
-        self.emitters, self.holds_all = PointerTable.marking(lit), len(lit) == len(emitters)
-        total = sum(e.sampling_weight() for e in emitters)
-        rows, chances, owners = [], [], []
-        for emitter in lit:
-            elements = AreaElements.from_shapes([emitter.get_shape()])
-            found = faces_of(elements)
-            areas = np.array([_area(face) for face, _ in found])
-            for (face, i), area in zip(found, areas, strict=True):
-                chance = emitter.sampling_weight() / total * area / areas.sum()
-                o, e1, e2, most = face
-                rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], 0.0])
-                chances.append(chance)
-                owners.append(emitter)
-        self.count = len(rows)
-        if self.count:
-            self._table = packed(np.array(rows))
-            self._choice = mi.DiscreteDistribution(floats(np.array(chances)))
-            self._numbers = whole_numbers(np.array([registry_number(owner) for owner in owners]))
+    # Connections that take a share of the light.
+    beside: tuple = ()
 
-    def face(self, u, active):
-        """Choose a face by a number ``u``, which is returned as one that is uniform again."""
-        i, u = self._choice.sample_reuse(u, active)
-        r = [dr.gather(mi.Vector4f, self._table, i * 4 + k, active) for k in range(4)]
-        o, e1, e2, n = (mi.Vector3f(q.x, q.y, q.z) for q in r)
-        emitter = dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._numbers, i, active))
-        return Local(o=o, e1=e1, e2=e2, n=n, pdf=r[0].w, most=r[1].w, chance=r[2].w, emitter=emitter), u
+    def prepare(self, context):
+        super().prepare(context)
+        self.faces = LightFaces(context.scene, emits_by_place)
+        if not self.faces.count:
+            raise SceneError(
+                "connections='ellipsoidal': expected an area light on a mesh or rectangle without texture, found none. "
+                "Add one, or leave the ordinary connections."
+            )
 
-    def sample(self, u, active):
-        """Draw a point: ``p``, ``n``, its ``emitter`` and its density ``pdf`` per area."""
-        face, v = self.face(u.x, active)
-        return Local(p=self.point(face, v, u.y), n=mi.Normal3f(face.n), emitter=face.emitter, pdf=face.pdf)
+    def propose(self, context, path, vertex, sampler):
+        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
+        u, window = sampler.next_2d(), context.window
+        listed = mi.Mask(True)
+        if not self.faces.holds_all:
+            other, other_weight = self.sample(context, vertex.at, u, active)
+            listed = self.faces.lists(other.emitter)
+            u = sampler.next_2d()
+        ends = (mi.Float(mi.Float64(end) - vertex.scattered_τ) / vertex.η for end in (window.first, window.last))
+        e = self.faces.sample_between(mi.Point3f(vertex.at.p), *ends, u, active & listed)
+        ds = towards(vertex.at, e)
+        cos = dr.abs_dot(e.n, ds.d)
+        lit = active & listed & (e.pdf > 0) & (cos > 0)
+        # The density of any point of the light, by which the weights beside light that is run into go.
+        ds.pdf = dr.select(lit, self.density(context, vertex.at, ds, lit), 0)
+        weight = e.emitter.eval_direction(vertex.at, ds, lit) * dr.select(lit, cos / (e.pdf * dr.square(ds.dist)), 0)
+        if not self.faces.holds_all:
+            ds, weight = dr.select(listed, ds, other), dr.select(listed, weight, other_weight)
+        return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, weight=weight, u=u, sampler=sampler)
 
-    @staticmethod
-    def point(face, a, b):
-        """Return a point of a face, uniformly by two numbers; those beyond the diagonal of a triangle are mirrored."""
-        over = a + b > face.most
-        a, b = dr.select(over, 1 - a, a), dr.select(over, 1 - b, b)
-        return mi.Point3f(face.o + face.e1 * a + face.e2 * b)
-
-    def sample_between(self, x, first, last, u, active):
-        """Draw a point at a distance between ``first`` and ``last`` from ``x``; ``pdf`` is 0 where that misses the light.
-
-        In the plane of a face these are the points between two circles around the foot of x. The box of the face in
-        the square of the radius and the angle is cut by those of the circles, and drawn from evenly.
-        """
-        face, v = self.face(u.x, active)
-        n = face.n
-        h = dr.dot(n, x - face.o)
-        foot = x - n * h
-        corners = [face.o, face.o + face.e1, face.o + face.e2]
-        corners.append(dr.select(face.most > 1.5, corners[1] + face.e2, corners[1]))
-        middle = dr.select(face.most > 1.5, face.e1 + face.e2, (face.e1 + face.e2) * (2 / 3)) * 0.5 + face.o
-        around = [c - foot for c in corners]
-        g = dr.normalize(middle - foot)
-        t = dr.cross(n, g)
-        angles = [dr.atan2(dr.dot(c, t), dr.dot(c, g)) for c in around]
-        low, high = (f(f(angles[0], angles[1]), f(angles[2], angles[3])) for f in (dr.minimum, dr.maximum))
-        squares = [dr.squared_norm(c) for c in around]
-        outer = dr.maximum(dr.maximum(squares[0], squares[1]), dr.maximum(squares[2], squares[3]))
-        # Edges in a ring: of a parallelogram o, o + e1, o + e1 + e2, o + e2.
-        ring = [around[0], around[1], around[3], around[2]]
-        inner = mi.Float(dr.inf)
-        crosses = []
-        for i in range(4):
-            p, edge = ring[i], ring[(i + 1) % 4] - ring[i]
-            size = dr.squared_norm(edge)
-            along = dr.clip(-dr.dot(p, edge) / dr.maximum(size, 1e-30), 0, 1)
-            inner = dr.minimum(inner, dr.squared_norm(p + edge * along))
-            crosses.append(dr.dot(n, dr.cross(p, edge)))
-        within = mi.Mask(True)
-        left, right = mi.Mask(True), mi.Mask(True)
-        for c in crosses:
-            left, right = left & (c >= 0), right & (c <= 0)
-        within = left | right
-        inner = dr.select(within, 0, inner)
-        low, high = dr.select(within, -dr.pi, low), dr.select(within, dr.pi, high)
-        h2 = dr.square(h)
-        begin = dr.maximum(inner * (1 - _LEAST), dr.select(first > 0, dr.square(first), 0) - h2)
-        end = dr.minimum(outer * (1 + _LEAST), dr.select(last > 0, dr.square(last), 0) - h2)
-        square = dr.fma(v, end - begin, begin)
-        sin, cos = dr.sincos(dr.fma(u.y, high - low, low))
-        p = foot + (g * cos + t * sin) * dr.sqrt(dr.maximum(square, 0))
-        a, b = _coordinates(p - face.o, face.e1, face.e2)
-        hit = (end > begin) & (a >= 0) & (b >= 0) & (a <= 1) & (b <= 1) & (a + b <= face.most)
-        ring = 0.5 * (end - begin) * (high - low)
-        pdf = dr.select(hit, face.chance / ring, 0)
-        # A part that is hardly smaller than the face is drawn from as the face.
-        whole = ring * face.pdf > face.chance
-        p, pdf = dr.select(whole, self.point(face, v, u.y), p), dr.select(whole, face.pdf, pdf)
-        return Local(p=mi.Point3f(p), n=mi.Normal3f(n), emitter=face.emitter, pdf=dr.select(active, pdf, 0))
+    def connect(self, context, path, vertex, proposal, answer, zeros):
+        event = super().connect(context, path, vertex, proposal, answer, zeros)
+        taken = event.active & self.faces.lists(proposal.ds.emitter)
+        for connection in self.beside:
+            share = connection.share_of_paths(context, path, vertex, proposal.ds)
+            event.value *= dr.select(taken & dr.isfinite(share), share, 1)
+        return event
 
 
-def _coordinates(p, e1, e2):
-    """Return the coordinates of a vector along two edges."""
-    a, b, c = dr.squared_norm(e1), dr.dot(e1, e2), dr.squared_norm(e2)
-    u, v, det = dr.dot(p, e1), dr.dot(p, e2), a * c - b * b
-    return (u * c - v * b) / det, (v * a - u * b) / det
-
-
-def _is_listed(emitter, contents):
-    """Return True for lights on meshes whose emission is the same everywhere and known by the direction."""
-    shape = emitter.get_shape()
-    if shape is None or not shape.is_mesh() or emits_by_place(emitter) or lacks_directions(emitter):
-        return False
-    return not (has_smooth_shape(emitter) or mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta))
-
-
-def _area(face):
-    o, e1, e2, most = face
-    return float(np.linalg.norm(np.cross(e1, e2))) * most / 2
-
-
-class Section:
-    """Ellipse in which an ellipsoid of revolution meets a plane: ``center + p cos(phi) + q sin(phi)``.
-
-    Args:
-        x, e: foci.
-        s: sum of the distances to the foci.
-        n: normal of the plane.
-        o: point of the plane.
-    """
-
-    def __init__(self, x, e, s, n, o):
-        D = e - x
-        d = dr.norm(D)
-        axis = D / d
-        m = x + D * 0.5
-        n_a = dr.dot(n, axis)
-        # Squares of the half axes of the ellipsoid.
-        α2, β2 = 0.25 * dr.square(s), 0.25 * (s - d) * (s + d)
-        E2 = β2 + 0.25 * dr.square(d * n_a)
-        δ = dr.dot(n, o - m)
-        λ2 = 1 - dr.square(δ) / E2
-        self.exists = λ2 > 0
-        self.center = m + (n * β2 + axis * (0.25 * dr.square(d) * n_a)) * (δ / E2)
-        across = dr.cross(n, axis)
-        size = dr.norm(across)
-        across = dr.select(size > 1e-4, across / size, mi.Frame3f(n).s)
-        reach = dr.sqrt(dr.maximum(λ2 * β2, 0))
-        self.p, self.q = across * reach, dr.cross(n, across) * (reach * dr.sqrt(α2 / E2))
-
-    def point(self, sin, cos):
-        """Return the point at an angle phi, and its derivative by phi."""
-        return self.center + self.p * cos + self.q * sin, self.q * cos - self.p * sin
-
-    def derivative_at(self, w):
-        """Return the derivative of the point by phi at the point ``w``."""
-        away = w - self.center
-        p2, q2 = dr.squared_norm(self.p), dr.squared_norm(self.q)
-        return self.q * (dr.dot(away, self.p) / p2) - self.p * (dr.dot(away, self.q) / q2)
-
-
-def same_side(x, e, w, n):
-    """Return a mask of foci on one side of the plane through ``w``."""
-    return dr.dot(n, x - w) * dr.dot(n, e - w) > 0
+def towards(ref, e):
+    """Return the DirectionSample3f of a :class:`~..sampling.flat_faces.LightPoint`, seen from an interaction."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.time, ds.emitter = e.p, e.n, ref.time, e.emitter
+    ds.dist = dr.norm(e.p - ref.p)
+    ds.d = (e.p - ref.p) / ds.dist
+    return ds
 
 
 class Ellipsoidal(Connection):
-    """Connection over a vertex that is drawn where the window of the film looks."""
+    """Base of connections over a vertex that is drawn by the arrival of its light.
 
-    name = "ellipsoidal"
+    Args:
+        lights: :class:`WindowedEmitterSampled` of the walk.
+    """
+
     light_of_scene_alone = True
     finds_light = False
 
@@ -304,212 +146,322 @@ class Ellipsoidal(Connection):
         self.lights = lights
 
     def prepare(self, context):
-        import os
-        self.M, self.c = int(os.environ.get("MM", 2)), float(os.environ.get("CC", 1))
-        self.first, self.last = context.window.first, context.window.last
-        self.faces, self.points = Faces(context.scene.shapes()), self.lights.faces
-        self.works = self.faces.count > 0 and self.points.count > 0
+        self.first, self.width = context.window.first, context.window.last - context.window.first
 
-    # ------------------------------------------------------------------------------------------------- density
+    def arrival(self, u, τ, η):
+        """Draw an arrival.
 
-    def density_of(self, x, e, w, n, along):
-        """Return the density per area with which ``w`` is drawn, for given x and e.
+        Args:
+            u: uniform number.
+            τ: optical path length up to the first focus, minus the film's start, Float64.
+            η: index of refraction behind it.
+
+        Returns:
+            (optical path length, Float64; sum of the distances to the foci that it leaves, Float).
+        """
+        opl = mi.Float64(self.first) + mi.Float64(u) * self.width
+        return opl, mi.Float(opl - τ) / η
+
+    def last_segment(self, context, at, e, value, pdf, active):
+        """Return (mask, emission times the cosine at the light over the square of the distance, weight beside light
+        that is run into).
+
+        Args:
+            at: interaction at the vertex between.
+            e: point of the light.
+            pdf: density of its direction in the scattering there.
+        """
+        ds = towards(at, e)
+        density = self.lights.density(context, at, ds, active)
+        weight = self.lights.weight(context, at, ds, density, pdf, active)
+        Le = mi.unpolarized_spectrum(e.emitter.eval_direction(at, ds, active))
+        return Le * value * (dr.abs_dot(e.n, ds.d) / (dr.square(ds.dist) * e.pdf) * weight)
+
+    @staticmethod
+    def cleared(context, ray, length, medium, u, sampler, active):
+        """Return (mask of segments that nothing is in the way of, transmittance).
+
+        Args:
+            ray: Ray3f that ends before what it leads to.
+            length: length that attenuates, metres.
+            medium: medium at its start, None in vacuum.
+            u: uniform numbers that were drawn for the segment.
+        """
+        if context.contents.media is None:
+            return active & ~context.scene.ray_test(ray, active), 1
+        settings, lanes = context.segment.settings, lane_numbers(sampler)
+        T, free = transmittance(context.scene, settings, ray, length, medium, u, lanes, active)
+        return free, T
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Surfaces.
+
+class Section:
+    """Ellipse in which an ellipsoid of revolution meets a plane: ``center + p cos φ + q sin φ``.
+
+    Args:
+        x, e: foci, Point3f.
+        s: sum of the distances to the foci.
+        n, o: normal and a point of the plane.
+
+    Attributes:
+        exists: mask of planes that meet the ellipsoid.
+    """
+
+    def __init__(self, x, e, s, n, o):
+        d = dr.norm(e - x)
+        axis = (e - x) / d
+        along = dr.dot(n, axis)
+        # Squares: of the half axis across, of half the distance of the foci, of the reach along the normal.
+        β2, f2 = 0.25 * (s - d) * (s + d), 0.25 * dr.square(d)
+        reach2 = β2 + f2 * dr.square(along)
+        δ = dr.dot(n, o - x) - 0.5 * d * along
+        left = 1 - dr.square(δ) / reach2
+        self.exists = left > 0
+        self.center = x + axis * (0.5 * d) + (n * β2 + axis * (f2 * along)) * (δ / reach2)
+        across = dr.cross(n, axis)
+        size = dr.norm(across)
+        # Any direction of a plane across the axis, which meets the ellipsoid in a circle.
+        across = dr.select(size > 1e-4, across / size, mi.Frame3f(n).s)
+        reach = dr.sqrt(dr.maximum(left * β2, 0))
+        self.p, self.q = across * reach, dr.cross(n, across) * (reach * dr.sqrt((β2 + f2) / reach2))
+
+    def point(self, sin, cos):
+        """Return (point at an angle φ, its derivative by φ)."""
+        return self.center + self.p * cos + self.q * sin, self.q * cos - self.p * sin
+
+    def derivative_at(self, w):
+        """Return the derivative by φ at a point of the ellipse."""
+        away = w - self.center
+        cos, sin = dr.dot(away, self.p) / dr.squared_norm(self.p), dr.dot(away, self.q) / dr.squared_norm(self.q)
+        return self.q * cos - self.p * sin
+
+
+class EllipsoidalSurface(Ellipsoidal):
+    """Connection over a vertex on a face of the scene."""
+
+    name = "ellipsoidal_surface"
+
+    def prepare(self, context):
+        super().prepare(context)
+        shapes = context.scene.shapes()
+        self.faces = FlatFaces([shape for shape in shapes if scatters(shape)])
+
+    def density_between(self, x, e, w, n, along, η):
+        """Return the density per area of a vertex for given foci, without the choice among faces.
 
         Args:
             along: derivative of w by the angle.
         """
         gradient = dr.normalize(w - x) + dr.normalize(w - e)
         gradient -= n * dr.dot(n, gradient)
-        return self.c * dr.norm(gradient) / dr.norm(along) * (dr.inv_two_pi / (self.last - self.first))
+        return dr.norm(gradient) / dr.norm(along) * (dr.inv_two_pi / self.width) * η
 
-    def share_of_others(self, context, path, vertex, ds, opl):
-        """Return the share that an ordinary connection at ``vertex`` keeps."""
+    def share_of_paths(self, context, path, vertex, ds):
+        """Return the share that paths keep of a connection at ``vertex`` to the point ``ds`` of a listed light."""
         x, w, n, e = path.prev_p, vertex.si.p, vertex.si.n, ds.p
-        drawn = ~path.prev_unconnected & vertex.si.is_valid() & (opl >= self.first) & (opl < self.last)
-        drawn &= self.lights.windowed(ds.emitter) & self.faces.lists(vertex.si.shape) & same_side(x, e, w, n)
+        drawn = ~path.prev_unconnected & vertex.surface & vertex.si.is_valid() & self.faces.lists(vertex.si.shape)
         r = dr.norm(w - x)
         s = r + dr.norm(w - e)
-        drawn &= s > dr.norm(e - x) * (1 + _LEAST)
+        drawn &= (dr.dot(n, x - w) * dr.dot(n, e - w) > 0) & (s > dr.norm(e - x) * (1 + _LEAST))
         a = path.prev_pdf * dr.abs_dot(n, w - x) / (r * r * r)
-        p = self.density_of(x, e, w, n, Section(x, e, s, n, w).derivative_at(w)) * path.η
-        share = dr.square(a) / (dr.square(a) + dr.square(p))
-        return dr.select(drawn & dr.isfinite(share), share, 1)
-
-    # ------------------------------------------------------------------------------------------------- primal
+        p = self.density_between(x, e, w, n, Section(x, e, s, n, w).derivative_at(w), path.η)
+        return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
 
     def propose(self, context, path, vertex, sampler):
-        if not self.works:
-            return None
         active = vertex.goes_on & vertex.connectable & (path.depth + 2 < context.max_depth)
         active = context.deep_enough(active, path.depth + 3)
-        u, at = sampler.next_2d(), sampler.next_2d()
-        e = self.points.sample(u, active)
-        x = mi.Point3f(vertex.at.p)
-        opl = mi.Float64(self.first) + mi.Float64(at.x) * (self.last - self.first)
-        s = mi.Float(opl - vertex.scattered_τ) / vertex.η
-        d = dr.norm(e.p - x)
-        active &= s > d * (1 + _LEAST)
-        n = mi.Normal3f(vertex.si.n)
-        n = dr.mulsign(n, -dr.dot(n, path.ray.d))
-        w, normal, along, t, total = choose(self, x, n, e, s, at.y, sampler.next_1d(), mi.Mask(active))
-        active &= total > 0
-        ray = vertex.at.spawn_ray_to(w)
+        e = self.lights.faces.sample(sampler.next_2d(), active)
+        u, x = sampler.next_2d(), mi.Point3f(vertex.at.p)
+        opl, s = self.arrival(u.x, vertex.scattered_τ, vertex.η)
+        active &= s > dr.norm(e.p - x) * (1 + _LEAST)
+        n = dr.mulsign(mi.Normal3f(vertex.si.n), -dr.dot(vertex.si.n, path.ray.d))
+        n_x = dr.select(vertex.surface, n, 0)
+        w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
+        active &= chance > 0
+        d = dr.select(active, vertex.at.spawn_ray_to(w).d, mi.Vector3f(0, 0, 1))
         ds = Local(p=w, emitter=None)
         return Proposal(
-            d=dr.select(active, ray.d, mi.Vector3f(0, 0, 1)), active=active, ds=ds, ray=ray, e=e, w=w, n=normal, along=along, opl=opl, s=s,
-            choice=dr.select(active, total / (t * self.M), 0),
-        )  # fmt: skip
+            d=d, active=active, ds=ds, e=e, w=w, n=n, along=along, chance=chance, opl=opl, u=u, sampler=sampler
+        )
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
-        if proposal is None:
-            return Event(value=mi.UnpolarizedSpectrum(0), opl=vertex.τ, active=mi.Bool(False), depth=path.depth)
-        x, w, e = mi.Point3f(vertex.at.p), proposal.w, proposal.e
-        active = proposal.active & (dr.max(mi.unpolarized_spectrum(answer.value)) > 0)
+        x, w, n, e, u = mi.Point3f(vertex.at.p), proposal.w, proposal.n, proposal.e, proposal.u
+        active = proposal.active & is_light(answer.value)
         active = context.counted(active, proposal.opl)
-        # ------------------------------------------------------------------------- to the vertex between
-        ray = vertex.at.spawn_ray(proposal.d)
-        pi = context.scene.ray_intersect_preliminary(ray, active=active)
         r = dr.norm(w - x)
-        active &= dr.abs(pi.t - r) < _FOUND * (1 + r)
+        # ------------------------------------------------------------------------- from x to w
+        ray = vertex.at.spawn_ray(proposal.d)
+        pi = context.segment.next_surface(context, ray, active)
+        active &= pi.is_valid() & (dr.abs(pi.t - r) < _FOUND * (1 + r))
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, proposal.n) > 0.999) & self.faces.lists(si.shape)
-        # ------------------------------------------------------------------------- to the light
-        ds = towards(si, e)
-        value, pdf = context.scattering.value_at(context, si, ds.d, ray, active)
-        active &= dr.max(mi.unpolarized_spectrum(value)) > 0
-        active &= ~context.scene.ray_test(si.spawn_ray_to(e.p), active)
-        Le = mi.unpolarized_spectrum(e.emitter.eval_direction(si, ds, active))
+        active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, n) > 1 - _FOUND) & self.faces.lists(si.shape)
+        medium, T = None, 1
+        if context.contents.media is not None:
+            medium = medium_behind(vertex.si, ray.d, vertex.medium, vertex.surface)
+            numbers = [u.x, u.y, mi.Float(1)]
+            to = vertex.at.spawn_ray_to(w)
+            active, T = self.cleared(context, to, r, medium, numbers, proposal.sampler, active)
+            medium = context.segment.medium_at(context, w, x, medium, active)
+        # ------------------------------------------------------------------------- from w to e
+        to = si.spawn_ray_to(e.p)
+        value, pdf = context.scattering.value_at(context, si, to.d, ray, active)
+        active &= is_light(value)
+        active, T_e = self.cleared(context, to, dr.norm(e.p - w), medium, [u.x, u.y], proposal.sampler, active)
+        value = self.last_segment(context, si, e, value, pdf, active)
         # ------------------------------------------------------------------------- weight
-        share = self.lights.weight(context, si, ds, self.lights.density(context, si, ds, active), pdf, active)
-        p = self.density_of(x, e.p, w, proposal.n, proposal.along) * vertex.η
-        cos_w = dr.abs_dot(proposal.n, w - x) / (r * r * r)
-        a = answer.pdf * cos_w
-        share *= dr.square(p) / (dr.square(a) + dr.square(p))
-        cos_e = dr.abs_dot(e.n, ds.d) / dr.square(ds.dist)
-        factor = share * cos_w * cos_e * proposal.choice * self.c / (p * e.pdf)
-        value = product(vertex.β, answer.value) * value * Le * dr.select(active, factor, 0)
+        p = self.density_between(x, e.p, w, n, proposal.along, vertex.η)
+        cos = dr.abs_dot(n, w - x) / (r * r * r)
+        a = answer.pdf * cos
+        factor = cos * p / ((dr.square(a) + dr.square(p)) * proposal.chance)
+        value = product(vertex.β, answer.value) * (value * T * T_e) * dr.select(active, factor, 0)
         return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 3, crowded=True)
 
 
 @dr.syntax
-def choose(connection, x, n_x, e, s, u_phi, u, active):
+def choose(connection, x, n_x, e, s, u_angle, u, active):
     """Choose a point of the faces where the sum of the distances to the foci is ``s``.
 
     Args:
-        connection: :class:`Ellipsoidal`.
-        x, n_x: first focus and the normal there, on the side of the sensor.
-        e: second focus, with its normal.
-        s: sum of the distances to the foci.
-        u_phi, u: uniform numbers for the angle and the choice.
+        connection: :class:`EllipsoidalSurface`.
+        x, n_x: first focus and its normal on the side of the sensor, zero in a medium.
+        e: second focus, :class:`~..sampling.flat_faces.LightPoint`.
+        u_angle, u: uniform numbers for the angles and the choice.
 
     Returns:
-        (point, normal of its face, derivative by the angle, its weight, sum of the weights of all).
+        (point; normal of its face; derivative by the angle; weight of the point over the mean that all weights have,
+        0 for none).
     """
-    w, normal, along = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0)
+    w, n, along = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0)
     best, total = mi.Float(0), mi.Float(0)
-    angles = [dr.sincos(dr.two_pi / connection.M * (u_phi + m)) for m in range(connection.M)]
-    i = mi.UInt32(0)
-    going = mi.Mask(active)
+    angles = [dr.sincos(dr.two_pi / ANGLES * (u_angle + k)) for k in range(ANGLES)]
+    i, going = mi.UInt32(0), active & (connection.faces.count > 0)
     while dr.hint(going, label="faces"):
         face = connection.faces.face(i)
-        w, normal, along, best, total, u = among(connection, face, x, n_x, e, s, angles, w, normal, along, best, total, u)
+        w, n, along, best, total, u = among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u)
         i += 1
         going = active & (i < connection.faces.count)
-    return w, normal, along, best, total
+    return w, n, along, dr.select(total > 0, best * ANGLES / total, 0)
 
 
-def among(connection, face, x, n_x, e, s, angles, w, normal, along, best, total, u):
-    """Return the choice with the points of one more face."""
-    n = face.n
-    section = Section(x, e.p, s, n, face.o)
-    h, h_e = dr.dot(n, face.o - x), dr.dot(n, face.o - e.p)
+def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
+    """Return the choice among the points of one more face, by weights (a reservoir of one)."""
+    section = Section(x, e.p, s, face.n, face.o)
+    h, h_e = dr.dot(face.n, face.o - x), dr.dot(face.n, face.o - e.p)
     meets = section.exists & (h * h_e > 0)
     for sin, cos in angles:
-        p, dp = section.point(sin, cos)
-        local = p - face.o
-        a, b = dr.dot(local, face.U), dr.dot(local, face.V)
+        point, derivative = section.point(sin, cos)
+        a, b = dr.dot(point - face.o, face.U), dr.dot(point - face.o, face.V)
         inside = meets & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
-        weight = dr.select(inside, connection_weight(connection, n, x, n_x, e, s, p, dp, h, h_e), 0)
-        weight = dr.select(dr.isfinite(weight), weight, 0)
+        weight = unoccluded(connection.width, x, n_x, e, s, point, derivative, h, h_e)
+        weight = dr.select(inside & dr.isfinite(weight), weight, 0)
         total = total + weight
         share = dr.select(weight > 0, weight / total, 0)
         taken = u < share
+        # What is left of the number is uniform again.
         u = dr.select(taken, u / share, (u - share) / (1 - share))
-        w, normal, along = dr.select(taken, p, w), dr.select(taken, n, normal), dr.select(taken, dp, along)
+        w, n, along = dr.select(taken, point, w), dr.select(taken, face.n, n), dr.select(taken, derivative, along)
         best = dr.select(taken, weight, best)
-    return w, normal, along, best, total, u
+    return w, n, along, best, total, u
 
 
-def connection_weight(connection, n, x, n_x, e, s, p, dp, h, h_e):
-    """Return what light a point would bring over its density, without occlusion and colour, by Lambertian surfaces."""
-    to = p - x
-    r2 = dr.squared_norm(to)
-    inv_r = dr.rsqrt(r2)
-    length = s - r2 * inv_r
-    inv = dr.rcp(length)
-    ω, to_e = to * inv_r, (p - e.p) * inv
-    cos_x, cos_e = facing(dr.dot(n_x, ω)), facing(dr.dot(e.n, to_e))
-    cos_w = dr.abs(h) * inv_r
-    gradient = ω + to_e
-    # Its length in the plane, since both directions have known cosines.
-    g2 = dr.squared_norm(gradient) - dr.square(h * inv_r + h_e * inv)
-    p_w = dr.sqrt(dr.maximum(g2, 0) * dr.rcp(dr.squared_norm(dp))) * (connection.c * dr.inv_two_pi / (connection.last - connection.first))
-    inv_r2 = dr.square(inv_r)
-    a = cos_x * dr.inv_pi * cos_w * inv_r2
-    return cos_x * cos_w * dr.abs(h_e) * inv * cos_e * inv_r2 * dr.square(inv) * p_w / (dr.square(a) + dr.square(p_w))
+def unoccluded(width, x, n_x, e, s, w, along, h, h_e):
+    """Return the share of light by a point that ellipsoidal connections take, over its density.
+
+    Of Lambertian surfaces without colour and with nothing in the way.
+
+    Args:
+        width: width of the window, metres.
+        h, h_e: distances of the foci from the plane of the point, with a sign.
+    """
+    inv_r = dr.rsqrt(dr.squared_norm(w - x))
+    inv_r_e = dr.rcp(s - dr.rcp(inv_r))
+    ω, to_w = (w - x) * inv_r, (w - e.p) * inv_r_e
+    cos_x = dr.select(dr.all(n_x == 0), 0.25, facing(dr.dot(n_x, ω)))
+    cos_w, cos_w_e = dr.abs(h) * inv_r, dr.abs(h_e) * inv_r_e
+    gradient2 = dr.squared_norm(ω + to_w) - dr.square(h * inv_r + h_e * inv_r_e)
+    p = dr.sqrt(dr.maximum(gradient2, 0) / dr.squared_norm(along)) * (dr.inv_two_pi / width)
+    a = cos_x * dr.inv_pi * cos_w * dr.square(inv_r)
+    light = cos_x * cos_w * cos_w_e * facing(dr.dot(e.n, to_w)) * dr.square(inv_r * inv_r_e)
+    return light * p / (dr.square(a) + dr.square(p))
+
+
+def scatters(shape):
+    """Return True for shapes that can be connected to lights."""
+    return shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Smooth)
 
 
 def facing(cos):
-    """Return a cosine, and little on the side that is dark unless a surface is translucent."""
-    return dr.select(cos > 0, cos, -1e-3 * cos)
+    """Return a cosine, and little of it on the other side."""
+    return dr.select(cos > 0, cos, -_BEHIND * cos)
 
 
-def towards(ref, e):
-    """Return the DirectionSample3f of a point of a light, seen from ``ref``."""
-    ds = dr.zeros(mi.DirectionSample3f)
-    ds.p, ds.n, ds.time, ds.emitter = mi.Point3f(e.p), e.n, ref.time, e.emitter
-    away = e.p - ref.p
-    ds.dist = dr.norm(away)
-    ds.d = away / ds.dist
-    return ds
+# --------------------------------------------------------------------------------------------------------------------
+# Media.
 
+class EllipsoidalMedium(Ellipsoidal):
+    """Connection over a vertex in a medium, on the segment that led to the vertex of the walk."""
 
-class OrdinarySampled(EmitterSampled):
-    """Connection to a point of a light that the window sees, beside :class:`Ellipsoidal`."""
+    name = "ellipsoidal_medium"
 
-    beside = None
+    def density_between(self, ω, w, e, η):
+        """Return the density of the distance along the segment for a given light point."""
+        return (1 + dr.dot(ω, dr.normalize(w - e))) * (η / self.width)
 
-    def prepare(self, context):
-        super().prepare(context)
-        self.faces = LightFaces(context)
+    def draws_on(self, context, path):
+        """Return a mask of segments on which vertices are drawn."""
+        if context.hide_emitters or context.segment.clip is not None:
+            return path.active & (path.depth > 0)
+        return path.active
 
-    def windowed(self, emitter):
-        """Return a mask of the lights that are sampled where the window sees them."""
-        return mi.Mask(True) if self.faces.holds_all else self.faces.emitters.lists(emitter)
+    def share_of_paths(self, context, path, vertex, ds):
+        """Return the share that paths keep of a connection at ``vertex`` to the point ``ds`` of a listed light."""
+        a = collision_density(vertex.mei, vertex.scatter)
+        p = self.density_between(path.ray.d, vertex.at.p, ds.p, path.η)
+        drawn = vertex.scatter & self.draws_on(context, path)
+        return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
 
     def propose(self, context, path, vertex, sampler):
-        if not self.faces.count:
-            return super().propose(context, path, vertex, sampler)
-        active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
-        u, window = sampler.next_2d(), context.window
-        first, last = (mi.Float(mi.Float64(end) - vertex.scattered_τ) / vertex.η for end in (window.first, window.last))
-        e = self.faces.sample_between(mi.Point3f(vertex.at.p), first, last, u, active)
-        ds = towards(vertex.at, e)
-        cos = -dr.dot(e.n, ds.d)
-        lit = active & (e.pdf > 0) & (dr.abs(cos) > 0)
-        # By the density of any point of the light, which the weights of others go by.
-        ds.pdf = dr.select(lit, self.density(context, vertex.at, ds, lit), 0)
-        inverse = dr.select(lit, dr.abs(cos) / (e.pdf * dr.square(ds.dist)), 0)
-        weight = e.emitter.eval_direction(vertex.at, ds, lit) * inverse
-        if not self.faces.holds_all:
-            other, other_weight = self.sample(context, vertex.at, u, active)
-            listed = self.windowed(other.emitter)
-            ...
-        active &= lit & (ds.pdf > 0)
-        return Proposal(d=ds.d, active=active, ds=ds, weight=weight, u=u, sampler=sampler)
+        active = self.draws_on(context, path) & (path.depth + 1 < context.max_depth)
+        active = context.deep_enough(active, path.depth + 2)
+        e, u = self.lights.faces.sample(sampler.next_2d(), active), sampler.next_2d()
+        opl, s = self.arrival(u.x, path.τ, path.η)
+        # The direction is that of the segment, for which nothing is asked.
+        return Proposal(
+            d=mi.Vector3f(0, 0, 1), active=mi.Mask(False), ds=Local(p=mi.Point3f(0), emitter=None), drawn=active, e=e,
+            opl=opl, s=s, u=u, sampler=sampler,
+        )  # fmt: skip
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
-        event = super().connect(context, path, vertex, proposal, answer, zeros)
-        if self.beside is not None and self.beside.works:
-            event.value = event.value * self.beside.share_of_others(context, path, vertex, proposal.ds, event.opl)
-        return event
+        sampler = proposal.sampler
+        x, ω, e, u = path.prev_p, path.ray.d, proposal.e, proposal.u
+        d2 = dr.squared_norm(e.p - x)
+        t = (dr.square(proposal.s) - d2) / (2 * (proposal.s - dr.dot(ω, e.p - x)))
+        active = context.counted(proposal.drawn, proposal.opl) & (proposal.s > dr.sqrt(d2)) & (t > 0)
+        w = x + ω * t
+        # ------------------------------------------------------------------------- from x to w
+        ray = mi.Ray3f(path.ray)
+        ray.maxt = t
+        begin = vertex.leg["begin"]
+        active, T = self.cleared(context, ray, t, begin, [u.x, u.y, mi.Float(1)], sampler, active)
+        medium = context.segment.medium_at(context, w, ray.o, begin, active)
+        active &= medium != None  # noqa: E711 (a Dr.Jit comparison)
+        mei = medium_interaction(ray, medium, t)
+        mei.p = w
+        # ------------------------------------------------------------------------- from w to e
+        value, pdf = context.scattering.value_in_medium(mei, dr.normalize(e.p - w), vertex.u_phase, active)
+        active &= is_light(value)
+        to = mei.spawn_ray_to(e.p)
+        active, T_e = self.cleared(context, to, dr.norm(e.p - w), medium, [u.x, u.y], sampler, active)
+        value = self.last_segment(context, mei, e, value, pdf, active)
+        # ------------------------------------------------------------------------- weight
+        a, p = collision_density(mei, active), self.density_between(ω, w, e.p, path.η)
+        factor = p / (dr.square(a) + dr.square(p))
+        value = mi.unpolarized_spectrum(path.β) * (value * T * T_e) * dr.select(active, factor, 0)
+        return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 2, crowded=True)
+
+
+def collision_density(mei, active):
+    """Return the density of collisions that weights go by: that of the majorant, without what was attenuated before."""
+    return dr.mean(mi.unpolarized_spectrum(mei.medium.get_majorant(mei, active)))

@@ -40,9 +40,13 @@ class Media(Vacuum):
     A leg is a dictionary: ``pi`` (the next surface), ``scatter`` (the leg ends in a medium, at distance ``t`` from the
     ray's origin), ``medium`` (at its end), ``weight`` (transmittance over density); for derivatives also ``begin`` (the
     medium at its start) and ``entry`` (the boundary passed last).
+
+    Attributes:
+        keeps_begin: legs have ``begin`` in renders, too.
     """
 
     clip = None
+    keeps_begin = False
 
     def prepare(self, context):
         super().prepare(context)
@@ -72,7 +76,7 @@ class Media(Vacuum):
             # A collision on top of the vertex before has no direction to it: as far as single precision can tell apart.
             t = dr.maximum(t, shortest(ray.o))
         leg = {"pi": end.pi, "scatter": end.scatter, "t": t, "medium": end.medium, "weight": end.weight}
-        if self.settings.recorded:
+        if self.settings.recorded or self.keeps_begin:
             leg["begin"] = medium
         if self.settings.keeps_entry:
             leg["entry"] = end.entry

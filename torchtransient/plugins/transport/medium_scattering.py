@@ -87,6 +87,21 @@ class SurfaceOrMedium(Surface):
         f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
         return dr.select(scatter, f, value), dr.select(scatter, finite(f_pdf), pdf)
 
+    def value_in_medium(self, mei, out, u, active):
+        """Return the scattering at a point in a medium that no path has walked to, unpolarized.
+
+        Args:
+            mei: MediumInteraction3f.
+            out: direction of the light in world space.
+            u: number that chooses a part of a blend, None without blends.
+
+        Returns:
+            (value times the scattering coefficient, density).
+        """
+        phase, σ_s = self._phase_and_scattering(mei, u, active)
+        f, pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active)
+        return finite(mi.unpolarized_spectrum(f)) * σ_s, finite(pdf)
+
     # ------------------------------------------------------------------------------------------------- record
 
     def fields(self, context):
