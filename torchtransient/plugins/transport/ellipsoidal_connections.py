@@ -34,6 +34,9 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Local, 
 
 # Angles that are drawn on each ellipse.
 ANGLES = 2
+# By how much more often connections find a point of a light in the window than paths that run into it, in the weights
+# between both.
+PREFERENCE = 8
 # Distance, relative to the length of a ray, within which it has found a point.
 _FOUND = 1e-3
 # Excess of s over the distance of the foci, relative to it, below which nothing is connected.
@@ -94,20 +97,25 @@ class WindowedEmitterSampled(EmitterSampled):
                 "Add one, or leave the ordinary connections."
             )
 
+    def density(self, context, ref, ds, active):
+        pdf = super().density(context, ref, ds, active)
+        return dr.select(self.faces.lists(ds.emitter), PREFERENCE, 1) * pdf
+
     def propose(self, context, path, vertex, sampler):
         active = context.deep_enough(vertex.goes_on & vertex.connectable, path.depth + 2)
         u, window = sampler.next_2d(), context.window
         listed = mi.Mask(True)
         if not self.faces.holds_all:
             other, other_weight = self.sample(context, vertex.at, u, active)
-            listed = self.faces.lists(other.emitter)
+            number, _, _ = context.scene.sample_emitter(u.x, active)
+            listed = self.faces.lists(dr.gather(mi.EmitterPtr, context.scene.emitters_dr(), number, active))
             u = sampler.next_2d()
         ends = (mi.Float(mi.Float64(end) - vertex.scattered_τ) / vertex.η for end in (window.first, window.last))
         e = self.faces.sample_between(mi.Point3f(vertex.at.p), *ends, u, active & listed)
         ds = towards(vertex.at, e)
         cos = dr.abs_dot(e.n, ds.d)
         lit = active & listed & (e.pdf > 0) & (cos > 0)
-        # The density of any point of the light, by which the weights beside light that is run into go.
+        # The density by which the weights beside light that is run into go.
         ds.pdf = dr.select(lit, self.density(context, vertex.at, ds, lit), 0)
         weight = e.emitter.eval_direction(vertex.at, ds, lit) * dr.select(lit, cos / (e.pdf * dr.square(ds.dist)), 0)
         if not self.faces.holds_all:
@@ -161,6 +169,15 @@ class Ellipsoidal(Connection):
         """
         opl = mi.Float64(self.first) + mi.Float64(u) * self.width
         return opl, mi.Float(opl - τ) / η
+
+    def second_focus(self, x, s, u, active):
+        """Draw a point of a light that is nearer to the first focus than ``s``.
+
+        Near lights that bounds the light over the density.
+        """
+        e = self.lights.faces.sample_between(x, mi.Float(0), s / (1 + _LEAST), u, active)
+        e.pdf = dr.select(dr.norm(e.p - x) * (1 + _LEAST) < s, e.pdf / self.lights.faces.share, 0)
+        return e
 
     def last_segment(self, context, at, e, value, pdf, active):
         """Return (mask, emission times the cosine at the light over the square of the distance, weight beside light
@@ -272,10 +289,10 @@ class EllipsoidalSurface(Ellipsoidal):
     def propose(self, context, path, vertex, sampler):
         active = vertex.goes_on & vertex.connectable & (path.depth + 2 < context.max_depth)
         active = context.deep_enough(active, path.depth + 3)
-        e = self.lights.faces.sample(sampler.next_2d(), active)
         u, x = sampler.next_2d(), mi.Point3f(vertex.at.p)
         opl, s = self.arrival(u.x, vertex.scattered_τ, vertex.η)
-        active &= s > dr.norm(e.p - x) * (1 + _LEAST)
+        e = self.second_focus(x, s, sampler.next_2d(), active)
+        active &= e.pdf > 0
         n = dr.mulsign(mi.Normal3f(vertex.si.n), -dr.dot(vertex.si.n, path.ray.d))
         n_x = dr.select(vertex.surface, n, 0)
         w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
@@ -425,8 +442,10 @@ class EllipsoidalMedium(Ellipsoidal):
     def propose(self, context, path, vertex, sampler):
         active = self.draws_on(context, path) & (path.depth + 1 < context.max_depth)
         active = context.deep_enough(active, path.depth + 2)
-        e, u = self.lights.faces.sample(sampler.next_2d(), active), sampler.next_2d()
+        u = sampler.next_2d()
         opl, s = self.arrival(u.x, path.τ, path.η)
+        e = self.second_focus(path.prev_p, s, sampler.next_2d(), active)
+        active &= e.pdf > 0
         # The direction is that of the segment, for which nothing is asked.
         return Proposal(
             d=mi.Vector3f(0, 0, 1), active=mi.Mask(False), ds=Local(p=mi.Point3f(0), emitter=None), drawn=active, e=e,
@@ -438,7 +457,7 @@ class EllipsoidalMedium(Ellipsoidal):
         x, ω, e, u = path.prev_p, path.ray.d, proposal.e, proposal.u
         d2 = dr.squared_norm(e.p - x)
         t = (dr.square(proposal.s) - d2) / (2 * (proposal.s - dr.dot(ω, e.p - x)))
-        active = context.counted(proposal.drawn, proposal.opl) & (proposal.s > dr.sqrt(d2)) & (t > 0)
+        active = context.counted(proposal.drawn, proposal.opl) & (t > 0)
         w = x + ω * t
         # ------------------------------------------------------------------------- from x to w
         ray = mi.Ray3f(path.ray)
