@@ -108,7 +108,7 @@ class PointerTable:
             # Laid out here, it needs no kernel of its own.
             entries = np.full(size, default, dtype=np.uint32)
             entries[numbers] = values
-            self.values = mi.UInt32(entries)
+            self.values = whole_numbers(entries)
             dr.make_opaque(self.values)
 
     @staticmethod

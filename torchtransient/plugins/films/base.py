@@ -296,11 +296,6 @@ class TimeResolvedFilm(mi.Film):
         window = self.arrivals()
         return None if window is None else window.last
 
-    def window(self) -> tuple[float, float] | None:
-        """Return the ends of the arrivals that the array counts, metres after ``start_opl``; None for films without."""
-        window = self.arrivals()
-        return None if window is None else (window.first, window.last)
-
     def lanes_at_most(self, most_events: int) -> int | None:
         """Return the largest number of paths of up to ``most_events`` events in a launch, None for no limit."""
         return None

@@ -182,10 +182,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     def arrivals(self):
         if self.keeps_steady:
             return None
-        return ArrivalWindow(*self.window())
-
-    def window(self):
-        return -self.filter.reach[1] * self.bin_width_opl, self.last_arrival()
+        return ArrivalWindow(-self.filter.reach[1] * self.bin_width_opl, self.last_arrival())
 
     def last_arrival(self):
         return (self.temporal_bins - self.filter.reach[0]) * self.bin_width_opl

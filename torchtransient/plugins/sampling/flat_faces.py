@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.kernel_arrays import PointerTable, floats, registry_number, whole_numbers
+from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
 from torchtransient.plugins.mitsuba_compat import has_smooth_shape, lacks_directions
 from torchtransient.plugins.sampling.area_elements import AreaElements
 from torchtransient.plugins.sampling.hidden_elements import packed
@@ -48,7 +48,7 @@ class FlatFaces:
     def __init__(self, shapes):
         meshes = []
         for shape in shapes:
-            if shape.is_mesh():
+            if _is_small(shape):
                 elements = AreaElements.from_shapes([shape])
                 faces = [face for face, _ in faces_of(elements)]
                 meshes.append((elements.area.sum() / max(len(faces), 1), shape, faces))
@@ -75,6 +75,11 @@ class FlatFaces:
             o=mi.Point3f(o.x, o.y, o.z), most=o.w, n=mi.Normal3f(n.x, n.y, n.z), U=mi.Vector3f(U.x, U.y, U.z),
             V=mi.Vector3f(V.x, V.y, V.z),
         )  # fmt: skip
+
+
+def _is_small(shape):
+    """Return True for meshes that may fit into the table, where pairs of triangles are one face."""
+    return shape.is_mesh() and shape.face_count() <= 2 * MOST_FACES
 
 
 def faces_of(elements):
@@ -131,7 +136,7 @@ class LightPoint:
 
 
 class LightFaces:
-    """Faces of the area lights on meshes that shine alike everywhere: points of them, anywhere or at given distances.
+    """Faces of the area lights that shine alike everywhere, on meshes of at most 128 triangles.
 
     A light is chosen as scenes choose theirs (``sampling_weight``), a face of it by its area.
 
@@ -149,34 +154,26 @@ class LightFaces:
         emitters = scene.emitters()
         lit = [emitter for emitter in emitters if _is_flat_light(emitter) and not emits_by_place(emitter)]
         total = sum(emitter.sampling_weight() for emitter in emitters)
-        rows, chances, numbers = [], [], []
+        rows, chances = [], []
         for emitter in lit:
             elements = AreaElements.from_shapes([emitter.get_shape()])
             faces = faces_of(elements)
             areas = np.array([np.linalg.norm(np.cross(e1, e2)) * most / 2 for (_, e1, e2, most), _ in faces])
             for ((o, e1, e2, most), i), area in zip(faces, areas, strict=True):
                 chance = emitter.sampling_weight() / total * area / areas.sum()
-                rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], 0.0])
+                # Numbers of plugins are small enough for single precision.
+                rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], registry_number(emitter)])
                 chances.append(chance)
-                numbers.append(registry_number(emitter))
         self.count, self.holds_all, self.share = len(rows), len(lit) == len(emitters), float(sum(chances))
         self._emitters = PointerTable.marking(lit)
         if self.count:
-            self._table, self._numbers = packed(np.array(rows)), whole_numbers(np.array(numbers))
-            self._choice = mi.DiscreteDistribution(floats(np.array(chances)))
+            self._table = packed(np.array(rows))
+            # Begin of each face's part of [0, 1], and the end of the last one.
+            self._begins = packed(np.cumsum([0.0, *chances]) / self.share)
 
     def lists(self, emitter):
         """Return a mask of pointers to the lights of these faces."""
         return mi.Mask(True) if self.holds_all else self._emitters.lists(emitter)
-
-    def sample(self, u, active):
-        """Draw a :class:`LightPoint` anywhere; densities are those given that one of these lights is chosen.
-
-        Args:
-            u: two uniform numbers, Point2f.
-        """
-        face, v = self._face(u.x, active)
-        return LightPoint(_point(face, v, u.y), face.n, face.emitter, face.pdf / self.share)
 
     def sample_between(self, x, first, last, u, active):
         """Draw a :class:`LightPoint` at distances of ``first`` to ``last`` from ``x``.
@@ -227,9 +224,11 @@ class LightFaces:
 
     def _face(self, u, active):
         """Choose a face by a number; return it and another number that is uniform."""
-        i, u = self._choice.sample_reuse(u, active)
+        i = dr.binary_search(0, self.count - 1, lambda k: dr.gather(mi.Float, self._begins, k + 1, active) <= u)
+        begin, end = (dr.gather(mi.Float, self._begins, i + k, active) for k in range(2))
+        u = dr.clip((u - begin) / (end - begin), 0, 1 - dr.epsilon(mi.Float))
         o, e1, e2, n = (dr.gather(mi.Vector4f, self._table, i * 4 + k, active) for k in range(4))
-        emitter = dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._numbers, i, active))
+        emitter = dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(n.w))
         face = Face(
             o=mi.Point3f(o.x, o.y, o.z), e1=mi.Vector3f(e1.x, e1.y, e1.z), e2=mi.Vector3f(e2.x, e2.y, e2.z),
             n=mi.Normal3f(n.x, n.y, n.z), pdf=o.w, most=e1.w, chance=e2.w, emitter=emitter,
@@ -239,7 +238,7 @@ class LightFaces:
 
 def _is_flat_light(emitter):
     shape = emitter.get_shape()
-    if shape is None or not shape.is_mesh() or lacks_directions(emitter) or has_smooth_shape(emitter):
+    if shape is None or not _is_small(shape) or lacks_directions(emitter) or has_smooth_shape(emitter):
         return False
     return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta) and emitter.sampling_weight() > 0
 
