@@ -71,7 +71,8 @@ class TransientPath(TransientIntegrator):
         if self.connections == "ordinary" or wanted is not None or settings is not None:
             return super().render_context(scene, contents, wanted, window, settings)
         segment, scattering, (found, _) = self.strategies(contents)
-        segment.keeps_begin = True
+        if contents.media is not None:
+            segment.keeps_begin = True
         strategies = segment, scattering, connections_in_window(contents, found)
         return RenderContext(scene, contents, self.settings(), strategies, None, window)
 
