@@ -148,6 +148,7 @@ class LightFaces:
         count: number of faces.
         holds_all: the scene has no other lights.
         share: probability that a scene chooses one of these lights.
+        area: square metres.
     """
 
     def __init__(self, scene, emits_by_place):
@@ -164,6 +165,7 @@ class LightFaces:
                 # Numbers of plugins are small enough for single precision.
                 rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], registry_number(emitter)])
                 chances.append(chance)
+        self.area = float(sum(chance / row[3] for chance, row in zip(chances, rows, strict=True)))
         self.count, self.holds_all, self.share = len(rows), len(lit) == len(emitters), float(sum(chances))
         self._emitters = PointerTable.marking(lit)
         if self.count:

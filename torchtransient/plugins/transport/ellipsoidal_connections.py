@@ -36,7 +36,7 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Local, 
 ANGLES = 2
 # By how much more often connections find a point of a light in the window than paths that run into it, in the weights
 # between both.
-PREFERENCE = 8
+PREFERENCE = 32
 # Distance, relative to the length of a ray, within which it has found a point.
 _FOUND = 1e-3
 # Excess of s over the distance of the foci, relative to it, below which nothing is connected.
@@ -178,6 +178,11 @@ class Ellipsoidal(Connection):
         e = self.lights.faces.sample_between(x, mi.Float(0), s / (1 + _LEAST), u, active)
         e.pdf = dr.select(dr.norm(e.p - x) * (1 + _LEAST) < s, e.pdf / self.lights.faces.share, 0)
         return e
+
+    def preference(self, w, e):
+        """Return by how much more often paths draw ``e`` from ``w``, between two spheres around it as wide as the window.
+        """
+        return 1 + dr.inv_two_pi * self.lights.faces.area / (self.width * dr.norm(w - e))
 
     def last_segment(self, context, at, e, value, pdf, active):
         """Return (mask, emission times the cosine at the light over the square of the distance, weight beside light
@@ -434,7 +439,7 @@ class EllipsoidalMedium(Ellipsoidal):
 
     def share_of_paths(self, context, path, vertex, ds):
         """Return the share that paths keep of a connection at ``vertex`` to the point ``ds`` of a listed light."""
-        a = collision_density(vertex.mei, vertex.scatter)
+        a = collision_density(vertex.mei, vertex.scatter) * self.preference(vertex.at.p, ds.p)
         p = self.density_between(path.ray.d, vertex.at.p, ds.p, path.η)
         drawn = vertex.scatter & self.draws_on(context, path)
         return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
@@ -475,7 +480,7 @@ class EllipsoidalMedium(Ellipsoidal):
         active, T_e = self.cleared(context, to, dr.norm(e.p - w), medium, [u.x, u.y], sampler, active)
         value = self.last_segment(context, mei, e, value, pdf, active)
         # ------------------------------------------------------------------------- weight
-        a, p = collision_density(mei, active), self.density_between(ω, w, e.p, path.η)
+        a, p = collision_density(mei, active) * self.preference(w, e.p), self.density_between(ω, w, e.p, path.η)
         factor = p / (dr.square(a) + dr.square(p))
         value = mi.unpolarized_spectrum(path.β) * (value * T * T_e) * dr.select(active, factor, 0)
         return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 2, crowded=True)
