@@ -12,7 +12,8 @@ drawn. The vertex w between them lies where ``|xw| + |we| = s = (τ - l) / η``,
 
 Paths find the same vertices w. Of the light that is connected to at w they keep the share ``a^2 / (a^2 + p^2)``, with
 the densities ``a`` of their own and ``p`` of ellipsoidal connections, which take the rest. The choice among faces is
-not part of ``p``: any weights that sum to one are right. Light that is run into keeps its weight.
+not part of ``p``: any weights that sum to one are right. Light that is run into keeps its weight beside connections,
+whose density counts more than once there (:data:`PREFERENCE`): it rarely arrives in the window.
 
 Source: Pediredla, Veeraraghavan, Gkioulekas, "Ellipsoidal path connections for time-gated rendering", 2019, who choose
 triangles by a hierarchy. Arguments that all methods share are explained in :mod:`.strategy`.
@@ -34,8 +35,8 @@ from torchtransient.plugins.transport.strategy import Connection, Event, Local, 
 
 # Angles that are drawn on each ellipse.
 ANGLES = 2
-# By how much more often connections find a point of a light in the window than paths that run into it, in the weights
-# between both.
+# Factor on the density of connections in the weights beside light that is run into: of little, and it is what few paths
+# bring; of much, and the noise near lights in media is that of connections.
 PREFERENCE = 32
 # Distance, relative to the length of a ray, within which it has found a point.
 _FOUND = 1e-3
@@ -180,18 +181,20 @@ class Ellipsoidal(Connection):
         return e
 
     def preference(self, w, e):
-        """Return by how much more often paths draw ``e`` from ``w``, between two spheres around it as wide as the window.
+        """Return the density of light points from ``w`` that the window sees, over that of all points of the light.
+
+        About, for weights: a ring of the window's width at the distance of ``e``.
         """
         return 1 + dr.inv_two_pi * self.lights.faces.area / (self.width * dr.norm(w - e))
 
     def last_segment(self, context, at, e, value, pdf, active):
-        """Return (mask, emission times the cosine at the light over the square of the distance, weight beside light
-        that is run into).
+        """Return what a point of a light brings over its density, by the share that connections have beside light that
+        is run into.
 
         Args:
             at: interaction at the vertex between.
             e: point of the light.
-            pdf: density of its direction in the scattering there.
+            value, pdf: scattering towards it, and its density.
         """
         ds = towards(at, e)
         density = self.lights.density(context, at, ds, active)
