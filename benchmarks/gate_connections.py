@@ -1,11 +1,11 @@
 """Squared error times CPU time of ellipsoidal connections over the plain path, in narrow gates.
 
 Gates of 1 % of the Cornell box's extent in time (6 cm of 6 m), early, in the middle and late, one after the other; with
-a box of glass; in thin and thick fog; and gates that are wider. All render the same scene in one process and take
-turns: plain paths with the samplers `independent` and `owen`, `transient_path_reuse` where it renders the scene, and
-`connections="ellipsoidal"`. Per gate and way: the variance between runs, summed over pixels and channels, over the
-square of the mean; CPU seconds of a render; the product over that of plain paths with `independent` and with `owen`
-(larger than 1: better); the energy with its standard error.
+a box of glass; in thin and thick fog, and in fog that does not reach the lamp; and gates that are wider. All render the
+same scene in one process and take turns: plain paths with the samplers `independent` and `owen`, `transient_path_reuse`
+where it renders the scene, and `connections="ellipsoidal"`. Per gate and way: the variance between runs, summed over
+pixels and channels, over the square of the mean; CPU seconds of a render; the product over that of plain paths with
+`independent` and with `owen` (larger than 1: better); the energy with its standard error.
 
     python benchmarks/gate_connections.py [--scenes cornell,glass] [--runs 16] [--json FILE]
 """
@@ -22,7 +22,7 @@ import torch
 from _runner import arguments, environment
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import scale
+from torchtransient.scenes.transforms import scale, translate
 
 SceneDict = dict[str, Any]
 NARROW = {"early": (4.4, 4.46), "middle": (6.0, 6.06), "late": (8.5, 8.56)}
@@ -47,15 +47,18 @@ def glass(resolution: int) -> SceneDict:
     return tt.scenes.cornell_box(resolution=resolution, glass=True)
 
 
-def fog(resolution: int, extinction: float) -> SceneDict:
-    """The Cornell box full of fog."""
+def fog(resolution: int, extinction: float, place: Any = None) -> SceneDict:
+    """The Cornell box full of fog, or with a cube of it in another place."""
     scene = cornell(resolution)
     medium = {"type": "homogeneous", "sigma_t": extinction, "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}
-    scene["fog"] = {"type": "cube", "to_world": scale(0.999), "bsdf": {"type": "null"}, "interior": medium}
+    place = scale(0.999) if place is None else place
+    scene["fog"] = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium}
     scene["integrator"] = {**scene["integrator"], "type": "transient_prbvolpath"}
     return scene
 
 
+# Below the lamp by 0.7 m, over the boxes.
+LOW = translate([0.0, -0.35, 0.0]) @ scale([0.98, 0.64, 0.98])
 # Scene, gates, samples per pixel.
 SCENES: dict[str, tuple[Callable[[int], SceneDict], dict[str, tuple[float, float]], int]] = {
     "cornell": (cornell, NARROW, 256),
@@ -63,6 +66,7 @@ SCENES: dict[str, tuple[Callable[[int], SceneDict], dict[str, tuple[float, float
     "wide gates": (cornell, WIDE, 256),
     "glass": (glass, NARROW, 256),
     "fog 0.3 / m": (lambda resolution: fog(resolution, 0.3), NARROW, 64),
+    "low fog 1.5 / m": (lambda resolution: fog(resolution, 1.5, LOW), NARROW, 64),
     "fog 1.5 / m": (lambda resolution: fog(resolution, 1.5), NARROW, 64),
 }
 
