@@ -267,6 +267,14 @@ class Scene:
 
     # --------------------------------------------------------------------------------------------- pickles and copies
 
+    def apart(self) -> Scene:
+        """Return a scene of the same description that shares nothing that was built; a shared scene returns itself."""
+        if self.is_shared:
+            return self
+        other = Scene(self._description, self._requested_variant)
+        other._variant = self._variant
+        return other
+
     def __getstate__(self) -> dict[str, Any]:
         self._description.check_described("tt.Scene: pickling")
         return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}
