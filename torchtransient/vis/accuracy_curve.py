@@ -85,8 +85,8 @@ def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
     from matplotlib.ticker import NullFormatter
 
     starts, ends, front = [], [], []
-    colours = _colours(lines)
-    grey = len(lines) - len(colours)
+    colours, hidden = _colours(lines), False
+    look: dict[str, Any]
     for i, curve in enumerate(lines):
         x = np.asarray(getattr(curve, unit), dtype=np.float64)
         with_bias = unit == "seconds" and curve.total is not None
@@ -97,23 +97,22 @@ def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
             starts.append((x[good][0], y[good][0]))
             ends.append(x[good].max())
         front += [(x[k], y[k]) for k, held in enumerate(curve.on_front) if held and good[k]]
-        if i not in colours:
-            name = f"{grey} others" if i == min(set(range(len(lines))) - set(colours)) else "_other"
-            axis.plot(x[good], y[good], color=_OTHERS, linewidth=0.8, label=name, zorder=1)
-            continue
-        colour, slope = _COLOURS[colours[i]], ""
-        if curve.slope is not None and unit == "spp":
-            slope = f"\nslope {curve.slope[0]:+.2f} ± {curve.slope[1]:.2f}".replace("-", "\N{MINUS SIGN}")
-        marker = _MARKERS[colours[i]]
-        axis.plot(
-            x[good], y[good], color=colour, marker=marker, markersize=4, linewidth=1.2, label=curve.label + slope
-        )
+        colour, alpha = _OTHERS, 0.1
+        if i in colours:
+            colour, alpha, slope = _COLOURS[colours[i]], 0.18, ""
+            if curve.slope is not None and unit == "spp":
+                slope = f"\nslope {curve.slope[0]:+.2f} ± {curve.slope[1]:.2f}".replace("-", "\N{MINUS SIGN}")
+            look = {"marker": _MARKERS[colours[i]], "markersize": 4, "linewidth": 1.2, "label": curve.label + slope}
+        else:
+            look = {"linewidth": 0.8, "zorder": 1, "label": "_" if hidden else f"{len(lines) - len(colours)} others"}
+            hidden = True
+        axis.plot(x[good], y[good], color=colour, **look)
         if band is not None:
             low, high = np.asarray(band, dtype=np.float64)[good].T
             if unit == "spp":
-                axis.fill_between(x[good], low, high, color=colour, alpha=0.18, linewidth=0)
+                axis.fill_between(x[good], low, high, color=colour, alpha=alpha, linewidth=0)
             else:  # points of a curve need not follow each other in time
-                axis.vlines(x[good], low, high, color=colour, alpha=0.35, linewidth=3)
+                axis.vlines(x[good], low, high, color=colour, alpha=2 * alpha, linewidth=3, zorder=1)
     if starts:
         x0, y0 = starts[0]
         x1 = max(*ends, 2 * x0)
@@ -121,8 +120,8 @@ def _draw(axis: Any, lines: Sequence[Curve], unit: str) -> None:
     if front and unit == "seconds":
         ordered = np.asarray(sorted(front))
         axis.plot(
-            *ordered.T, color=_FRONT, linewidth=0.8, linestyle=":", marker="o", markersize=9, markerfacecolor="none",
-            label="Pareto front", zorder=3,
+            *ordered.T, color=_FRONT, linewidth=0.8, linestyle=":", drawstyle="steps-post", marker="o", markersize=9,
+            markerfacecolor="none", label="Pareto front", zorder=3,
         )  # fmt: skip
     axis.set_xscale("log")
     if starts:
