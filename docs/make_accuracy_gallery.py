@@ -177,9 +177,9 @@ GALLERY = {
     ),
     "staircase": Picture(
         "The Wooden Staircase", "24 x 42 pixels, 64 bins of 25 cm, `owen`.", of_staircase,
-        lambda report: "Rare bright paths make the noise, which falls as that of independent samples. A depth of 3 has "
-        f"the transient, and its light after 9 m is off by {percent(report, 'light after 9 m', 'depth 3')}. Pixels that "
-        "share light have less noise in single bins, more in sums over them, and take longer.",
+        lambda report: "Rare bright paths make the noise, which falls as that of independent samples. A depth of 3 "
+        f"does for the transient, and its light after 9 m is off by {percent(report, 'light after 9 m', 'depth 3')}. "
+        "Pixels that share light have less noise in single bins, more in sums over them, and take longer.",
         {"transient": 0.3, "light after 9 m": 0.2},
     ),
     "letter": Picture(
@@ -192,16 +192,16 @@ GALLERY = {
     ),
     "fog": Picture(
         "Fog", "Cornell box full of thin fog, 24 x 24 pixels.", of_fog,
-        lambda report: f"With a depth of 4 the light after 7 m is off by {percent(report, 'light after 7 m', 'depth 4')}, "
-        "which looks best by its noise alone (right). Depths of 8 and 16 cannot be told apart; late light is noisy with "
-        "either sampler.",
+        lambda report: "A depth of 4 looks best by its noise alone (right), and its light after 7 m is off by "
+        f"{percent(report, 'light after 7 m', 'depth 4')}. Depths of 8 and 16 cannot be told apart; late light is noisy "
+        "with either sampler.",
         {"transient": 0.2, "light after 7 m": 0.3},
     ),
     "caustic": Picture(
         "A caustic", "Cornell box with a box of glass under a lamp of 12 cm, 24 x 24 pixels.", of_caustic,
         lambda report: "Few bright paths through the glass hold the noise, so that four repeats hardly know it: the "
-        "bands are wide. `owen` has a tenth of the squared error and less all the same, and a depth of 4 has no bias beyond the "
-        "noise.",
+        "bands are wide. `owen` has a tenth of the squared error and less all the same, and a depth of 4 has no bias "
+        "beyond the noise.",
         {"transient": 0.1, "steady picture": 0.05},
     ),
     "gates": Picture(

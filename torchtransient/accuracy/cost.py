@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_counts, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_whole, function, positive, shown
+from torchtransient.checks import Numbers, as_whole, function, numbers, positive, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.output import RenderOutput
@@ -62,7 +62,7 @@ def cost_of_accuracy(
     temporal_filters: Sequence[str] | None = None,
     integrators: Sequence[str] | None = None,
     max_depths: Sequence[int] | None = None,
-    bin_widths: Sequence[float] | None = None,
+    bin_widths: Numbers | None = None,
     loss: Loss = cosine_over_the_window,
     seed: int = 0,
     progress: bool = True,
@@ -188,14 +188,15 @@ def _variations(
     temporal_filters: Sequence[str] | None,
     integrators: Sequence[str] | None,
     max_depths: Sequence[int] | None,
-    bin_widths: Sequence[float] | None,
+    bin_widths: Numbers | None,
 ) -> dict[Choice, TransientRenderer]:
     """A renderer for every combination; choices name what is compared beside sampler and filter."""
     filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
     if not samplers or not filters:
         raise ArgumentError("expected at least one sampler and one temporal filter, got none")
     found = {}
-    builds = itertools.product(integrators or (None,), max_depths or (None,), bin_widths or (None,))
+    widths = (None,) if bin_widths is None else numbers("bin_widths", bin_widths).reshape(-1).tolist()
+    builds = itertools.product(integrators or (None,), max_depths or (None,), widths)
     for integrator, depth, width in builds:
         built = renderer.variation(
             integrator=integrator, max_depth=depth, time_axis=None if width is None else _axis(renderer, width)
