@@ -193,8 +193,8 @@ GALLERY = {
     "fog": Picture(
         "Fog", "Cornell box full of thin fog, 24 x 24 pixels.", of_fog,
         lambda report: "A depth of 4 looks best by its noise alone (right), and its light after 7 m is off by "
-        f"{percent(report, 'light after 7 m', 'depth 4')}. Depths of 8 and 16 cannot be told apart; late light is noisy "
-        "with either sampler.",
+        f"{percent(report, 'light after 7 m', 'depth 4')}. Depths of 8 and 16 cannot be told apart; late light is "
+        "noisy with either sampler.",
         {"transient": 0.2, "light after 7 m": 0.3},
     ),
     "caustic": Picture(
