@@ -346,6 +346,33 @@ def test_a_setting_is_recommended_for_a_depth_that_suffices(settings_report):
         report.recommend(1e-9, quantity="energy")
 
 
+@pytest.mark.slow
+def test_fresh_renders_have_the_recommended_error():
+    """Of six recommendations with intervals of 95 %, one fails in a quarter of all cases, two in 3 %."""
+    scene = tt.scenes.cornell_box(16, num_bins=60, bin_width_opl=0.1, max_depth=8)
+    scene["integrator"]["hide_emitters"] = True
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), physics="ignore")
+    functions = {"transient": lambda out: out.transient, "late": lambda out: out.transient[:, 35:].sum(1)}
+    report = tt.cost_of_accuracy(
+        renderer, spp=(16, 64, 256), quantities={"late": functions["late"]}, max_depths=(3, 8), repeats=8,
+        reference_spp=4096, progress=False,
+    )  # fmt: skip
+    long = renderer.variation(sampler="owen", temporal_filter="box")(seed=0, spp=16384)
+    held = []
+    for quantity, share in [(name, share) for name in functions for share in (1.05, 1.5, 2.5)]:
+        least = min(p.error for p in report.points if p.quantity == quantity)
+        found = report.recommend(share * least, quantity=quantity)
+        choice, truth = found.choice, functions[quantity](long).double()
+        twin = renderer.variation(
+            sampler=choice.sampler, temporal_filter=choice.temporal_filter, max_depth=choice.max_depth
+        )
+        runs = [functions[quantity](twin(seed=9000 + k, spp=found.spp)).double() for k in range(16)]
+        error = float(torch.stack([(run - truth).square().mean() for run in runs]).mean().sqrt())
+        held.append(found.low < error / float(truth.square().mean().sqrt()) < found.high)
+        assert found.error <= share * least
+    assert sum(held) >= 5
+
+
 def test_complex_quantities_and_samplers_alone():
     """A unit phasor: its relative error is that of the phase in radians."""
 

@@ -53,6 +53,14 @@ def test_the_quickest_setting_that_reaches_an_error(report):
     assert report.recommend(0.099).spp == 103  # 1 / 0.099^2 = 102.03
 
 
+@pytest.mark.parametrize("error, spp", [(0.3, 16), (0.2, 32), (0.15, 50), (0.14, 64)])
+def test_samplers_that_spread_points_get_powers_of_two(error, spp):
+    """Or what was measured, where that is less; errors of n^-1/2 here."""
+    report = AccuracyReport([point(Choice("owen", "box"), n, n / 1e3, n**-0.5) for n in (4, 20, 50, 64)], "")
+    found = report.recommend(error)
+    assert found.spp == spp and found.error == pytest.approx(spp**-0.5) and found.seconds == pytest.approx(spp / 1e3)
+
+
 def test_what_no_setting_reaches(report):
     with pytest.raises(ArgumentError, match=r"got 1\.00%; the least is 6\.25%, of 256 spp \[independent, box\]\."):
         report.recommend(0.01)

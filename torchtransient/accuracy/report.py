@@ -204,7 +204,8 @@ class AccuracyReport:
         """Return the quickest setting and samples per pixel for a relative error, 0.05 for 5 %.
 
         On each curve of `CostPoint.error`, the error between two measured points is a power of the samples; the samples
-        are the fewest whose error is at most `error`, and none are beyond those that were measured.
+        are the fewest whose error is at most `error`, and none are beyond those that were measured. Except of
+        "independent" they are powers of two or measured ones: other numbers are spread less evenly.
 
         Args:
             error: relative error, bias included where it was measured.
@@ -239,6 +240,8 @@ class AccuracyReport:
         if n > 0 and after.error > 0:
             share = math.log(before.error / wanted) / math.log(before.error / after.error)
             spp = math.ceil(before.spp * (after.spp / before.spp) ** share * (1.0 - 1e-9))
+            if after.choice.sampler != "independent":
+                spp = min(1 << (spp - 1).bit_length(), after.spp)
             share = math.log(spp / before.spp) / math.log(after.spp / before.spp)
         part = 1.0 if n == 0 else (spp - before.spp) / (after.spp - before.spp)
         low, high = (
