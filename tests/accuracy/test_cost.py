@@ -400,6 +400,10 @@ def test_gradients_are_compared_with_the_finest_that_has_some():
         progress=False,
     )  # fmt: skip
     assert report.settings["finest"] == {"values": "independent, box", "gradients": "independent, tent"}
+    report = tt.cost_of_accuracy(
+        wall_renderer(), spp=(4,), repeats=2, samplers=("independent", "owen"), max_depths=(1, 2, -1), progress=False
+    )
+    assert report.settings["finest"] == {"values": "owen, tent, any depth"}
 
 
 def test_settings_that_a_film_does_not_have():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import time
@@ -103,6 +104,18 @@ def test_the_front_goes_by_the_noise_where_no_bias_was_measured():
     report = AccuracyReport([point(*each) for each in figures], "")
     assert [p.error for p in report.pareto("transient")] == [0.5, 0.2]
     assert "Pareto front of transient" in report.table() and "total" not in report.table()
+
+
+def test_the_error_is_at_least_that_of_the_noise():
+    """Of little bias a reference says nothing, or a squared error below zero."""
+    few = {"total_squared_error": -0.01, "total_squared_error_standard_error": 0.2, "total_error": 0.0}
+    lucky = point(SLOW, 4, 1.0, 0.5, **few)
+    assert lucky.error == 0.5
+    report = AccuracyReport([lucky, point(BIASED, 4, 2.0, 0.4, bias=0.0)], "")
+    assert [p.error for p in report.pareto()] == [0.5, 0.4]
+    assert report.recommend(0.45).choice == BIASED and report.recommend(0.5).low > 0.4
+    unknown = dataclasses.replace(lucky, squared_error=-0.01, relative_error=0.0)
+    assert math.isnan(unknown.error) and dataclasses.replace(unknown, squared_error=0.0).error == 0.0
 
 
 @pytest.mark.parametrize("degrees, t", [(1, 12.706), (4, 2.7764), (10, 2.2281), (math.inf, 1.95996)])

@@ -117,6 +117,13 @@ def test_bands_totals_and_the_front(drawn):
     assert [panel.get_title(loc="right") for panel in (left, right)] == ["noise and bias", "noise alone"]
 
 
+def test_the_picture_is_that_of_the_points(drawn):
+    """Not of a band that goes anywhere."""
+    wide = Curve("q", "a", [4, 16], [1.0, 2.0], [0.4, 0.1], band=[(1e-20, 1e20), (0.05, 0.2)])
+    _, panels = drawn([wide])
+    assert panels[0, 0].get_ylim() == panels[0, 1].get_ylim() == pytest.approx((0.025, 1.6))
+
+
 def test_of_many_curves_those_on_the_front_have_colours(drawn):
     curves = [Curve("q", str(k), [4, 16], [1.0 + k, 2.0 + k], [0.4, 0.1], on_front=[k == 7, k == 3]) for k in range(9)]
     _, panels = drawn(curves)

@@ -72,8 +72,8 @@ def cost_of_accuracy(
     Every combination of samplers, filters, integrators, depths and bin widths is one curve. Its *error* is that of its
     own noise: every curve is compared with its own expectation, and what a filter blurs does not count. Its *total
     error* is measured where anything but samplers is compared, and of ``quantities``: the distance to a reference of
-    the finest setting (deepest paths, narrowest bins, box before tent before gaussian, the first integrator and
-    sampler), so that light that a small depth leaves out, and detail that a filter or a wide bin blurs, count as bias.
+    the finest setting (deepest paths, narrowest bins, box before tent before gaussian; of samplers "owen", else the
+    first, and the first integrator), so that light that a small depth leaves out, and detail that a filter or a wide bin blurs, count as bias.
     What the finest setting itself lacks is not seen. Histograms are compared on the narrowest bins, wide ones spread
     evenly over them.
 
@@ -89,7 +89,7 @@ def cost_of_accuracy(
 
     Of a phasor film the quantity "phasor" takes the place of "transient": real and imaginary parts, frequencies in the
     place of bins; of a gated film "gated". Both have no temporal filters and no bins to choose from. A temporary copy
-    of the largest cube is held per curve, two where there is a total error.
+    of the largest cube is held per curve, three where there is a total error.
 
     Args:
         renderer: renders at the current values of its parameters.
@@ -137,8 +137,7 @@ def cost_of_accuracy(
             "name them in TransientRenderer(parameters=[...])"
         )
     functions = {
-        name: function(f"quantities: {name!r}", each, "a RenderOutput")
-        for name, each in (quantities or {}).items()
+        name: function(f"quantities: {name!r}", each, "a RenderOutput") for name, each in (quantities or {}).items()
     }
     twins = _variations(renderer, samplers, temporal_filters, integrators, max_depths, bin_widths)
     axes = [twin.axis for twin in twins.values() if twin.axis is not None]
@@ -217,13 +216,14 @@ def _axis(renderer: TransientRenderer, width: float) -> TimeAxis:
     return TimeAxis(axis.start_opl, wanted, bins)
 
 
-def _blur(choice: Choice) -> tuple[float, float, int]:
-    """Order of choices, the finest first; those that are equal stay in their order."""
+def _blur(choice: Choice) -> tuple[float, float, int, bool]:
+    """Order of choices, the finest first, of equal ones that with the quieter reference; others stay in their order."""
     depth = choice.max_depth
     return (
         0.0 if depth is None else -math.inf if depth < 0 else -depth,
         choice.bin_width_opl or 0.0,
         ("box", "tent", "gaussian").index(choice.temporal_filter) if choice.temporal_filter else 0,
+        choice.sampler != "owen",
     )
 
 

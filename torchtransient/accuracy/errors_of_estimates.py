@@ -92,17 +92,19 @@ class ErrorTally:
     _waiting: NDArray[np.float32] | None = None
     _reference_sums: tuple[Array, Array, NDArray[np.float32]] | None = None
     # Sums over the runs of the deviations from the reference, entry by entry, and of their squares.
-    _deviations: Array | float = 0.0
-    _squares: Array | float = 0.0
+    _deviations: NDArray[np.float32] | None = None
+    _squares: NDArray[np.float32] | None = None
 
     def add(self, run: ArrayLike) -> None:
         """One independent run. Raises ShapeError when its shape differs from the reference's or the run before."""
         x = np.asarray(run, dtype=np.float32)
         if self.reference is not None:
             noise, power, mean = self._against_reference(x)
-            deviations = np.asarray(x - mean, dtype=np.float64)
+            deviations = np.asarray(x - mean, dtype=np.float32)
             squares = _square(deviations)
-            self._deviations, self._squares = self._deviations + deviations, self._squares + squares
+            if self._deviations is None or self._squares is None:
+                self._deviations, self._squares = np.zeros_like(deviations), np.zeros_like(deviations)
+            self._deviations, self._squares = self._deviations + deviations, self._squares + np.float32(squares)
             self.squared.append(self._per_bin(squares) - noise)
             self.power.append(power)
         elif self._waiting is None:
@@ -182,12 +184,13 @@ class ErrorTally:
         mean, which all runs share: E[n^2], with n estimated from two halves, is three times its square.
         """
         runs, reference = len(self.squared), self.reference
-        if reference is None:
-            raise ShapeError("ErrorTally: no reference was given")
+        if reference is None or self._deviations is None or self._squares is None:
+            raise ShapeError("ErrorTally: no run was compared with a reference")
         halves = np.asarray(reference.first, np.float32) - np.asarray(reference.second, np.float32)
         of_reference = _square(halves) / 4.0
-        mean = np.asarray(self._deviations) / runs
-        spread = np.maximum(np.asarray(self._squares) / runs - _square(mean), 0.0) * runs / max(runs - 1, 1)
+        mean = np.asarray(self._deviations, dtype=np.float64) / runs
+        spread = np.maximum(np.asarray(self._squares, dtype=np.float64) / runs - _square(mean), 0.0)
+        spread = spread * runs / max(runs - 1, 1)
         of_mean = spread / runs
         noise = of_mean + of_reference
         without_bias = _square(noise) + _square(of_mean) / max(runs - 1, 1) + _square(of_reference)

@@ -72,8 +72,13 @@ class CostPoint:
 
     @property
     def error(self) -> float:
-        """Relative error with the bias where it was measured, else that of the noise."""
-        return self.relative_error if math.isnan(self.total_error) else self.total_error
+        """Relative error with the bias where it was measured, else that of the noise; NaN where it is not known.
+
+        The total error is no less than the noise, of which it is a worse estimate where there is little bias: against a
+        reference its squared error can come out below zero.
+        """
+        known = [e for e in (self.relative_error, self.total_error) if e > 0 or (e == 0 and self.squared_error == 0)]
+        return max(known, default=math.nan)
 
 
 @dataclass(frozen=True)
@@ -261,7 +266,8 @@ class AccuracyReport:
         )
 
     def _interval(self, point: CostPoint) -> tuple[float, float]:
-        return self.band(point, total=not math.isnan(point.total_error))
+        """The band of `CostPoint.error`."""
+        return self.band(point, total=point.total_error == point.error)
 
     def _quantity(self, who: str, quantity: str | None) -> str:
         """The quantity, the first one for None."""
@@ -412,8 +418,8 @@ class AccuracyReport:
             seconds=[p.seconds for p in curve],
             squared_relative_error=[p.relative_error**2 for p in curve],
             band=_squares([self.band(p) for p in curve]),
-            total=[p.total_error**2 for p in curve] if has_total else None,
-            total_band=_squares([self.band(p, total=True) for p in curve]) if has_total else None,
+            total=[p.error**2 for p in curve] if has_total else None,
+            total_band=_squares([self._interval(p) for p in curve]) if has_total else None,
             slope=None if slope is None else (slope.slope, slope.standard_error),
             on_front=[not alone and p in front for p in curve],
         )

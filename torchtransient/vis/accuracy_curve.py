@@ -58,6 +58,7 @@ def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
         lines = [curve for curve in curves if curve.quantity == quantity]
         for axis, unit in zip(row, ("seconds", "spp"), strict=True):
             _draw(axis, lines, unit)
+        _limit(row[0])
         row[0].set_title(quantity, loc="left", fontsize=10)
         row[0].set_ylabel("squared relative error")
         if any(curve.total is not None for curve in lines):
@@ -70,6 +71,15 @@ def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
     for axis, label in zip(axes[-1], ("seconds per render", "samples per pixel"), strict=True):
         axis.set_xlabel(label)
     save_figure(figure, path, "plot_accuracy", dpi=100)
+
+
+def _limit(axis: Any) -> None:
+    """Show the points of a row: a band that is not known may be any size."""
+    axes = axis.get_shared_y_axes().get_siblings(axis)
+    points = [np.asarray(line.get_ydata()) for each in axes for line in each.lines if line.get_color() != _GUIDE]
+    values = np.concatenate(points) if points else np.empty(0)
+    if values.size:
+        axis.set_ylim(values.min() / 4.0, values.max() * 4.0)
 
 
 def _colours(lines: Sequence[Curve]) -> dict[int, int]:
