@@ -394,16 +394,38 @@ def test_complex_quantities_and_samplers_alone():
     assert all(np.isnan(p.total_error) for p in alone.points) and alone.settings["finest"] == {}
 
 
+@pytest.mark.slow
+def test_polarization_and_phasors():
+    """The degree of polarization of polished walls, and a phasor's phase, are known the better the more samples."""
+    scene = tt.scenes.cornell_box(4, num_bins=20, bin_width_opl=0.3)
+    scene["white"] = {"type": "pplastic", "diffuse_reflectance": 0.5, "alpha": 0.3}
+    scene["integrator"]["hide_emitters"] = True
+    polarized = tt.TransientRenderer(tt.load(scene, "llvm_ad_mono_polarized"), physics="ignore")
+    phasors = tt.TransientRenderer(tt.load(scene, VARIANT), frequencies=[0.0, 0.3], physics="ignore")
+    for renderer, measures, function in (
+        (polarized, "transient", lambda out: tt.stokes.degree_of_polarization(out.steady, dim=0)),
+        (phasors, "phasor", lambda out: out.phasor / out.phasor.abs().clamp(min=1e-20)),
+    ):
+        report = tt.cost_of_accuracy(
+            renderer, spp=(64, 4096), quantities={"made": function}, samplers=("independent",), max_depths=(3, 6),
+            progress=False,
+        )  # fmt: skip
+        assert report.quantities() == [measures, "made"]
+        deep = [p for p in report.points if p.quantity == "made" and p.choice.max_depth == 6]
+        assert 0 < deep[1].total_error < 0.5 * deep[0].total_error
+
+
 def test_gradients_are_compared_with_the_finest_that_has_some():
     report = tt.cost_of_accuracy(
         wall_renderer(), spp=(16,), gradients=[WALL], samplers=("independent",), temporal_filters=("box", "tent"),
         progress=False,
     )  # fmt: skip
     assert report.settings["finest"] == {"values": "independent, box", "gradients": "independent, tent"}
+    values = tt.TransientRenderer(wall_renderer().scene)
     report = tt.cost_of_accuracy(
-        wall_renderer(), spp=(4,), repeats=2, samplers=("independent", "owen"), max_depths=(1, 2, -1), progress=False
+        values, spp=(4,), repeats=2, samplers=("independent", "owen"), max_depths=(1, 2, -1), progress=False
     )
-    assert report.settings["finest"] == {"values": "owen, tent, any depth"}
+    assert report.settings["finest"] == {"values": "owen, box, any depth"}
 
 
 def test_settings_that_a_film_does_not_have():
@@ -414,6 +436,9 @@ def test_settings_that_a_film_does_not_have():
         tt.cost_of_accuracy(renderer, spp=(4,), max_depths=(-2,), progress=False)
     with pytest.raises(ArgumentError, match="quantities: 'depth': expected a function"):
         tt.cost_of_accuracy(renderer, spp=(4,), quantities={"depth": 3}, progress=False)
+    shares = {"share": lambda out: out.transient / (0 * out.transient)}
+    with pytest.raises(UnitError, match="quantities: 'share': expected finite numbers"):
+        tt.cost_of_accuracy(renderer, spp=(4,), quantities=shares, progress=False)
     gated = tt.TransientRenderer(renderer.scene, gates=[tt.Gate.rectangular(7.0, 8.0)])
     with pytest.raises(ArgumentError, match="bin_widths: a gated film has no bins"):
         tt.cost_of_accuracy(gated, spp=(4,), bin_widths=(0.1,), progress=False)

@@ -72,10 +72,10 @@ def cost_of_accuracy(
     Every combination of samplers, filters, integrators, depths and bin widths is one curve. Its *error* is that of its
     own noise: every curve is compared with its own expectation, and what a filter blurs does not count. Its *total
     error* is measured where anything but samplers is compared, and of ``quantities``: the distance to a reference of
-    the finest setting (deepest paths, narrowest bins, box before tent before gaussian; of samplers "owen", else the
-    first, and the first integrator), so that light that a small depth leaves out, and detail that a filter or a wide bin blurs, count as bias.
-    What the finest setting itself lacks is not seen. Histograms are compared on the narrowest bins, wide ones spread
-    evenly over them.
+    the finest setting (deepest paths, narrowest bins, box before tent before gaussian, the first integrator, and of
+    the samplers "owen" or else the first), so that light that a small depth leaves out, and detail that a filter or a
+    wide bin blurs, count as bias. What the finest setting itself lacks is not seen. Histograms are compared on the
+    narrowest bins, wide ones spread evenly over them.
 
     Errors are squared and relative, of independent runs. Seconds are medians of wall time, with CPU seconds beside: a
     forward render for values, render and backward for gradients; the runs of all curves take turns. A loss that is not
@@ -119,7 +119,7 @@ def cost_of_accuracy(
     Raises:
         ArgumentError: for what is no renderer, and settings that its film does not have.
         SceneError: for a key, sampler or integrator that the renderer does not know.
-        UnitError: for counts out of range.
+        UnitError: for counts out of range, and a quantity that is not finite.
         ShapeError: for a quantity whose shape depends on the setting.
     """
     if not isinstance(renderer, TransientRenderer):
@@ -233,7 +233,14 @@ def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], nar
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
-            found = {film.measures: _response(out)} | {name: each(out) for name, each in functions.items()}
+            made = {name: each(out) for name, each in functions.items()}
+        for name, tensor in made.items():
+            if not bool(tensor.isfinite().all()):
+                raise UnitError(
+                    f"quantities: {name!r}: expected finite numbers, got others of a render with {spp} samples per "
+                    "pixel; say what dark pixels have (torch.where, nan_to_num, a clamped divisor)."
+                )
+        found = {film.measures: _response(out)} | made
         return Estimates({name: _array(_real(tensor)) for name, tensor in found.items()}, renderer.samples_drawn(spp))
 
     spread = {}
