@@ -356,7 +356,8 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult|accuracy\.(SamplesNeeded|GradientEstimate))\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult)\(.*\)": "results",
+    r"accuracy\.(SamplesNeeded|GradientEstimate)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
     r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",
