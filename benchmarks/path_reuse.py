@@ -8,7 +8,11 @@ the first, second and last third of the time axis, without the worst 0.1 % of th
 Energy and Student's t of blocks of 8 x 8 pixels x 10 bins are those of reuse against `owen`: mean 0, deviation 1 once
 divided by that of t.
 
-    python benchmarks/path_reuse.py [--scenes cornell,glass] [--runs 12] [--archive FILE] [--json FILE]
+`--fit` measures gradients of a squared relative loss at its optimum instead, 64 samples per pixel, forward by each of
+the three, backward by plain paths with seeds of their own: variance times CPU seconds of a step, of the baseline over
+the others'.
+
+    python benchmarks/path_reuse.py [--fit] [--scenes cornell,glass] [--runs 12] [--archive FILE] [--json FILE]
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ import numpy as np
 import torch
 from _runner import arguments
 from sampler_gain import Moments, cornell, small_lamp, staircase, with_box_of
+from tqdm import trange
 
 import torchtransient as tt
 
@@ -112,20 +117,66 @@ def agreement(one: Moments, other: Moments, runs: int) -> dict[str, float]:
     }
 
 
+def gradients_of_a_fit(runs: int, spp: int, variant: str) -> dict[str, Any]:
+    """Gains of gradients by a lamp, a wall's colour, and a texture of 16 x 16 texels."""
+    keys = {"lamp": "light.emitter.radiance.value", "colour": "red.reflectance.value"}
+    keys["texture"] = "floor.bsdf.reflectance.data"
+    scene = cornell(40)
+    texture = {"type": "bitmap", "data": np.full((16, 16, 3), 0.5, np.float32), "raw": True}
+    scene["floor"] |= {"bsdf": {"type": "diffuse", "reflectance": texture}}
+    loaded = tt.load(scene, variant=variant)
+    renderers = {}
+    for name, (plugin, sampler) in CASES.items():
+        plan = tt.plan(loaded, integrator=plugin, pilot=False, time_axis="scene", max_depth="scene", variant=variant)
+        renderers[name] = plan.renderer(parameters=list(keys.values()), spp=spp, sampler=sampler, physics="ignore")
+    with torch.no_grad():
+        target = sum(renderers["reuse"](seed=9000 + i, spp=16 * spp).transient for i in range(6)) / 6
+    near = torch.from_numpy(nearby(target.numpy()))
+    weight = 1 / (near**2 + (1e-2 * near.mean()) ** 2)
+    found: dict[str, list[list[torch.Tensor]]] = {name: [] for name in CASES}
+    seconds: dict[str, list[float]] = {name: [] for name in CASES}
+    for run in trange(runs + 1, leave=False):
+        for name, renderer in renderers.items():
+            begin = time.process_time()
+            loss = ((renderer(seed=1000 + run).transient - target) ** 2 * weight).mean()
+            gradients = torch.autograd.grad(loss, [renderer.values[key] for key in keys.values()])
+            if run > 0:  # the first one compiles
+                seconds[name].append(time.process_time() - begin)
+                found[name].append([gradient.double() for gradient in gradients])
+    errors = {
+        name: [float(torch.stack(column).var(0).sum()) for column in zip(*found[name], strict=True)] for name in CASES
+    }
+    cost = {name: float(np.median(seconds[name])) for name in CASES}
+    report = {}
+    for name in CASES:
+        scale = cost["independent"] / cost[name]
+        gains = [scale * a / b for a, b in zip(errors["independent"], errors[name], strict=True)]
+        report[name] = {"cpu_seconds": cost[name], "gain": dict(zip(keys, gains, strict=True))}
+    return report
+
+
 def main() -> None:
     parser = arguments(__doc__, peer=False)
     parser.add_argument("--scenes", default=",".join((*SCENES, "staircase")))
     parser.add_argument("--runs", type=int, default=12)
+    parser.add_argument("--fit", action="store_true", help="gradients of a relative loss")
     parser.add_argument("--archive", type=Path, help="staircase_ccby.tar.gz")
     options = parser.parse_args()
     runs = 3 if options.quick else options.runs
-    report = {}
+    report: dict[str, Any] = {}
+    if options.json and options.json.exists():
+        report = json.loads(options.json.read_text())
+    if options.fit:
+        report["fit"] = gradients_of_a_fit(runs, 1 if options.quick else 64, options.variant)
+        for name, x in report["fit"].items():
+            print(f"{name:16}" + "".join(f"{key:>9} {gain:6.2f}" for key, gain in x["gain"].items()))
     scenes = SCENES | {"staircase": (functools.partial(staircase, options.archive, options.variant), 256)}
     heads = (
         "gain", "early", "mid", "late", "trimmed", "squared", "owen", "plan", "CPU", "t mean", "t dev", "energy", "+-"
     )  # fmt: skip
-    print(f"{'scene':16}" + "".join(f"{head:>9}" for head in heads))
-    for name in options.scenes.split(","):
+    if not options.fit:
+        print(f"{'scene':16}" + "".join(f"{head:>9}" for head in heads))
+    for name in () if options.fit else options.scenes.split(","):
         make, spp = scenes[name]
         x = report[name] = measure(make(), 4 if options.quick else spp, runs, options.variant)
         reuse = x["reuse"]
