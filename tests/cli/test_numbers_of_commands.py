@@ -108,7 +108,7 @@ def test_the_overview_shows_the_intensity(monkeypatch, tmp_path, polarized):
     (((transient, steady, axis), more),) = shown
     plain = rendered(0.0, 0.0)
     assert torch.equal(transient, plain.transient) and torch.equal(steady, plain.steady) and axis == plain.axis
-    assert more == {"path": tmp_path / "a.png", "pixel": (1, 0), "title": "title"}
+    assert more == {"path": tmp_path / "a.png", "pixel": (1, 0), "title": "title", "errors": None}
 
 
 # ------------------------------------------------------------------------------------------------------- reconstruct

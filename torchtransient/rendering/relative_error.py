@@ -8,6 +8,7 @@ import torch
 
 from torchtransient.errors import SceneError
 from torchtransient.rendering.error_bars import local_mean
+from torchtransient.rendering.films import measured
 from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.renderer import TransientRenderer
 
@@ -46,4 +47,4 @@ def _runs(renderer: TransientRenderer, seed: int) -> torch.Tensor:
     """Return the bins of some renders, means over channels, (runs, T, H, W)."""
     with torch.no_grad():
         outputs = (renderer(seed=mix_seed(seed, run), spp=SPP) for run in range(RUNS))
-        return torch.stack([renderer.film.tensor(out).mean(0) for out in outputs])
+        return torch.stack([measured(out, renderer.film.measures).mean(0) for out in outputs])
