@@ -79,7 +79,7 @@ def rendered(before, after, inside=100.0, polarized=False):
         transient = torch.stack([transient, *[torch.full_like(transient, 99.0)] * 3])
     return SimpleNamespace(
         polarized=polarized, transient=transient, steady=transient.sum(-3), axis=tt.TimeAxis(1.0, 0.5, 5),
-        outside=(before / (before + inside + after), after / (before + inside + after)),
+        outside=(before / (before + inside + after), after / (before + inside + after)), cells=None,
     )  # fmt: skip
 
 
