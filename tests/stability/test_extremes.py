@@ -1,5 +1,5 @@
-"""Distances, sizes, indices, roughnesses, albedos, extinctions, phase functions and bins from one end of their range to
-the other, against closed forms; every value and derivative on the way is finite.
+"""Distances, sizes, bins, indices, roughnesses and albedos from one end of their range to the other, against closed
+forms; every value and derivative on the way is finite.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import strategies as st
-from scipy.integrate import quad
 
 import torchtransient as tt
 from support.extremes import (
     FACING_DOWN,
+    NOISE,
+    ROUNDING,
+    SAMPLES,
     SKY,
-    fog_between,
     for_all_runs,
     gradients,
     holds,
@@ -31,16 +31,11 @@ from support.extremes import (
 from torchtransient.scenes.transforms import look_at, scale, translate
 
 VARIANT = "llvm_ad_mono"
-# Nothing here warns but of edges that move: all are far outside of the view.
+# Of edges that move the pages tell: here all are far outside of the view.
 pytestmark = pytest.mark.filterwarnings(
-    "error", "ignore::torchtransient.errors.GradientWarning", "ignore::DeprecationWarning:torch"
-)
-ROUNDING = 2e-6  # of a product of some ten factors in single precision
-SAMPLES = 4096
-# Five standard errors of the mean of numbers with a variance of one.
-NOISE = 5 / math.sqrt(SAMPLES)
-SIGMA_T, ALBEDO, G = (f"fog.interior_medium.{name}" for name in ("sigma_t.value.value", "albedo.value.value",
-                                                                 "phase_function.g"))  # fmt: skip
+    "error::RuntimeWarning", "error::torchtransient.errors.PhysicsWarning",
+    "ignore::torchtransient.errors.GradientWarning",
+)  # fmt: skip
 
 # ---------------------------------------------------------------------------------------------------------- lengths
 
@@ -51,7 +46,8 @@ def test_wall_at_any_distance(variant, sampler, examples):
     any number; both follow the wall. Each number of bins is another kernel.
     """
     lamp = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1.0}
-    scene = tt.load(seen_from(0.0, 2, wall={"type": "rectangle", "to_world": square(-1, 1)}, lamp=lamp), variant=variant)
+    wall = {"type": "rectangle", "to_world": square(-1, 1)}
+    scene = tt.load(seen_from(0.0, 2, wall=wall, lamp=lamp), variant=variant)
     pose, albedo = "wall.to_world", "wall.bsdf.reflectance.value"
 
     def property_(distance, share, bins):
@@ -70,7 +66,7 @@ def test_wall_at_any_distance(variant, sampler, examples):
         of_pose, of_albedo = gradients((light * (1 + late)).sum(), at)
         # Up is nearer: the energy grows by 2 / d, and arrives earlier by as much. Adjoints of neighbouring bins differ
         # by 1 / bins, in single precision.
-        assert of_pose[2, 3] == pytest.approx(0, abs=(1e-5 + 2e-7 * bins) * energy / distance)
+        assert of_pose[2, 3] == pytest.approx(0, abs=(1e-5 + 4e-7 * bins) * energy / distance)
         assert of_albedo.sum() == pytest.approx(1 / (math.pi * distance**2), rel=ROUNDING)
 
     bins = magnitudes(2, 1e5).map(round)
@@ -165,8 +161,10 @@ def test_index_of_glass(variant, sampler, examples):
         arrival = 3 * R + (1 + 2 * n) * (1 - R) / n**2
         assert float((light * axis.centers_opl).detach().sum()) == pytest.approx(arrival, abs=3 * noise + ROUNDING * 9)
         of_energy = slope * (1 - 1 / n**2) - 2 * (1 - R) / n**3
-        assert found == pytest.approx(of_energy, abs=2 * noise + 2e-5)
-        assert tangent(renderer, at, eta) == pytest.approx(of_energy, abs=2 * noise + 2e-5)
+        # Where the lobe is drawn a sample has the slope R' / R, of which the deviation is R' / root(R).
+        noise = NOISE * 4 / (n + 1) ** 2
+        assert found == pytest.approx(of_energy, abs=noise + 2e-5)
+        assert tangent(renderer, at, eta) == pytest.approx(of_energy, abs=noise + 2e-5)
         if n == 1:
             late = axis.edges_opl[1:] <= 2.75
             assert float(light[late].detach().sum()) == 0  # half a bin before the 3 m of all there is
@@ -218,6 +216,13 @@ def rough_glass(alpha, n):
     return (F * masking(alpha, 2 * angle)).mean(), ((1 - F) * masking(alpha, refracted)).mean() / n**2
 
 
+def noise_of_sky(energy, largest, alpha):
+    """Five standard errors of samples between 0 and ``largest``, a share of some alpha of which is found by connections
+    to the sky beside the lobe. Another 5e-4 of narrow lobes are the digits of the facet's height.
+    """
+    return NOISE * math.sqrt(max(largest * energy - energy**2, 0) + 2 * alpha)
+
+
 @for_all_runs
 def test_roughness_of_metal(variant, sampler, examples):
     """What facets of a metal without losses send on to a white sky, once."""
@@ -234,8 +239,7 @@ def test_roughness_of_metal(variant, sampler, examples):
         (slope,) = gradients(light, at)
         clamped = max(alpha, 1e-4)  # Mitsuba's
         energy = masking(clamped, 2 * facets(clamped)).mean()
-        # Samples lie between 0 and 1. Narrow lobes lose digits of the facet's height.
-        assert float(light.detach()) == pytest.approx(energy, abs=NOISE * math.sqrt(energy * (1 - energy)) + 5e-4)
+        assert float(light.detach()) == pytest.approx(energy, abs=noise_of_sky(energy, 1, alpha) + 5e-4)
         near = [masking(a, 2 * facets(a)).mean() for a in (0.9 * clamped, 1.1 * clamped)]
         # By the logarithm of the roughness that of the density has a variance of 4 / 3, and its masking less.
         by_log = (near[1] - near[0]) / 0.2 if alpha > 1.001e-4 else 0
@@ -261,9 +265,8 @@ def test_roughness_and_index_of_glass(variant, sampler, examples):
         clamped = max(alpha, 1e-3)
         parts = rough_glass(clamped, n)
         energy = sum(parts)
-        # Samples lie between 0 and 1, or those of the one lobe between 0 and 1 / n^2.
-        noise = NOISE * math.sqrt(max(parts[0] + parts[1] / n**2 - energy**2, 0))
-        assert float(light.detach()) == pytest.approx(energy, abs=noise + 2e-3 * alpha + 1e-4)
+        noise = noise_of_sky(energy, (parts[0] + parts[1] / n**2) / energy, alpha)
+        assert float(light.detach()) == pytest.approx(energy, abs=noise + 5e-4)
         if n < 1.02:
             return  # the half vector has too few digits for a slope
         h = 1e-3 * (n - 1)
@@ -334,147 +337,3 @@ def test_light_is_linear_in_an_albedo(variant, sampler, examples):
         assert slope == pytest.approx(float((white - of_lamp).sum() / white.shape[0]), rel=1e-5)
 
     holds(property_, examples, albedo=numbers(0, 1, 1e-30))
-
-
-# ------------------------------------------------------------------------------------------------------------ media
-
-
-@for_all_runs
-def test_extinction_of_a_shadow(variant, sampler, examples):
-    """exp(-sigma l) of a lamp above a metre of black fog, and its slope in both modes, until it underflows."""
-    scene = seen_from(
-        1.0, 2, floor={"type": "rectangle", "to_world": scale(3)}, fog=fog_between(1.5, 2.5),
-        lamp={"type": "point", "position": [0.01, 0.02, 4.0], "intensity": 1.0},
-    )  # fmt: skip
-    renderer = tt.TransientRenderer(
-        tt.load(scene, variant=variant), [SIGMA_T], time_axis=tt.TimeAxis(0.0, 0.5, 20), spp=4, sampler=sampler
-    )
-    distance = math.sqrt(16 + 5e-4)
-    path, clear = distance / 4, 0.5 / math.pi * 4 / distance**3
-
-    def property_(extinction):
-        at = leaves(renderer, {SIGMA_T: extinction})
-        light = light_over_time(renderer(at, seed=0)).sum()
-        (slope,) = gradients(light, at)
-        energy = clear * math.exp(-extinction * path)
-        near = {"rel": ROUNDING * (1 + extinction), "abs": 1e-37}
-        assert float(light.detach()) == pytest.approx(energy, **near)
-        assert slope.sum() == pytest.approx(-path * energy, **near)
-        assert tangent(renderer, at, SIGMA_T) == pytest.approx(-path * energy, **near)
-
-    holds(property_, examples, extinction=magnitudes(1e-6, 1e5, 0))
-
-
-def scattered_once(extinction, g, height, offset=0.3):
-    """Light of a lamp at ``height`` that fog from z = -1 to 0 scatters straight up once, per albedo: (light, its
-    derivative by the extinction and by g, largest weight of a sample)."""
-
-    def at(z):
-        away = math.hypot(offset, height + z)
-        passed = (z if height > 0 else 1 - z) * away / abs(height + z)
-        c = (height + z) / away
-        root = 1 + g * g + 2 * g * c
-        phase = (1 - g * g) / (4 * math.pi * root**1.5)
-        by_g = -2 * g / (1 - g * g) - 3 * (g + c) / root
-        weight = phase * math.exp(-extinction * passed) / away**2
-        return weight, z + passed, by_g
-
-    deep = min(1.0, 50 / extinction)
-
-    def mean(factor):
-        def integrand(z):
-            weight, length, by_g = at(z)
-            return extinction * math.exp(-extinction * z) * weight * factor(length, by_g)
-
-        return quad(integrand, 0, deep, limit=200, epsabs=0, epsrel=1e-8)[0]
-
-    largest = max(at(z)[0] for z in np.linspace(0, deep, 100))
-    light = mean(lambda length, by_g: 1)
-    of_extinction = light / extinction - mean(lambda length, by_g: length)
-    steepest = max(abs(at(z)[2]) for z in np.linspace(0, deep, 100))
-    return light, of_extinction, mean(lambda length, by_g: by_g), largest, steepest
-
-
-@pytest.mark.parametrize("height", [1.0, -2.0], ids=["lit from above", "lit from below"])
-@for_all_runs
-def test_light_scattered_once(variant, sampler, examples, height):
-    """A metre of fog of any extinction, phase function and albedo. The meter looks at the edge between two triangles of
-    its boundary, and in dense fog all light is scattered beside that boundary.
-    """
-    lamp = {"type": "point", "position": [0.3, 0.0, height], "intensity": 1.0}
-    scene = tt.load(seen_from(1.0, 2, fog=fog_between(-1, 0), lamp=lamp), variant=variant)
-    keys = [SIGMA_T, ALBEDO, G]
-    renderer = tt.TransientRenderer(
-        scene, keys, time_axis=tt.TimeAxis(0.0, 0.1, 100), spp=SAMPLES, sampler=sampler
-    )
-
-    def property_(extinction, albedo, g):
-        at = leaves(renderer, dict(zip(keys, (extinction, albedo, g), strict=True)))
-        light = light_over_time(renderer(at, seed=0)).sum()
-        of_extinction, of_albedo, of_g = (found.sum() for found in gradients(light, at))
-        energy, by_extinction, by_g, largest, steepest = scattered_once(extinction, g, height)
-        # Samples lie between 0 and the largest weight; depths are known to a few roundings of a metre.
-        noise = NOISE * math.sqrt(largest * energy)
-        digits = energy * (ROUNDING + 4e-7 * extinction)
-        assert float(light.detach()) == pytest.approx(albedo * energy, abs=albedo * (noise + digits))
-        assert of_albedo == pytest.approx(energy, abs=noise + digits)
-        # Depths have a deviation of 1 / extinction.
-        assert of_extinction == pytest.approx(albedo * by_extinction, abs=2 * albedo * (noise + digits) / extinction)
-        assert of_g == pytest.approx(albedo * by_g, abs=albedo * (noise + digits) * steepest)
-
-    # From behind, light of dense fog is that of a few samples in a million.
-    densest = 1e5 if height > 0 else 3
-    holds(
-        property_, examples, extinction=magnitudes(0.1, densest, 1), albedo=numbers(0, 1), g=numbers(-0.999, 0.999, 0)
-    )
-
-
-@for_all_runs
-def test_light_from_the_side(variant, sampler, examples):
-    """Across the line of sight g and -g scatter alike, sample by sample, with opposite slopes."""
-    sun = {"type": "directional", "direction": [1.0, 0.0, 0.0], "irradiance": 1.0}
-    scene = tt.load(seen_from(1.0, 2, fog=fog_between(-1, 0), sun=sun), variant=variant)
-    renderer = tt.TransientRenderer(
-        scene, [G, SIGMA_T], time_axis=tt.TimeAxis(-100.0, 1.0, 200), spp=64, sampler=sampler, grad_seed="same"
-    )
-
-    def at_asymmetry(g, extinction):
-        at = leaves(renderer, {G: g, SIGMA_T: extinction})
-        light = light_over_time(renderer(at, seed=0)).sum()
-        return float(light.detach()), float(gradients(light, at)[0].sum())
-
-    def property_(g, extinction):
-        (light, slope), (other, opposite) = at_asymmetry(g, extinction), at_asymmetry(-g, extinction)
-        assert light == pytest.approx(other, rel=1e-5)
-        assert slope == pytest.approx(-opposite, rel=1e-4, abs=1e-6 * light)
-
-    holds(property_, examples // 2, g=numbers(0, 0.999, 0.5), extinction=magnitudes(1e-3, 5))
-
-
-@for_all_runs
-def test_fog_in_a_furnace(variant, sampler, examples):
-    """A sky of radiance one is seen through fog as at most one, and as one where nothing is absorbed and no light has
-    more than the bounces that are followed.
-    """
-    scene = tt.load(seen_from(2.0, 48, fog={**fog_between(-1, 1), "type": "sphere", "to_world": scale(1)}, sky=SKY),
-                    variant=variant)  # fmt: skip
-    keys = [SIGMA_T, ALBEDO, G]
-    renderer = tt.TransientRenderer(
-        scene, keys, time_axis=tt.TimeAxis(0.0, 1.0, 200), spp=1024, sampler=sampler, physics="ignore"
-    )
-
-    def property_(extinction, albedo, g):
-        at = leaves(renderer, dict(zip(keys, (extinction, albedo, g), strict=True)))
-        light = light_over_time(renderer(at, seed=0)).sum()
-        gradients(light, at)
-        # By a connection and by scattering the sky is found with weights that add up to at most one each.
-        noise = 5 / math.sqrt(1024)
-        found = float(light.detach())
-        assert 0 <= found <= 1 + noise
-        # What passes the middle without a collision is no less, and nothing is lost in thin fog of albedo one.
-        assert found >= math.exp(-2 * extinction) - noise
-        if albedo == 1 and extinction <= 1:
-            assert found == pytest.approx(1, abs=noise)
-
-    extinctions, shares = magnitudes(1e-6, 1e5, 0, 1), st.one_of(st.just(1.0), numbers(0, 1))
-    holds(property_, examples, extinction=extinctions, albedo=shares, g=numbers(-0.999, 0.999, 0))

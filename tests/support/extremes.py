@@ -15,6 +15,10 @@ from hypothesis import strategies as st
 import torchtransient as tt
 from torchtransient.scenes.transforms import scale, translate
 
+ROUNDING = 2e-6  # of a product of some ten factors in single precision
+SAMPLES = 4096
+NOISE = 5 / math.sqrt(SAMPLES)  # five standard errors of the mean of numbers with a variance of one
+
 for_all_runs = pytest.mark.parametrize(
     ("variant", "sampler", "examples"),
     [
