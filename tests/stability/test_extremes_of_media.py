@@ -28,7 +28,7 @@ from support.extremes import (
     seen_from,
     tangent,
 )
-from torchtransient.scenes.transforms import scale
+from torchtransient.scenes.transforms import scale, translate
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::torchtransient.errors.PhysicsWarning")
@@ -177,3 +177,36 @@ def test_fog_in_a_furnace(variant, sampler, examples):
 
     extinctions, shares = magnitudes(1e-6, 1e5, 0, 1), st.one_of(st.just(1.0), numbers(0, 1))
     holds(property_, examples, extinction=extinctions, albedo=shares, g=numbers(-0.999, 0.999, 0))
+
+
+def test_lamp_just_inside_of_fog():
+    """The shadow ray ends in the fog, a millimetre behind its boundary, as far as such rays stop before an occluder."""
+    depth = 1e-3
+    scene = seen_from(
+        1.0, 2, floor={"type": "rectangle", "to_world": scale(3)}, fog=fog_between(1.5, 2.5),
+        lamp={"type": "point", "position": [0.0, 0.0, 1.5 + depth], "intensity": 1.0},
+    )  # fmt: skip
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), [SIGMA_T], time_axis=tt.TimeAxis(0.0, 0.5, 10))
+    for extinction in (1.0, 1e3):
+        at = leaves(renderer, {SIGMA_T: extinction})
+        light = light_over_time(renderer(at, seed=0, spp=4)).sum()
+        expected = 0.5 / math.pi / (1.5 + depth) ** 2 * math.exp(-extinction * depth)
+        # Of the depth four digits are left in single precision.
+        assert float(light.detach()) == pytest.approx(expected, rel=1e-3)
+        assert gradients(light, at)[0].sum() == pytest.approx(-depth * expected, rel=2e-3)
+
+
+def test_boundary_met_between_two_triangles():
+    """A ray along the diagonal of a face may slip through it: derivatives have to follow the ray of the render."""
+
+    def slope(*aside):
+        fog = fog_between(-1, 0)
+        fog["to_world"] = translate([*aside, 0]) @ fog["to_world"]
+        lamp = {"type": "point", "position": [0.3, 0.0, -2.0], "intensity": 1.0}
+        scene = tt.load(seen_from(1.0, 2, fog=fog, lamp=lamp), variant=VARIANT)
+        renderer = tt.TransientRenderer(scene, [SIGMA_T], time_axis=tt.TimeAxis(0.0, 0.1, 100), spp=SAMPLES)
+        light = renderer(seed=0).steady.sum()
+        return float(gradients(light, renderer.values)[0].sum()), float(light.detach())
+
+    (met_at_edge, light), (met_in_face, _) = slope(0, 0), slope(0.13, 0.07)
+    assert met_at_edge == pytest.approx(met_in_face, abs=1e-5 * light)

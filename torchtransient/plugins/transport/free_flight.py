@@ -252,18 +252,19 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hid
         T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
     else:
         rng = generator(numbers, lanes, SHADOW)
-        t = mi.Float(0)
         medium = mi.MediumPtr(medium)
         T = mi.UnpolarizedSpectrum(1)
         visible = mi.Bool(active)
-        until = ray.maxt
+        # The ray starts a little off the surface that ``length`` counts from, and ends before an occluder at the end.
+        until, last = ray.maxt, ray.maxt / (1 - mi.math.ShadowEpsilon)
+        t = last - length
         ray = mi.Ray3f(ray)
-        ray.maxt = dr.select(dr.isfinite(until), until / (1 - mi.math.ShadowEpsilon) - shortest(ray(until)), until)
+        ray.maxt = last - shortest(ray(last))
         pi = scene.ray_intersect_preliminary(ray, active=active)
         going = mi.Bool(active)
         while dr.hint(going, label="transmittance through media"):
             inside = going & (medium != None)  # noqa: E711
-            t_end = dr.minimum(pi.t, length)
+            t_end = dr.minimum(pi.t, last)
             collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
             blocked = pi.is_valid() & ~lets_through(media, ray, pi, hide)
