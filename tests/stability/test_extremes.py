@@ -193,6 +193,26 @@ def test_index_of_metal(variant, sampler, examples):
     holds(property_, examples, n=numbers(0, 4, 1, 1e-3), k=numbers(1e-3, 10, 1))
 
 
+@for_all_runs
+def test_index_of_plastic(variant, sampler, examples):
+    """A white base under a smooth coating of any index sends back all the light of a white sky."""
+    bsdf = {"type": "diff_plastic", "int_ior": 1.5, "ext_ior": 1.0, "diffuse_reflectance": 1.0}
+    scene = tt.load(seen_from(0.5, 3, plate={"type": "rectangle", "bsdf": bsdf}, sky=SKY), variant=variant)
+    key = "plate.bsdf.eta"
+    renderer = tt.TransientRenderer(
+        scene, [key], time_axis=tt.TimeAxis(0.0, 0.5, 60), spp=SAMPLES, sampler=sampler
+    )
+
+    def property_(n):
+        at = leaves(renderer, {key: n})
+        light = light_over_time(renderer(at, seed=0)).sum()
+        gradients(light, at)
+        # The transmittance of the coating differs between directions by up to a third. Mitsuba's fit is good to 2e-3.
+        assert float(light.detach()) == pytest.approx(1, abs=NOISE / 3 + 2e-3)
+
+    holds(property_, examples, n=numbers(1, 4, 1 + 1e-6, 2))
+
+
 # Random numbers that draw visible facets along the normal, by the angle of the facet.
 U = (np.arange(20000) + 0.5) / 20000
 
