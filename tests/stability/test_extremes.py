@@ -120,9 +120,9 @@ def test_room_of_any_size(variant, sampler, examples):
     def property_(size):
         lifted = 9e-5 * (1 + 1 / size)
         found, of_pose, of_albedo = rendered(size)
-        assert found.sum() == pytest.approx(light.sum(), rel=lifted)
+        assert found.sum() == pytest.approx(light.sum(), rel=2 * lifted)
         np.testing.assert_allclose(found, light, atol=10 * lifted * light.max())
-        assert of_albedo == pytest.approx(painted, rel=lifted)
+        assert of_albedo == pytest.approx(painted, rel=2 * lifted)
         # Segments in corners are as short as they are lifted.
         assert of_pose == pytest.approx(moving, rel=30 * lifted)
 
