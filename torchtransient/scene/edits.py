@@ -390,7 +390,7 @@ def _substitute_twins(state: Any, options: BuildOptions) -> None:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
             if plugin in BUILDS_LOBES and name in asked:
                 node.props["lobes"] = ",".join(sorted(asked[name]))
-        elif plugin in PLASTICS.values() and _lacks_mean(state, node):
+        elif plugin in PLASTICS.values() and (_lacks_mean(state, node) or _is_too_bright(node.props)):
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin in COMPLETED_PLUGINS:
             node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
@@ -409,6 +409,17 @@ def _lacks_mean(state: Any, node: Any) -> bool:
 
     described = any(inner.props.plugin_name() in TEXTURES_WITHOUT_MEAN for inner in descendants(state, node))
     return described or any(isinstance(v, mi.Texture) and not has_mean(v) for _, v in node.props.items())
+
+
+def _is_too_bright(props: Any) -> bool:
+    """Return whether a node is a smooth plastic whose index is beyond that of Mitsuba's fit (see ``diff_plastic``)."""
+    from torchtransient.plugins.bsdfs.ior import relative_index
+    from torchtransient.plugins.bsdfs.plastic import GOOD_FIT
+
+    given = any(name in props for name in ("int_ior", "ext_ior"))
+    if props.plugin_name() != "plastic" or not given:
+        return False
+    return bool(relative_index(props, "plastic", "polypropylene")[0] > GOOD_FIT)
 
 
 def _has_index_of_one(props: Any) -> bool:
