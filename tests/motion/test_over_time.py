@@ -52,7 +52,7 @@ def relative(found, truth):
 
 
 def test_a_wall_that_comes_nearer(facing):
-    """Its distance and its brightness change: the second makes 62 % of the signal. What three poses leave is the fourth
+    """Its distance and its brightness change: the second makes 62 % of the beat. What three poses leave is the fourth
     degree in time, (30 mm of a wavelength of 10 m)^3, and rounding of a phasor of 260 times the signal.
     """
     x, g = np.polynomial.legendre.leggauss(200)
@@ -61,6 +61,8 @@ def test_a_wall_that_comes_nearer(facing):
     out = tt.over_time(facing, {"wall": TOWARDS}, HETERODYNE, seed=0)
     assert out.phasor.shape == (3, 1, 1, 1) and out.phasor.dtype == torch.complex64
     assert relative(out.phasor, np.full((3, 1, 1, 1), truth)) < 2e-4
+    as_bright = (g / 2 * wall_phasor(2 - 10 * t) * (1 - 5 * t) ** 2 * np.exp(2j * np.pi * BEAT_HZ * t)).sum()
+    assert abs(as_bright - truth) / abs(truth) == pytest.approx(0.62, abs=0.01)
     steady = (g / 2 * 0.5 / np.pi / (2 - 10 * t) ** 2).sum()
     torch.testing.assert_close(out.steady, torch.full((3, 1, 1), steady), rtol=1e-5, atol=0, check_dtype=False)
     assert relative(instants(facing, {"wall": TOWARDS}, 0), np.full((3, 1, 1, 1), truth)) < 2e-4
@@ -85,7 +87,7 @@ def test_against_many_instants_in_a_corner():
     scene, motion = corner()
     renderer = renderer_of(scene, "second.to_world", spp=4096, frequencies=FREQUENCIES)
     moving = {"second": tt.Motion(**motion)}
-    assert relative(tt.over_time(renderer, moving, HETERODYNE, seed=1).phasor, instants(renderer, moving, 1)) < 1e-2
+    assert relative(tt.over_time(renderer, moving, HETERODYNE, seed=1).phasor, instants(renderer, moving, 1)) < 2e-3
 
 
 def test_camera_and_lamp_that_move_together_are_a_world_that_moves():
@@ -203,9 +205,10 @@ WALL = "wall.to_world"
         (lambda r: tt.over_time(r, {"wall": lambda t: torch.eye(4)}, HETERODYNE), ShapeError,
          r"returns \(3, 4, 4\) for 3 times of 'wall.to_world', got \(4, 4\)"),
         (lambda r: tt.over_time(r, lambda t: torch.eye(4), HETERODYNE), ArgumentError, r"a dictionary \{key: values\}"),
+        (lambda r: tt.over_time(r, {}, HETERODYNE), ArgumentError, "expected something that moves, got nothing"),
         (lambda r: tt.over_time(r, {"wall": 10.0}, HETERODYNE), ArgumentError, "wall: expected a function of times"),
         (lambda r: tt.over_time(r, TOWARDS, HETERODYNE), ArgumentError, "expected a function of times"),
-        (lambda r: tt.over_time(r, {"wall": TOWARDS}, 1e-3), ArgumentError, "exposure: expected a SlowTimes, got 0.001"),
+        (lambda r: tt.over_time(r, {"wall": TOWARDS}, 1e-3), ArgumentError, "expected a SlowTimes, got 0.001"),
         (lambda r: tt.over_time(r.scene, {"wall": TOWARDS}, HETERODYNE), ArgumentError, "expected a TransientRenderer"),
         (lambda r: tt.over_time(r, {"wall": TOWARDS}, HETERODYNE, seed=[0, 1, 2]), UnitError, "one whole number"),
         (lambda r: tt.over_time(r, {}, HETERODYNE, values={WALL: torch.eye(4).expand(3, 4, 4)}), ShapeError,
@@ -221,7 +224,7 @@ def test_films_and_renderers_that_are_refused():
     histogram = renderer_of(make_room(), "box.to_world", "light.intensity.value", spp=1)
     with pytest.raises(ArgumentError, match=r"seen by a phasor film, got one that measures transient"):
         tt.over_time(histogram, {"box": TOWARDS}, HETERODYNE)
-    with pytest.raises(ArgumentError, match="moves to_world, position, vertex_positions, got 'light.intensity.value'"):
+    with pytest.raises(ArgumentError, match=r"moves to_world, position, .*, got 'light\.intensity\.value'"):
         tt.over_time(histogram, {"light.intensity.value": TOWARDS}, tt.Frames([0.0]))
     numbered = renderer_of(make_room(), "box.to_world", spp=1, grad_seed=7)
     with pytest.raises(ArgumentError, match="grad_seed=None or 'same'"):

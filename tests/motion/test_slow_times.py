@@ -57,7 +57,8 @@ def test_rows_see_their_own_times(row_s, rows, poses):
     pictures = polynomial(t).reshape(-1, 1, 1, 1).expand(-1, 2, rows, 3)
     at = shutter.rows_s(rows) / 1e-3
     assert at[0] == pytest.approx(-1e3 * row_s * (rows - 1) / 2, abs=1e-12)
-    torch.testing.assert_close(shutter.combine(pictures), polynomial(at)[:, None].expand(2, rows, 3), atol=1e-11, rtol=0)
+    expected = polynomial(at)[:, None].expand(2, rows, 3)
+    torch.testing.assert_close(shutter.combine(pictures), expected, atol=1e-11, rtol=0)
 
 
 def test_phase_steps_take_each_tap_from_its_own_exposure():

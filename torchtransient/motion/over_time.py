@@ -62,7 +62,7 @@ def over_time(
 
     Raises:
         ArgumentError: for a renderer with a whole number as ``grad_seed``, whose poses would differ in noise; for films
-            without what the exposure needs; for a motion of what has no place.
+            without what the exposure needs; for a motion of what has no place, and for none.
         UnknownKeyError: for keys and names that the renderer does not have.
         ShapeError: for batches, and functions that return other than one value for each time.
         SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
@@ -70,7 +70,7 @@ def over_time(
     Not supported: Doppler shifts of the light itself. See ``docs/motion.md``.
     """
     of_class("over_time: renderer", renderer, TransientRenderer)
-    of_class("over_time: exposure", exposure, SlowTimes, ", such as tt.Exposure(1e-3)")
+    of_class("over_time: exposure", exposure, SlowTimes, ", such as tt.Exposure(1e-3)")  # type: ignore[type-abstract]
     if exposure.needs_phasors and not renderer.film.is_complex:
         raise ArgumentError(
             f"over_time: {exposure} is seen by a phasor film, got one that measures {renderer.film.measures}. Make the "
@@ -100,6 +100,8 @@ def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dic
         at = {name: how if isinstance(how, Motion) else _called(name, how, time_s) for name, how in moving.items()}
     else:
         at = dict(mapping("over_time: function of times", _called("moving", moving, time_s), "{key: values}"))
+    if not at:
+        raise ArgumentError("over_time: expected something that moves, got nothing. renderer(...) renders still ones.")
     found: dict[str, Tensor] = {}
     for name, value in at.items():
         key = _key_of(name, own)

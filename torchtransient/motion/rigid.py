@@ -29,7 +29,11 @@ class Motion:
     """
 
     def __init__(
-        self, *, linear: Numbers = (0.0, 0.0, 0.0), angular: Numbers = (0.0, 0.0, 0.0), center: Numbers = (0.0, 0.0, 0.0)
+        self,
+        *,
+        linear: Numbers = (0.0, 0.0, 0.0),
+        angular: Numbers = (0.0, 0.0, 0.0),
+        center: Numbers = (0.0, 0.0, 0.0),
     ) -> None:
         self.linear, self.angular = _three("linear", linear), _three("angular", angular)
         self.center = _three("center", center)

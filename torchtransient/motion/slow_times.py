@@ -94,9 +94,8 @@ class Exposure(SlowTimes):
         if pictures.is_complex():
             # In double precision: what stands still is a thousand times what is left.
             weights = self.weights().to(pictures.device)
-            return torch.tensordot(weights, pictures.to(weights.dtype), 1).to(pictures.dtype)
-        weights = torch.tensor(_beat_weights(int(self.poses), 0.0).real)
-        return torch.tensordot(weights.to(pictures), pictures, 1)
+            return _sum(weights, pictures.to(weights.dtype)).to(pictures.dtype)
+        return _sum(torch.tensor(_beat_weights(int(self.poses), 0.0).real).to(pictures), pictures)
 
 
 @dataclass(frozen=True)
@@ -182,11 +181,11 @@ class PhaseSteps(SlowTimes):
         n = int(self.number)
         if taps.ndim < 5 or taps.shape[0] != n or taps.shape[-3] not in (n, 2 * n):
             raise ShapeError(
-                f"PhaseSteps: expected taps ({n}, ..., C, {n} or {2 * n}, H, W), got {tuple(taps.shape)}: exposures are "
-                "phase steps times frequencies."
+                f"PhaseSteps: expected taps ({n}, ..., C, {n} or {2 * n}, H, W), got {tuple(taps.shape)}: exposures "
+                "are phase steps times frequencies."
             )
-        each = taps.unflatten(-3, (n, -1))
-        return torch.cat([each[k, ..., k, :, :, :] for k in range(n)], -3)
+        each = taps.shape[-3] // n
+        return torch.cat([taps[k, ..., k * each : (k + 1) * each, :, :] for k in range(n)], -3)
 
 
 class Frames(SlowTimes):
@@ -221,6 +220,12 @@ class Frames(SlowTimes):
 # ------------------------------------------------------------------------------------------------------- polynomials
 
 
+def _sum(weights: Tensor, pictures: Tensor) -> Tensor:
+    """Return the weighted sum over the first dimension."""
+    total: Tensor = torch.tensordot(weights, pictures, 1)
+    return total
+
+
 def _check_poses(name: str, poses: int, least: int = 1) -> None:
     if count(f"{name}: poses", poses, 1, UnitError, _MOST_POSES) < least:
         raise UnitError(f"{name}: expected at least two poses for a beat: one sees no motion.")
@@ -232,7 +237,7 @@ def _nodes(poses: int) -> NDArray[np.float64]:
 
 
 def _coefficients(poses: int) -> NDArray[np.float64]:
-    """Return the Legendre coefficients (degree, node) of the polynomial that is one at a node and zero at the others."""
+    """Return Legendre coefficients (degree, node) of the polynomials that are one at a node and zero at the others."""
     x, g = np.polynomial.legendre.leggauss(poses)
     degree = np.arange(poses)[:, None]
     return (degree + 0.5) * g * np.polynomial.legendre.legvander(x, poses - 1).T
@@ -249,4 +254,5 @@ def _beat_weights(poses: int, turns: float) -> NDArray[np.complex128]:
     # The beat is no polynomial: nodes enough for it.
     x, g = np.polynomial.legendre.leggauss(poses + 32 + math.ceil(math.pi * abs(turns)))
     beat = g / 2 * np.exp(1j * math.pi * turns * x)
-    return beat @ np.polynomial.legendre.legvander(x, poses - 1) @ _coefficients(poses)
+    weights: NDArray[np.complex128] = beat @ np.polynomial.legendre.legvander(x, poses - 1) @ _coefficients(poses)
+    return weights
