@@ -20,6 +20,7 @@ from support.moving_scenes import (
 from support.sweeps import together
 from tools.small_room import make_room
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.motion import SlowTimes
 
 VARIANT = "llvm_ad_rgb"
 HETERODYNE = tt.Exposure(EXPOSURE_S, beat_hz=BEAT_HZ)
@@ -181,6 +182,27 @@ def test_shapes_of_a_merge_have_poses_of_their_own():
     assert not torch.equal(shutter.transient, renderer(seed=0).transient)
     with pytest.raises(UnknownKeyError, match="this renderer has no parameter 'both'"):
         tt.over_time(renderer, {"both": moving["box"]}, tt.RollingShutter(1e-3), seed=0)
+
+
+def test_a_camera_of_ones_own_and_times_with_gradients(facing):
+    """The difference of two instants, and its slope by when the second is."""
+
+    class Pair(SlowTimes):
+        def __init__(self, later):
+            self.later = later
+
+        def poses_s(self, rows):
+            return torch.stack([torch.zeros(()), self.later]).double()
+
+        def combine(self, pictures):
+            return pictures[1] - pictures[0]
+
+    later = torch.tensor(0.01, requires_grad=True)
+    out = tt.over_time(facing, {"wall": TOWARDS}, Pair(later), seed=0)
+    z = 2 - 10 * 0.01
+    assert relative(out.steady, np.full((3, 1, 1), 0.5 / np.pi * (1 / z**2 - 1 / 4))) < 1e-4
+    (slope,) = torch.autograd.grad(out.steady[0, 0, 0], later)
+    assert float(slope) == pytest.approx(0.5 / np.pi * 2 * 10 / z**3, rel=1e-3)
 
 
 def test_sensors_and_seeds(facing):

@@ -74,6 +74,16 @@ def test_phase_steps_take_each_tap_from_its_own_exposure():
             steps.taps(torch.ones(shape))
 
 
+def test_autocast_leaves_the_weights_as_they_are():
+    """Weighted sums are no matrix products, which autocast rounds to 3e-3."""
+    pictures = torch.rand(3, 2, 4, 4, generator=torch.Generator().manual_seed(0))
+    exact = tt.Exposure(1e-3).combine(pictures.double())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert (tt.Exposure(1e-3).combine(pictures) - exact).abs().max() < 1e-6
+        moved = tt.Motion(angular=(0.1, 0.2, 0.3)).matrices(torch.tensor([0.7]))
+    assert torch.equal(moved, tt.Motion(angular=(0.1, 0.2, 0.3)).matrices(torch.tensor([0.7])))
+
+
 def test_times_of_frames_keep_their_gradient():
     t = torch.tensor([0.0, 1.0], requires_grad=True)
     assert tt.Frames(t).poses_s().requires_grad and tt.Frames([0.0, 0.5]).poses_s().tolist() == [0.0, 0.5]

@@ -129,9 +129,10 @@ def _key_of(name: str, own: Mapping[str, Tensor]) -> str:
     for key in (name, *(f"{name}.{place}" for place in _PLACES)):
         if key in own:
             return key
+    example = name if "." in str(name) else f"{name}.to_world"
     raise UnknownKeyError(
-        f"{unknown_key(name, list(own), 'this renderer')} What moves is a parameter of the renderer: "
-        f"TransientRenderer(scene, parameters=['{name}.to_world'])."
+        f"{unknown_key(name, list(own), 'this renderer')} What moves is one of its parameters: "
+        f"TransientRenderer(scene, parameters=['{example}'])."
     )
 
 

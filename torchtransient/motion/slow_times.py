@@ -93,9 +93,8 @@ class Exposure(SlowTimes):
         """Return the average of pictures (poses, ...), with the beat if they are complex."""
         if pictures.is_complex():
             # In double precision: what stands still is a thousand times what is left.
-            weights = self.weights().to(pictures.device)
-            return _sum(weights, pictures.to(weights.dtype)).to(pictures.dtype)
-        return _sum(torch.tensor(_beat_weights(int(self.poses), 0.0).real).to(pictures), pictures)
+            return _sum(self.weights(), pictures.to(torch.complex128)).to(pictures.dtype)
+        return _sum(torch.tensor(_beat_weights(int(self.poses), 0.0).real), pictures)
 
 
 @dataclass(frozen=True)
@@ -131,8 +130,7 @@ class RollingShutter(SlowTimes):
         """Return the pictures (poses, ..., H, W) with each row at its time."""
         rows = pictures.shape[-2]
         weights = torch.tensor(_polynomial(int(self.poses), np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)))
-        shape = [len(weights), *[1] * (pictures.ndim - 3), rows, 1]
-        return (weights.to(pictures).reshape(shape) * pictures).sum(0)
+        return _sum(weights[..., None], pictures)
 
 
 @dataclass(frozen=True)
@@ -221,9 +219,10 @@ class Frames(SlowTimes):
 
 
 def _sum(weights: Tensor, pictures: Tensor) -> Tensor:
-    """Return the weighted sum over the first dimension."""
-    total: Tensor = torch.tensordot(weights, pictures, 1)
-    return total
+    """Return the sum over the first dimension; weights (K, ...) have the last dimensions of the pictures."""
+    between = [1] * (pictures.ndim - weights.ndim)
+    # Not as a matrix product, which autocast rounds to half precision.
+    return (weights.to(pictures).reshape(len(weights), *between, *weights.shape[1:]) * pictures).sum(0)
 
 
 def _check_poses(name: str, poses: int, least: int = 1) -> None:
