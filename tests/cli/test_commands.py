@@ -59,9 +59,19 @@ def test_render_to_a_tolerance(folder):
     assert "of 90% of the bins with light, reached" in result.output and f"{expected.error:.3g}" in result.output
     short = run("render", "box.xml", "-o", "out.npz", "--rtol", 1e-5, "--max-seconds", 0.2, "--quiet")
     assert short.exit_code == 0 and "not reached" in short.output and "max_seconds" in short.output
-    for options in (("--max-seconds", 1), ("--rtol", 0.1, "--spp", 4), ("--rtol", 2)):
+    for options in (("--max-seconds", 1), ("--rtol", 0.1, "--spp", 4), ("--rtol", 2), ("--rtol", 0.1, "--errors")):
         wrong = run("render", "box.xml", *options)
         assert wrong.exit_code == 2 and options[0] in wrong.output
+
+
+def test_render_with_error_bars(folder):
+    result = run("render", "box.xml", "-o", "out.npz", "--errors", "--overview", "out.png", "--seed", 3, "--quiet")
+    assert result.exit_code == 0, result.output
+    expected = tt.render("box.xml", seed=3, errors=True)
+    stored = read_result(folder / "out.npz")
+    assert torch.allclose(stored.standard_error(), expected.standard_error())
+    assert f"sum known to {expected.relative_error():.2%}" in result.output
+    assert (folder / "out.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize("ending", long(["h5", "npz"], ["h5"]))

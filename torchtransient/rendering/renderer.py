@@ -179,7 +179,8 @@ class TransientRenderer(CopiesParametrized):
         self._watch = PhysicsWatch(physics, self.scene.warned)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
-        changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
+        if isinstance(effects, Effects):
+            changes |= {"integrator": effects.integrator, "rr_depth": effects.rr_depth}
         self.sampler = checked_sampler(sampler)
         self._options = self._build_options(max_depth, changes)
         self._infos = self._parameter_infos()
