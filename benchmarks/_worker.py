@@ -3,8 +3,8 @@
 Run as `python _worker.py LIBRARY VARIANT` with LIBRARY `torchtransient`, `mitransient` or `mitsuba`. It imports only
 the named library, so that each side of a comparison runs in its own environment. Requests:
   {"do": "load", "name", "scene", "gradients": [keys], "shifts": {key: [x, y, z]}}           -> {"ok": true}
-  {"do": "render", "name", "spp", "seed"}                                              -> {"seconds", "mean"}
-  {"do": "save", "name", "spp", "seed", "file"}   render, and write the transient as .npy -> {"seconds", "mean"}
+  {"do": "render", "name", "spp", "seed"}                                 -> {"seconds", "cpu_seconds", "mean"}
+  {"do": "save", "name", "spp", "seed", "file"}   render, and write the transient as .npy -> the same
   {"do": "backward", "name", "spp", "seed"}   render, then render_backward              -> {"seconds", "gradients"}
   {"do": "first", "what": "render" or "backward", "name", "spp", "seed"}   with its kernels -> {"seconds", "kernels"}
   {"do": "memory"}                                                                     -> {"peak_bytes"}
@@ -72,15 +72,15 @@ class Job:
 
     def render(self, spp, seed, file=None):
         """Seconds of one render, everything evaluated; the mean of the result as a check."""
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), time.process_time()
         images = self.integrator.render(self.scene, sensor=0, seed=seed, spp=spp)
         dr.eval(images)
         dr.sync_thread()
-        seconds = time.perf_counter() - begin
+        seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
         image = images[0] if isinstance(images, tuple) else images
         if file is not None:
             np.save(file, np.array(images[1]))
-        return {"seconds": seconds, "mean": float(np.array(image, dtype=np.float64).mean())}
+        return {"seconds": seconds, "cpu_seconds": cpu, "mean": float(np.array(image, dtype=np.float64).mean())}
 
     def backward(self, spp, seed):
         """Seconds of attaching the parameters, rendering, and the backward pass down to the leaves."""

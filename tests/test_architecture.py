@@ -33,7 +33,7 @@ LEVEL = {
     "scenes": 2,
     "scene": 3,
     "rendering": 4,
-    "files": 5, "nlos": 5, "data": 5, "accuracy": 5, "testing": 5, "training": 5,
+    "files": 5, "motion": 5, "nlos": 5, "data": 5, "accuracy": 5, "testing": 5, "training": 5,
     "cli": 6,
     "__main__": 7,
 }  # fmt: skip

@@ -36,6 +36,12 @@ if TYPE_CHECKING:
     from torchtransient.axes import FrequencyAxis as FrequencyAxis
     from torchtransient.axes import TimeAxis as TimeAxis
     from torchtransient.gates import Gate as Gate
+    from torchtransient.motion.over_time import over_time as over_time
+    from torchtransient.motion.rigid import Motion as Motion
+    from torchtransient.motion.slow_times import Exposure as Exposure
+    from torchtransient.motion.slow_times import Frames as Frames
+    from torchtransient.motion.slow_times import PhaseSteps as PhaseSteps
+    from torchtransient.motion.slow_times import RollingShutter as RollingShutter
     from torchtransient.pulses import Pulse as Pulse
     from torchtransient.rendering.functional import render as render
     from torchtransient.rendering.output import RenderOutput as RenderOutput
@@ -52,12 +58,17 @@ if TYPE_CHECKING:
 __version__ = "0.1.0.dev0"
 
 _LAZY = {
+    "Exposure": "torchtransient.motion.slow_times",
+    "Frames": "torchtransient.motion.slow_times",
     "FrequencyAxis": "torchtransient.axes",
     "Gate": "torchtransient.gates",
+    "Motion": "torchtransient.motion.rigid",
+    "PhaseSteps": "torchtransient.motion.slow_times",
     "Plan": "torchtransient.rendering.plan",
     "Pulse": "torchtransient.pulses",
     "RenderOutput": "torchtransient.rendering.output",
     "RenderStats": "torchtransient.rendering.output",
+    "RollingShutter": "torchtransient.motion.slow_times",
     "Scene": "torchtransient.scene.load",
     "TimeAxis": "torchtransient.axes",
     "ToleranceResult": "torchtransient.rendering.tolerance",
@@ -71,6 +82,7 @@ _LAZY = {
     "losses": "torchtransient.losses",
     "metrics": "torchtransient.metrics",
     "nlos": "torchtransient.nlos",
+    "over_time": "torchtransient.motion.over_time",
     "parametrize": "torchtransient.parametrize",
     "plan": "torchtransient.rendering.plan",
     "pulses": "torchtransient.pulses",

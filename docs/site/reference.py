@@ -10,7 +10,9 @@ from types import ModuleType
 import torchtransient as tt
 
 # Rooms that are not names of the package itself, and are named on pages.
-MORE = ("units", "files.result_file", "rendering.films", "rendering.labels", "testing", "interfaces", "plugins")
+MORE = (
+    "units", "motion", "files.result_file", "rendering.films", "rendering.labels", "testing", "interfaces", "plugins"
+)  # fmt: skip
 NOT_PUBLIC = {"annotations", "importlib", "TYPE_CHECKING"}
 
 

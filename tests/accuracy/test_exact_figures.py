@@ -71,7 +71,12 @@ def test_errors_of_given_numbers(time_dim):
         found = tally.result()
         assert found.squared == pytest.approx(squared.mean(), rel=1e-5)
         totals = squared.mean(1)
-        assert found.squared_standard_error == pytest.approx(totals.std(ddof=1) / len(totals) ** 0.5, rel=1e-4)
+        error = totals.std(ddof=1) / len(totals) ** 0.5
+        if reference is not None:
+            # That of the reference: of its product with the distance of the runs, and of its own square.
+            noise, distance = (a - b) ** 2 / 4, (np.mean(runs, 0) - (a + b) / 2) ** 2
+            error = math.hypot(error, math.sqrt((4 * distance * noise + 4 / 3 * noise**2).sum()) / noise.size)
+        assert found.squared_standard_error == pytest.approx(error, rel=1e-4) and found.comparisons == len(totals)
         assert found.relative == pytest.approx(math.sqrt(squared.mean() / power.mean()), rel=1e-5)
         of_bins = np.sqrt(np.maximum(squared.mean(0), 0) / power.mean(0))
         assert found.median_bin == pytest.approx(np.median(of_bins[power.mean(0) > 0]), rel=1e-5)

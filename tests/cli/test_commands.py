@@ -59,9 +59,19 @@ def test_render_to_a_tolerance(folder):
     assert "of 90% of the bins with light, reached" in result.output and f"{expected.error:.3g}" in result.output
     short = run("render", "box.xml", "-o", "out.npz", "--rtol", 1e-5, "--max-seconds", 0.2, "--quiet")
     assert short.exit_code == 0 and "not reached" in short.output and "max_seconds" in short.output
-    for options in (("--max-seconds", 1), ("--rtol", 0.1, "--spp", 4), ("--rtol", 2)):
+    for options in (("--max-seconds", 1), ("--rtol", 0.1, "--spp", 4), ("--rtol", 2), ("--rtol", 0.1, "--errors")):
         wrong = run("render", "box.xml", *options)
         assert wrong.exit_code == 2 and options[0] in wrong.output
+
+
+def test_render_with_error_bars(folder):
+    result = run("render", "box.xml", "-o", "out.npz", "--errors", "--overview", "out.png", "--seed", 3, "--quiet")
+    assert result.exit_code == 0, result.output
+    expected = tt.render("box.xml", seed=3, errors=True)
+    stored = read_result(folder / "out.npz")
+    assert torch.allclose(stored.standard_error(), expected.standard_error())
+    assert f"sum known to {expected.relative_error():.2%}" in result.output
+    assert (folder / "out.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize("ending", long(["h5", "npz"], ["h5"]))
@@ -229,6 +239,20 @@ def test_cost(folder):
     assert all(p["seconds"] > 0 and p["squared_error"] > 0 for p in points)
     assert "grey.reflectance.value" in result.stdout
     assert (folder / "cost.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_cost_of_settings(folder):
+    options = ("--depth", 2, "--depth", 4, "--bin-width", 0.05, "--integrator", "transient_path", "--sampler", "owen")
+    result = run("cost", "box.xml", "--spp", "4,8", *options, "--error", 1000, "--json", "cost.json", "--quiet")
+    assert result.exit_code == 0, result.output
+    points = json.loads((folder / "cost.json").read_text(encoding="utf-8"))["points"]
+    assert {(p["max_depth"], p["integrator"], p["bin_width_opl"]) for p in points} == {
+        (depth, "transient_path", 0.05) for depth in (2, 4)
+    }
+    assert "recommended for 100000.00%: transient: transient_path, owen" in result.stdout
+    result = run("cost", "box.xml", "--spp", "4,8", "--sampler", "owen", "--error", 1e-9, "--quiet")
+    assert result.exit_code == 0 and "expected an error of transient that a measured setting reaches" in result.stdout
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def rendered(before, after, inside=100.0, polarized=False):
         transient = torch.stack([transient, *[torch.full_like(transient, 99.0)] * 3])
     return SimpleNamespace(
         polarized=polarized, transient=transient, steady=transient.sum(-3), axis=tt.TimeAxis(1.0, 0.5, 5),
-        outside=(before / (before + inside + after), after / (before + inside + after)),
+        outside=(before / (before + inside + after), after / (before + inside + after)), cells=None,
     )  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def test_the_overview_shows_the_intensity(monkeypatch, tmp_path, polarized):
     (((transient, steady, axis), more),) = shown
     plain = rendered(0.0, 0.0)
     assert torch.equal(transient, plain.transient) and torch.equal(steady, plain.steady) and axis == plain.axis
-    assert more == {"path": tmp_path / "a.png", "pixel": (1, 0), "title": "title"}
+    assert more == {"path": tmp_path / "a.png", "pixel": (1, 0), "title": "title", "errors": None}
 
 
 # ------------------------------------------------------------------------------------------------------- reconstruct

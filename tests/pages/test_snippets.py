@@ -74,6 +74,14 @@ def test_phasors(folder):
     assert bool((found["renderer"].values["red.reflectance.value"].grad != 0).all())
 
 
+def test_motion(folder):
+    found = Page("docs/motion.md").names(SMALL)
+    assert found["out"].phasor.shape == (3, 1, 6, 6) and found["velocity"].grad.norm() > 0
+    assert found["taps"].shape == (3, 4, 6, 6) and found["rows"].phasor.shape == (3, 1, 6, 6)
+    # A beat drops out of what stands still: the box is a thousandth of the picture.
+    assert found["out"].phasor.abs().max() < 0.01 * found["rows"].phasor.abs().max()
+
+
 def test_pictures(folder):
     Page("docs/pictures.md").names({**SMALL, "num_bins=400": "num_bins=10, bin_width_opl=0.8", "every=5": "every=2"})
     assert (folder / "light.mp4").stat().st_size > 500

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.extremes import SKY, seen_from
 from support.gradient_cases.scenes import area_light, room
 from support.marks import long, long_rows
 from support.surface_samples import activate, start
@@ -161,6 +162,21 @@ def test_a_texture_without_a_mean(kind, lobe):
     found, beside = moments(read, "wall.vertex_paint.value", vertex_paint=paint)
     assert bool(((found - mean).abs() < 5 * (noise + beside).sqrt()).all())
     assert bool(((noise + beside).sqrt() < 0.06 * mean.abs()).all())
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_plastic_of_a_high_index(nonlinear):
+    """White under a white sky is white. Mitsuba's fit of the light that is thrown back inside makes it 19 % too bright
+    at an index of 3, and darker than black at 4.
+    """
+    for index in (3.0, 4.0):
+        wall = {"type": "plastic", "int_ior": index, "ext_ior": 1.0, "diffuse_reflectance": 1.0, "nonlinear": nonlinear}
+        scene = tt.load(seen_from(0.5, 3, wall={"type": "rectangle", "bsdf": wall}, sky=SKY), variant="llvm_ad_mono")
+        axis, noise = tt.TimeAxis(0.0, 0.5, 60), 5 * 0.3 / np.sqrt(4096)
+        plain = tt.render(scene, time_axis=axis, spp=4096, seed=0).steady.mean()
+        assert float(plain) == pytest.approx(1, abs=noise)
+        keyed = tt.render(scene, {"wall.bsdf.eta": torch.tensor(index)}, time_axis=axis, spp=4096, seed=0).steady.mean()
+        assert float(keyed) == pytest.approx(float(plain), rel=1e-5)
 
 
 def test_the_index_of_a_described_plastic():

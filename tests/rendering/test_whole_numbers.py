@@ -30,6 +30,8 @@ CALLS = {
     "max_depth of a plan": lambda n: tt.plan(make_room(), max_depth=n, pilot=False).max_depth,
     "grad_seed": lambda n: tt.TransientRenderer(make_room(), grad_seed=n).grad_seed,
     "seed": lambda n: tt.render(make_room(), spp=1, seed=n).stats.seeds[0],
+    "seed of poses": lambda n: over_time(seed=n).stats.seeds[2],
+    "spp of poses": lambda n: over_time(spp=n, seed=0).stats.spp,
     "one seed of several": lambda n: tt.render(make_room(), spp=1, seed=[n]).stats.seeds[0],
     "batch_spp": lambda n: tolerance(batch_spp=n).spp,
     "seed of passes": lambda n: tolerance(seed=n, batch_spp=1).state.sums.seed,
@@ -40,6 +42,11 @@ CALLS = {
 
 def tolerance(**settings):
     return tt.TransientRenderer(make_room()).to_tolerance(rtol=0.5, max_seconds=1e-9, progress=False, **settings)
+
+
+def over_time(**settings):
+    renderer = tt.TransientRenderer(make_room(), ["box.to_world"], spp=1)
+    return tt.over_time(renderer, {"box": tt.Motion()}, tt.Exposure(1e-3), **settings)
 
 
 def room_of_four():

@@ -80,6 +80,9 @@ def _tensors() -> dict[str, Case]:
         "Gate.gaussian_s": Case(tt.Gate.gaussian_s, center_s=1e-9, fwhm_s=5e-10),
         "Gate.shifted": Case(GATE.shifted, opl=1.0),
         "Gate.sequence": Case(GATE.sequence, step_opl=0.5, count=3),
+        "Exposure": Case(tt.Exposure, duration_s=1e-3, beat_hz=1e3, poses=3),
+        "RollingShutter": Case(tt.RollingShutter, row_s=1e-5, poses=3),
+        "PhaseSteps": Case(tt.PhaseSteps, number=4, period_s=1e-3),
         "Pulse": Case(tt.Pulse, "gaussian", width_opl=0.5, center_opl=0.1),
         "Pulse.gaussian": Case(tt.Pulse.gaussian, fwhm_opl=0.5, center_opl=0.1),
         "Pulse.rectangular": Case(tt.Pulse.rectangular, width_opl=0.5, center_opl=0.1),
@@ -356,12 +359,14 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult|accuracy\.(SamplesNeeded|GradientError))\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult)\(.*\)": "results",
+    r"accuracy\.(SamplesNeeded|GradientEstimate)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
     r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",
     r"nlos\.PlanarScan\(.*\)": "what is found of a scan",
-    r"(TransientRenderer|plan|render|cost_of_accuracy)\b.*": "rendering/test_whole_numbers.py",
+    r"(TransientRenderer|plan|render|over_time|cost_of_accuracy)\b.*": "rendering/test_whole_numbers.py",
+    r"\w+\.\w+_s\(rows\)": "the height of the film, which tt.over_time gives",
     r"accuracy\.gradient_errors\b.*": "accuracy/test_gradient_errors.py",
     r"(Gate|Pulse)\((opl|values)\)": "rows of a table, which `tabulated` checks",
     r"nlos\.(CaptureRenderer|simulate|forecast)\b.*": "nlos/test_arguments.py",

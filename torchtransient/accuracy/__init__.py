@@ -5,4 +5,5 @@ from torchtransient.accuracy.cost import cost_of_accuracy as cost_of_accuracy
 from torchtransient.accuracy.gradient_errors import GradientEstimate as GradientEstimate
 from torchtransient.accuracy.gradient_errors import gradient_errors as gradient_errors
 from torchtransient.accuracy.report import AccuracyReport as AccuracyReport
+from torchtransient.accuracy.report import Recommendation as Recommendation
 from torchtransient.accuracy.report import SamplesNeeded as SamplesNeeded

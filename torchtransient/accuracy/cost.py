@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,7 +13,8 @@ from numpy.typing import NDArray
 
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_counts, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
-from torchtransient.checks import as_whole, shown
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import Numbers, as_whole, function, numbers, positive, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.output import RenderOutput
@@ -52,27 +55,31 @@ def cost_of_accuracy(
     spp: Sequence[int] = (16, 64, 256, 1024),
     gradients: Sequence[str] = (),
     *,
+    quantities: Mapping[str, Loss] | None = None,
     reference_spp: int | None = None,
     repeats: int = 4,
     samplers: Sequence[str] = ("owen", "independent"),
     temporal_filters: Sequence[str] | None = None,
+    integrators: Sequence[str] | None = None,
+    max_depths: Sequence[int] | None = None,
+    bin_widths: Numbers | None = None,
     loss: Loss = cosine_over_the_window,
     seed: int = 0,
     progress: bool = True,
 ) -> AccuracyReport:
-    """Measure the error of the transient, and of gradients, against seconds and samples per pixel.
+    """Measure the error of the transient, of quantities made of it, and of gradients, against seconds and samples.
 
-    `renderer` renders at the current values of its parameters; `gradients` are keys among them, each the derivative of
-    `loss`, a scalar of the `RenderOutput`. Every pair of `samplers` (plugin names) and `temporal_filters`
-    ("box", "tent", "gaussian"; None: the one that the renderer uses) is one curve. Where a filter has no slope in time
-    (box) and a key moves path lengths, there is no gradient: that filter's curve then shows the transient alone, and
-    `settings` of the report names the pair under "without_gradients".
+    Every combination of samplers, filters, integrators, depths and bin widths is one curve. Its *error* is that of its
+    own noise: every curve is compared with its own expectation, and what a filter blurs does not count. Its *total
+    error* is measured where anything but samplers is compared, and of ``quantities``: the distance to a reference of
+    the finest setting (deepest paths, narrowest bins, box before tent before gaussian, the first integrator, and of
+    the samplers "owen" or else the first), so that light that a small depth leaves out, and detail that a filter or a
+    wide bin blurs, count as bias. What the finest setting itself lacks is not seen. Histograms are compared on the
+    narrowest bins, wide ones spread evenly over them.
 
-    Errors are squared and relative, over `repeats` independent runs at each of `spp`, either against a reference of
-    `reference_spp` samples (at least four times the largest `spp`) or, with None, in pairs of runs (`repeats` even).
-    Every curve is compared with its own expectation: what a filter blurs does not count as an error. Seconds are
-    medians of wall time: a forward render for the transient, render and backward for gradients; the runs of all curves
-    take turns. A loss that is not linear has a biased gradient, which only a reference shows, and only in part.
+    Errors are squared and relative, of independent runs. Seconds are medians of wall time, with CPU seconds beside: a
+    forward render for values, render and backward for gradients; the runs of all curves take turns. A loss that is not
+    linear has a biased gradient, which only a reference shows, and only in part.
 
     A few runs do not show that a gradient is rarely very wrong. Of every gradient 96 more runs, of 16 samples per pixel
     at most, show the tail of its distribution (`CostPoint.tail`): where Hill's index of it is below 2, so that the
@@ -81,12 +88,39 @@ def cost_of_accuracy(
     spread of these runs. Outliers that come less than about once in 30 of them stay unseen.
 
     Of a phasor film the quantity "phasor" takes the place of "transient": real and imaginary parts, frequencies in the
-    place of bins; of a gated film "gated". Both have no temporal filters to choose from.
+    place of bins; of a gated film "gated". Both have no temporal filters and no bins to choose from. A temporary copy
+    of the largest cube is held per curve, three where there is a total error.
 
-    Returns an `AccuracyReport` with `table()`, `plot(path)` and `to_json(path)`. Raises ArgumentError for what is no
-    renderer, SceneError for a key or sampler
-    that the renderer does not know and UnitError for counts out of range. A temporary copy of the largest cube is held
-    per curve.
+    Args:
+        renderer: renders at the current values of its parameters.
+        spp: samples per pixel.
+        gradients: keys of the renderer, each the derivative of ``loss``. Where a filter has no slope in time (box) and
+            a key moves path lengths, there is no gradient: that filter's curve then shows the values alone, and
+            `settings` of the report names the pair under "without_gradients".
+        quantities: functions of a `RenderOutput` by name: a depth, a phase, a degree of polarization, a loss. Each
+            returns a real or complex tensor (a phase best as a complex number of magnitude one, whose error is the
+            phase's in radians), finite and of one shape in all settings.
+        reference_spp: None compares each curve's noise in pairs of runs (``repeats`` even); a number, at least four
+            times the largest ``spp``, with a reference of that many samples. That of the total error has as many, with
+            None four times the largest ``spp``.
+        repeats: independent runs at each of ``spp``.
+        samplers: plugin names.
+        temporal_filters: "box", "tent", "gaussian"; None for the one that the renderer uses.
+        integrators: plugin names; None for the renderer's.
+        max_depths: longest paths, in segments, -1 for no limit; None for the renderer's.
+        bin_widths: metres of optical path; None for the renderer's.
+        loss: a scalar of the `RenderOutput`, for ``gradients``.
+        seed: seed of the first run.
+        progress: show a progress bar.
+
+    Returns:
+        An `AccuracyReport` with `table()`, `plot(path)`, `recommend(error=)`, `pareto()` and `to_json(path)`.
+
+    Raises:
+        ArgumentError: for what is no renderer, and settings that its film does not have.
+        SceneError: for a key, sampler or integrator that the renderer does not know.
+        UnitError: for counts out of range, and a quantity that is not finite.
+        ShapeError: for a quantity whose shape depends on the setting.
     """
     if not isinstance(renderer, TransientRenderer):
         raise ArgumentError(
@@ -102,22 +136,26 @@ def cost_of_accuracy(
             f"gradients: {missing} are not parameters of this renderer, which has {list(renderer.values)}; "
             "name them in TransientRenderer(parameters=[...])"
         )
-    filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
-    if not samplers or not filters:
-        raise ArgumentError("expected at least one sampler and one temporal filter, got none")
-    axis = renderer.axis
+    functions = {
+        name: function(f"quantities: {name!r}", each, "a RenderOutput") for name, each in (quantities or {}).items()
+    }
+    twins = _variations(renderer, samplers, temporal_filters, integrators, max_depths, bin_widths)
+    axes = [twin.axis for twin in twins.values() if twin.axis is not None]
+    narrowest = min(axes, key=lambda axis: axis.bin_width_opl, default=None)
     candidates: dict[Choice, Candidate] = {}
     without: list[str] = []
-    for sampler in samplers:
-        for name in filters:
-            twin = renderer.variation(sampler=sampler, temporal_filter=name)
-            choice = Choice(sampler, twin.effective_filter)
-            candidate = {"values": _values_task(twin)}
-            if gradients and twin.has_slope_for(gradients):
-                candidate["gradients"] = _gradients_task(twin, tuple(gradients), loss)
-            elif gradients:
-                without.append(str(choice))
-            candidates[choice] = candidate
+    for choice, twin in twins.items():
+        candidate = {"values": _values_task(twin, functions, narrowest)}
+        if gradients and twin.has_slope_for(gradients):
+            candidate["gradients"] = _gradients_task(twin, tuple(gradients), loss)
+        elif gradients:
+            without.append(str(choice))
+        candidates[choice] = candidate
+    finest: dict[str, Choice] = {}
+    if len({replace(choice, sampler="") for choice in candidates}) > 1 or functions:
+        for task in ("values", "gradients"):
+            having = [choice for choice in sorted(candidates, key=_blur) if task in candidates[choice]]
+            finest |= {task: having[0]} if having else {}
     settings = {
         "scene": repr(renderer.scene),
         "variant": renderer.scene.variant,
@@ -125,8 +163,9 @@ def cost_of_accuracy(
         "gradients": list(gradients),
         "loss": getattr(loss, "__name__", type(loss).__name__),
         "measured": repr(renderer.film.settings),
-        "time_axis": axis and [axis.start_opl, axis.bin_width_opl, axis.num_bins],
+        "time_axis": narrowest and [narrowest.start_opl, narrowest.bin_width_opl, narrowest.num_bins],
         "without_gradients": without,
+        "finest": {task: str(choice) for task, choice in finest.items()},
     }
     # One switch of variant for all runs: a switch within each would be timed with it.
     with active_variant(renderer.scene.variant):
@@ -138,21 +177,90 @@ def cost_of_accuracy(
             seed=first,
             progress=progress,
             settings=settings,
+            finest=finest,
         )
 
 
-def _values_task(renderer: TransientRenderer) -> Task:
+def _variations(
+    renderer: TransientRenderer,
+    samplers: Sequence[str],
+    temporal_filters: Sequence[str] | None,
+    integrators: Sequence[str] | None,
+    max_depths: Sequence[int] | None,
+    bin_widths: Numbers | None,
+) -> dict[Choice, TransientRenderer]:
+    """A renderer for every combination; choices name what is compared beside sampler and filter."""
+    filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
+    if not samplers or not filters:
+        raise ArgumentError("expected at least one sampler and one temporal filter, got none")
+    found = {}
+    widths = (None,) if bin_widths is None else numbers("bin_widths", bin_widths).reshape(-1).tolist()
+    builds = itertools.product(integrators or (None,), max_depths or (None,), widths)
+    for integrator, depth, width in builds:
+        built = renderer.variation(
+            integrator=integrator, max_depth=depth, time_axis=None if width is None else _axis(renderer, width)
+        )
+        for sampler, name in itertools.product(samplers, filters):
+            twin = built.variation(sampler=sampler, temporal_filter=name)
+            found[Choice(sampler, twin.effective_filter, integrator or "", depth, width)] = twin
+    return found
+
+
+def _axis(renderer: TransientRenderer, width: float) -> TimeAxis:
+    """The renderer's window in bins of another width."""
+    axis, wanted = renderer.axis, positive("bin_widths", width)
+    if axis is None:
+        raise ArgumentError(f"bin_widths: a {renderer.film.measures} film has no bins; leave them out.")
+    # A window that holds a whole number of bins up to rounding has no bin more.
+    bins = math.ceil(axis.num_bins * axis.bin_width_opl / wanted - 1e-6)
+    return TimeAxis(axis.start_opl, wanted, bins)
+
+
+def _blur(choice: Choice) -> tuple[float, float, int, bool]:
+    """Order of choices, the finest first, of equal ones that with the quieter reference; others stay in their order."""
+    depth = choice.max_depth
+    return (
+        0.0 if depth is None else -math.inf if depth < 0 else -depth,
+        choice.bin_width_opl or 0.0,
+        ("box", "tent", "gaussian").index(choice.temporal_filter) if choice.temporal_filter else 0,
+        choice.sampler != "owen",
+    )
+
+
+def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], narrowest: TimeAxis | None) -> Task:
     film = renderer.film
 
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
-        response = _response(out)
-        numbers = torch.view_as_real(response) if film.is_complex else response
-        return Estimates({film.measures: _array(numbers)}, renderer.samples_drawn(spp))
+            made = {name: each(out) for name, each in functions.items()}
+        for name, tensor in made.items():
+            if not bool(tensor.isfinite().all()):
+                raise UnitError(
+                    f"quantities: {name!r}: expected finite numbers, got others of a render with {spp} samples per "
+                    "pixel; say what dark pixels have (torch.where, nan_to_num, a clamped divisor)."
+                )
+        found = {film.measures: _response(out)} | made
+        return Estimates({name: _array(_real(tensor)) for name, tensor in found.items()}, renderer.samples_drawn(spp))
 
+    spread = {}
+    if narrowest is not None and renderer.axis is not None and renderer.axis != narrowest:
+        matrix = _shares(renderer.axis, narrowest)
+        spread = {film.measures: lambda cube: np.einsum("kt,...thw->...khw", matrix, cube, optimize=True)}
     # After the film's own dimension come rows and columns, and real and imaginary parts of complex numbers.
-    return Task(run, {film.measures: -4 if film.is_complex else -3})
+    return Task(run, {film.measures: -4 if film.is_complex else -3}, to_common=spread)
+
+
+def _shares(wide: TimeAxis, narrow: TimeAxis) -> NDArray[np.float32]:
+    """Shares of each wide bin that lie in each narrow one, (narrow, wide)."""
+    edges, ends = wide.edges_opl.numpy(), narrow.edges_opl.numpy()
+    low = np.maximum(edges[None, :-1], ends[:-1, None])
+    high = np.minimum(edges[None, 1:], ends[1:, None])
+    return np.asarray(np.maximum(high - low, 0.0) / wide.bin_width_opl, dtype=np.float32)
+
+
+def _real(tensor: torch.Tensor) -> torch.Tensor:
+    return torch.view_as_real(tensor) if tensor.is_complex() else tensor
 
 
 def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchtransient.accuracy.statistics import student_t_quantile
 from torchtransient.errors import ShapeError
 
 Array = NDArray[np.float64]
@@ -30,6 +31,8 @@ TAIL_RUNS, _FURTHEST = 96, 8
 _LEAST_INDEX, _MOST_OF_ONE = 2.0, 1 / 3
 # Relative distance of runs up to which they are equal, but for the rounding of single precision.
 _ROUNDING = 1e-6
+# Two-sided 95 % of a normal deviate.
+_DEVIATE = 1.96
 
 
 @dataclass(frozen=True)
@@ -88,13 +91,21 @@ class ErrorTally:
     power: list[Array] = field(default_factory=list)
     _waiting: NDArray[np.float32] | None = None
     _reference_sums: tuple[Array, Array, NDArray[np.float32]] | None = None
+    # Sums over the runs of the deviations from the reference, entry by entry, and of their squares.
+    _deviations: NDArray[np.float32] | None = None
+    _squares: NDArray[np.float32] | None = None
 
     def add(self, run: ArrayLike) -> None:
         """One independent run. Raises ShapeError when its shape differs from the reference's or the run before."""
         x = np.asarray(run, dtype=np.float32)
         if self.reference is not None:
             noise, power, mean = self._against_reference(x)
-            self.squared.append(self._per_bin(_square(x - mean)) - noise)
+            deviations = np.asarray(x - mean, dtype=np.float32)
+            squares = _square(deviations)
+            if self._deviations is None or self._squares is None:
+                self._deviations, self._squares = np.zeros_like(deviations), np.zeros_like(deviations)
+            self._deviations, self._squares = self._deviations + deviations, self._squares + np.float32(squares)
+            self.squared.append(self._per_bin(squares) - noise)
             self.power.append(power)
         elif self._waiting is None:
             self._waiting = np.array(x, copy=True)
@@ -138,39 +149,99 @@ class ErrorTally:
         if not self.squared:
             raise ShapeError("ErrorTally: expected at least one run against a reference, or two without one")
         if tail is not None and tail.heavy:
-            return ErrorEstimate(math.nan, math.nan, math.nan, math.nan)
+            return NOT_MEASURED
         per_run = np.stack(self.squared)
-        totals = per_run.mean(axis=1)
+        totals, runs = per_run.mean(axis=1), len(per_run)
+        bias = self._bias() if self.reference is not None else _Bias(0.0, 0.0, 0.0, 0.0)
         if tail is not None:
-            error = float(totals.mean() * tail.spread / math.sqrt(len(totals)))
+            # Of a bias the spread of short runs says nothing.
+            noise = (float(totals.mean()) - bias.squared) * tail.spread / math.sqrt(runs)
+            error = math.hypot(noise, bias.times_noise)
         else:
-            error = float(totals.std(ddof=1) / math.sqrt(len(totals))) if len(totals) > 1 else math.nan
+            error = float(totals.std(ddof=1) / math.sqrt(runs)) if runs > 1 else math.nan
+        # Few runs hardly know their own noise.
+        least = student_t_quantile(_DEVIATE, max(runs - 1, 1)) * bias.standard_error
         squared, power = per_run.mean(axis=0), np.stack(self.power).mean(axis=0)
         lit = power > 0
         per_bin = np.sqrt(np.maximum(squared[lit], 0.0) / power[lit])
-        total_power = float(power.mean())
+        mean_power = float(power.mean())
         mean_squared = float(squared.mean())
-        relative = math.sqrt(max(mean_squared, 0.0) / total_power) if total_power > 0 else math.nan
         return ErrorEstimate(
             squared=mean_squared,
-            squared_standard_error=error,
-            relative=relative,
+            squared_standard_error=math.hypot(error, bias.error_of_reference),
+            relative=relative(mean_squared, mean_power),
             median_bin=float(np.median(per_bin)) if lit.any() else math.nan,
+            power=mean_power,
+            bias=relative(bias.squared if bias.squared > least else 0.0, mean_power),
+            comparisons=runs,
+        )
+
+    def _bias(self) -> _Bias:
+        """What the runs have in common against the reference, and errors of it; entries count as independent.
+
+        With the mean d of the deviations, s^2 the variance of a run, and n = (A - B)^2 / 4 that of the reference's
+        mean, b^2 = d^2 - s^2 / R - n. The squared error is off by -2 d e + e^2 - n by an error e of the reference's
+        mean, which all runs share: E[n^2], with n estimated from two halves, is three times its square.
+        """
+        runs, reference = len(self.squared), self.reference
+        if reference is None or self._deviations is None or self._squares is None:
+            raise ShapeError("ErrorTally: no run was compared with a reference")
+        halves = np.asarray(reference.first, np.float32) - np.asarray(reference.second, np.float32)
+        of_reference = _square(halves) / 4.0
+        mean = np.asarray(self._deviations, dtype=np.float64) / runs
+        spread = np.maximum(np.asarray(self._squares, dtype=np.float64) / runs - _square(mean), 0.0)
+        spread = spread * runs / max(runs - 1, 1)
+        of_mean = spread / runs
+        noise = of_mean + of_reference
+        without_bias = _square(noise) + _square(of_mean) / max(runs - 1, 1) + _square(of_reference)
+
+        def error(variances: Array) -> float:
+            return math.sqrt(float(variances.sum())) / mean.size
+
+        return _Bias(
+            squared=max(float((_square(mean) - noise).mean()), 0.0),
+            standard_error=error(2.0 * without_bias),
+            times_noise=error(4.0 * _square(mean) * of_mean),
+            error_of_reference=error(4.0 * _square(mean) * of_reference + 4.0 / 3.0 * _square(of_reference)),
         )
 
 
 @dataclass(frozen=True)
+class _Bias:
+    """Squared bias, its standard error where there is none, and standard errors of the squared error: by its product
+    with the noise, and by the noise of the reference."""
+
+    squared: float
+    standard_error: float
+    times_noise: float
+    error_of_reference: float
+
+
+@dataclass(frozen=True)
 class ErrorEstimate:
-    """`squared`: expected squared error per entry, and its standard error over the runs (NaN for one run or pair).
+    """`squared`: expected squared error per entry, and its standard error over the runs (NaN for one run or pair),
+    which contains that of the reference. `comparisons`: runs, or pairs of them, that it is the mean of.
 
     `relative`: root of squared error over power, all entries together: what bright bins decide. `median_bin`: the same
     per time bin, median over the bins that hold light: what dim, late bins decide. NaN where there is no light at all.
+    `power`: what the squared error is relative to. `bias`: relative, against the reference, 0 within its noise.
     """
 
     squared: float
     squared_standard_error: float
     relative: float
     median_bin: float
+    power: float = math.nan
+    bias: float = math.nan
+    comparisons: int = 0
+
+
+NOT_MEASURED = ErrorEstimate(math.nan, math.nan, math.nan, math.nan)
+
+
+def relative(squared: float, power: float) -> float:
+    """Root of a squared error over a power; NaN without power."""
+    return math.sqrt(max(squared, 0.0) / power) if power > 0 else math.nan
 
 
 def _square(values: NDArray[np.float32] | Array) -> Array:

@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
-from torchtransient.accuracy.statistics import Slope, log_log_slope
+from torchtransient.accuracy.statistics import Slope, log_log_slope, student_t_quantile
 from torchtransient.array_files.part_files import write_text
-from torchtransient.checks import is_one_of, positive, shown
-from torchtransient.errors import ArgumentError
+from torchtransient.checks import check_source, is_one_of, positive, shown
+from torchtransient.errors import ArgumentError, StorageError
+
+if TYPE_CHECKING:
+    from torchtransient.vis.accuracy_curve import Curve
 
 # Two-sided 95 % of a normal deviate.
 _DEVIATE = 1.96
@@ -23,22 +26,31 @@ _DEVIATE = 1.96
 
 @dataclass(frozen=True)
 class Choice:
-    """What is compared: a sampler and a temporal filter, both by their plugin names."""
+    """What is compared: a sampler and a temporal filter by their plugin names, and where they are compared too, an
+    integrator, a depth (-1: no limit) and the width of a bin in metres of optical path. Empty or None: the renderer's.
+    """
 
     sampler: str
     temporal_filter: str
+    integrator: str = ""
+    max_depth: int | None = None
+    bin_width_opl: float | None = None
 
     def __str__(self) -> str:
-        return f"{self.sampler}, {self.temporal_filter}" if self.temporal_filter else self.sampler
+        depth = "" if self.max_depth is None else f"depth {self.max_depth}" if self.max_depth >= 0 else "any depth"
+        width = "" if self.bin_width_opl is None else f"bins of {self.bin_width_opl:g} m"
+        return ", ".join(filter(None, (self.integrator, self.sampler, self.temporal_filter, depth, width)))
 
 
 @dataclass(frozen=True)
 class CostPoint:
     """One point of a curve.
 
-    `quantity`: "transient", "phasor" or the key of a gradient. `spp`: samples per pixel really drawn. `seconds`: median
-    wall time of one run (forward for values, forward and backward for gradients). The errors are those of
-    `ErrorEstimate`. `tail`: of a gradient, the tail of its distribution; where it is heavy the errors are NaN.
+    `quantity`: "transient", "phasor", a name of `quantities` or the key of a gradient. `spp`: samples per pixel really
+    drawn. `seconds`, `cpu_seconds`: medians of wall and CPU time of one run (forward for values, forward and backward
+    for gradients). The errors are those of `ErrorEstimate`. `tail`: of a gradient, the tail of its distribution; where
+    it is heavy the errors are NaN. The total errors are those against the finest setting, bias included; of them
+    `total_error` is relative, and so is `bias`, 0 within its noise. All are NaN where they were not measured.
     """
 
     choice: Choice
@@ -51,6 +63,22 @@ class CostPoint:
     median_bin_error: float
     repeats: int
     tail: Tail | None = None
+    cpu_seconds: float = math.nan
+    comparisons: int = 0
+    total_squared_error: float = math.nan
+    total_squared_error_standard_error: float = math.nan
+    total_error: float = math.nan
+    bias: float = math.nan
+
+    @property
+    def error(self) -> float:
+        """Relative error with the bias where it was measured, else that of the noise; NaN where it is not known.
+
+        The total error is no less than the noise, of which it is a worse estimate where there is little bias: against a
+        reference its squared error can come out below zero.
+        """
+        known = [e for e in (self.relative_error, self.total_error) if e > 0 or (e == 0 and self.squared_error == 0)]
+        return max(known, default=math.nan)
 
 
 @dataclass(frozen=True)
@@ -75,6 +103,31 @@ class SamplesNeeded:
         return f"{self.spp:.3g} spp ({self.low:.3g} to {self.high:.3g}{where}), about {self.seconds:.3g} s"
 
 
+@dataclass(frozen=True)
+class Recommendation:
+    """Quickest measured setting that reaches an error.
+
+    `spp`: samples per pixel. `error`: relative error at `spp`, bias included where it was measured, and `low`, `high`
+    its 95 % interval. `seconds`, `cpu_seconds`: time of one run.
+    """
+
+    _: KW_ONLY
+    quantity: str
+    choice: Choice
+    spp: int
+    error: float
+    low: float
+    high: float
+    seconds: float
+    cpu_seconds: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.quantity}: {self.choice}, {self.spp} spp: error {self.error:.2%} ({self.low:.2%} to "
+            f"{self.high:.2%}), {self.seconds:.3g} s"
+        )
+
+
 @dataclass
 class AccuracyReport:
     """Error against seconds and samples for every quantity and choice. Made by `cost_of_accuracy`."""
@@ -91,18 +144,138 @@ class AccuracyReport:
         """Every curve as (quantity, choice, points in rising spp)."""
         keys = dict.fromkeys((point.quantity, point.choice) for point in self.points)
         for quantity, choice in keys:
-            curve = [p for p in self.points if (p.quantity, p.choice) == (quantity, choice)]
-            yield quantity, choice, sorted(curve, key=lambda p: p.spp)
+            yield quantity, choice, self.curve(quantity, choice)
+
+    def curve(self, quantity: str, choice: Choice) -> list[CostPoint]:
+        """Points of one curve in rising spp; empty where there is none."""
+        found = [p for p in self.points if (p.quantity, p.choice) == (quantity, choice)]
+        return sorted(found, key=lambda p: p.spp)
 
     def slope(self, quantity: str, choice: Choice) -> Slope | None:
         """Line through log squared error against log spp; -1 for independent samples. None with fewer than three
-        points."""
-        for name, candidate, curve in self.curves():
-            if (name, candidate) == (quantity, choice):
-                good = [p for p in curve if p.squared_error > 0]
-                if len(good) >= 3:
-                    return log_log_slope([p.spp for p in good], [p.squared_error for p in good])
-        return None
+        points.
+
+        Its standard error is that of the scatter about the line, or what the standard errors of the points make where
+        that is larger: of few points the scatter is known by chance alone.
+        """
+        good = [p for p in self.curve(quantity, choice) if p.squared_error > 0]
+        if len(good) < 3:
+            return None
+        line = log_log_slope([p.spp for p in good], [p.squared_error for p in good])
+        u = np.log([float(p.spp) for p in good])
+        weights = (u - u.mean()) / ((u - u.mean()) ** 2).sum()
+        known = np.array([p.squared_error_standard_error / p.squared_error for p in good])
+        of_points = math.sqrt(float((weights**2 * np.nan_to_num(known) ** 2).sum()))
+        return replace(line, standard_error=max(line.standard_error, of_points))
+
+    def band(self, point: CostPoint, *, total: bool = False) -> tuple[float, float]:
+        """Return the 95 % interval of a point's relative error, or of its total error.
+
+        Bounds are factors, the exponential of the relative standard error of the squared error times Student's t. A
+        few runs hardly know that standard error: of the noise it is pooled over the points of the curve, which have
+        the same number of entries. NaN where there is none.
+        """
+        if total:
+            value, degrees = point.total_error, float(point.repeats - 1)
+            deviation = point.total_squared_error_standard_error / point.total_squared_error
+        else:
+            value, curve = point.relative_error, self.curve(point.quantity, point.choice)
+            pooled = [(p.squared_error_standard_error / p.squared_error) ** 2 for p in curve if p.squared_error > 0]
+            pooled = [x for x in pooled if math.isfinite(x)]
+            degrees = float(sum(p.comparisons - 1 for p in curve)) if point.comparisons > 1 else math.inf
+            deviation = math.sqrt(sum(pooled) / len(pooled)) if pooled else math.nan
+        if point.tail is not None:
+            degrees = math.inf
+        if not (value > 0 and math.isfinite(deviation)):
+            return math.nan, math.nan
+        # The relative error is the root of the squared one.
+        factor = math.exp(min(0.5 * student_t_quantile(_DEVIATE, degrees) * deviation, 300.0))
+        return value / factor, value * factor
+
+    def pareto(self, quantity: str | None = None) -> list[CostPoint]:
+        """Points of a quantity (None: the first) that none is both quicker and closer than, in rising seconds.
+
+        Closer by `CostPoint.error`: with the bias of a small depth, a filter and a wide bin where it was measured.
+        """
+        quantity = self._quantity("pareto", quantity)
+        known = [p for p in self.points if p.quantity == quantity and p.error >= 0]
+        front: list[CostPoint] = []
+        for point in sorted(known, key=lambda p: (p.seconds, p.error)):
+            if not front or point.error < front[-1].error:
+                front.append(point)
+        return front
+
+    def recommend(self, error: float, *, quantity: str | None = None) -> Recommendation:
+        """Return the quickest setting and samples per pixel for a relative error, 0.05 for 5 %.
+
+        On each curve of `CostPoint.error`, the error between two measured points is a power of the samples; the samples
+        are the fewest whose error is at most `error`, and none are beyond those that were measured. Except of
+        "independent" they are powers of two or measured ones: other numbers are spread less evenly.
+
+        Args:
+            error: relative error, bias included where it was measured.
+            quantity: name of a quantity, None for the first one of the report.
+
+        Raises:
+            UnitError: for an error that is not positive.
+            ArgumentError: for a quantity that the report does not have, and where no curve reaches the error.
+        """
+        wanted = positive("recommend: error", error)
+        quantity = self._quantity("recommend", quantity)
+        curves = [[p for p in curve if p.error >= 0] for name, _, curve in self.curves() if name == quantity]
+        found = [self._reached(curve, wanted) for curve in curves if any(p.error <= wanted for p in curve)]
+        if found:
+            return min(found, key=lambda each: (each.seconds, each.error))
+        known = [p for curve in curves for p in curve]
+        if not known:
+            raise ArgumentError(f"recommend: no curve of {quantity} has an error that is known.")
+        best = min(known, key=lambda p: p.error)
+        biased = f", of it {best.bias:.2%} bias, which more samples do not lower" if best.bias > 0 else ""
+        raise ArgumentError(
+            f"recommend: expected an error of {quantity} that a measured setting reaches, got {wanted:.2%}; the least "
+            f"is {best.error:.2%}, of {best.spp} spp [{best.choice}]{biased}. Measure more samples or other settings, "
+            "or ask spp_for, which extrapolates the noise."
+        )
+
+    def _reached(self, curve: list[CostPoint], wanted: float) -> Recommendation:
+        """The first place of a curve, in rising samples, where its error is at most `wanted`."""
+        n = next(i for i, p in enumerate(curve) if p.error <= wanted)
+        before, after = curve[max(n - 1, 0)], curve[n]
+        share, spp = 1.0, after.spp
+        if n > 0 and after.error > 0:
+            share = math.log(before.error / wanted) / math.log(before.error / after.error)
+            spp = math.ceil(before.spp * (after.spp / before.spp) ** share * (1.0 - 1e-9))
+            if after.choice.sampler != "independent":
+                spp = min(1 << (spp - 1).bit_length(), after.spp)
+            share = math.log(spp / before.spp) / math.log(after.spp / before.spp)
+        part = 1.0 if n == 0 else (spp - before.spp) / (after.spp - before.spp)
+        low, high = (
+            math.exp((1.0 - share) * math.log(a) + share * math.log(b)) if after.error > 0 else after.error
+            for a, b in zip(self._interval(before), self._interval(after), strict=True)
+        )
+        reached = before.error ** (1.0 - share) * after.error**share if share < 1.0 else after.error
+        return Recommendation(
+            quantity=after.quantity,
+            choice=after.choice,
+            spp=spp,
+            error=reached,
+            low=low,
+            high=high,
+            seconds=before.seconds + part * (after.seconds - before.seconds),
+            cpu_seconds=before.cpu_seconds + part * (after.cpu_seconds - before.cpu_seconds),
+        )
+
+    def _interval(self, point: CostPoint) -> tuple[float, float]:
+        """The band of `CostPoint.error`."""
+        return self.band(point, total=point.total_error == point.error)
+
+    def _quantity(self, who: str, quantity: str | None) -> str:
+        """The quantity, the first one for None."""
+        if quantity is None:
+            return self.quantities()[0]
+        if not is_one_of(quantity, self.quantities()):
+            raise ArgumentError(f"{who}: quantity: expected one of {self.quantities()}, got {shown(quantity)}.")
+        return quantity
 
     def spp_for(self, error: float, *, quantity: str | None = None, choice: Choice | None = None) -> SamplesNeeded:
         """Samples per pixel for a relative error (`CostPoint.relative_error`, 0.05 for 5 %), by the line through the
@@ -117,9 +290,7 @@ class AccuracyReport:
         and for one with less than three points of known error, or whose error does not fall.
         """
         wanted = positive("spp_for: error", error)
-        quantity = self.quantities()[0] if quantity is None else quantity
-        if not is_one_of(quantity, self.quantities()):
-            raise ArgumentError(f"spp_for: quantity: expected one of {self.quantities()}, got {shown(quantity)}.")
+        quantity = self._quantity("spp_for", quantity)
         curves = {found: points for name, found, points in self.curves() if name == quantity}
         choice = next(iter(curves)) if choice is None else choice
         if choice not in curves:
@@ -150,9 +321,9 @@ class AccuracyReport:
         return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
     def table(self) -> str:
-        """The points as text, one row each, with the slope and the gain of each curve."""
+        """The points as text, one row each, with the slope and the gain of each curve, and the Pareto fronts."""
         lines = []
-        header = f"{'spp':>7} {'seconds':>10} {'squared error':>22} {'relative':>10} {'median bin':>11}"
+        header = f"{'spp':>7} {'seconds':>10} {'CPU s':>10} {'squared error':>22} {'relative':>10} {'median bin':>11}"
         for quantity, choice, curve in self.curves():
             slope = self.slope(quantity, choice)
             tail = f"slope {slope.slope:+.2f} +- {slope.standard_error:.2f}, " if slope is not None else ""
@@ -161,7 +332,7 @@ class AccuracyReport:
             if of_runs is not None and of_runs.heavy:
                 lines[-1] = f"{quantity} [{choice}]  heavy tailed: no error"
                 reason = (
-                    f"tail index {of_runs.index:.1f} (below 2 the variance is infinite), one of {TAIL_RUNS} runs has "
+                    f"tail index {of_runs.index:.2g}, one of {TAIL_RUNS} runs has "
                     f"{of_runs.largest:.0%} of the squared deviations"
                 )
                 if math.isnan(of_runs.index):
@@ -169,22 +340,32 @@ class AccuracyReport:
                 lines.append(f"  {reason}; seconds of a run:")
                 lines += [f"  {p.spp:>7} spp {p.seconds:>10.4g}" for p in curve] + [""]
                 continue
-            lines.append(header)
+            has_total = not math.isnan(curve[0].total_error)
+            lines.append(header + (f" {'total':>10} {'bias':>10}" if has_total else ""))
             for p in curve:
                 deviation = p.squared_error_standard_error
                 spread = f"+- {deviation:.1e}" if math.isfinite(deviation) else ""
                 lines.append(
-                    f"{p.spp:>7} {p.seconds:>10.4g} {p.squared_error:>11.3e} {spread:>10} "
-                    f"{_percent(p.relative_error):>10} {_percent(p.median_bin_error):>11}"
+                    f"{p.spp:>7} {p.seconds:>10.4g} {_plain(p.cpu_seconds):>10} {p.squared_error:>11.3e} "
+                    f"{spread:>10} {_percent(p.relative_error):>10} {_percent(p.median_bin_error):>11}"
+                    + (f" {_percent(p.total_error):>10} {_percent(p.bias):>10}" if has_total else "")
                 )
             lines.append("")
+        for quantity in self.quantities():
+            front = self.pareto(quantity)
+            if len({p.choice for p in self.points if p.quantity == quantity}) > 1 and front:
+                lines.append(f"Pareto front of {quantity}")
+                lines += [f"  {p.seconds:>10.4g} s {_percent(p.error):>10}  {p.spp} spp [{p.choice}]" for p in front]
+                lines.append("")
         lines.append(f"error {self.method}; gain: squared error x seconds of the first choice over this one")
+        if any(not math.isnan(p.total_error) for p in self.points):
+            lines.append("total: against the finest setting, noise and bias")
         if any(math.isnan(p.relative_error) for p in self.points if not (p.tail and p.tail.heavy)):
             lines.append("-: the noise hides the quantity itself, so that there is nothing to be relative to")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data; NaN becomes None, since JSON has none."""
+        """Everything as plain data; NaN becomes None and an infinite number "inf", since JSON has neither."""
         slopes = []
         for quantity, choice, _ in self.curves():
             slope = self.slope(quantity, choice)
@@ -198,29 +379,67 @@ class AccuracyReport:
                     }
                 )
         points = [{**{k: v for k, v in asdict(p).items() if k != "choice"}, **asdict(p.choice)} for p in self.points]
-        plain = _without_nan({"method": self.method, "settings": self.settings, "slopes": slopes, "points": points})
+        plain = _for_json({"method": self.method, "settings": self.settings, "slopes": slopes, "points": points})
         return dict(plain)
 
     def to_json(self, path: str | Path) -> None:
         """Write `to_dict()` to `path`; StorageError when the file cannot be written."""
         write_text(path, json.dumps(self.to_dict(), indent=2) + "\n", "accuracy report")
 
-    def plot(self, path: str | Path) -> None:
-        """Log-log picture of relative error squared against seconds and spp, a row per quantity, with a guide of slope
-        -1."""
-        from torchtransient.vis.accuracy_curve import Curve, plot_accuracy
+    @classmethod
+    def from_json(cls, path: str | Path) -> AccuracyReport:
+        """Return the report of a file that `to_json` wrote. Raises StorageError for other files."""
+        source = check_source(path, "accuracy report")
+        try:
+            data = json.loads(source.read_text(encoding="utf-8"))
+            points = [_point(dict(entry)) for entry in data["points"]]
+            return cls(points, data["method"], data["settings"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise StorageError(f"{source}: expected a file of AccuracyReport.to_json, got another: {error}.") from error
 
-        curves = [
-            Curve(
-                quantity=quantity,
-                label=str(choice),
-                spp=[p.spp for p in curve],
-                seconds=[p.seconds for p in curve],
-                squared_relative_error=[p.relative_error**2 for p in curve],
-            )
-            for quantity, choice, curve in self.curves()
-        ]
-        plot_accuracy(curves, path)
+    def plot(self, path: str | Path) -> None:
+        """Log-log picture of squared relative error with 95 % bands, a row per quantity: the noise against samples
+        with its slopes, and against seconds the error with its bias, where that was measured, and the Pareto front.
+        """
+        from torchtransient.vis.accuracy_curve import plot_accuracy
+
+        plot_accuracy([self._drawn(quantity, choice, curve) for quantity, choice, curve in self.curves()], path)
+
+    def _drawn(self, quantity: str, choice: Choice, curve: list[CostPoint]) -> Curve:
+        from torchtransient.vis.accuracy_curve import Curve
+
+        slope, front = self.slope(quantity, choice), self.pareto(quantity)
+        alone = len({p.choice for p in self.points if p.quantity == quantity}) == 1
+        has_total = not math.isnan(curve[0].total_error)
+        return Curve(
+            quantity=quantity,
+            label=str(choice),
+            spp=[p.spp for p in curve],
+            seconds=[p.seconds for p in curve],
+            squared_relative_error=[p.relative_error**2 for p in curve],
+            band=_squares([self.band(p) for p in curve]),
+            total=[p.error**2 for p in curve] if has_total else None,
+            total_band=_squares([self._interval(p) for p in curve]) if has_total else None,
+            slope=None if slope is None else (slope.slope, slope.standard_error),
+            on_front=[not alone and p in front for p in curve],
+        )
+
+
+def _squares(bands: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    return [(low**2, high**2) for low, high in bands]
+
+
+def _point(entry: dict[str, Any]) -> CostPoint:
+    """A point of its entry in a file: None is NaN, except for what has none."""
+    choice = Choice(**{f.name: entry.pop(f.name) for f in fields(Choice) if f.name in entry})
+    tail = entry.pop("tail", None)
+    tail = None if tail is None else Tail(**{name: _number(value) for name, value in tail.items()})
+    plain: dict[str, Any] = {name: _number(value) for name, value in entry.items() if name != "quantity"}
+    return CostPoint(choice=choice, quantity=entry["quantity"], tail=tail, **plain)
+
+
+def _number(value: float | str | None) -> float:
+    return math.nan if value is None else float(value) if isinstance(value, str) else value
 
 
 def _samples_needed(points: list[CostPoint], error: float) -> SamplesNeeded:
@@ -257,11 +476,15 @@ def _percent(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2%}"
 
 
-def _without_nan(value: Any) -> Any:
+def _plain(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.4g}"
+
+
+def _for_json(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _for_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_nan(item) for item in value]
+        return [_for_json(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
-        return None
+        return None if math.isnan(value) else str(value)
     return value

@@ -162,6 +162,21 @@ def student_t_deviate(t: float, dof: float) -> float:
     return math.copysign(-NormalDist().inv_cdf(min(tail, 0.5)), t)
 
 
+def student_t_quantile(z: float, dof: float) -> float:
+    """Return the t with ``dof`` degrees of freedom whose tail probability is that of the normal deviate ``z`` > 0: the
+    inverse of :func:`student_t_deviate`, z itself for infinite ``dof``.
+    """
+    if math.isinf(dof):
+        return z
+    low, high = z, 2.0 * z
+    while student_t_deviate(high, dof) < z:
+        high *= 2.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if student_t_deviate(middle, dof) < z else (low, middle)
+    return 0.5 * (low + high)
+
+
 def _score(difference: Array, error: Array, dof: float | Array, alpha: float, rounding: float) -> ZTest:
     if not 0.0 < alpha < 1.0:
         raise UnitError(f"alpha: expected a probability between 0 and 1, got {alpha!r}")

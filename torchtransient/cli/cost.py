@@ -35,13 +35,20 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="Also the derivative by this parameter.")
 @click.option("--sampler", "samplers", multiple=True, default=("owen", "independent"), show_default=True)
 @click.option("--temporal-filter", "filters", multiple=True, type=click.Choice(["box", "tent", "gaussian"]))
+@click.option("--integrator", "integrators", multiple=True, metavar="PLUGIN")
+@click.option("--depth", "depths", multiple=True, type=int, metavar="N", help="A longest path; -1 for no limit.")
+@click.option("--bin-width", "widths", multiple=True, type=float, metavar="M", help="Metres of optical path.")
+@click.option("--error", type=click.FloatRange(min=0.0, min_open=True), help="Recommend a setting: 0.05 for 5 %.")
 @click.option("--reference-spp", type=click.IntRange(1, 2**32 - 1), help="Compare with a long one, not in pairs.")
 @click.option("--repeats", type=click.IntRange(min=2), default=4, show_default=True, help="Runs of each kind.")
 @click.option("--plot", type=click.Path(path_type=Path), help="Write the log-log picture (.png).")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the numbers (.json).")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def command(scene: Path, **options: Any) -> None:
-    """Measure the error of SCENE's transient, and of derivatives, against seconds and samples; print a table."""
+    """Measure the error of SCENE's transient, and of derivatives, against seconds and samples; print a table.
+
+    Options that may be given several times say what is compared.
+    """
     from torchtransient.files.result_file import check_folder
     from torchtransient.vis.overview import check_picture
 
@@ -53,12 +60,25 @@ def command(scene: Path, **options: Any) -> None:
     described = load_scene(scene, options["variant"], options["params"])
     report = _measure(described, film, options)
     click.echo(report.table())
+    if options["error"]:
+        for quantity in report.quantities():
+            click.echo(_recommended(report, quantity, options["error"]))
     if options["plot"]:
         report.plot(options["plot"])
         click.echo(f"{options['plot']}: the curves")
     if options["json_path"]:
         report.to_json(options["json_path"])
         click.echo(f"{options['json_path']}: the numbers")
+
+
+def _recommended(report: Any, quantity: str, error: float) -> str:
+    """The setting for an error in words, or why there is none: the table was measured in any case."""
+    from torchtransient.errors import ArgumentError
+
+    try:
+        return f"recommended for {error:.2%}: {report.recommend(error, quantity=quantity)}"
+    except ArgumentError as none:
+        return str(none)
 
 
 def _measure(described: Any, film: Any, options: dict[str, Any]) -> Any:
@@ -75,6 +95,9 @@ def _measure(described: Any, film: Any, options: dict[str, Any]) -> Any:
         repeats=options["repeats"],
         samplers=list(options["samplers"]),
         temporal_filters=list(options["filters"]) or None,
+        integrators=list(options["integrators"]) or None,
+        max_depths=list(options["depths"]) or None,
+        bin_widths=list(options["widths"]) or None,
         seed=options["seed"],
         progress=not options["quiet"],
     )

@@ -72,7 +72,12 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
 
     if options["overview"]:
         power = (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
-        tt.vis.plot_overview(*power, output.axis, path=options["overview"], pixel=options["pixel"], title=title)
+        errors = None
+        if output.cells is not None:
+            errors = output.error_map()[0] if output.polarized else output.error_map()
+        tt.vis.plot_overview(
+            *power, output.axis, path=options["overview"], pixel=options["pixel"], title=title, errors=errors
+        )
         click.echo(f"{options['overview']}: overview")
     if options["peak_time"]:
         tt.vis.peak_time_picture(output, options["peak_time"], title=title)

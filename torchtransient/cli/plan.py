@@ -38,6 +38,13 @@ class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer 
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
 @click.option("--strict", is_flag=True, help="Carry polarization between smooth surfaces too.")
 @click.option("--no-pilot", is_flag=True, help="Decide from the file alone, without tracing paths.")
+@click.option(
+    "--error",
+    type=click.Choice(("squared", "relative")),
+    default="squared",
+    show_default=True,
+    help="Error that is to be small: of the light, or of every bin relative to its own.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON.")
 def command(scene: Path, **options: Any) -> None:
     """Choose variant, integrator, film, depth and time axis for SCENE, and print a line of reason for each.
@@ -62,6 +69,7 @@ def command(scene: Path, **options: Any) -> None:
         sensor=options["sensor"],
         seed=options["seed"],
         film=film,
+        error=options["error"],
         **{name: options[name] for name in wishes},
     )
     click.echo(json.dumps(found.to_dict(), indent=2) if options["as_json"] else str(found))

@@ -22,6 +22,7 @@ from torchtransient.rendering.films import layout_of_output
 @picture_options
 @click.option("--pixel", type=(int, int), metavar="ROW COLUMN", help="Pixel whose histogram the picture shows.")
 @click.option("--spp", type=click.IntRange(1, 2**32 - 1), help="Samples per pixel.  [default: the scene's]")
+@click.option("--errors", is_flag=True, help="Keep error bars in the result, and show them in the overview.")
 @click.option(
     "--rtol", type=click.FloatRange(0, 1, min_open=True, max_open=True), metavar="ERROR",
     help="Render until 90 % of the bins with light have this relative error: 0.05.",
@@ -71,6 +72,8 @@ def command(scene: Path, **options: Any) -> None:
     stats, film = output.stats, layout_of_output(output)
     assert film is not None  # a steady film was refused before the render
     what, how = summary(film, output)
+    if options["errors"] and (error := output.relative_error()) is not None:
+        how += f", sum known to {error:.2%}"
     click.echo(f"{target}: {what}, {stats.spp} samples per pixel, {stats.seconds:.1f} s, {stats.variant}{how}")
     if output.axis is not None:
         _report_energy(output)
@@ -96,12 +99,15 @@ def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str
             max_depth=options["max_depth"],
             temporal_filter=options["temporal_filter"],
             sensors=options["sensor"],
+            errors=options["errors"],
         )
 
 
 def _check_tolerance(options: dict[str, Any]) -> None:
     if options["rtol"] is None and options["max_seconds"] is not None:
         raise click.UsageError("--max-seconds is for --rtol: a render of a given --spp ends with its last sample.")
+    if options["rtol"] is not None and options["errors"]:
+        raise click.UsageError("--rtol, --errors: give one of them; --rtol says the error that it reached.")
     if options["rtol"] is not None and options["spp"] is not None:
         raise click.UsageError("--rtol, --spp: give one of them; --rtol finds the samples, --max-seconds bounds them.")
 

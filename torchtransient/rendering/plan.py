@@ -7,7 +7,7 @@ arrivals are listed one by one), or from the caller; ``plan.reasons`` names the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from torchtransient import plugins
@@ -18,10 +18,11 @@ from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
 from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
+from torchtransient.rendering.relative_error import PIXELS, prefers_reuse
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.scene.edits import checked_pulse
+from torchtransient.scene.edits import NO_LIMIT, checked_pulse
 from torchtransient.scene.inventory import scene_inventory
-from torchtransient.scene.load import load
+from torchtransient.scene.load import cropped, load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.pilot import PilotReport
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
@@ -32,7 +33,10 @@ from torchtransient.scene.variant import resolve_variant
 _ANY_FILM = ("steady", "stokes", "bands")
 # Decisions of a draft that a plan takes over as they are.
 _FROM_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
-_PLAIN = ("outputs", "variant", "integrator", "film", "max_depth", "temporal_filter", "parameters", "sensor", "reasons")
+_PLAIN = (
+    "outputs", "variant", "integrator", "film", "max_depth", "rr_depth", "temporal_filter", "parameters", "sensor",
+    "reasons",
+)  # fmt: skip
 # Nothing is stored in a pilot run: the film only has to be one that integrators take.
 _ANY_AXIS = TimeAxis(0.0, 1.0, 1)
 
@@ -199,6 +203,7 @@ def plan(
     sensor: int = 0,
     seed: int = 0,
     film: FilmLayout | None = None,
+    error: str = "squared",
 ) -> Plan:
     """Choose the cheapest variant, integrator, depth and film that show the requested outputs.
 
@@ -226,6 +231,9 @@ def plan(
         sensor: index of the sensor that is planned for, and rendered.
         seed: seed of the pilot run.
         film: film and its settings, in place of ``frequencies`` and ``gates``.
+        error: error that is to be small: "squared", which bright bins make, or "relative", to which every bin adds
+            alike. For the latter there is no Russian roulette below the depth, and where short runs show that it
+            pays, pixels share light (``transient_path_reuse``).
 
     Returns:
         The plan; ``str(plan)`` prints its reasons.
@@ -241,6 +249,8 @@ def plan(
     for name, share in (("tail", tail), ("missed", missed)):
         if not 0 < share < 1:
             raise UnitError(f"tt.plan: {name} is a share of the light between 0 and 1, got {share!r}.")
+    if not is_one_of(error, ("squared", "relative")):
+        raise ArgumentError(f"tt.plan: error: expected 'squared' or 'relative', got {shown(error)}.")
     if not isinstance(max_depth, str):
         max_depth = checked_depth(max_depth)
     num_bins = None if num_bins is None else count("tt.plan: num_bins", num_bins, 1, ArgumentError)
@@ -262,6 +272,11 @@ def plan(
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
         time_axis = given.settings
     planned_film = planned(wanted)
+    if error == "relative" and (planned_film.all_times or planned_film.kind is Phasors):
+        raise ArgumentError(
+            f"tt.plan: error='relative' is about bins and gates, and a {planned_film.name} film sums over all times; "
+            "leave it out."
+        )
     best, notes = choose_variant(inventory, wanted, loaded.variant.split("_")[0], strict)
     tracer, more = choose_integrator(inventory)
     reasons = (
@@ -287,9 +302,35 @@ def plan(
     finder = Finder(draft, reasons, inventory, tail, missed, seed)
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _FROM_DRAFT}
-    return Plan(
+    result = Plan(
         outputs=wanted, film=planned_film.name, filter_is_given=temporal_filter is not None, **kept, **vars(found)
     )
+    return result if error == "squared" else _for_relative_errors(result, integrator is None and pilot, seed)
+
+
+def _for_relative_errors(given: Plan, chooses: bool, seed: int) -> Plan:
+    """Return a plan without Russian roulette, and with path reuse where it pays.
+
+    Args:
+        given: plan for squared errors.
+        chooses: the integrator may be another one.
+        seed: seed of the runs that decide it.
+    """
+    depth, reasons = given.max_depth, list(given.reasons)
+    if depth is None or depth == NO_LIMIT:
+        reasons.append("Russian roulette: kept, since nothing else bounds the depth")
+    else:
+        reasons.append("Russian roulette: none, since it leaves late light to few paths of great weight")
+        given = replace(given, rr_depth=depth)
+    if chooses and given.integrator == "transient_path":
+        small = replace(given, scene=cropped(given.scene, PIXELS), parameters=())
+        shares, reason = prefers_reuse(
+            lambda name: replace(small, integrator=name).renderer(physics="ignore"), seed, given.film == "gated"
+        )
+        name = "transient_path_reuse" if shares else "transient_path"
+        reasons.append(f"integrator: {name} in the end: {reason}")
+        given = replace(given, integrator=name)
+    return replace(given, reasons=tuple(reasons))
 
 
 def known_outputs() -> tuple[str, ...]:

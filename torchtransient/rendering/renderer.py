@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -178,7 +179,8 @@ class TransientRenderer(CopiesParametrized):
         self._watch = PhysicsWatch(physics, self.scene.warned)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
-        changes["integrator"] = effects.integrator if isinstance(effects, Effects) else None
+        if isinstance(effects, Effects):
+            changes |= {"integrator": effects.integrator, "rr_depth": effects.rr_depth}
         self.sampler = checked_sampler(sampler)
         self._options = self._build_options(max_depth, changes)
         self._infos = self._parameter_infos()
@@ -308,29 +310,59 @@ class TransientRenderer(CopiesParametrized):
         return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
 
     @opaque
-    def variation(self, *, sampler: str | None = None, temporal_filter: str | None = None) -> TransientRenderer:
-        """Return a copy with the same values and another sampler or temporal filter.
+    def variation(
+        self,
+        *,
+        sampler: str | None = None,
+        temporal_filter: str | None = None,
+        integrator: str | None = None,
+        max_depth: int | None = None,
+        time_axis: TimeAxis | None = None,
+    ) -> TransientRenderer:
+        """Return a copy with the same values and other settings. None keeps this renderer's.
 
         Args:
-            sampler: plugin name of a sampler, or "scene", None to keep this renderer's.
-            temporal_filter: "box", "tent", "gaussian" or "auto", None to keep this renderer's.
+            sampler: plugin name of a sampler, or "scene".
+            temporal_filter: "box", "tent", "gaussian" or "auto".
+            integrator: plugin name of a transient integrator; it takes over the parameters of this renderer's.
+            max_depth: longest path, in segments; -1 for no limit.
+            time_axis: bins in place of those of this renderer's histogram.
 
         Returns:
             The copy, with parameters of its own.
 
         Raises:
-            ArgumentError: for other names, and for a filter of a film that has none.
+            ArgumentError: for other names and depths, and for a filter or a time axis of a film that has no bins.
+            SceneError: for an integrator that cannot render the scene.
         """
         if temporal_filter is not None:
             checked_filter(temporal_filter)
         if not self.film.has_bins and temporal_filter not in (None, "auto"):
             raise ArgumentError(f"temporal_filter: the film has none, expected 'auto', got {temporal_filter!r}.")
+        if not self.film.has_bins and time_axis is not None:
+            raise ArgumentError(f"time_axis: a {self.film.measures} film has no bins, expected None, got {time_axis}.")
         twin = copy.deepcopy(self)
         if sampler is not None:
             twin.sampler = checked_sampler(sampler)
         if temporal_filter is not None:
             twin.temporal_filter = temporal_filter
+        changes: dict[str, Any] = {
+            "integrator": integrator,
+            "max_depth": checked_depth(max_depth),
+            "film": requested_film(None, {"time_axis": time_axis}),
+        }
+        changes = {name: value for name, value in changes.items() if value is not None}
+        if changes:
+            twin._rebuild(changes)
         return twin
+
+    @opaque
+    def _rebuild(self, changes: Mapping[str, Any]) -> None:
+        """Change options of the build, in a scene of its own: others keep what they have built and recorded."""
+        self._options = replace(self._options, **changes)
+        self.scene = self.scene.apart()
+        with active_variant(self.scene.variant):
+            self._read_scene(list(self._sensors) if self._stack_sensors else self._sensors[0])
 
     def has_slope_for(self, keys: Sequence[str]) -> bool:
         """Return whether gradients for ``keys`` exist with the filter or gates in use: a box has none of path lengths.

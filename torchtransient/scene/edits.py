@@ -123,6 +123,7 @@ class BuildOptions:
     Attributes:
         film: film that takes the place of every film, None to keep them.
         max_depth: bound for the integrator, None to keep its own.
+        rr_depth: first depth of Russian roulette, None to keep the integrator's.
         substitute: BSDFs to be built as their differentiable twins: name, and name of the texture with the parameter
             ("" for a number).
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
@@ -135,6 +136,7 @@ class BuildOptions:
 
     film: FilmRequest | None = None
     max_depth: int | None = None
+    rr_depth: int | None = None
     substitute: frozenset[tuple[str, str]] = frozenset()
     real_bitmaps: bool = False
     merge: bool = False
@@ -301,6 +303,8 @@ def _edit_integrator(state: Any, options: BuildOptions) -> None:
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
+    if options.rr_depth is not None and index is not None:
+        state.nodes[index].props["rr_depth"] = options.rr_depth
 
 
 def _traced(state: Any, index: int) -> int:
@@ -386,7 +390,7 @@ def _substitute_twins(state: Any, options: BuildOptions) -> None:
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
             if plugin in BUILDS_LOBES and name in asked:
                 node.props["lobes"] = ",".join(sorted(asked[name]))
-        elif plugin in PLASTICS.values() and _lacks_mean(state, node):
+        elif plugin in PLASTICS.values() and (_lacks_mean(state, node) or _is_too_bright(node.props)):
             node.props.set_plugin_name(DIFFERENTIABLE_PLUGINS[plugin])
         elif plugin in COMPLETED_PLUGINS:
             node.props.set_plugin_name(COMPLETED_PLUGINS[plugin])
@@ -405,6 +409,17 @@ def _lacks_mean(state: Any, node: Any) -> bool:
 
     described = any(inner.props.plugin_name() in TEXTURES_WITHOUT_MEAN for inner in descendants(state, node))
     return described or any(isinstance(v, mi.Texture) and not has_mean(v) for _, v in node.props.items())
+
+
+def _is_too_bright(props: Any) -> bool:
+    """Return whether a node is a smooth plastic whose index is beyond that of Mitsuba's fit (see ``diff_plastic``)."""
+    from torchtransient.plugins.bsdfs.ior import relative_index
+    from torchtransient.plugins.bsdfs.plastic import GOOD_FIT
+
+    given = any(name in props for name in ("int_ior", "ext_ior"))
+    if props.plugin_name() != "plastic" or not given:
+        return False
+    return bool(relative_index(props, "plastic", "polypropylene")[0] > GOOD_FIT)
 
 
 def _has_index_of_one(props: Any) -> bool:

@@ -267,6 +267,14 @@ class Scene:
 
     # --------------------------------------------------------------------------------------------- pickles and copies
 
+    def apart(self) -> Scene:
+        """Return a scene of the same description that shares nothing that was built; a shared scene returns itself."""
+        if self.is_shared:
+            return self
+        other = Scene(self._description, self._requested_variant)
+        other._variant = self._variant
+        return other
+
     def __getstate__(self) -> dict[str, Any]:
         self._description.check_described("tt.Scene: pickling")
         return {"description": self._description, "variant": self._requested_variant, "settled": self._variant}
@@ -451,11 +459,24 @@ def _render_pixels(scene: Scene, variant: str) -> None:
         dr.sync_thread()
 
 
-class _Cropped:
-    """Description whose films have a few pixels."""
+def cropped(scene: Scene, pixels: int) -> Scene:
+    """Return a scene with films cropped to at most ``pixels`` along each side, about their middle.
 
-    def __init__(self, description: Any):
-        self._whole = description
+    Films of sensors that place each pixel themselves, and loaded ones, keep their size.
+    """
+    return Scene(_Cropped(scene._description, pixels), scene.variant)  # type: ignore[arg-type]
+
+
+class _Cropped:
+    """Description whose films show the middle of what they showed.
+
+    Args:
+        description: whole description.
+        pixels: largest number of pixels along a side.
+    """
+
+    def __init__(self, description: Any, pixels: int = PIXELS):
+        self._whole, self._pixels = description, pixels
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._whole, name)
@@ -469,17 +490,17 @@ class _Cropped:
             if kind_of(node.props.plugin_name()) != "sensor":
                 for film in below:
                     if is_film(film):
-                        _crop(film.props)
+                        _crop(film.props, self._pixels)
         return state
 
 
-def _crop(props: Any) -> None:
+def _crop(props: Any, pixels: int) -> None:
     if props.get("exhaustive_scan", False) is not False:
         return
     for side, along in (("width", "x"), ("height", "y")):
         whole = props.get(side, 768 if side == "width" else 576)
         there, first = props.get(f"crop_{side}", whole), props.get(f"crop_offset_{along}", 0)
         numbers = [value for value in (whole, there, first) if isinstance(value, int) and value is not True]
-        if len(numbers) == 3 and first >= 0 and PIXELS < there <= whole - first:  # others are refused as they are
+        if len(numbers) == 3 and first >= 0 and pixels < there <= whole - first:  # others are refused as they are
             props[side] = whole
-            props[f"crop_{side}"], props[f"crop_offset_{along}"] = PIXELS, first + (there - PIXELS) // 2
+            props[f"crop_{side}"], props[f"crop_offset_{along}"] = pixels, first + (there - pixels) // 2

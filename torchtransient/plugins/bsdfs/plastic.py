@@ -14,6 +14,9 @@ from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.parameter_effect import VALUE, declare_effects
 from torchtransient.plugins.properties import truth
 
+GOOD_FIT = 2.0
+"""Index up to which Mitsuba's polynomial of the diffuse reflectance from inside is good."""
+
 
 class DiffPlastic(mi.BSDF):
     """Smooth dielectric coating over a diffuse base, parameters and values as Mitsuba's ``plastic``.
@@ -24,7 +27,9 @@ class DiffPlastic(mi.BSDF):
 
     Lobes are chosen with detached probabilities, and weights are a lobe's value over them; ``bs.pdf`` is detached.
     The mirror lobe leaves the surface as it came, so that ``eta`` moves nothing. The diffuse Fresnel reflectance
-    is Mitsuba's polynomial (``mi.fresnel_diffuse_reflectance``), good to some 1e-3; so is its derivative.
+    is Mitsuba's polynomial (``mi.fresnel_diffuse_reflectance``) up to an index of 2, good to some 1e-3 as its
+    derivative is. Beyond, where the diffuse light of Mitsuba's ``plastic`` is 4 % too bright at 2.5, 25 % at 3, and
+    negative at 4, it is exact.
     """
 
     def __init__(self, props: Any) -> None:
@@ -68,10 +73,7 @@ class DiffPlastic(mi.BSDF):
     def _diffuse(self, si: Any, cos_o: Any, f_i: Any, active: Any) -> Any:
         """Value of the diffuse lobe without the cosine and 1 / pi."""
         colour = self.diffuse_reflectance.eval(si, active)
-        inverse = dr.rcp(self.eta)
-        # Mitsuba's fit has two parts, and the slope of the other one at an index of exactly one.
-        beside = mi.fresnel_diffuse_reflectance(dr.select(inverse == 1, inverse * (1 - 6e-8), inverse))
-        internal = dr.replace_grad(mi.fresnel_diffuse_reflectance(inverse), beside)
+        internal = _internal_reflectance(self.eta)
         colour = colour / (1 - (colour * internal if self.nonlinear else internal))
         passes = fresnel(cos_o, self.eta).transmittance
         return colour * (dr.rcp(dr.square(self.eta)) * f_i.transmittance * passes)
@@ -128,6 +130,29 @@ class DiffPlastic(mi.BSDF):
             f"DiffPlastic[\n  eta = {self.eta},\n  diffuse_reflectance = {self.diffuse_reflectance},\n"
             f"  specular_reflectance = {self.specular_reflectance},\n  nonlinear = {self.nonlinear}\n]"
         )
+
+
+def _internal_reflectance(eta: Any) -> Any:
+    """Fraction of diffuse light from inside that a smooth interface throws back.
+
+    Beyond ``GOOD_FIT`` by Walsh's integral of Fresnel's equations from outside (Duntley 1942); what passes to the
+    outside is less by the square of the index.
+    """
+    inverse = dr.rcp(eta)
+    # Mitsuba's fit has two parts, and the slope of the other one at an index of exactly one.
+    beside = mi.fresnel_diffuse_reflectance(dr.select(inverse == 1, inverse * (1 - 6e-8), inverse))
+    fit = dr.replace_grad(mi.fresnel_diffuse_reflectance(inverse), beside)
+    n = dr.maximum(eta, GOOD_FIT)
+    n2 = n * n
+    n4 = n2 * n2
+    external = (
+        0.5
+        + (n - 1) * (3 * n + 1) / (6 * dr.square(n + 1))
+        + n2 * dr.square(n2 - 1) / ((n2 + 1) * dr.square(n2 + 1)) * dr.log((n - 1) / (n + 1))
+        - 2 * n * n2 * (n2 + 2 * n - 1) / ((n2 + 1) * (n4 - 1))
+        + 8 * n4 * (n4 + 1) / ((n2 + 1) * dr.square(n4 - 1)) * dr.log(n)
+    )
+    return dr.select(eta > GOOD_FIT, 1 - (1 - external) / n2, fit)
 
 
 def depolarizing(value: Any) -> Any:

@@ -16,6 +16,8 @@ from torchtransient.plugins.parameter_effect import ParameterEffect, declare_eff
 from torchtransient.plugins.properties import truth
 
 _DISTRIBUTIONS = {"ggx": True, "beckmann": False}
+# From an index of one to the nearest one whose refracted lobe single precision resolves at the smallest roughness.
+_NEAREST = 1e-6
 
 
 class DiffRoughDielectric(mi.BSDF):
@@ -32,9 +34,9 @@ class DiffRoughDielectric(mi.BSDF):
     both attached, so that ``weight * dr.relative_grad(bs.pdf)`` is the detached estimator's. A roughness at the
     clamp has no derivative.
 
-    Single precision: the half vector of a refraction keeps about ``1e-7 / |eta - 1|`` of relative accuracy. At an
-    index of exactly one the transmitted lobe is a delta function, which this plugin cannot represent: it evaluates
-    to zero.
+    Single precision: the half vector of a refraction keeps about ``1e-7 / |eta - 1|`` of relative accuracy, and the
+    derivative by an index within 1e-3 of one is wrong. At exactly one the transmitted lobe is a delta function; an
+    index within 1e-6 of one scatters as ``1 + 1e-6``, or ``1 - 1e-6`` below it, without a derivative.
 
     In polarized variants every facet is a smooth interface with its Mueller matrix, as in Mitsuba's
     ``roughconductor``; Mitsuba's ``roughdielectric`` depolarises instead. Powers of unpolarized light agree.
@@ -122,6 +124,10 @@ class DiffRoughDielectric(mi.BSDF):
             return alpha_u, alpha_u
         return alpha_u, dr.maximum(self.alpha_v.eval_1(si, active), ALPHA_MIN)
 
+    def _index(self) -> Any:
+        """Return the index of the lobes."""
+        return dr.select(dr.abs(self.eta - 1) < _NEAREST, 1 + dr.mulsign(mi.Float(_NEAREST), self.eta - 1), self.eta)
+
     def _lobe(self, ctx: Any, si: Any, wo: Any, m: Any, reflect: Any, active: Any) -> tuple[Any, Any, Any]:
         """Density of ``wo``, value over density (without colours), and the mask where both are meant.
 
@@ -135,11 +141,10 @@ class DiffRoughDielectric(mi.BSDF):
         active &= (wi_m * wi.z > 0) & (wo_m * wo.z > 0)
         active &= dr.select(reflect, mi.Mask(has_r), mi.Mask(has_t))
 
-        terms = fresnel(wi_m, self.eta)
+        terms = fresnel(wi_m, self._index())
         c, cos_t = dr.abs(wi_m), dr.abs(wo_m)
         excess = (terms.eta_it - 1) * (terms.eta_it + 1)
-        refracts = (reflect ^ True) & (excess != 0)
-        active &= reflect | refracts
+        refracts = reflect ^ True
         rcp_length = (c + terms.eta_it * cos_t) / dr.select(refracts, excess, 1.0)
         jacobian = dr.select(
             reflect,
@@ -179,7 +184,7 @@ class DiffRoughDielectric(mi.BSDF):
         if not mi.is_polarized:
             return mi.Spectrum(colour) & active
         # The facet is a smooth interface. The power of its matrix is in the value already, the same for all colours.
-        interface = Interface(dr.dot(si.wi, m), self.eta)
+        interface = Interface(dr.dot(si.wi, m), self._index())
         matrix = dr.select(reflect, interface.reflection(), interface.transmission())
         power = dr.max(mi.unpolarized_spectrum(matrix))
         there = active & (power > 0)
@@ -192,7 +197,8 @@ class DiffRoughDielectric(mi.BSDF):
         wi = si.wi
         active = mi.Mask(active) & (wi.z != 0)
         reflect = wi.z * wo.z > 0
-        eta_it = dr.select(wi.z > 0, self.eta, dr.rcp(self.eta))
+        eta = self._index()
+        eta_it = dr.select(wi.z > 0, eta, dr.rcp(eta))
         m, defined = half_vector(wi, wo, dr.select(reflect, 1.0, eta_it))
         pdf, weight, active = self._lobe(ctx, si, wo, m, reflect, active & defined)
         return self._spectrum(ctx, si, wo, m, pdf * weight, reflect, active), pdf
@@ -214,7 +220,7 @@ class DiffRoughDielectric(mi.BSDF):
         with dr.suspend_grad():
             wi = si.wi
             m = self._draw_normal(si, wi, sample2, active)
-            terms = fresnel(dr.dot(wi, m), self.eta)
+            terms = fresnel(dr.dot(wi, m), self._index())
             if has_r and has_t:
                 selected_r = (sample1 < terms.reflectance) | (terms.transmittance <= 0)
             else:
@@ -224,7 +230,8 @@ class DiffRoughDielectric(mi.BSDF):
 
         # The facet that turns si.wi into the fixed direction wo. Its value is the normal that was drawn, which does not
         # suffer from the cancellation in the half vector.
-        eta_it = dr.select(wi.z > 0, self.eta, dr.rcp(self.eta))
+        eta = self._index()
+        eta_it = dr.select(wi.z > 0, eta, dr.rcp(eta))
         if dr.is_diff_v(m):  # dr.replace_grad ends the process on the vectors of a scalar variant
             attached_m, _ = half_vector(si.wi, wo, dr.select(selected_r, 1.0, eta_it))
             m = dr.replace_grad(m, attached_m)

@@ -186,7 +186,8 @@ class Wanted:
         light: an emitter without a shape moves.
         sky: emitter of the sun that moves, None without.
         emitter_shape: the shape of an emitter moves.
-        sphere_lights: path lengths change and some emitters are spheres.
+        sphere_lights: points move, and with them path lengths, and some emitters are spheres. An index of rough
+            surfaces and a lifetime change lengths alone.
         sensor: the sensor moves.
         index: an index of refraction changes.
         ray: the Carry has the ray, behind delta lobes or a moving sensor.
@@ -214,7 +215,8 @@ class Wanted:
         self.emitter_shape = any(isinstance(node, mi.Shape) and node.is_emitter() for node in moved("shape"))
         self.sensor = any(node.ptr in sensors for node in moved("sensor"))
         self.sensor |= any(node.ptr in carriers for node in moved("shape"))
-        self.sphere_lights = self.geometry and contents.sphere_lights is not None
+        points_move = any(effect.moves_length and effect.moves_silhouette for _, _, effect in effects)
+        self.sphere_lights = points_move and contents.sphere_lights is not None
         self.ray = self.geometry and (contents.delta or self.sensor)
         bent = any(key in (NORMALS, POSITIONS) for _, key, _ in effects)
         self.slides_position_only = self.geometry and not (self.ray or bent or contents.patterned)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.sampling.rays import past
+from torchtransient.plugins.sampling.rays import past, shortest
 from torchtransient.plugins.transport.scene_contents import is_open
 from torchtransient.plugins.transport.surface_interactions import distance_to
 
@@ -238,11 +238,12 @@ def medium_along(scene, ray, medium, active):
 
 @dr.syntax
 def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hide=False):
-    """Transmittance over ``length`` along ``ray``, which starts in ``medium`` and ends before ``ray.maxt``; with
-    ``hide`` light sources are passed, as rays from the sensor pass them.
+    """Transmittance over ``length`` along ``ray``, which starts in ``medium``; with ``hide`` light sources are passed,
+    as rays from the sensor pass them.
 
-    Returns (per channel, whether nothing is in the way). Analytic in homogeneous media; ratio tracking (Novak et al.
-    2014) in others, with random numbers that follow from ``numbers`` of the sampler and the lane.
+    Returns (per channel, whether nothing is in the way before ``ray.maxt``). Open boundaries count up to the end.
+    Analytic in homogeneous media; ratio tracking (Novak et al. 2014) in others, with random numbers that follow from
+    ``numbers`` of the sampler and the lane.
     """
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         visible = active & ~scene.ray_test(ray, active)
@@ -251,20 +252,24 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hid
         T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
     else:
         rng = generator(numbers, lanes, SHADOW)
-        t = mi.Float(0)
         medium = mi.MediumPtr(medium)
         T = mi.UnpolarizedSpectrum(1)
         visible = mi.Bool(active)
+        # The ray starts a little off the surface that ``length`` counts from, and ends before an occluder at the end.
+        until, last = ray.maxt, ray.maxt / (1 - mi.math.ShadowEpsilon)
+        t = last - length
+        ray = mi.Ray3f(ray)
+        ray.maxt = last - shortest(ray(last))
         pi = scene.ray_intersect_preliminary(ray, active=active)
         going = mi.Bool(active)
         while dr.hint(going, label="transmittance through media"):
             inside = going & (medium != None)  # noqa: E711
-            t_end = dr.minimum(pi.t, length)
+            t_end = dr.minimum(pi.t, last)
             collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
             blocked = pi.is_valid() & ~lets_through(media, ray, pi, hide)
             passes = going & ~collides & pi.is_valid() & ~blocked
-            visible &= ~(going & ~collides & blocked)
+            visible &= ~(going & ~collides & blocked & (pi.t < until))
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
             pi, medium = cross_boundary(scene, ray, pi, medium, passes)
             going = (collides | passes) & (dr.max(T) > 0)
@@ -311,7 +316,7 @@ class Leg:
     Args:
         v: :class:`.record.RecordedVertex` that it belongs to, whose numbers seed its tracking.
         x0, x1: ends, Point3f.
-        d, far: direction of legs without end, and their mask.
+        d, far: direction, as the ray had it that was followed, and mask of legs without end.
         medium: medium at the start, MediumPtr.
         stream: number that tells the legs of a vertex apart.
         clip: distance from ``x0`` of the first surface at least, None for 0.
@@ -320,10 +325,10 @@ class Leg:
     def __init__(self, v, x0, x1, d, far, medium, stream, clip=None):
         self.x0, self.x1, self.far, self.medium = mi.Point3f(x0), mi.Point3f(x1), far, medium
         self.length = dr.select(far, dr.inf, dr.norm(self.x1 - self.x0))
-        self.d = dr.select(far, d, dr.normalize(self.x1 - self.x0))
+        self.d = dr.detach(mi.Vector3f(d))
         self.ray = mi.Ray3f(v.ray)
         self.ray.o, self.ray.d = self.x0, self.d
-        self.ray.maxt = self.length * (1 - mi.math.ShadowEpsilon)
+        self.ray.maxt = self.length - shortest(self.x1)
         self.clip, self.numbers = clip, v.numbers()
         self.lanes, self.stream = dr.arange(mi.UInt32, dr.width(v.ray.d)), stream
 

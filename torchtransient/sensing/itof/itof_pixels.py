@@ -7,7 +7,7 @@ all N exposures; the next exposure has its phase a step further on. Cameras repo
 
     Compose([ItofCorrelation(TwoTapCode(sine_code(4)), f, axis), PixelElectronics(...), TapDifference()])
 
-The scene is taken to stand still during all exposures.
+The scene is taken to stand still during all exposures; `tt.PhaseSteps` takes each from a scene of its own.
 
 Sources: Schwarte et al., "New electro-optical mixing and correlating sensor" (SPIE 1997); Bamji et al., "A 0.13 um
 CMOS system-on-chip for a 512 x 424 time-of-flight image sensor" (IEEE JSSC 2015), differential pixels; Lindner,

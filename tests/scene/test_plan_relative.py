@@ -1,0 +1,87 @@
+"""Plans for small relative errors: no Russian roulette, and shared light where it pays."""
+
+import pytest
+import torch
+
+import torchtransient as tt
+from support import plan_scenes
+from support.marks import long
+from torchtransient.errors import ArgumentError
+from torchtransient.rendering.error_bars import local_mean
+
+
+def box(resolution=24, **integrator):
+    scene = tt.scenes.cornell_box(resolution=resolution, num_bins=60, bin_width_opl=0.1)
+    scene["integrator"] |= integrator
+    return scene
+
+
+def test_diffuse_rooms_share_their_light():
+    plan = tt.plan(box(), error="relative")
+    assert plan.integrator == "transient_path_reuse"
+    assert plan.rr_depth == plan.max_depth
+    assert any("path reuse" in line for line in plan.reasons)
+    assert plan.renderer(spp=16)(seed=0).stats.integrator == "transient_path_reuse"
+
+
+def test_squared_errors_are_those_of_plain_paths():
+    plan = tt.plan(box())
+    assert (plan.integrator, plan.rr_depth) == ("transient_path", None)
+
+
+@pytest.mark.parametrize("reason", ["one bounce", "polarized", "asked for", "no pilot"])
+def test_paths_stay_plain(reason):
+    scene, settings = box(8), {}
+    if reason == "one bounce":  # nothing to share
+        settings = {"max_depth": 2}
+    if reason == "polarized":
+        settings = {"variant": "llvm_ad_spectral_polarized"}
+    if reason == "asked for":
+        settings = {"integrator": "transient_path"}
+    if reason == "no pilot":
+        settings = {"pilot": False, "max_depth": 8}
+    plan = tt.plan(scene, error="relative", **settings)
+    assert plan.integrator == "transient_path"
+    assert plan.rr_depth == plan.max_depth
+
+
+def test_roulette_stays_where_nothing_else_ends_paths():
+    plan = tt.plan(box(8, max_depth=-1), error="relative", max_depth="scene", pilot=False, time_axis="scene")
+    assert plan.rr_depth is None
+
+
+def test_dark_scenes():
+    scene = plan_scenes.grey_room()
+    del scene["light"]
+    plan = tt.plan(scene, error="relative", time_axis="scene", max_depth=6)
+    assert plan.integrator == "transient_path"
+
+
+@pytest.mark.parametrize("settings", [{"outputs": "steady"}, {"outputs": "phasor", "frequencies": [1.0]}])
+def test_films_without_times_are_refused(settings):
+    with pytest.raises(ArgumentError, match="relative"):
+        tt.plan(box(8), error="relative", **settings)
+
+
+def test_unknown_errors_are_refused():
+    with pytest.raises(ArgumentError, match="squared"):
+        tt.plan(box(8), error="absolute")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", long(["transient_path", "transient_path_reuse"], ["transient_path"]))
+def test_late_bins_are_less_noisy_for_the_plan_and_the_mean_is_the_same(integrator):
+    """Late light of a room with depth 20, 24 runs of each: variances over the local mean squared, means by z."""
+    scene, axis = box(16, max_depth=20), tt.TimeAxis(4.0, 0.5, 60)
+    plan = tt.plan(scene, error="relative", time_axis=axis, max_depth="scene", integrator=integrator)
+    planned, plain = plan.renderer(spp=64), tt.TransientRenderer(scene, time_axis=axis, spp=64)
+    runs = {}
+    for name, renderer in (("planned", planned), ("plain", plain)):
+        with torch.no_grad():
+            runs[name] = torch.stack([renderer(seed=100 + k).transient.mean(0).double() for k in range(24)])
+    energies = [r.sum((1, 2, 3)) for r in runs.values()]
+    z = (energies[0].mean() - energies[1].mean()) / (energies[0].var() / 24 + energies[1].var() / 24).sqrt()
+    assert abs(float(z)) < 4
+    near = local_mean(torch.cat(list(runs.values())).mean(0), (0, 1, 2))
+    late = [float((r.var(0) / (near**2 + (0.01 * near.mean()) ** 2))[30:].mean()) for r in runs.values()]
+    assert late[0] < late[1] / 3

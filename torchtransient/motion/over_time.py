@@ -1,0 +1,150 @@
+"""``tt.over_time``: a renderer whose scene moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+from torch import Tensor
+
+from torchtransient.checks import as_whole, function, mapping, of_class, shown
+from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.motion.rigid import Motion
+from torchtransient.motion.slow_times import SlowTimes
+from torchtransient.rendering.job import draw_seed
+from torchtransient.rendering.output import RenderOutput
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.scene.opaque import opaque
+from torchtransient.scene.parameters import unknown_key
+from torchtransient.scene.values import as_float
+from torchtransient.scene.variant import device_type
+
+# A motion or a function of times (K,) by key or name of a body, or one function of all.
+Moving: TypeAlias = Mapping[str, "Motion | Callable[[Tensor], Any]"] | Callable[[Tensor], Mapping[str, Any]]
+
+# Parameters that a rigid motion moves.
+_PLACES = ("to_world", "position", "vertex_positions")
+
+
+@opaque
+def over_time(
+    renderer: TransientRenderer,
+    moving: Moving,
+    exposure: SlowTimes,
+    *,
+    values: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    spp: int | None = None,
+    progress: bool = False,
+) -> RenderOutput:
+    """Render a scene that moves, as a camera sees it that looks for a while.
+
+    One batch of poses is rendered, all with the same samples, so that noise does not differ between instants; what the
+    exposure makes of it is linear. Costs as many renders as poses, and holds their pictures.
+
+    Args:
+        renderer: a renderer whose parameters include what moves, ``parameters=["fan.to_world"]``.
+        moving: what moves, by key or by name of a body ("fan" for "fan.to_world", "lamp.position" or
+            "mesh.vertex_positions", whichever the renderer has):
+
+            - a :class:`tt.Motion`, from the value of the call or of the renderer, which is that of t = 0;
+            - a function of times (K,), seconds, float64, that returns the values (K, *shape) of the key;
+            - or, in place of the mapping, one function of times that returns values by key.
+        exposure: :class:`tt.Exposure`, :class:`tt.RollingShutter`, :class:`tt.PhaseSteps` or :class:`tt.Frames`.
+        values: by key in place of the renderer's own, without a batch.
+        seed: one seed for all poses; None draws one from torch's generator.
+        spp: samples per pixel of each pose, None for the renderer's.
+        progress: show a progress bar.
+
+    Returns:
+        A :class:`RenderOutput` as of the renderer, with one leading dimension more for ``PhaseSteps`` and ``Frames``.
+        Its tensors carry gradients to velocities, to what functions are made of, and to all values.
+
+    Raises:
+        ArgumentError: for a renderer with a whole number as ``grad_seed``, whose poses would differ in noise; for films
+            without what the exposure needs; for a motion of what has no place, and for none.
+        UnknownKeyError: for keys and names that the renderer does not have.
+        ShapeError: for batches, and functions that return other than one value for each time.
+        SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
+
+    Not supported: Doppler shifts of the light itself. See ``docs/motion.md``.
+    """
+    of_class("over_time: renderer", renderer, TransientRenderer)
+    of_class("over_time: exposure", exposure, SlowTimes, ", such as tt.Exposure(1e-3)")  # type: ignore[type-abstract]
+    if exposure.needs_phasors and not renderer.film.is_complex:
+        raise ArgumentError(
+            f"over_time: {exposure} is seen by a phasor film, got one that measures {renderer.film.measures}. Make the "
+            "renderer with frequencies=..., or leave out beat_hz."
+        )
+    if isinstance(renderer.grad_seed, int):
+        raise ArgumentError(
+            f"over_time: expected a renderer with grad_seed=None or 'same', which give all poses the same samples, got "
+            f"{renderer.grad_seed}."
+        )
+    number = as_whole(draw_seed(seed)[0])
+    if number is None:
+        raise UnitError(f"seed: expected one whole number for all poses, got {shown(seed)}.")
+    tensors, _, batch = renderer._collect(values)
+    if batch is not None:
+        raise ShapeError(f"over_time: expected values without a batch, got one of {batch}. Poses are the batch here.")
+    time_s = exposure.poses_s(renderer._cube_shape[0]).to(device_type(renderer.scene.variant))
+    own = dict(zip(renderer._keys, tensors, strict=True))
+    given = {**(values or {}), **_values_at(moving, time_s, own)}
+    poses: RenderOutput = renderer(given, seed=[number] * len(time_s), spp=spp, progress=progress)
+    return poses.map(exposure.combine)
+
+
+def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the values (K, *shape) of what moves; ``own``: values of all keys at t = 0."""
+    if isinstance(moving, Mapping):
+        at = {name: how if isinstance(how, Motion) else _called(name, how, time_s) for name, how in moving.items()}
+    else:
+        at = dict(mapping("over_time: function of times", _called("moving", moving, time_s), "{key: values}"))
+    if not at:
+        raise ArgumentError("over_time: expected something that moves, got nothing. renderer(...) renders still ones.")
+    found: dict[str, Tensor] = {}
+    for name, value in at.items():
+        key = _key_of(name, own)
+        if key in found:
+            raise ArgumentError(f"over_time: {key!r} is moved twice.")
+        still = own[key]
+        if isinstance(value, Motion):
+            found[key] = _moved(key, still, value.matrices(time_s))
+            continue
+        found[key] = as_float(key, value, still.device.type)
+        if found[key].shape != (len(time_s), *still.shape):
+            raise ShapeError(
+                f"over_time: expected a function that returns {(len(time_s), *still.shape)} for {len(time_s)} times of "
+                f"{key!r}, got {tuple(found[key].shape)}."
+            )
+    return found
+
+
+def _called(name: str, how: Any, time_s: Tensor) -> Any:
+    return function(f"over_time: {name}", how, "times (K,), or a tt.Motion")(time_s)
+
+
+def _key_of(name: str, own: Mapping[str, Tensor]) -> str:
+    """Return the key of a name. Raises UnknownKeyError."""
+    for key in (name, *(f"{name}.{place}" for place in _PLACES)):
+        if key in own:
+            return key
+    example = name if "." in str(name) else f"{name}.to_world"
+    raise UnknownKeyError(
+        f"{unknown_key(name, list(own), 'this renderer')} What moves is one of its parameters: "
+        f"TransientRenderer(scene, parameters=['{example}'])."
+    )
+
+
+def _moved(key: str, still: Tensor, matrices: Tensor) -> Tensor:
+    """Return a pose, a position or vertices after each of the motions ``matrices`` (K, 4, 4)."""
+    place = key.rpartition(".")[2]
+    if place not in _PLACES:
+        raise ArgumentError(
+            f"over_time: a tt.Motion moves {', '.join(_PLACES)}, got {key!r}. Give a function of times in its place."
+        )
+    if place == "to_world":
+        return matrices @ still.to(matrices)
+    points = still.to(matrices).reshape(-1, 3)
+    moved = points @ matrices[:, :3, :3].mT + matrices[:, None, :3, 3]
+    return moved.reshape(len(matrices), *still.shape)
