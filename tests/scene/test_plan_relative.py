@@ -1,4 +1,4 @@
-"""Plans for small relative errors: no Russian roulette, and shared light where it pays."""
+"""Plans for small errors: no Russian roulette, shared light, and ellipsoidal connections where they pay."""
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ def test_diffuse_rooms_share_their_light():
     plan = tt.plan(box(), error="relative")
     assert plan.integrator == "transient_path_reuse"
     assert plan.rr_depth == plan.max_depth
-    assert any("path reuse" in line for line in plan.reasons)
+    assert any("path reuse: used" in line for line in plan.reasons)
     assert plan.renderer(spp=16)(seed=0).stats.integrator == "transient_path_reuse"
 
 
@@ -66,6 +66,21 @@ def test_films_without_times_are_refused(settings):
 def test_unknown_errors_are_refused():
     with pytest.raises(ArgumentError, match="squared"):
         tt.plan(box(8), error="absolute")
+
+
+@pytest.mark.parametrize("error", ["squared", "relative"])
+@pytest.mark.parametrize("width", [0.06, 6.0])
+def test_narrow_gates_are_connected_by_path_length(width, error):
+    plan = tt.plan(box(), "gates", gates=tt.Gate.rectangular(7.5 - width / 2, 7.5 + width / 2), error=error)
+    assert plan.connections == ("ellipsoidal" if width < 1 else None)
+    out = plan.renderer(spp=16)(seed=0)
+    assert out.gated.isfinite().all() and out.gated.sum() > 0
+
+
+def test_gates_of_scenes_without_faces_that_shine():
+    plan = tt.plan(plan_scenes.grey_room(), "gates", gates=tt.Gate.rectangular(8.0, 8.1))
+    assert plan.connections is None
+    assert any("ellipsoidal connections: not used" in line for line in plan.reasons)
 
 
 @pytest.mark.slow

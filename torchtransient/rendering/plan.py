@@ -18,8 +18,8 @@ from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
 from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
-from torchtransient.rendering.relative_error import PIXELS, prefers_reuse
 from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.rendering.trial_runs import SPP, variances
 from torchtransient.scene.edits import NO_LIMIT, checked_pulse
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import cropped, load
@@ -34,9 +34,14 @@ _ANY_FILM = ("steady", "stokes", "bands")
 # Decisions of a draft that a plan takes over as they are.
 _FROM_DRAFT = ("scene", "variant", "integrator", "pulse", "irf", "parameters", "sensor")
 _PLAIN = (
-    "outputs", "variant", "integrator", "film", "max_depth", "rr_depth", "temporal_filter", "parameters", "sensor",
-    "reasons",
+    "outputs", "variant", "integrator", "film", "max_depth", "rr_depth", "connections", "temporal_filter", "parameters",
+    "sensor", "reasons",
 )  # fmt: skip
+_PATH, _VOLUMES, _REUSE = "transient_path", "transient_prbvolpath", "transient_path_reuse"
+# Time of path reuse and of ellipsoidal connections over that of plain paths with as many samples, at most.
+_TIME_OF_REUSE, _TIME_OF_ELLIPSOIDS = 2.0, 5.0
+# Largest side of the pictures that tell which of them pays.
+_PIXELS = 64
 # Nothing is stored in a pilot run: the film only has to be one that integrators take.
 _ANY_AXIS = TimeAxis(0.0, 1.0, 1)
 
@@ -232,8 +237,9 @@ def plan(
         seed: seed of the pilot run.
         film: film and its settings, in place of ``frequencies`` and ``gates``.
         error: error that is to be small: "squared", which bright bins make, or "relative", to which every bin adds
-            alike. For the latter there is no Russian roulette below the depth, and where short runs show that it
-            pays, pixels share light (``transient_path_reuse``).
+            alike. For the latter there is no Russian roulette below the depth, and pixels share light
+            (``transient_path_reuse``) where short runs show that it pays, as they show for the ellipsoidal
+            connections of gates.
 
     Returns:
         The plan; ``str(plan)`` prints its reasons.
@@ -305,32 +311,51 @@ def plan(
     result = Plan(
         outputs=wanted, film=planned_film.name, filter_is_given=temporal_filter is not None, **kept, **vars(found)
     )
-    return result if error == "squared" else _for_relative_errors(result, integrator is None and pilot, seed)
+    if error == "relative":
+        result = _without_roulette(result)
+    return _with_least_variance(result, error == "relative", seed) if integrator is None and pilot else result
 
 
-def _for_relative_errors(given: Plan, chooses: bool, seed: int) -> Plan:
-    """Return a plan without Russian roulette, and with path reuse where it pays.
+def _without_roulette(given: Plan) -> Plan:
+    depth = given.max_depth
+    if depth is None or depth == NO_LIMIT:
+        reason = "Russian roulette: kept, since nothing else bounds the depth"
+        return replace(given, reasons=(*given.reasons, reason))
+    reason = "Russian roulette: none, since it leaves late light to few paths of great weight"
+    return replace(given, rr_depth=depth, reasons=(*given.reasons, reason))
+
+
+def _with_least_variance(given: Plan, relative: bool, seed: int) -> Plan:
+    """Return a plan with path reuse or ellipsoidal connections where short runs show that they pay.
 
     Args:
-        given: plan for squared errors.
-        chooses: the integrator may be another one.
-        seed: seed of the runs that decide it.
+        given: plan with plain paths and ordinary connections.
+        relative: the variance of each bin counts over its squared mean.
+        seed: seed of the runs.
     """
-    depth, reasons = given.max_depth, list(given.reasons)
-    if depth is None or depth == NO_LIMIT:
-        reasons.append("Russian roulette: kept, since nothing else bounds the depth")
-    else:
-        reasons.append("Russian roulette: none, since it leaves late light to few paths of great weight")
-        given = replace(given, rr_depth=depth)
-    if chooses and given.integrator == "transient_path":
-        small = replace(given, scene=cropped(given.scene, PIXELS), parameters=())
-        shares, reason = prefers_reuse(
-            lambda name: replace(small, integrator=name).renderer(physics="ignore"), seed, given.film == "gated"
+    other: list[tuple[str, dict[str, Any], float]] = []
+    if relative and given.integrator == _PATH:
+        other.append(("path reuse", {"integrator": _REUSE}, _TIME_OF_REUSE))
+    if given.film == "gated" and given.integrator in (_PATH, _VOLUMES):
+        other.append(("ellipsoidal connections", {"connections": "ellipsoidal"}, _TIME_OF_ELLIPSOIDS))
+    best, reasons = 1.0, list(given.reasons)
+    small, chosen = replace(given, scene=cropped(given.scene, _PIXELS), parameters=()), given
+    for name, changes, time in other:
+        try:
+            renderers = [p.renderer(physics="ignore") for p in (small, replace(small, **changes))]
+            plain, less = variances(renderers[0], renderers[1], seed, relative)
+        except SceneError as error:
+            reasons.append(f"{name}: not used: {error}")
+            continue
+        gain = plain / (time * less) if less > 0 else 0.0
+        if gain > best:
+            best, chosen = gain, replace(given, **changes)
+        kind = "relative variance" if relative else "variance"
+        reasons.append(
+            f"{name}: {'used' if gain > 1 else 'not used'}, since the {kind} with {SPP} samples per pixel is "
+            f"{less:.2g} with it and {plain:.2g} without, and it takes up to {time:g} times the time"
         )
-        name = "transient_path_reuse" if shares else "transient_path"
-        reasons.append(f"integrator: {name} in the end: {reason}")
-        given = replace(given, integrator=name)
-    return replace(given, reasons=tuple(reasons))
+    return replace(chosen, reasons=tuple(reasons))
 
 
 def known_outputs() -> tuple[str, ...]:

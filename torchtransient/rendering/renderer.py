@@ -180,7 +180,7 @@ class TransientRenderer(CopiesParametrized):
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         if isinstance(effects, Effects):
-            changes |= {"integrator": effects.integrator, "rr_depth": effects.rr_depth}
+            changes |= {name: getattr(effects, name) for name in ("integrator", "rr_depth", "connections")}
         self.sampler = checked_sampler(sampler)
         self._options = self._build_options(max_depth, changes)
         self._infos = self._parameter_infos()

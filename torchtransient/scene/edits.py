@@ -123,7 +123,7 @@ class BuildOptions:
     Attributes:
         film: film that takes the place of every film, None to keep them.
         max_depth: bound for the integrator, None to keep its own.
-        rr_depth: first depth of Russian roulette, None to keep the integrator's.
+        rr_depth, connections: parameters of the integrator, None to keep its own.
         substitute: BSDFs to be built as their differentiable twins: name, and name of the texture with the parameter
             ("" for a number).
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
@@ -137,6 +137,7 @@ class BuildOptions:
     film: FilmRequest | None = None
     max_depth: int | None = None
     rr_depth: int | None = None
+    connections: str | None = None
     substitute: frozenset[tuple[str, str]] = frozenset()
     real_bitmaps: bool = False
     merge: bool = False
@@ -303,8 +304,10 @@ def _edit_integrator(state: Any, options: BuildOptions) -> None:
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
-    if options.rr_depth is not None and index is not None:
-        state.nodes[index].props["rr_depth"] = options.rr_depth
+    for name in ("rr_depth", "connections"):
+        value = getattr(options, name)
+        if value is not None and index is not None:
+            state.nodes[index].props[name] = value
 
 
 def _traced(state: Any, index: int) -> int:

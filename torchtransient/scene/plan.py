@@ -45,7 +45,7 @@ class Effects(abc.ABC):
     Attributes:
         scene: the scene, in the variant of the plan.
         variant, integrator: names.
-        film_choice, max_depth, rr_depth, pulse, irf: None keeps the scene's.
+        film_choice, max_depth, rr_depth, connections, pulse, irf: None keeps the scene's.
         temporal_filter: empty for films without one.
         filter_is_given: the filter was an argument of the plan, which no other filter replaces.
         sensor: index of the sensor whose light the decisions are about.
@@ -62,6 +62,7 @@ class Effects(abc.ABC):
     filter_is_given: bool = False
     sensor: int = 0
     rr_depth: int | None = None
+    connections: str | None = None
 
     @abc.abstractmethod
     def __str__(self) -> str:
