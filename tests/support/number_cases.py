@@ -235,6 +235,7 @@ def _runs() -> dict[str, Case]:
     batches, table = t.Batches(4, 2), Table()
     return {
         "accuracy.AccuracyReport.spp_for": Case(_report().spp_for, error=0.1),
+        "accuracy.AccuracyReport.recommend": Case(_report().recommend, error=0.3),
         "data.first_return": Case(d.first_return, LIGHT, AXIS, threshold=0.5),
         "data.Augmented": Case(d.Augmented, table, d.Augment(d.Flip()), seed=3),
         "data.Augmented.sample": Case(
@@ -360,7 +361,7 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
     r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult)\(.*\)": "results",
-    r"accuracy\.(SamplesNeeded|GradientEstimate)\(.*\)": "results",
+    r"accuracy\.(SamplesNeeded|GradientEstimate|Recommendation)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
     r"nlos\.(Laplacian|Phasor)Filter\.\w+\(.*\)": "what reconstruction gives its filters",
