@@ -94,6 +94,30 @@ def many_triangles():
     return with_object(cloth={"type": "mesh_arrays", "vertices": vertices, "faces": faces, "bsdf": bsdf})
 
 
+def cloth_alone():
+    """Of all that scatters, no mesh is small enough to be looked through."""
+    kept = ("type", "integrator", "sensor", "cloth")
+    scene = {name: node for name, node in many_triangles().items() if name in kept}
+    lamp = {"to_world": translate([0, 0.9, 0]) @ rotate([1, 0, 0], 90) @ scale(0.2), "bsdf": {"type": "null"}}
+    scene["light"] = {"type": "rectangle", **lamp, "emitter": {"type": "area", "radiance": 10.0}}
+    return scene
+
+
+def far_away(by=60.0):
+    """The box far from the origin, where rays start millimetres off surfaces."""
+    scene = room(gates="gaussian 6.0 0.1; rectangular 7.2 7.3; rectangular 8.5 8.7")
+    for name, node in scene.items():
+        if isinstance(node, dict) and "to_world" in node:
+            scene[name] = node | {"to_world": translate([by, 0, 0]) @ node["to_world"]}
+    return scene
+
+
+def glossy_mask():
+    """A part of the walls is a mirror almost, which paths see alone."""
+    gloss = {"type": "mask", "opacity": 0.5, "nested": {"type": "roughconductor", "alpha": 0.03}}
+    return room() | {"back": room()["back"] | {"bsdf": gloss}}
+
+
 SCENES = {
     "gates": room,
     "window": histogram,
@@ -111,6 +135,10 @@ SCENES = {
     "sky": lambda: with_object(sky={"type": "constant", "radiance": 0.3}),
     "hidden lamp": lambda: room(hide_emitters=True),
     "unwarped": lambda: room(gates="rectangular 1.5 1.6; rectangular 4.5 4.7", camera_unwarp=True),
+    "cloth alone": cloth_alone,
+    "far away": far_away,
+    "glossy mask": glossy_mask,
+    "unwarped fog": lambda: fog() | {"integrator": fog()["integrator"] | {"camera_unwarp": True}},
     "two bounces": lambda: room(max_depth=3),
     "fog": fog,
     "low fog": low_fog,

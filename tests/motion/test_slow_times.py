@@ -34,6 +34,25 @@ def test_polynomials_with_a_beat_are_averaged_exactly(poses, beat_hz):
         assert abs(complex(exposure.combine(pictures)) - moment(degree, beat_hz)) < 1e-13
 
 
+@pytest.mark.parametrize("beat_hz", [1 / DURATION_S, -1 / DURATION_S])
+def test_the_beat_is_the_light_over_the_sensor(beat_hz):
+    """Light of a path that changes, times a sensor's sine, averaged by steps of 1/40 of a period: the tap of the
+    sensor's phase is half the real part of the beat's phasor, turned by it. Of 150 periods of the modulation, which is
+    slow here, a few 1e-4 of the amplitude are left over.
+    """
+    frequency, opl_per_s, start, speed_of_light = 1e5, 2e5, 700.0, 299792458.0
+    t = (np.arange(int(40 * frequency * DURATION_S)) + 0.5) / (40 * frequency) - DURATION_S / 2
+    delay = (start + opl_per_s * t) / speed_of_light
+    light = 1 + np.cos(2 * np.pi * frequency * (t - delay))
+    exposure = tt.Exposure(DURATION_S, beat_hz=beat_hz, poses=12)
+    opl = start + opl_per_s * exposure.poses_s().numpy()
+    phasor = complex(exposure.combine(torch.tensor(np.exp(-2j * np.pi * frequency * opl / speed_of_light))))
+    for phase in (0.0, 1.0, 2.5):
+        sensor = np.cos(2 * np.pi * (frequency - beat_hz) * t + phase)
+        tap = (light * sensor).mean()
+        assert tap == pytest.approx(0.5 * (phasor * np.exp(-1j * phase)).real, abs=3e-4)
+
+
 def test_without_a_beat_it_is_the_mean():
     exposure = tt.Exposure(DURATION_S, poses=1)
     assert exposure.poses_s().tolist() == [0.0] and exposure.combine(torch.full((1, 2), 3.0)).tolist() == [3.0, 3.0]
@@ -59,6 +78,17 @@ def test_rows_see_their_own_times(row_s, rows, poses):
     assert at[0] == pytest.approx(-1e3 * row_s * (rows - 1) / 2, abs=1e-12)
     expected = polynomial(at)[:, None].expand(2, rows, 3)
     torch.testing.assert_close(shutter.combine(pictures), expected, atol=1e-11, rtol=0)
+
+
+@pytest.mark.parametrize("poses", [2, 3, 8])
+def test_rows_lie_between_the_poses(poses):
+    """The first and the last row are poses, and no pose counts with much more than one."""
+    shutter = tt.RollingShutter(1e-5, poses=poses)
+    pictures = torch.eye(poses).double()[:, :, None, None].expand(poses, poses, 65, 1)
+    weights = shutter.combine(pictures)[..., 0]
+    assert weights[0, 0] == pytest.approx(1) and weights[-1, -1] == pytest.approx(1)
+    assert weights.abs().max() < 1.0 + 1e-9
+    assert shutter.poses_s(65)[-1] == pytest.approx(shutter.rows_s(65)[-1])
 
 
 def test_phase_steps_take_each_tap_from_its_own_exposure():

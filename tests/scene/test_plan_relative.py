@@ -19,7 +19,7 @@ def box(resolution=24, **integrator):
 def test_diffuse_rooms_share_their_light():
     plan = tt.plan(box(), error="relative")
     assert plan.integrator == "transient_path_reuse"
-    assert plan.rr_depth == plan.max_depth
+    assert plan.rr_depth > plan.max_depth
     assert any("path reuse: used" in line for line in plan.reasons)
     assert plan.renderer(spp=16)(seed=0).stats.integrator == "transient_path_reuse"
 
@@ -42,7 +42,7 @@ def test_paths_stay_plain(reason):
         settings = {"pilot": False, "max_depth": 8}
     plan = tt.plan(scene, error="relative", **settings)
     assert plan.integrator == "transient_path"
-    assert plan.rr_depth == plan.max_depth
+    assert plan.rr_depth > plan.max_depth
 
 
 def test_roulette_stays_where_nothing_else_ends_paths():

@@ -233,15 +233,8 @@ def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], nar
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
-            made = {name: each(out) for name, each in functions.items()}
-        for name, tensor in made.items():
-            if not bool(tensor.isfinite().all()):
-                raise UnitError(
-                    f"quantities: {name!r}: expected finite numbers, got others of a render with {spp} samples per "
-                    "pixel; say what dark pixels have (torch.where, nan_to_num, a clamped divisor)."
-                )
-        found = {film.measures: _response(out)} | made
-        return Estimates({name: _array(_real(tensor)) for name, tensor in found.items()}, renderer.samples_drawn(spp))
+        arrays = {film.measures: _array(_real(_response(out)))}
+        return Estimates(arrays, renderer.samples_drawn(spp), lambda: _quantities_of(out, functions, spp))
 
     spread = {}
     if narrowest is not None and renderer.axis is not None and renderer.axis != narrowest:
@@ -249,6 +242,18 @@ def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], nar
         spread = {film.measures: lambda cube: np.einsum("kt,...thw->...khw", matrix, cube, optimize=True)}
     # After the film's own dimension come rows and columns, and real and imaginary parts of complex numbers.
     return Task(run, {film.measures: -4 if film.is_complex else -3}, to_common=spread)
+
+
+def _quantities_of(out: RenderOutput, functions: Mapping[str, Loss], spp: int) -> dict[str, NDArray[np.float32]]:
+    with torch.no_grad():
+        made = {name: torch.as_tensor(each(out)) for name, each in functions.items()}
+    for name, tensor in made.items():
+        if not bool(tensor.isfinite().all()):
+            raise UnitError(
+                f"quantities: {name!r}: expected finite numbers, got others of a render with {spp} samples per pixel; "
+                "say what dark pixels have (torch.where, nan_to_num, a clamped divisor)."
+            )
+    return {name: _array(_real(tensor)) for name, tensor in made.items()}
 
 
 def _shares(wide: TimeAxis, narrow: TimeAxis) -> NDArray[np.float32]:

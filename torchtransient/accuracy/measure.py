@@ -21,10 +21,14 @@ from torchtransient.errors import UnitError
 
 @dataclass(frozen=True)
 class Estimates:
-    """What one run returns: arrays by quantity, and the samples per pixel it really drew."""
+    """What one run returns: arrays by quantity, and the samples per pixel it really drew.
+
+    `derived`: function that makes further arrays, which is not timed.
+    """
 
     arrays: Mapping[str, ArrayLike]
     spp: int
+    derived: Callable[[], Mapping[str, ArrayLike]] = dict
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,8 @@ class Task:
 
     def comparable(self, estimates: Estimates) -> dict[str, NDArray[np.float32]]:
         """Arrays of a run in the shape that all choices share."""
-        arrays = {name: np.asarray(array, dtype=np.float32) for name, array in estimates.arrays.items()}
+        given = {**estimates.arrays, **estimates.derived()}
+        arrays = {name: np.asarray(array, dtype=np.float32) for name, array in given.items()}
         return {name: self.to_common[name](x) if name in self.to_common else x for name, x in arrays.items()}
 
 

@@ -15,7 +15,7 @@ from torchtransient.accuracy.errors_of_estimates import TAIL_RUNS, Tail
 from torchtransient.accuracy.statistics import Slope, log_log_slope, student_t_quantile
 from torchtransient.array_files.part_files import write_text
 from torchtransient.checks import check_source, is_one_of, positive, shown
-from torchtransient.errors import ArgumentError, StorageError
+from torchtransient.errors import ArgumentError, StorageError, UnitError
 
 if TYPE_CHECKING:
     from torchtransient.vis.accuracy_curve import Curve
@@ -210,17 +210,20 @@ class AccuracyReport:
 
         On each curve of `CostPoint.error`, the error between two measured points is a power of the samples; the samples
         are the fewest whose error is at most `error`, and none are beyond those that were measured. Except of
-        "independent" they are powers of two or measured ones: other numbers are spread less evenly.
+        "independent" they are powers of two or measured ones: other numbers are spread less evenly. The quickest of
+        many noisy curves is often a lucky one: where the interval reaches far beyond, measure with more `repeats`.
 
         Args:
             error: relative error, bias included where it was measured.
             quantity: name of a quantity, None for the first one of the report.
 
         Raises:
-            UnitError: for an error that is not positive.
+            UnitError: for an error that is not between 0 and 1.
             ArgumentError: for a quantity that the report does not have, and where no curve reaches the error.
         """
         wanted = positive("recommend: error", error)
+        if wanted >= 1:
+            raise UnitError(f"recommend: error: expected a share below 1, 0.05 for 5 %, got {shown(error)}.")
         quantity = self._quantity("recommend", quantity)
         curves = [[p for p in curve if p.error >= 0] for name, _, curve in self.curves() if name == quantity]
         found = [self._reached(curve, wanted) for curve in curves if any(p.error <= wanted for p in curve)]

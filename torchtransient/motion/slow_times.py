@@ -29,6 +29,8 @@ from torchtransient.floating import holds, number_tensor
 
 # Polynomials of higher degree than this are not what a smooth picture is made of.
 _MOST_POSES = 64
+# More beats than this in an exposure are a mistake of units.
+_MOST_BEATS = 1000
 
 
 class SlowTimes(abc.ABC):
@@ -59,7 +61,7 @@ class Exposure(SlowTimes):
 
     Args:
         duration_s: length of the exposure, seconds.
-        beat_hz: frequency of the sensor's modulation over that of the light, hertz, of either sign; zero for none.
+        beat_hz: frequency of the light's modulation minus that of the sensor's, hertz, of either sign; zero for none.
         poses: number of renders; the picture is a polynomial of one degree less in time.
 
     Raises:
@@ -75,6 +77,11 @@ class Exposure(SlowTimes):
     def __post_init__(self) -> None:
         positive("Exposure: duration_s", self.duration_s)
         _check_poses("Exposure", self.poses, 2 if finite("Exposure: beat_hz", self.beat_hz) else 1)
+        if abs(self.beat_hz) * self.duration_s > _MOST_BEATS:
+            raise UnitError(
+                f"Exposure: beat_hz: expected at most {_MOST_BEATS} beats in an exposure, got {shown(self.beat_hz)} "
+                f"hertz in {shown(self.duration_s)} s. It is the difference of the frequencies of light and sensor."
+            )
 
     @property
     def needs_phasors(self) -> bool:  # type: ignore[override]
@@ -101,7 +108,8 @@ class Exposure(SlowTimes):
 class RollingShutter(SlowTimes):
     """Rows at their own times, from the first at the top to the last; the middle of the film is t = 0.
 
-    Rows stand between the poses: the picture is a polynomial in time. Each row sees one instant.
+    The picture is a polynomial in time through its poses, of which the first and the last row are two: it can be
+    negative where a body crosses bins between them. Each row sees one instant.
 
     Args:
         row_s: from one row to the next, seconds; negative from the bottom to the top.
@@ -120,7 +128,7 @@ class RollingShutter(SlowTimes):
 
     def poses_s(self, rows: int) -> Tensor:
         """Return the times of the poses, (poses,), seconds."""
-        return float(self.row_s) * (rows - 1) / 2 * torch.tensor(_nodes(int(self.poses)))
+        return float(self.row_s) * (rows - 1) / 2 * torch.tensor(_nodes_with_ends(int(self.poses)))
 
     def rows_s(self, rows: int) -> Tensor:
         """Return the times of the rows, (rows,), seconds."""
@@ -129,7 +137,7 @@ class RollingShutter(SlowTimes):
     def combine(self, pictures: Tensor) -> Tensor:
         """Return the pictures (poses, ..., H, W) with each row at its time."""
         rows = pictures.shape[-2]
-        weights = torch.tensor(_polynomial(int(self.poses), np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)))
+        weights = torch.tensor(_through_ends(int(self.poses), np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)))
         return _sum(weights[..., None], pictures)
 
 
@@ -242,9 +250,19 @@ def _coefficients(poses: int) -> NDArray[np.float64]:
     return (degree + 0.5) * g * np.polynomial.legendre.legvander(x, poses - 1).T
 
 
-def _polynomial(poses: int, at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (node, place) of the values at nodes for places in [-1, 1]."""
-    return (np.polynomial.legendre.legvander(at, poses - 1) @ _coefficients(poses)).T
+@functools.cache
+def _nodes_with_ends(poses: int) -> NDArray[np.float64]:
+    """Return Gauss-Lobatto nodes of [-1, 1], its middle for one."""
+    if poses == 1:
+        return np.zeros(1)
+    inner = np.polynomial.Legendre.basis(poses - 1).deriv().roots().real
+    return np.asarray([-1.0, *np.sort(inner), 1.0])
+
+
+def _through_ends(poses: int, at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights (node, place) of the values at Gauss-Lobatto nodes for places in [-1, 1]."""
+    values = np.polynomial.legendre.legvander(_nodes_with_ends(poses), poses - 1)
+    return np.asarray(np.linalg.solve(values.T, np.polynomial.legendre.legvander(at, poses - 1).T), dtype=np.float64)
 
 
 @functools.cache

@@ -6,6 +6,7 @@ arrivals are listed one by one), or from the caller; ``plan.reasons`` names the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
@@ -40,6 +41,8 @@ _PLAIN = (
 _PATH, _VOLUMES, _REUSE = "transient_path", "transient_prbvolpath", "transient_path_reuse"
 # Time of path reuse and of ellipsoidal connections over that of plain paths with as many samples, at most.
 _TIME_OF_REUSE, _TIME_OF_ELLIPSOIDS = 2.0, 5.0
+# Depth that no path reaches.
+_NO_ROULETTE = 2**30
 # Largest side of the pictures that tell which of them pays.
 _PIXELS = 64
 # Nothing is stored in a pilot run: the film only has to be one that integrators take.
@@ -305,7 +308,7 @@ def plan(
         sensor=sensor,
     )
     _check_registered(draft, reasons)
-    finder = Finder(draft, reasons, inventory, tail, missed, seed)
+    finder = Finder(draft, reasons, inventory, tail, missed, seed, error == "relative")
     found = finder.settle(pilot, max_depth, time_axis, (num_bins, bin_width_opl), temporal_filter)
     kept = {name: getattr(draft, name) for name in _FROM_DRAFT}
     result = Plan(
@@ -313,7 +316,9 @@ def plan(
     )
     if error == "relative":
         result = _without_roulette(result)
-    return _with_least_variance(result, error == "relative", seed) if integrator is None and pilot else result
+    if integrator is not None or not pilot:
+        return result
+    return _with_least_variance(result, error == "relative", inventory.connections is None, seed)
 
 
 def _without_roulette(given: Plan) -> Plan:
@@ -322,21 +327,22 @@ def _without_roulette(given: Plan) -> Plan:
         reason = "Russian roulette: kept, since nothing else bounds the depth"
         return replace(given, reasons=(*given.reasons, reason))
     reason = "Russian roulette: none, since it leaves late light to few paths of great weight"
-    return replace(given, rr_depth=depth, reasons=(*given.reasons, reason))
+    return replace(given, rr_depth=_NO_ROULETTE, reasons=(*given.reasons, reason))
 
 
-def _with_least_variance(given: Plan, relative: bool, seed: int) -> Plan:
+def _with_least_variance(given: Plan, relative: bool, connects: bool, seed: int) -> Plan:
     """Return a plan with path reuse or ellipsoidal connections where short runs show that they pay.
 
     Args:
         given: plan with plain paths and ordinary connections.
         relative: the variance of each bin counts over its squared mean.
+        connects: connections are open, since the scene names none.
         seed: seed of the runs.
     """
     other: list[tuple[str, dict[str, Any], float]] = []
     if relative and given.integrator == _PATH:
         other.append(("path reuse", {"integrator": _REUSE}, _TIME_OF_REUSE))
-    if given.film == "gated" and given.integrator in (_PATH, _VOLUMES):
+    if connects and given.film == "gated" and given.integrator in (_PATH, _VOLUMES):
         other.append(("ellipsoidal connections", {"connections": "ellipsoidal"}, _TIME_OF_ELLIPSOIDS))
     best, reasons = 1.0, list(given.reasons)
     small, chosen = replace(given, scene=cropped(given.scene, _PIXELS), parameters=()), given
@@ -347,7 +353,8 @@ def _with_least_variance(given: Plan, relative: bool, seed: int) -> Plan:
         except SceneError as error:
             reasons.append(f"{name}: not used: {error}")
             continue
-        gain = plain / (time * less) if less > 0 else 0.0
+        # What plain paths do not find at all is found by the others alone.
+        gain = 0.0 if not less > 0 else plain / (time * less) if plain > 0 else math.inf
         if gain > best:
             best, chosen = gain, replace(given, **changes)
         kind = "relative variance" if relative else "variance"
@@ -355,6 +362,9 @@ def _with_least_variance(given: Plan, relative: bool, seed: int) -> Plan:
             f"{name}: {'used' if gain > 1 else 'not used'}, since the {kind} with {SPP} samples per pixel is "
             f"{less:.2g} with it and {plain:.2g} without, and it takes up to {time:g} times the time"
         )
+    if chosen.integrator != given.integrator:
+        reasons = [line for line in reasons if not line.startswith("integrator: ")]
+        reasons.append(f"integrator: {chosen.integrator}, see path reuse")
     return replace(chosen, reasons=tuple(reasons))
 
 

@@ -180,7 +180,9 @@ class TransientRenderer(CopiesParametrized):
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
         if isinstance(effects, Effects):
-            changes |= {name: getattr(effects, name) for name in ("integrator", "rr_depth", "connections")}
+            changes |= {name: getattr(effects, name) for name in ("integrator", "rr_depth")}
+            # Made for the gates of the plan.
+            changes["connections"] = effects.connections if film is effects.film_choice else None
         self.sampler = checked_sampler(sampler)
         self._options = self._build_options(max_depth, changes)
         self._infos = self._parameter_infos()

@@ -64,6 +64,14 @@ _TRANSIENT_PROPERTIES = (
     *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
 )  # fmt: skip
 
+# Further ones that these integrators of the library read.
+_OWN_PROPERTIES = {
+    **dict.fromkeys(
+        ("transient_path", "transient_prbvolpath", "transient_path_reuse"), ("connections", "boundary", "spp_boundary")
+    ),
+    "transient_nlos_path": ("boundary",),
+}
+
 # Advice for integrators of other pictures.
 _ADVICE = {
     "aov": " Give the integrator inside of it alone; depths, normals and numbers of shapes are tt.data.scene_labels.",
@@ -290,7 +298,8 @@ def _edit_integrator(state: Any, options: BuildOptions) -> None:
         plugin, depth = state.nodes[index].props.plugin_name(), described_depth(state, index)
         if options.integrator is not None and plugin != options.integrator:
             source = _traced(state, index)
-            _become(state, index, options.integrator, keep=_TRANSIENT_PROPERTIES, nested=False, source=source)
+            kept = _TRANSIENT_PROPERTIES + _OWN_PROPERTIES.get(options.integrator, ())
+            _become(state, index, options.integrator, keep=kept, nested=False, source=source)
             state.nodes[index].props["max_depth"] = depth
         elif plugin in _COUNTERPARTS:
             wanted = "transient_prbvolpath" if has_media(state) else _COUNTERPARTS[plugin]

@@ -77,6 +77,7 @@ class SceneInventory:
         albedo: largest share of the light that a surface or medium scatters, 1 if unknown.
         brightest: label of the node with that share.
         integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
+        connections: what the integrator says of connections, None if nothing.
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
         sampler: sampler that integrator or sensor name, None if neither does.
@@ -95,6 +96,7 @@ class SceneInventory:
     albedo: float = 0.0
     brightest: str = ""
     integrator: str | None = None
+    connections: str | None = None
     max_depth: int = NO_LIMIT
     film: str | None = None
     film_props: Any = None
@@ -282,6 +284,7 @@ def _note_integrator(inventory: SceneInventory, state: Any) -> None:
         if is_integrator(state.nodes[index]):
             inventory.integrator = props.plugin_name()
             inventory.max_depth = int(described_depth(state, index))
+            inventory.connections = str(props["connections"]) if "connections" in props else None
             if props.get("temporal_filter", ""):
                 inventory.temporal_filter = str(props["temporal_filter"])
 

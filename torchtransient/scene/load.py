@@ -214,7 +214,8 @@ class Scene:
         """
         keys = tuple(keys)
         if not keys:
-            return replace(options, merge=True)
+            # Meshes of a few faces are looked through one by one.
+            return replace(options, merge=options.connections is None)
         # The build that most keys need anyway, so that looking them up costs nothing.
         table = self._parameters(replace(options, real_bitmaps=True, merge=False))
         substitute = set(options.substitute)

@@ -145,6 +145,22 @@ class Arrivals:
                 low = middle + 1
         return low
 
+    def enough_depth_of_all_times(self, tail: float) -> int:
+        """Return the smallest depth beyond which no eighth of the time of the light has more than ten times ``tail``.
+
+        Of the light after which ``tail`` of it comes. Late parts have few arrivals: what they show counts as it is.
+        """
+        first, last = self.window(-1, tail)
+        depth = 1
+        for part in range(BLOCKS):
+            begin, end = (first + (last - first) * k / BLOCKS for k in (part, part + 1))
+            inside = (self.opl >= begin) & (self.opl <= end)
+            order = np.argsort(self.depth[inside])
+            behind = self.energy[inside].sum() - np.cumsum(self.energy[inside][order])
+            enough = self.depth[inside][order][behind <= BLOCK_ALLOWANCE * tail * self.energy[inside].sum()]
+            depth = max(depth, int(enough[0])) if len(enough) else depth
+        return depth
+
     def beyond(self, deepest: int) -> tuple[float, float]:
         """Return the share of the light in paths deeper than the run's ``deepest``, and its standard error.
 

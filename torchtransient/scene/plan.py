@@ -273,10 +273,17 @@ class Finder:
     """Search for depth, window and temporal filter, by a pilot run where it is needed."""
 
     def __init__(
-        self, draft: Draft, reasons: tuple[str, ...], inventory: SceneInventory, tail: float, missed: float, seed: int
+        self,
+        draft: Draft,
+        reasons: tuple[str, ...],
+        inventory: SceneInventory,
+        tail: float,
+        missed: float,
+        seed: int,
+        relative: bool = False,
     ):
         self.draft, self.inventory, self.tail, self.missed = draft, inventory, tail, missed
-        self.seed = seed
+        self.seed, self.relative = seed, relative
         self.reasons: list[str] = list(reasons)
         # Of the pilot run: its arrivals, None without one, and its wall time.
         self.arrivals: Arrivals | None = None
@@ -386,12 +393,18 @@ class Finder:
             self.reasons.append(reason)
             return bound
         if self.arrivals.dark:
-            self.reasons.append(f"max_depth: {self._depth_words(own)}, kept, since the pilot run saw no light")
-            return None
+            bound, reason = depth_by_albedo(self.inventory, self.tail)
+            self.reasons.append(f"{reason}; the pilot run saw no light")
+            return bound
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH
 
         depth = self.arrivals.enough_depth(self.tail)
-        reason = f"max_depth: {depth}{self._deeper(depth)}, asked for was {self.tail:g}"
+        late = self.arrivals.enough_depth_of_all_times(self.tail) if self.relative else 0
+        if late > depth:
+            depth = late
+            reason = f"max_depth: {depth}, so that no eighth of the time of the light loses more than 1 %"
+        else:
+            reason = f"max_depth: {depth}{self._deeper(depth)}, asked for was {self.tail:g}"
         if depth >= PILOT_DEPTH:
             reason += f"; the pilot run went no deeper than {PILOT_DEPTH}, so light beyond it is not bounded"
         if own != NO_LIMIT and own < depth:

@@ -73,7 +73,7 @@ class TransientPath(TransientIntegrator):
         segment, scattering, (found, _) = self.strategies(contents)
         if contents.media is not None:
             segment.keeps_begin = True
-        strategies = segment, scattering, connections_in_window(contents, found)
+        strategies = segment, scattering, connections_in_window(scene, contents, found)
         return RenderContext(scene, contents, self.settings(), strategies, None, window)
 
     def silhouettes(self, scene, sensors=None):

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
+from torchtransient.plugins.kernel_arrays import PointerTable, floats, registry_number
 from torchtransient.plugins.mitsuba_compat import has_smooth_shape, lacks_directions
 from torchtransient.plugins.sampling.area_elements import AreaElements
 from torchtransient.plugins.sampling.hidden_elements import packed
@@ -59,7 +59,8 @@ class FlatFaces:
                 rows += [_row(*face) for face in faces]
         self.count = len(rows)
         self._shapes = PointerTable.marking(listed)
-        self._table = packed(np.array(rows)) if rows else None
+        if rows:
+            self._table = packed(np.array(rows))
 
     def lists(self, shape):
         """Return a mask of pointers to shapes in the table."""
@@ -165,13 +166,15 @@ class LightFaces:
                 # Numbers of plugins are small enough for single precision.
                 rows.append([*o, chance / area, *e1, most, *e2, chance, *elements.normal[i], registry_number(emitter)])
                 chances.append(chance)
-        self.area = float(sum(chance / row[3] for chance, row in zip(chances, rows, strict=True)))
-        self.count, self.holds_all, self.share = len(rows), len(lit) == len(emitters), float(sum(chances))
+        # Arrays: as literals they would be part of kernels.
+        self.area = floats(np.array([sum(chance / row[3] for chance, row in zip(chances, rows, strict=True))]))
+        self.share = floats(np.array([sum(chances)]))
+        self.count, self.holds_all = len(rows), len(lit) == len(emitters)
         self._emitters = PointerTable.marking(lit)
         if self.count:
             self._table = packed(np.array(rows))
             # Begin of each face's part of [0, 1], and the end of the last one.
-            self._begins = packed(np.cumsum([0.0, *chances]) / self.share)
+            self._begins = packed(np.cumsum([0.0, *chances]) / sum(chances))
 
     def lists(self, emitter):
         """Return a mask of pointers to the lights of these faces."""
@@ -210,6 +213,9 @@ class LightFaces:
             turn = dr.dot(face.n, dr.cross(p, edge))
             left, right = left & (turn >= 0), right & (turn <= 0)
         within = left | right
+        # Around a foot within the face any direction is the first.
+        forward = dr.select(within, mi.Frame3f(face.n).s, forward)
+        aside = dr.cross(face.n, forward)
         low, high = dr.select(within, -dr.pi, low), dr.select(within, dr.pi, high)
         nearest, h2 = dr.select(within, 0, nearest), dr.square(h)
         begin = dr.maximum(nearest * (1 - _MARGIN), dr.square(dr.maximum(first, 0)) - h2)

@@ -46,16 +46,19 @@ _LEAST = 1e-5
 _BEHIND = 1e-3
 
 
-def connections_in_window(contents, found):
+def connections_in_window(scene, contents, found):
     """Return the connections of a walk: ``found`` (emission that is run into) and those of this module.
 
     Args:
+        scene: Mitsuba scene.
         contents: :class:`.scene_contents.SceneContents`.
         found: :class:`.emitter_connections.EmitterFound`.
     """
-    lights = WindowedEmitterSampled()
-    kinds = [EllipsoidalSurface] if contents.media is None else [EllipsoidalSurface, EllipsoidalMedium]
-    lights.beside = tuple(kind(lights) for kind in kinds)
+    lights, faces = WindowedEmitterSampled(), FlatFaces([shape for shape in scene.shapes() if scatters(shape)])
+    if faces.count:
+        lights.beside += (EllipsoidalSurface(lights, faces),)
+    if contents.media is not None:
+        lights.beside += (EllipsoidalMedium(lights),)
     return [found, lights, *lights.beside]
 
 
@@ -264,14 +267,18 @@ class Section:
 
 
 class EllipsoidalSurface(Ellipsoidal):
-    """Connection over a vertex on a face of the scene."""
+    """Connection over a vertex on a face of the scene.
+
+    Args:
+        lights: :class:`WindowedEmitterSampled` of the walk.
+        faces: :class:`~..sampling.flat_faces.FlatFaces`, one at least.
+    """
 
     name = "ellipsoidal_surface"
 
-    def prepare(self, context):
-        super().prepare(context)
-        shapes = context.scene.shapes()
-        self.faces = FlatFaces([shape for shape in shapes if scatters(shape)])
+    def __init__(self, lights, faces):
+        super().__init__(lights)
+        self.faces = faces
 
     def density_between(self, x, e, w, n, along, η):
         """Return the density per area of a vertex for given foci, without the choice among faces.
@@ -319,7 +326,7 @@ class EllipsoidalSurface(Ellipsoidal):
         # ------------------------------------------------------------------------- from x to w
         ray = vertex.at.spawn_ray(proposal.d)
         pi = context.segment.next_surface(context, ray, active)
-        active &= pi.is_valid() & (dr.abs(pi.t - r) < _FOUND * (1 + r))
+        active &= pi.is_valid()
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, n) > 1 - _FOUND) & self.faces.lists(si.shape)
         medium, T = None, 1
@@ -331,7 +338,7 @@ class EllipsoidalSurface(Ellipsoidal):
             medium = context.segment.medium_at(context, w, x, medium, active)
         # ------------------------------------------------------------------------- from w to e
         to = si.spawn_ray_to(e.p)
-        value, pdf = context.scattering.value_at(context, si, to.d, ray, active)
+        value, pdf = context.scattering.value_at(context, si, to.d, ray, proposal.sampler, active)
         active &= is_light(value)
         active, T_e = self.cleared(context, to, dr.norm(e.p - w), medium, [u.x, u.y], proposal.sampler, active)
         value = self.last_segment(context, si, e, value, pdf, active)
@@ -436,7 +443,7 @@ class EllipsoidalMedium(Ellipsoidal):
 
     def draws_on(self, context, path):
         """Return a mask of segments on which vertices are drawn."""
-        if context.hide_emitters or context.segment.clip is not None:
+        if context.hide_emitters or context.camera_unwarp or context.segment.clip is not None:
             return path.active & (path.depth > 0)
         return path.active
 

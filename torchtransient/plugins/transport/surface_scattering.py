@@ -262,18 +262,23 @@ class Surface(Scattering):
         value = self.correct_two_sided(context, vertex.bsdf, si, wo, vertex.delay.scaled(value))
         return rotate_mueller(value, rotation_to_sensor(si, path.ray.d), rotation_from_light(si, wo, out)), pdf
 
-    def value_at(self, context, si, out, ray, active):
+    def value_at(self, context, si, out, ray, sampler, active):
         """Return the scattering at a surface that no path has walked to, unpolarized.
 
         Args:
             si: SurfaceInteraction3f.
             out: direction of the light in world space.
             ray: Ray3f that found it.
+            sampler: Mitsuba sampler of the lanes, which chooses a part of a mixture as paths do.
 
         Returns:
             (value, density).
         """
-        return si.bsdf(ray).eval_pdf(mi.BSDFContext(), si, si.to_local(out), active)
+        bsdf, weight = si.bsdf(ray), 1
+        if self.mixtures is not None:
+            bsdf, weight = self.mixtures.part_of(bsdf, si, sampler.next_1d(), active)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(out), active)
+        return value * weight, pdf
 
     # ---------------------------------------------------------------------------------------- scene contents
 
@@ -491,7 +496,7 @@ class Lambertian(Surface):
         answer = self._towards(vertex, out)
         return answer.value, answer.pdf
 
-    def value_at(self, context, si, out, ray, active):
+    def value_at(self, context, si, out, ray, sampler, active):
         bsdf = si.bsdf(ray)
         vertex = Local(si=si, side=_side(bsdf, si), ρ=_albedo(bsdf, si, active))
         answer = self._towards(vertex, out)
