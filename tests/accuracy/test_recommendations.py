@@ -62,6 +62,19 @@ def test_samplers_that_spread_points_get_powers_of_two(error, spp):
     assert found.spp == spp and found.error == pytest.approx(spp**-0.5) and found.seconds == pytest.approx(spp / 1e3)
 
 
+def test_two_points_of_as_many_samples():
+    """As of samplers that round them."""
+    points = [point(SLOW, 4, 0.004, 0.8), point(SLOW, 16, 0.016, 0.6), point(SLOW, 16, 0.016, 0.4)]
+    found = AccuracyReport(points, "").recommend(0.5)
+    assert (found.spp, found.error) == (16, 0.4)
+
+
+@pytest.mark.parametrize("error", [0.0, 1.0, 5])
+def test_errors_are_shares(report, error):
+    with pytest.raises(UnitError, match="recommend: error"):
+        report.recommend(error)
+
+
 def test_what_no_setting_reaches(report):
     with pytest.raises(ArgumentError, match=r"got 1\.00%; the least is 6\.25%, of 256 spp \[independent, box\]\."):
         report.recommend(0.01)

@@ -70,7 +70,7 @@ def heterogeneous():
 
 
 def lamps():
-    """Lamps of four kinds, of which only the first two are drawn by their arrivals."""
+    """Lamps of five kinds, of which only the rectangle is drawn by its arrivals."""
     turned = translate([-0.6, 0.2, -0.6]) @ rotate([1, 1, 0], 30) @ scale(0.1)
     picture = {"type": "bitmap", "raw": True, "data": np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)}
     return with_object(
@@ -118,6 +118,17 @@ def glossy_mask():
     return room() | {"back": room()["back"] | {"bsdf": gloss}}
 
 
+def rug():
+    """Parallel faces a millimetre apart."""
+    pose = translate([0, -0.9985, 0]) @ scale([0.9, 0.0005, 0.9])
+    return with_object(rug={"type": "cube", "to_world": pose, "bsdf": DIFFUSE})
+
+
+def listed_twice():
+    """Walls at the same place."""
+    return with_object(more=room()["back"], again=room()["floor"])
+
+
 SCENES = {
     "gates": room,
     "window": histogram,
@@ -136,6 +147,8 @@ SCENES = {
     "hidden lamp": lambda: room(hide_emitters=True),
     "unwarped": lambda: room(gates="rectangular 1.5 1.6; rectangular 4.5 4.7", camera_unwarp=True),
     "cloth alone": cloth_alone,
+    "rug": rug,
+    "listed twice": listed_twice,
     "far away": far_away,
     "glossy mask": glossy_mask,
     "unwarped fog": lambda: fog() | {"integrator": fog()["integrator"] | {"camera_unwarp": True}},
@@ -165,7 +178,7 @@ def runs(one, count, seed=0):
     return cubes.unfold(3, 8, 8).unfold(4, 8, 8).sum((-1, -2)).numpy()
 
 
-@pytest.mark.parametrize("name", long(SCENES, ("gates", "tent", "glass", "lamps", "fog")))
+@pytest.mark.parametrize("name", long(SCENES, ("gates", "tent", "glass", "lamps", "fog", "rug")))
 def test_it_is_the_light_of_ordinary_connections(name):
     scene = SCENES[name]()
     plain, ellipsoidal = runs(renderer(scene, "ordinary", spp=256), 24), runs(renderer(scene), 24, 5000)

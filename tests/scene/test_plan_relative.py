@@ -77,6 +77,14 @@ def test_narrow_gates_are_connected_by_path_length(width, error):
     assert out.gated.isfinite().all() and out.gated.sum() > 0
 
 
+@pytest.mark.parametrize("outputs", ["transient", "phasor"])
+def test_other_films_have_ordinary_connections(outputs):
+    frequencies = {"frequencies": [0.3]} if outputs == "phasor" else {}
+    plan = tt.plan(box(8, connections="ellipsoidal"), outputs, **frequencies)
+    assert plan.connections == "ordinary"
+    assert plan.renderer(spp=4)(seed=0).steady.sum() > 0
+
+
 def test_gates_of_scenes_without_faces_that_shine():
     plan = tt.plan(plan_scenes.grey_room(), "gates", gates=tt.Gate.rectangular(8.0, 8.1))
     assert plan.connections is None

@@ -245,13 +245,14 @@ class AccuracyReport:
         n = next(i for i, p in enumerate(curve) if p.error <= wanted)
         before, after = curve[max(n - 1, 0)], curve[n]
         share, spp = 1.0, after.spp
-        if n > 0 and after.error > 0:
+        between = n > 0 and after.error > 0 and after.spp > before.spp
+        if between:
             share = math.log(before.error / wanted) / math.log(before.error / after.error)
             spp = math.ceil(before.spp * (after.spp / before.spp) ** share * (1.0 - 1e-9))
             if after.choice.sampler != "independent":
                 spp = min(1 << (spp - 1).bit_length(), after.spp)
             share = math.log(spp / before.spp) / math.log(after.spp / before.spp)
-        part = 1.0 if n == 0 else (spp - before.spp) / (after.spp - before.spp)
+        part = 1.0 if not between else (spp - before.spp) / (after.spp - before.spp)
         low, high = (
             math.exp((1.0 - share) * math.log(a) + share * math.log(b)) if after.error > 0 else after.error
             for a, b in zip(self._interval(before), self._interval(after), strict=True)

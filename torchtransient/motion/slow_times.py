@@ -106,7 +106,8 @@ class Exposure(SlowTimes):
 
 @dataclass(frozen=True)
 class RollingShutter(SlowTimes):
-    """Rows at their own times, from the first at the top to the last; the middle of the film is t = 0.
+    """Rows at their own times, from the first at the top to the last; the middle of the film, or its crop window, is
+    t = 0.
 
     The picture is a polynomial in time through its poses, of which the first and the last row are two: it can be
     negative where a body crosses bins between them. Each row sees one instant.

@@ -314,11 +314,17 @@ def plan(
     result = Plan(
         outputs=wanted, film=planned_film.name, filter_is_given=temporal_filter is not None, **kept, **vars(found)
     )
+    if inventory.connections == "ellipsoidal" and planned_film.kind is not Gates:
+        result = _with_ordinary_connections(result)
     if error == "relative":
         result = _without_roulette(result)
-    if integrator is not None or not pilot:
-        return result
-    return _with_least_variance(result, error == "relative", inventory.connections is None, seed)
+    chooses = integrator is None and pilot
+    return _with_least_variance(result, error == "relative", inventory.connections is None, seed) if chooses else result
+
+
+def _with_ordinary_connections(given: Plan) -> Plan:
+    reason = "connections: ordinary, in place of the scene's ellipsoidal ones, which are for gates"
+    return replace(given, connections="ordinary", reasons=(*given.reasons, reason))
 
 
 def _without_roulette(given: Plan) -> Plan:
@@ -344,24 +350,29 @@ def _with_least_variance(given: Plan, relative: bool, connects: bool, seed: int)
         other.append(("path reuse", {"integrator": _REUSE}, _TIME_OF_REUSE))
     if connects and given.film == "gated" and given.integrator in (_PATH, _VOLUMES):
         other.append(("ellipsoidal connections", {"connections": "ellipsoidal"}, _TIME_OF_ELLIPSOIDS))
-    best, reasons = 1.0, list(given.reasons)
     small, chosen = replace(given, scene=cropped(given.scene, _PIXELS), parameters=()), given
+    best, used, reasons = 1.0, "", list(given.reasons)
+    found: dict[str, str] = {}
     for name, changes, time in other:
         try:
             renderers = [p.renderer(physics="ignore") for p in (small, replace(small, **changes))]
             plain, less = variances(renderers[0], renderers[1], seed, relative)
         except SceneError as error:
-            reasons.append(f"{name}: not used: {error}")
+            found[name] = str(error)
+            continue
+        if not plain + less > 0:
+            found[name] = "no light in the short runs"
             continue
         # What plain paths do not find at all is found by the others alone.
         gain = 0.0 if not less > 0 else plain / (time * less) if plain > 0 else math.inf
         if gain > best:
-            best, chosen = gain, replace(given, **changes)
+            best, used, chosen = gain, name, replace(given, **changes)
         kind = "relative variance" if relative else "variance"
-        reasons.append(
-            f"{name}: {'used' if gain > 1 else 'not used'}, since the {kind} with {SPP} samples per pixel is "
-            f"{less:.2g} with it and {plain:.2g} without, and it takes up to {time:g} times the time"
+        found[name] = (
+            f"the {kind} with {SPP} samples per pixel is {less:.2g} with it and {plain:.2g} without, and it takes up "
+            f"to {time:g} times the time"
         )
+    reasons += [f"{name}: {'used' if name == used else 'not used'}; {why}" for name, why in found.items()]
     if chosen.integrator != given.integrator:
         reasons = [line for line in reasons if not line.startswith("integrator: ")]
         reasons.append(f"integrator: {chosen.integrator}, see path reuse")

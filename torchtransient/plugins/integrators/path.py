@@ -60,16 +60,12 @@ class TransientPath(TransientIntegrator):
             )
         self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
 
-    def resolve(self, scene, sensor):
-        sensor, film = super().resolve(scene, sensor)
-        reason = None if self.connections == "ordinary" else why_not(self.contents(scene, sensor), film)
-        if reason is not None:
-            raise SceneError(f"connections='ellipsoidal': {reason}, or leave the ordinary connections.")
-        return sensor, film
-
     def render_context(self, scene, contents, wanted=None, window=None, settings=None):
         if self.connections == "ordinary" or wanted is not None or settings is not None:
             return super().render_context(scene, contents, wanted, window, settings)
+        reason = why_not(contents, contents.sensor.film())
+        if reason is not None:
+            raise SceneError(f"connections='ellipsoidal': {reason}, or leave the ordinary connections.")
         segment, scattering, (found, _) = self.strategies(contents)
         if contents.media is not None:
             segment.keeps_begin = True

@@ -50,13 +50,13 @@ class FlatFaces:
         for shape in shapes:
             if _is_small(shape):
                 elements = AreaElements.from_shapes([shape])
-                faces = [face for face, _ in faces_of(elements)]
+                faces = faces_of(elements)
                 meshes.append((elements.area.sum() / max(len(faces), 1), shape, faces))
         listed, rows = [], []
         for _, shape, faces in sorted(meshes, key=lambda mesh: -mesh[0]):
             if faces and len(rows) + len(faces) <= MOST_FACES:
                 listed.append(shape)
-                rows += [_row(*face) for face in faces]
+                rows += [_row(*face, registry_number(shape), i) for face, i in faces]
         self.count = len(rows)
         self._shapes = PointerTable.marking(listed)
         if rows:
@@ -76,6 +76,12 @@ class FlatFaces:
             o=mi.Point3f(o.x, o.y, o.z), most=o.w, n=mi.Normal3f(n.x, n.y, n.z), U=mi.Vector3f(U.x, U.y, U.z),
             V=mi.Vector3f(V.x, V.y, V.z),
         )  # fmt: skip
+
+    def is_on(self, i, pi, active):
+        """Return a mask of intersections with face number ``i``, and not with another one close to it."""
+        most, shape, first = (dr.gather(mi.Float, self._table, i * _ROW + k, active) for k in (3, 7, 11))
+        triangle = mi.Float(pi.prim_index) - first
+        return (pi.shape == dr.reinterpret_array(mi.ShapePtr, mi.UInt32(shape))) & (triangle >= 0) & (triangle < most)
 
 
 def _is_small(shape):
@@ -113,11 +119,18 @@ def _parallelogram(one, other):
     return (apex, a, b) if np.abs(apex + a + b - far).max() <= _SAME * size else None
 
 
-def _row(o, e1, e2, most):
+def _row(o, e1, e2, most, shape, first):
+    """Return the numbers of a face; those of plugins and triangles are small enough for single precision.
+
+    Args:
+        most: largest sum of the coordinates, which is the number of triangles.
+        shape: number of the shape in Mitsuba's registry.
+        first: index of the first triangle.
+    """
     n = np.cross(e1, e2)
     n = n / np.linalg.norm(n)
     U, V = np.cross(e2, n), np.cross(n, e1)
-    return [*o, most, *n, 0.0, *(U / (U @ e1)), 0.0, *(V / (V @ e2)), 0.0]
+    return [*o, most, *n, shape, *(U / (U @ e1)), first, *(V / (V @ e2)), 0.0]
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -310,13 +310,14 @@ class EllipsoidalSurface(Ellipsoidal):
         active &= e.pdf > 0
         n = dr.mulsign(mi.Normal3f(vertex.si.n), -dr.dot(vertex.si.n, path.ray.d))
         n_x = dr.select(vertex.surface, n, 0)
-        w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
+        face, w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
         active &= chance > 0
         d = dr.select(active, vertex.at.spawn_ray_to(w).d, mi.Vector3f(0, 0, 1))
         ds = Local(p=w, emitter=None)
         return Proposal(
-            d=d, active=active, ds=ds, e=e, w=w, n=n, along=along, chance=chance, opl=opl, u=u, sampler=sampler
-        )
+            d=d, active=active, ds=ds, e=e, face=face, w=w, n=n, along=along, chance=chance, opl=opl, u=u,
+            sampler=sampler,
+        )  # fmt: skip
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
         x, w, n, e, u = mi.Point3f(vertex.at.p), proposal.w, proposal.n, proposal.e, proposal.u
@@ -326,9 +327,9 @@ class EllipsoidalSurface(Ellipsoidal):
         # ------------------------------------------------------------------------- from x to w
         ray = vertex.at.spawn_ray(proposal.d)
         pi = context.segment.next_surface(context, ray, active)
-        active &= pi.is_valid()
+        active &= pi.is_valid() & self.faces.is_on(proposal.face, pi, active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        active &= (dr.norm(si.p - w) < _FOUND * r) & (dr.abs_dot(si.n, n) > 1 - _FOUND) & self.faces.lists(si.shape)
+        active &= dr.norm(si.p - w) < _FOUND * r
         medium, T = None, 1
         if context.contents.media is not None:
             medium = medium_behind(vertex.si, ray.d, vertex.medium, vertex.surface)
@@ -362,26 +363,29 @@ def choose(connection, x, n_x, e, s, u_angle, u, active):
         u_angle, u: uniform numbers for the angles and the choice.
 
     Returns:
-        (point; normal of its face; derivative by the angle; weight of the point over the mean that all weights have,
-        0 for none).
+        (number of a face; point of it; its normal; derivative by the angle; weight of the point over the mean that all
+        weights have, 0 for none).
     """
-    w, n, along = mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0)
+    found, w, n, along = mi.UInt32(0), mi.Point3f(x), mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0)
     best, total = mi.Float(0), mi.Float(0)
     angles = [dr.sincos(dr.two_pi / ANGLES * (u_angle + k)) for k in range(ANGLES)]
     i, going = mi.UInt32(0), active & (connection.faces.count > 0)
     while dr.hint(going, label="faces"):
         face = connection.faces.face(i)
-        w, n, along, best, total, u = among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u)
+        w, n, along, best, total, u, taken = among(
+            face, connection, x, n_x, e, s, angles, w, n, along, best, total, u
+        )
+        found = dr.select(taken, i, found)
         i += 1
         going = active & (i < connection.faces.count)
-    return w, n, along, dr.select(total > 0, best * ANGLES / total, 0)
+    return found, w, n, along, dr.select(total > 0, best * ANGLES / total, 0)
 
 
 def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
     """Return the choice among the points of one more face, by weights (a reservoir of one)."""
     section = Section(x, e.p, s, face.n, face.o)
     h, h_e = dr.dot(face.n, face.o - x), dr.dot(face.n, face.o - e.p)
-    meets = section.exists & (h * h_e > 0)
+    meets, is_here = section.exists & (h * h_e > 0), mi.Mask(False)
     for sin, cos in angles:
         point, derivative = section.point(sin, cos)
         a, b = dr.dot(point - face.o, face.U), dr.dot(point - face.o, face.V)
@@ -394,8 +398,8 @@ def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
         # What is left of the number is uniform again.
         u = dr.select(taken, u / share, (u - share) / (1 - share))
         w, n, along = dr.select(taken, point, w), dr.select(taken, face.n, n), dr.select(taken, derivative, along)
-        best = dr.select(taken, weight, best)
-    return w, n, along, best, total, u
+        best, is_here = dr.select(taken, weight, best), is_here | taken
+    return w, n, along, best, total, u, is_here
 
 
 def unoccluded(width, x, n_x, e, s, w, along, h, h_e):
