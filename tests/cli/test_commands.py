@@ -244,13 +244,13 @@ def test_cost(folder):
 @pytest.mark.slow
 def test_cost_of_settings(folder):
     options = ("--depth", 2, "--depth", 4, "--bin-width", 0.05, "--integrator", "transient_path", "--sampler", "owen")
-    result = run("cost", "box.xml", "--spp", "4,8", *options, "--error", 1000, "--json", "cost.json", "--quiet")
+    result = run("cost", "box.xml", "--spp", "4,8", *options, "--error", 0.99, "--json", "cost.json", "--quiet")
     assert result.exit_code == 0, result.output
     points = json.loads((folder / "cost.json").read_text(encoding="utf-8"))["points"]
     assert {(p["max_depth"], p["integrator"], p["bin_width_opl"]) for p in points} == {
         (depth, "transient_path", 0.05) for depth in (2, 4)
     }
-    assert "recommended for 100000.00%: transient: transient_path, owen" in result.stdout
+    assert "recommended for 99.00%: transient: transient_path, owen" in result.stdout
     result = run("cost", "box.xml", "--spp", "4,8", "--sampler", "owen", "--error", 1e-9, "--quiet")
     assert result.exit_code == 0 and "expected an error of transient that a measured setting reaches" in result.stdout
 

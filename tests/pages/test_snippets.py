@@ -65,6 +65,7 @@ def test_first_render(folder):
 def test_light(folder):
     found = Page("docs/light.md").names({r"resolution=\d+": "resolution=4", r"count=20": "count=3"})
     assert found["out"].gated.shape == (3, 3, 4, 4) and found["out"].transient is None
+    assert found["late"].gated.shape == (3, 1, 4, 4) and found["late"].gated.sum() > 0
 
 
 @pytest.mark.slow

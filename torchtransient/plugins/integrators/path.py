@@ -6,10 +6,17 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
+from torchtransient.plugins.sampling.flat_faces import FlatFaces
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.context import RenderContext
-from torchtransient.plugins.transport.ellipsoidal_connections import connections_in_window, why_not
+from torchtransient.plugins.transport.ellipsoidal_connections import (
+    EllipsoidalMedium,
+    EllipsoidalSurface,
+    WindowedEmitterSampled,
+    scatters,
+    why_not,
+)
 from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
 from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.vacuum import Vacuum
@@ -69,7 +76,12 @@ class TransientPath(TransientIntegrator):
         segment, scattering, (found, _) = self.strategies(contents)
         if contents.media is not None:
             segment.keeps_begin = True
-        strategies = segment, scattering, connections_in_window(scene, contents, found)
+        lights, faces = WindowedEmitterSampled(), FlatFaces([shape for shape in scene.shapes() if scatters(shape)])
+        if faces.count:
+            lights.beside += (EllipsoidalSurface(lights, faces),)
+        if contents.media is not None:
+            lights.beside += (EllipsoidalMedium(lights),)
+        strategies = segment, scattering, [found, lights, *lights.beside]
         return RenderContext(scene, contents, self.settings(), strategies, None, window)
 
     def silhouettes(self, scene, sensors=None):

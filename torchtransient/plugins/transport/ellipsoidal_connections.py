@@ -26,7 +26,7 @@ import mitsuba as mi
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins.polarized import product
-from torchtransient.plugins.sampling.flat_faces import FlatFaces, LightFaces
+from torchtransient.plugins.sampling.flat_faces import LightFaces
 from torchtransient.plugins.transport.emitter_connections import EmitterSampled, is_light
 from torchtransient.plugins.transport.free_flight import medium_interaction, transmittance
 from torchtransient.plugins.transport.media import lane_numbers, medium_behind
@@ -44,22 +44,6 @@ _FOUND = 1e-3
 _LEAST = 1e-5
 # Weight in the choice among faces of what only translucent surfaces and lights on both sides would bring.
 _BEHIND = 1e-3
-
-
-def connections_in_window(scene, contents, found):
-    """Return the connections of a walk: ``found`` (emission that is run into) and those of this module.
-
-    Args:
-        scene: Mitsuba scene.
-        contents: :class:`.scene_contents.SceneContents`.
-        found: :class:`.emitter_connections.EmitterFound`.
-    """
-    lights, faces = WindowedEmitterSampled(), FlatFaces([shape for shape in scene.shapes() if scatters(shape)])
-    if faces.count:
-        lights.beside += (EllipsoidalSurface(lights, faces),)
-    if contents.media is not None:
-        lights.beside += (EllipsoidalMedium(lights),)
-    return [found, lights, *lights.beside]
 
 
 def why_not(contents, film):
