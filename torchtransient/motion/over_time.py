@@ -11,6 +11,7 @@ from torchtransient.checks import as_whole, function, mapping, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.motion.rigid import Motion
 from torchtransient.motion.slow_times import SlowTimes
+from torchtransient.plugins.mitsuba_compat import POSITIONS
 from torchtransient.rendering.job import draw_seed
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
@@ -23,7 +24,7 @@ from torchtransient.scene.variant import device_type
 Moving: TypeAlias = Mapping[str, "Motion | Callable[[Tensor], Any]"] | Callable[[Tensor], Mapping[str, Any]]
 
 # Parameters that a rigid motion moves.
-_PLACES = ("to_world", "position", "vertex_positions")
+_PLACES = ("to_world", "position", POSITIONS)
 
 
 @opaque
