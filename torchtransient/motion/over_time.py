@@ -45,8 +45,8 @@ def over_time(
 
     Args:
         renderer: a renderer whose parameters include what moves, ``parameters=["fan.to_world"]``.
-        moving: what moves, by key or by name of a body ("fan" for "fan.to_world", "lamp.position" or
-            "mesh.vertex_positions", whichever the renderer has):
+        moving: what moves, by key or by name of a body ("fan" for its pose "fan.to_world", its position or the
+            vertices of its mesh, whichever the renderer has):
 
             - a :class:`tt.Motion`, from the value of the call or of the renderer, which is that of t = 0;
             - a function of times (K,), seconds, float64, that returns the values (K, *shape) of the key;
