@@ -27,7 +27,7 @@ TOOLS = sorted(p for p in (TESTS.parent / "tools").rglob("*.py") if p.parent.nam
 LEVEL = {
     "errors": 0, "_llvm": 0, "checks": 0, "units": 0, "axes": 0, "capture": 0, "interfaces": 0,
     "pulses": 0, "gates": 0, "stokes": 0, "tensor_record": 0, "floating": 0, "modules": 0, "volume_methods": 0,
-    "array_files": 0,
+    "array_files": 0, "chirps": 0,
     "plugins": 1, "sensing": 1, "reconstruction": 1, "losses": 1, "metrics": 1, "vis": 1,
     "parametrize": 1, "geometry": 1,
     "scenes": 2,
@@ -41,7 +41,7 @@ LEVEL = {
 # records with axes, data sets hold captures, whose simulations are files.
 BASIC = {"errors", "checks", "units"}
 BESIDE = {
-    "gates": {"pulses"}, "capture": {"axes", "tensor_record"},
+    "gates": {"pulses"}, "chirps": {"axes", "pulses"}, "capture": {"axes", "tensor_record"},
     "losses": {"sensing"}, "metrics": {"losses", "reconstruction"},
     "nlos": {"files"}, "data": {"files", "nlos"}, "testing": {"accuracy"},
 }  # fmt: skip

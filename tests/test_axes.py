@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.axes import FrequencyAxis, TimeAxis, fast_length
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis, fast_length
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -173,3 +173,24 @@ def test_the_next_length_of_small_factors(multiple):
     """Beside the list of all products of 2, 3 and 5."""
     for least in (*range(1, 700), 4097, 4375):
         assert fast_length(least, multiple) == next(multiple * n for n in SMOOTH if multiple * n >= least)
+
+
+def test_rates():
+    axis = RateAxis(-2.0, 0.25, 16)
+    assert axis.edges.dtype == axis.centers.dtype == torch.float64
+    assert axis.edges[0].item() == -2.0 and axis.edges[-1].item() == axis.end == 2.0
+    torch.testing.assert_close(axis.centers, (axis.edges[:-1] + axis.edges[1:]) / 2, rtol=1e-15, atol=0)
+    assert pickle.loads(pickle.dumps(axis)) == axis == RateAxis(torch.tensor(-2.0), np.float32(0.25), np.int64(16))
+    assert len({axis, RateAxis(-2, 0.25, 16), RateAxis(-2, 0.25, 17)}) == 2
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 0.0, 3), (0.0, -1.0, 3), (float("nan"), 1.0, 3), (1e9, 1e-9, 3)])
+def test_rates_that_are_refused(numbers):
+    with pytest.raises(UnitError, match="RateAxis: "):
+        RateAxis(*numbers)
+
+
+@pytest.mark.parametrize("bins", [0, 2.5])
+def test_numbers_of_rates_that_are_refused(bins):
+    with pytest.raises(ShapeError, match="RateAxis: expected num_bins"):
+        RateAxis(0.0, 1.0, bins)

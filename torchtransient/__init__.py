@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from torchtransient import vis as vis
     from torchtransient.accuracy.cost import cost_of_accuracy as cost_of_accuracy
     from torchtransient.axes import FrequencyAxis as FrequencyAxis
+    from torchtransient.axes import RateAxis as RateAxis
     from torchtransient.axes import TimeAxis as TimeAxis
+    from torchtransient.chirps import Chirps as Chirps
     from torchtransient.gates import Gate as Gate
     from torchtransient.motion.over_time import over_time as over_time
     from torchtransient.motion.rigid import Motion as Motion
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0.dev0"
 
 _LAZY = {
+    "Chirps": "torchtransient.chirps",
     "Exposure": "torchtransient.motion.slow_times",
     "Frames": "torchtransient.motion.slow_times",
     "FrequencyAxis": "torchtransient.axes",
@@ -66,6 +69,7 @@ _LAZY = {
     "PhaseSteps": "torchtransient.motion.slow_times",
     "Plan": "torchtransient.rendering.plan",
     "Pulse": "torchtransient.pulses",
+    "RateAxis": "torchtransient.axes",
     "RenderOutput": "torchtransient.rendering.output",
     "RenderStats": "torchtransient.rendering.output",
     "RollingShutter": "torchtransient.motion.slow_times",

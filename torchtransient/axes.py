@@ -1,4 +1,4 @@
-"""Axes of a measurement: equal half-open bins over optical path length, or frequencies."""
+"""Axes of a measurement: equal half-open bins over optical path length or over its rate, or frequencies."""
 
 from __future__ import annotations
 
@@ -47,21 +47,7 @@ class TimeAxis:
     num_bins: int
 
     def __post_init__(self) -> None:
-        start = finite("TimeAxis: start_opl", self.start_opl)
-        width = finite("TimeAxis: bin_width_opl", self.bin_width_opl)
-        if width <= 0:
-            raise UnitError(f"TimeAxis: expected bin_width_opl > 0 metres, got {width!r}.")
-        bins = as_whole(self.num_bins)
-        if bins is None:
-            raise ShapeError(f"TimeAxis: expected num_bins to be a whole number, got {shown(self.num_bins)}.")
-        if not 1 <= bins <= MOST_BINS:
-            raise ShapeError(f"TimeAxis: expected num_bins >= 1 and at most 2^62, got {shown(bins)}.")
-        end = start + bins * width
-        if not math.isfinite(end) or width < 4 * max(math.ulp(start), math.ulp(end)):
-            raise UnitError(
-                f"TimeAxis: bins of {width!r} m between {start!r} m and {end!r} m cannot be told apart in float64. "
-                "Use wider bins or an earlier start."
-            )
+        start, width, bins = _equal_bins("TimeAxis", ("start_opl", "bin_width_opl"), "m", self)
         if width < SHORTEST_OPL:
             raise UnitError(
                 f"TimeAxis: expected bin_width_opl in metres of optical path, at least {SHORTEST_OPL:g} (0.3 fs; "
@@ -247,6 +233,70 @@ class FrequencyAxis:
         low, high = min(self.frequencies), max(self.frequencies)
         start = f", start_opl={self.start_opl:g}" if self.start_opl else ""
         return f"FrequencyAxis({self.num_frequencies} from {low:g} to {high:g} per metre{start})"
+
+
+@dataclass(frozen=True)
+class RateAxis:
+    """Axis of equal bins over the rate of optical path lengths, d opl / dt in metres per second.
+
+    Bin ``k`` is ``[start + k bin_width, start + (k + 1) bin_width)``. The rate is positive where paths get longer;
+    light of such a path is shifted by ``- rate / wavelength``. A target that comes nearer at v, seen from beside the
+    light, has the rate -2 v. Frozen, hashable and picklable.
+
+    Args:
+        start: start of the first bin, m/s.
+        bin_width: width of a bin, m/s.
+        num_bins: number of bins, R.
+
+    Raises:
+        UnitError: for rates that are not finite, and widths that are not positive or too narrow for float64.
+        ShapeError: unless ``num_bins`` is a positive whole number.
+    """
+
+    start: float
+    bin_width: float
+    num_bins: int
+
+    def __post_init__(self) -> None:
+        start, width, bins = _equal_bins("RateAxis", ("start", "bin_width"), "m/s", self)
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "bin_width", width)
+        object.__setattr__(self, "num_bins", bins)
+
+    @property
+    def end(self) -> float:
+        """End of the last bin, m/s; the first rate outside."""
+        return self.start + self.num_bins * self.bin_width
+
+    @property
+    def edges(self) -> Tensor:
+        """Edges of the bins, (R + 1,) float64, m/s."""
+        return self.start + torch.arange(self.num_bins + 1, dtype=torch.float64, device="cpu") * self.bin_width
+
+    @property
+    def centers(self) -> Tensor:
+        """Centres of the bins, (R,) float64, m/s."""
+        middles = torch.arange(self.num_bins, dtype=torch.float64, device="cpu") + 0.5
+        return self.start + middles * self.bin_width
+
+
+def _equal_bins(owner: str, names: tuple[str, str], unit: str, axis: Any) -> tuple[float, float, int]:
+    """Return start, width and number of an axis' bins as plain numbers. Raises UnitError, ShapeError."""
+    start, width = (finite(f"{owner}: {name}", getattr(axis, name)) for name in names)
+    if width <= 0:
+        raise UnitError(f"{owner}: expected {names[1]} > 0 {'metres' if unit == 'm' else unit}, got {width!r}.")
+    bins = as_whole(axis.num_bins)
+    if bins is None:
+        raise ShapeError(f"{owner}: expected num_bins to be a whole number, got {shown(axis.num_bins)}.")
+    if not 1 <= bins <= MOST_BINS:
+        raise ShapeError(f"{owner}: expected num_bins >= 1 and at most 2^62, got {shown(bins)}.")
+    end = start + bins * width
+    if not math.isfinite(end) or width < 4 * max(math.ulp(start), math.ulp(end)):
+        raise UnitError(
+            f"{owner}: bins of {width!r} {unit} between {start!r} {unit} and {end!r} {unit} cannot be told apart in "
+            "float64. Use wider bins or an earlier start."
+        )
+    return start, width, bins
 
 
 def _row(given: Any, owner: str) -> tuple[float, ...]:

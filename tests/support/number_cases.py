@@ -29,6 +29,7 @@ from torchtransient.errors import TorchTransientError
 AXIS, LIGHT = tt.TimeAxis(1.0, 0.05, 8), 0.1 + torch.rand(1, 8, 16, 16, generator=torch.Generator().manual_seed(0))
 PICTURE, STOKES = LIGHT[:, :3], torch.tensor([2.0, 0.3, 0.4, 0.5]).view(4, 1, 1, 1, 1).expand(4, 1, 8, 16, 16)
 GATE, BAND = tt.Gate.rectangular(1.0, 2.0), tt.FrequencyAxis.uniform(1.0, 0.5, 3)
+CHIRPS = tt.Chirps(1e9, 1e-5, 1550e-9)
 K = torch.tensor([[4.0, 0, 2], [0, 4, 2], [0, 0, 1]])
 MESH = (torch.eye(3), torch.tensor([[0, 1, 2]]))
 SPHERE, FOAM = {"type": "sphere"}, (262.0, 0.53, 1.12, 0.0036)
@@ -70,6 +71,9 @@ def _tensors() -> dict[str, Case]:
         "TimeAxis": Case(tt.TimeAxis, start_opl=1.0, bin_width_opl=0.5, num_bins=3),
         "TimeAxis.from_seconds": Case(tt.TimeAxis.from_seconds, start_s=1e-9, bin_width_s=1e-10, num_bins=3),
         "TimeAxis.bin_index": Case(AXIS.bin_index, opl=1.2),
+        "RateAxis": Case(tt.RateAxis, start=-2.0, bin_width=0.5, num_bins=3),
+        "Chirps": Case(tt.Chirps, bandwidth_hz=1e9, duration_s=1e-5, wavelength_m=1e-6),
+        "Chirps.time_axis": Case(CHIRPS.time_axis, range_m=(0.0, 9.0), speed_m_s=(-1.0, 1.0), bins_per_line=3),
         "FrequencyAxis": Case(tt.FrequencyAxis, frequencies=1.0, start_opl=1.0),
         "FrequencyAxis.uniform": Case(tt.FrequencyAxis.uniform, first=1.0, step=0.5, count=3, start_opl=1.0),
         "FrequencyAxis.from_hertz": Case(tt.FrequencyAxis.from_hertz, frequencies_hz=1e8, start_opl=1.0),
