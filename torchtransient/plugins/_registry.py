@@ -151,6 +151,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.gated", (("film", "gated_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.rates", (("film", "rate_hdr_film"), ("film", "beat_hdr_film"))),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
     PluginModule(
@@ -162,6 +163,7 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.integrators.nlos_path", (("integrator", "transient_nlos_path"),)),
     PluginModule("torchtransient.plugins.emitters.laser_beam", (("emitter", "laser_beam"),)),
     PluginModule("torchtransient.plugins.samplers.owen", (("sampler", "owen"),)),
+    PluginModule("torchtransient.plugins.shapes.rigid_motion", (("texture", "rigid_motion"),)),
     PluginModule("torchtransient.plugins.shapes.mesh_arrays", (("shape", "mesh_arrays"),)),
     PluginModule("torchtransient.plugins.emitters.angular_area", (("emitter", "angulararea"),)),
     PluginModule("torchtransient.plugins.emitters.directional_area", (("emitter", "diff_directionalarea"),)),

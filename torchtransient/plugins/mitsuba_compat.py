@@ -193,6 +193,8 @@ TEXTURES_WITHOUT_MEAN = {"mesh_attribute": "MeshAttribute", "volume": "VolumeAda
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 # Columns of the arrays that a user can replace.
 VERTEX_COLUMNS = {POSITIONS: 3, NORMALS: 3, TEXCOORDS: 2}
+# Attribute of a mesh, three numbers a vertex: metres per second in the world.
+VELOCITY = "vertex_velocity"
 # Mitsuba 3.10 (pull request 1933) renames these, shows all arrays as tensors of rows, makes meshes of arrays that are
 # given to the constructor, and has no buffers. Its vertices may share rows of positions and normals, so that there are
 # fewer rows than vertices. Silhouette tables, which it makes on demand, are not used here.
@@ -316,6 +318,11 @@ def has_normals(mesh: Any) -> bool:
 def has_texcoords(mesh: Any) -> bool:
     """Return True if a mesh has texture coordinates at its vertices."""
     return bool(mesh.has_texcoords() if shows_rows() else mesh.has_vertex_texcoords())
+
+
+def has_velocities(shape: Any) -> bool:
+    """Return True for meshes with velocities at their vertices."""
+    return isinstance(shape, mi.Mesh) and shape.has_attribute(VELOCITY)
 
 
 def has_more_than_arrays(mesh: Any) -> bool:

@@ -26,7 +26,7 @@ from torchtransient.errors import PluginRegistrationError
 
 CORRECT = "correct"
 ANY_KEY = "*"
-ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "medium", "value")
+ROLES = ("shape", "normal", "emitter", "sun", "sensor", "index", "delay", "medium", "velocity", "value")
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class ParameterEffect:
             phase function only where it is one of flakes.
         role: part of the geometry that it moves. "shape": points of a surface; "normal": the frame that a delta lobe
             works in; "emitter": an emitter without a shape; "sun": the disk in a sky; "sensor": the sensor and its
-            rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction; "value": none.
+            rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction;
+            "velocity": how fast it moves, which films of rates alone measure; "value": none.
         supported: it has a derivative.
         biased: that derivative is wrong in some scenes, beside what it lacks of moving edges, which integrators answer
             (``silhouettes``).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -45,6 +45,14 @@ def number(props: Any, name: str, default: float | None = None) -> float:
     if not math.isfinite(given):
         raise SceneError(f"{props.plugin_name()}: {name}: expected a finite number, got {shown(given)}.")
     return float(given)
+
+
+def vector(props: Any, name: str, default: Sequence[float]) -> list[float]:
+    """Return three finite numbers. Raises SceneError."""
+    given = np.array(props.get(name, default), dtype=np.float64).reshape(-1)
+    if len(given) != 3 or not np.isfinite(given).all():  # noqa: PLR2004 (dimensions of space)
+        raise SceneError(f"{props.plugin_name()}: {name}: expected three finite numbers, got {shown(given.tolist())}.")
+    return [float(x) for x in given]
 
 
 def truth(props: Any, name: str, default: bool) -> bool:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
 from torchtransient.interfaces import FilmInterface, is_time_resolved
@@ -85,6 +86,12 @@ class FilmLayout(abc.ABC):
         for films with bins, whose temporal filter decides.
         """
         return ""
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
+        """Return the film that the keywords of a call ask for, None for another one."""
+        value = arguments.get(cls.argument)
+        return None if value is None else cls(value)
 
     # ----------------------------------------------------------------------------------------------- scene and film
 
@@ -373,27 +380,180 @@ class Gates(FilmLayout):
         return arrivals.through(seen)
 
 
+@dataclass(frozen=True)
+class RowsOfHistograms(FilmLayout):
+    """Base of films with several histograms a pixel: float32 (C, rows, T, H, W).
+
+    A subclass has two fields, its settings and ``axis``, the bins of all histograms; None for those of the scene's
+    film.
+    """
+
+    has_bins: ClassVar[bool] = True
+    kind: ClassVar[type]
+
+    def __post_init__(self) -> None:
+        given: Any = self.settings
+        if not isinstance(given, self.kind):
+            raise ArgumentError(
+                f"{self.argument}: expected a tt.{self.kind.__name__}, got {type(given).__name__}; write {self.example}."
+            )
+        axis: Any = self.attributes()["axis"]
+        if axis is not None:
+            Histogram(axis)
+
+    @property
+    def count(self) -> int:
+        axis = self.attributes()["axis"]
+        assert isinstance(axis, TimeAxis)  # of a built film
+        return axis.num_bins
+
+    def attributes(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def plain(self) -> dict[str, Any]:
+        axis = self.attributes()["axis"]
+        return asdict(self.settings) | ({} if axis is None else Histogram(axis).plain())
+
+    def describe(self, temporal_filter: str) -> str:
+        words = ", ".join(f"{name}={value}" for name, value in self.attributes().items())
+        return f"{words}, temporal_filter={temporal_filter!r}"
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
+        value = arguments.get(cls.argument)
+        return None if value is None else cls(value, arguments.get(Histogram.argument))  # type: ignore[call-arg]
+
+    def write(self, props: Any) -> None:
+        axis = self.attributes()["axis"]
+        if axis is not None:
+            Histogram(axis).write(props)
+
+    def describes(self, film: FilmInterface) -> bool:
+        if film.measures != self.measures:
+            return False
+        built = self.from_film(film).attributes()
+        return all(value is None or built[name] == value for name, value in self.attributes().items())
+
+    def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+        cube = cube.reshape(*leading, *cube.shape[-5:])
+        return _stokes_first(cube.movedim((-1, -3, -2), (-5, -4, -3)), -5, components)
+
+    @classmethod
+    def from_output(cls, output: Any) -> Self | None:
+        if measured(output, cls.measures) is None:
+            return None
+        return cls(*(measured(output, field.name) for field in fields(cls)))
+
+    def entries(self) -> dict[str, Any]:
+        return self.plain()
+
+    @classmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        if cls.measures not in values:
+            return None
+        names = [field.name for field in fields(cls.kind)]
+        plain = {name: value.item() if hasattr(value := values[name], "item") else value for name in names}
+        axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+        return cls(cls.kind(**plain), axis)  # type: ignore[call-arg]
+
+
+@dataclass(frozen=True)
+class Rates(RowsOfHistograms):
+    """Radiance integrated over each bin of the rate and of the optical path length: float32 (C, R, T, H, W).
+
+    Args:
+        rate_axis: bins of the rate d opl / dt.
+        axis: bins of optical path length, None for those of the scene's film.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
+
+    measures: ClassVar[str] = "rates"
+    plugin: ClassVar[str] = "rate_hdr_film"
+    letter: ClassVar[str] = "R x T"
+    argument: ClassVar[str] = "rates"
+    example: ClassVar[str] = "rates=tt.RateAxis(start=..., bin_width=..., num_bins=...)"
+    plural: ClassVar[str] = "rates"
+    output: ClassVar[str] = "rates"
+    takes_pulse: ClassVar[bool] = True
+    kind: ClassVar[type] = RateAxis
+
+    rate_axis: RateAxis
+    axis: TimeAxis | None = None
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(RateAxis(film.rate_start, film.rate_width, film.rate_bins), Histogram.from_film(film).axis)
+
+    def write(self, props: Any) -> None:
+        super().write(props)
+        axis = self.rate_axis
+        props["rate_start"], props["rate_width"], props["rate_bins"] = axis.start, axis.bin_width, axis.num_bins
+
+
+_CHIRPS = {"bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength"}
+
+
+@dataclass(frozen=True)
+class Beats(RowsOfHistograms):
+    """Expected power spectra of the beat of chirps, up and down: float32 (C, 2, T, H, W).
+
+    Args:
+        chirps: chirps of the light.
+        axis: bins over ``opl +- k rate``, None for those of the scene's film; ``chirps.time_axis`` proposes some.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
+
+    measures: ClassVar[str] = "beats"
+    plugin: ClassVar[str] = "beat_hdr_film"
+    letter: ClassVar[str] = "2 x T"
+    argument: ClassVar[str] = "chirps"
+    example: ClassVar[str] = "chirps=tt.Chirps(bandwidth_hz=..., duration_s=..., wavelength_m=...)"
+    plural: ClassVar[str] = "beats"
+    output: ClassVar[str] = "beats"
+    takes_pulse: ClassVar[bool] = True
+    kind: ClassVar[type] = Chirps
+
+    chirps: Chirps
+    axis: TimeAxis | None = None
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(film.chirps, Histogram.from_film(film).axis)
+
+    def write(self, props: Any) -> None:
+        super().write(props)
+        for name, prop in _CHIRPS.items():
+            props[prop] = getattr(self.chirps, name)
+        props["chirp_window"] = self.chirps.window
+
+
 # ------------------------------------------------------------------------------------------------------ list of films
 
 # A new film is added here, one of a user's own too. The first one is that of a plan that is asked for no other.
-FILMS: list[type[FilmLayout]] = [Histogram, Phasors, Gates]
+FILMS: list[type[FilmLayout]] = [Histogram, Phasors, Gates, Rates, Beats]
 
 
 def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
     """Return the film that keyword arguments ask for, None without one.
 
     Args:
-        arguments: ``time_axis``, ``frequencies``, ``gates``: at most one that is not None.
+        arguments: ``time_axis``, ``frequencies``, ``gates``, ``rates``, ``chirps``: at most one that is not None, beside
+            the time axis of a film that has one.
 
     Raises:
         ArgumentError: for several, and for wrong settings, as the layouts raise it.
     """
-    given = [(kind, arguments.get(kind.argument)) for kind in FILMS]
-    given = [(kind, value) for kind, value in given if value is not None]
+    given = [found for kind in FILMS if (found := kind.from_arguments(arguments)) is not None]
+    if len(given) == 2 and isinstance(given[0], Histogram) and given[1].has_bins:  # noqa: PLR2004 (whose axis it is)
+        del given[0]
     if len(given) > 1:
         names, films = ", ".join(kind.argument for kind in FILMS), [f"a {kind.measures} film" for kind in FILMS]
         raise ArgumentError(f"{names}: a film is {', '.join(films[:-1])} or {films[-1]}; give one of them.")
-    return given[0][0](given[0][1]) if given else None
+    return given[0] if given else None
 
 
 def layout_of_film(film: Any) -> FilmLayout:

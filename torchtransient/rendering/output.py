@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
@@ -112,7 +113,9 @@ class RenderStats:
 
 
 # Fields that belong to a film: None in the output of another one.
-_OF_FILMS = ("transient", "phasor", "gated", "axis", "frequencies", "gates")
+_OF_FILMS = (
+    "transient", "phasor", "gated", "rates", "beats", "axis", "frequencies", "gates", "rate_axis", "chirps",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +128,10 @@ class RenderOutput(ErrorBars, TensorRecord):
       ``steady`` as far as the axis reaches;
     - ``phasor``: complex64 (C, F, H, W), radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of
       ``frequencies``, so that its value at zero frequency is ``steady``;
-    - ``gated``: float32 (C, G, H, W), the light as each of ``gates`` sees it; ``steady`` is the sum over the gates.
+    - ``gated``: float32 (C, G, H, W), the light as each of ``gates`` sees it; ``steady`` is the sum over the gates;
+    - ``rates``: float32 (C, R, T, H, W), the light by the bins of ``rate_axis`` (how fast its path gets longer) and of
+      ``axis``;
+    - ``beats``: float32 (C, 2, T, H, W), expected power spectra of the beat of ``chirps``, up and down, over ``axis``.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
     variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
@@ -153,6 +159,10 @@ class RenderOutput(ErrorBars, TensorRecord):
     channels: tuple[str, ...] = ()
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
+    rates: torch.Tensor | None = None
+    beats: torch.Tensor | None = None
+    rate_axis: RateAxis | None = None
+    chirps: Chirps | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
     differences: torch.Tensor | None = None
     squares: torch.Tensor | None = None

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.chirps import Chirps
 from torchtransient.checks import Numbers, flag, is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.gates import Gate
@@ -78,10 +79,13 @@ class TransientRenderer(CopiesParametrized):
             slashes, since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps
             them in range.
         time_axis: replaces the one of the scene's films; phasor films become histograms. At most one of ``time_axis``,
-            ``frequencies``, ``gates`` and ``film``.
+            ``frequencies``, ``gates``, ``rates``, ``chirps`` and ``film``, but for the axis of rates and chirps.
         frequencies: a :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and
             ``out.phasor`` takes the place of ``out.transient``.
         gates: :class:`Gate` objects; the films become gated films with ``out.gated``.
+        rates: bins of the rate of path lengths (:class:`RateAxis`), in scenes where things move (``scene.moving``); the
+            films become rate films with ``out.rates`` over the bins of ``time_axis``, or of the scene's histogram.
+        chirps: :class:`Chirps` of a frequency-modulated lidar; the films become beat films with ``out.beats``.
         film: the same as an object of ``torchtransient.rendering.films``; films of one's own are asked for so.
         max_depth: replaces the integrator's. Where that is no limit, calls whose values can be differentiated by use a
             bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond which
@@ -146,6 +150,8 @@ class TransientRenderer(CopiesParametrized):
         pulse: Pulse | None = None,
         irf: Pulse | None = None,
         gates: Sequence[Gate] | None = None,
+        rates: RateAxis | None = None,
+        chirps: Chirps | None = None,
         steady: bool = True,
         film: FilmLayout | None = None,
         physics: str = "warn",
@@ -154,7 +160,8 @@ class TransientRenderer(CopiesParametrized):
         freeze: bool = True,
     ):
         super().__init__()
-        film = requested_film(film, {"time_axis": time_axis, "frequencies": frequencies, "gates": gates})
+        named = {"time_axis": time_axis, "frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
+        film = requested_film(film, named)
         if isinstance(effects, Effects):
             scene = effects.planned_scene(scene)
             film, temporal_filter = effects.film_settings(film, temporal_filter)

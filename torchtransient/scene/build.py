@@ -25,6 +25,7 @@ from torchtransient.plugins.parameters import PhysicalRange, described_ranges, r
 from torchtransient.scene.checks import check_finite, check_mesh_files, check_meshes, check_nodes
 from torchtransient.scene.description import Plain, SceneDescription
 from torchtransient.scene.edits import BuildOptions, edit, forget_queries
+from torchtransient.scene.motions import has_velocities
 from torchtransient.scene.nodes import (
     described_transforms,
     find_child,
@@ -126,6 +127,9 @@ def _instantiated(description: Plain, variant: str, options: BuildOptions) -> Bu
         mi.parser.transform_upgrade(config, state)
         if state.root.props.plugin_name() != "scene":
             raise SceneError(f"expected a <scene> at the top, got <{state.root.props.plugin_name()}>.")
+        if options.merge and has_velocities(state):
+            # What is merged forgets whose it was.
+            return _instantiated(description, variant, replace(options, merge=False))
         check_nodes(state)
         check_mesh_files(state)
         check_meshes(description.objects)

@@ -21,6 +21,7 @@ from torchtransient.checks import check_special, path_of, shown
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.plugins.dictionaries import NUMBERS_IN_TEXT, Pixels, Voxels, is_ours, numbers_in_text, parsed
 from torchtransient.scene.checks import MOST_LEVELS
+from torchtransient.scene.motions import BodyMotion, place_motions
 from torchtransient.scene.objects import Description, LoadedObject, LoadedScene, describe_object, objects_inside
 
 # Files in files: Mitsuba takes fewer.
@@ -34,6 +35,7 @@ class XmlDescription(Description):
     path: str
     text: str
     parameters: tuple[tuple[str, str], ...]
+    motions: tuple[BodyMotion, ...] = ()
 
     @property
     def name(self) -> str:
@@ -47,8 +49,11 @@ class XmlDescription(Description):
         path = Path(self.path)
         parameters = dict(self.parameters)
         if path.is_file() and path.read_text(encoding="utf-8") == self.text:
-            return mi.parser.parse_file(config, self.path, **parameters)
-        return mi.parser.parse_string(config, self.text, **parameters)
+            state = mi.parser.parse_file(config, self.path, **parameters)
+        else:
+            state = mi.parser.parse_string(config, self.text, **parameters)
+        place_motions(state, self.motions)
+        return state
 
     @contextmanager
     def resolved_files(self) -> Iterator[None]:
@@ -63,6 +68,7 @@ class DictDescription(Description):
 
     tree: dict[str, Any]
     folder: str
+    motions: tuple[BodyMotion, ...] = ()
 
     @property
     def name(self) -> str:
@@ -79,11 +85,12 @@ class DictDescription(Description):
         import mitsuba as mi
 
         state = parsed(config, self.tree)
-        kinds = {"shape": mi.ObjectType.Shape, "sampler": mi.ObjectType.Sampler}
+        kinds = {"shape": mi.ObjectType.Shape, "sampler": mi.ObjectType.Sampler, "texture": mi.ObjectType.Texture}
         for node in state.nodes:
             # Mitsuba learns the kind of a plugin written in Python when it builds it.
             if node.type == mi.ObjectType.Unknown:
                 node.type = kinds.get(plugins.kind_of(node.props.plugin_name()) or "", node.type)
+        place_motions(state, self.motions)
         return state
 
     @contextmanager
@@ -122,7 +129,7 @@ def same_description(a: SceneDescription, b: SceneDescription) -> bool:
         return a.scene is b.scene
     if not isinstance(a, DictDescription) or not isinstance(b, DictDescription):
         return a == b
-    if not _same(a.tree, b.tree):
+    if a.motions != b.motions or not _same(a.tree, b.tree):
         return False
     return a.folder == b.folder or not _names_files(a.tree)
 

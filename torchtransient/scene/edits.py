@@ -59,6 +59,8 @@ _FILM_PROPERTIES = (
     "width", "height", "crop_width", "crop_height", "crop_offset_x", "crop_offset_y", "sample_border",
     "exhaustive_scan", "laser_scan_width", "laser_scan_height",
 )  # fmt: skip
+# Properties that one film with bins takes over from another.
+_BIN_PROPERTIES = ("start_opl", "bin_width_opl", "temporal_bins", "temporal_filter", "gaussian_stddev")
 # Properties that one transient integrator takes over from another.
 _TRANSIENT_PROPERTIES = (
     *_PATH_PROPERTIES, "camera_unwarp", "discard_direct_light", "temporal_filter", "gaussian_stddev",
@@ -96,7 +98,7 @@ _PRINTED = {"y": "luminance", "ya": "luminance_alpha"}
 _PULSES = ("pulse", "irf")
 _PULSE_NUMBERS = ("fwhm_opl", "width_opl", "center_opl", "opl", "values")
 _PULSE_PROPERTIES = tuple(prefix + suffix for prefix in _PULSES for suffix in ("", *(f"_{n}" for n in _PULSE_NUMBERS)))
-_SPREADING = ("transient_hdr_film", "gated_hdr_film")
+_SPREADING = ("transient_hdr_film", "gated_hdr_film", "rate_hdr_film", "beat_hdr_film")
 
 
 class FilmRequest(Protocol):
@@ -109,6 +111,10 @@ class FilmRequest(Protocol):
     @property
     def argument(self) -> str:
         """Argument of a renderer that chooses the film, for messages."""
+
+    @property
+    def has_bins(self) -> bool:
+        """The film has bins of time."""
 
     @property
     def takes_pulse(self) -> bool:
@@ -272,7 +278,8 @@ def _edit_film(state: Any, index: int, options: BuildOptions) -> None:
             raise SceneError(
                 f"the film {plugin!r} has a pulse or an irf, which a {film.plugin} would lose; take it out."
             )
-        _become(state, index, film.plugin, keep=_FILM_PROPERTIES + _PULSE_PROPERTIES)
+        kept = _FILM_PROPERTIES + _PULSE_PROPERTIES + (_BIN_PROPERTIES if film.has_bins else ())
+        _become(state, index, film.plugin, keep=kept)
         props = state.nodes[index].props
     if not film.fits(props.plugin_name()):
         raise SceneError(f"the film {plugin!r} cannot become a {film.plugin}; make it one.")

@@ -21,6 +21,7 @@ from torchtransient.plugins.guards import ensure_restored
 from torchtransient.scene.build import BuiltScene, build
 from torchtransient.scene.description import SceneDescription, describe_dict, describe_xml, same_description
 from torchtransient.scene.edits import BuildOptions
+from torchtransient.scene.motions import body_motions
 from torchtransient.scene.nodes import children, is_film
 from torchtransient.scene.objects import LoadedScene, transient_dictionary
 from torchtransient.scene.opaque import opaque
@@ -151,6 +152,34 @@ class Scene:
             True for equal values, and files looked up in the same places.
         """
         return same_description(self._description, other._description)
+
+    @opaque
+    def moving(self, motions: Mapping[str, Any]) -> Scene:
+        """Return a scene whose bodies have velocities, which films of rates measure (``rates=``, ``chirps=``).
+
+        All poses stay those of one instant. The velocities of ``"fan"`` are parameters: ``fan.velocity.linear``,
+        ``.angular`` and ``.center``.
+
+        Args:
+            motions: a :class:`torchtransient.Motion` by the name of a shape, an instance, a near light, a sensor or a
+                medium. They take the place of described ones.
+
+        Returns:
+            A scene of the same description otherwise, in the same variant.
+
+        Raises:
+            ArgumentError: unless ``motions`` maps names to motions.
+            SceneError: for names that the scene does not have, and for scenes of loaded objects.
+        """
+        self._description.check_described("scene.moving")
+        assert not isinstance(self._description, LoadedScene)  # refused above
+        given = body_motions(mapping("scene.moving", motions, "{name: tt.Motion(...)}"))
+        kept = [motion for motion in self._description.motions if motion.of not in {one.of for one in given}]
+        other = Scene(replace(self._description, motions=(*kept, *given)), self._requested_variant)
+        other._variant = self._variant
+        with active_variant(other.variant):
+            other.built(BuildOptions(real_bitmaps=True))  # a wrong name is told here
+        return other
 
     # ------------------------------------------------------------------------------------------------- built scenes
 

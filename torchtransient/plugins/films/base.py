@@ -115,6 +115,8 @@ class TimeResolvedFilm(mi.Film):
     knows_exclusive_lanes = False
     # `put` takes `crowded`: most lanes add something at once.
     knows_crowds = False
+    # Arrivals come with the rates at which their lengths change: `put`, `put_slope` and `read` take `rate`.
+    knows_rates = False
     # The array changes smoothly with path lengths; otherwise the end of an error message that says what to do.
     has_slope = True
     slope_remedy = "Set temporal_filter to 'tent' or 'gaussian'."
@@ -345,17 +347,21 @@ class TimeResolvedFilm(mi.Film):
         """Return the number of laser positions of an exhaustive scan, otherwise 1."""
         return self.laser_scan_width * self.laser_scan_height if self.exhaustive_scan else 1
 
+    def row_count(self) -> int:
+        """Return the number of rows of (entries, channels) of one pixel and laser position."""
+        return 1
+
     def laser_shape(self) -> tuple[int, ...]:
         """Return the dimensions of the array that belong to the laser: (Lh, Lw), or none."""
         return (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
 
     def entries_per_array(self) -> int:
         """Return the number of floats of one pixel and laser position."""
-        return math.prod(self.cube_shape()[-2:])
+        return self.row_count() * math.prod(self.cube_shape()[-2:])
 
     def entries_per_pixel(self) -> int:
         """Return the number of floats behind one pixel."""
-        return self.laser_count() * math.prod(self.cube_shape()[-2:])
+        return self.laser_count() * self.entries_per_array()
 
     def pixel_base(self, base, laser):
         """Return the index of the array of one laser position.

@@ -36,7 +36,7 @@ class FilmBlock:
         """Return the loop state of the film: a PyTree that ``put``, ``put_slope`` and ``end`` receive."""
         return {}
 
-    def put(self, events, opl, value, active, crowded=False):
+    def put(self, events, opl, value, active, crowded=False, rate=None):
         """Write an event.
 
         Args:
@@ -45,6 +45,7 @@ class FilmBlock:
             value: contribution, throughput included, a spectrum.
             active: mask of lanes that have the event.
             crowded: most lanes have it, see :class:`~..transport.strategy.Event`.
+            rate: derivative of ``opl`` by time, m/s; for films with ``knows_rates``.
 
         Returns:
             Energy (mean over channels) before and after the film's window.
@@ -53,6 +54,8 @@ class FilmBlock:
         options = {"exclusive": True} if self.exclusive else {}
         if crowded and self.film.knows_crowds:
             options["crowded"] = True
+        if rate is not None:
+            options["rate"] = rate
         before, after = self.film.put(self.band, self.base, self.counted(opl), channels, active, **options)
         energy = dr.select(active, mean_of(channels), 0)
         return energy * before, energy * after
@@ -61,7 +64,7 @@ class FilmBlock:
         """Return a path length counted from the film's start, Float64."""
         return opl if self.origin is None else self.origin + mi.Float64(opl)
 
-    def put_slope(self, events, opl, d_value, value_d_opl, active):
+    def put_slope(self, events, opl, d_value, value_d_opl, active, rate=None, value_d_rate=None):
         """Write the derivative ``k df + f k' dtau`` of an event, with the film's response ``k``.
 
         Args:
@@ -70,9 +73,13 @@ class FilmBlock:
             d_value: derivative ``df`` of the contribution, a spectrum.
             value_d_opl: contribution times derivative of the path length, ``f dtau``.
             active: mask of lanes that have the event.
+            rate, value_d_rate: rate, and contribution times its derivative; for films with ``knows_rates``.
         """
         d, slope = self.match.to_channels(d_value), self.match.to_channels(value_d_opl)
-        self.film.put_slope(self.band, self.base, self.counted(opl), d, slope, active)
+        options = {}
+        if rate is not None:
+            options = {"rate": rate, "value_d_rate": self.match.to_channels(value_d_rate)}
+        self.film.put_slope(self.band, self.base, self.counted(opl), d, slope, active, **options)
 
     def end(self, events):
         """Finish the loop state, after the last event of all paths."""
@@ -95,22 +102,32 @@ class AdjointBlock:
     def __init__(self, film, response, base, steady, match):
         self.film, self.response, self.base, self.steady, self.match = film, response, base, steady, match
 
-    def read(self, opl, active):
+    def read(self, opl, active, rate=None):
         """Read the adjoint at an arrival.
 
         Args:
             opl: optical path length, minus the film's start, metres (Float64).
             active: mask of lanes.
+            rate: rate of the arrival, m/s; for films with ``knows_rates``.
 
         Returns:
-            (adjoint, slope per metre), spectra that weigh a contribution of a primary ray.
+            (adjoint, slope per metre), and with a rate the slope by it: spectra that weigh a contribution of a
+            primary ray.
         """
+        if rate is not None:
+            return self._read_rate(opl, active, rate)
         if not self.film.keeps_steady:
             A, slope = self.film.read(self.response, self.base, opl, active, self.steady)
             return self.match.to_spectrum(A), self.match.to_spectrum(slope)
         if self.response is None:
             return self.match.to_spectrum(self.steady), light_type()(0)
         return self.as_spectra(*self.film.read(self.response, self.base, opl, active))
+
+    def _read_rate(self, opl, active, rate):
+        if self.response is None:
+            return self.match.to_spectrum(self.steady), light_type()(0), light_type()(0)
+        A, slope, by_rate = self.film.read(self.response, self.base, opl, active, rate=rate)
+        return *self.as_spectra(A, slope), self.match.to_spectrum(by_rate)
 
     def as_spectra(self, A, slope):
         """Return the adjoint of transient and steady image as spectra.

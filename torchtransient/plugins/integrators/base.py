@@ -49,6 +49,7 @@ from torchtransient.plugins.transport.derivative import (
 from torchtransient.plugins.transport.record import RecordSink
 from torchtransient.plugins.transport.scene_contents import SceneCache, SceneContents
 from torchtransient.plugins.transport.sinks import FilmSink
+from torchtransient.plugins.transport.velocities import Velocities
 from torchtransient.plugins.transport.walk import first_leg, start, walk
 
 UNLIMITED = 0xFFFFFFFF
@@ -190,7 +191,9 @@ class TransientIntegrator(mi.CppADIntegrator):
             self.max_depth, self.rr_depth, bool(self.hide_emitters), self.discard_direct_light, self.camera_unwarp
         )
 
-    def render_context(self, scene, contents, wanted=None, window=None, settings=None) -> RenderContext:
+    def render_context(
+        self, scene, contents, wanted=None, window=None, settings=None, velocities=None
+    ) -> RenderContext:
         """Build the :class:`~..transport.context.RenderContext` of a job.
 
         Args:
@@ -198,8 +201,10 @@ class TransientIntegrator(mi.CppADIntegrator):
             wanted: :class:`~..transport.context.Wanted` derivatives, None for a render.
             window: :class:`~..films.block.ArrivalWindow` of the film, or None.
             settings: settings of the walk, None for the integrator's own.
+            velocities: :class:`~..transport.velocities.Velocities`, None for films without rates.
         """
-        return RenderContext(scene, contents, settings or self.settings(), self.strategies(contents), wanted, window)
+        strategies = self.strategies(contents)
+        return RenderContext(scene, contents, settings or self.settings(), strategies, wanted, window, velocities)
 
     def frozen_state(self, scene, sensor=0) -> list:
         """Return the arrays that kernels read beside the scene's parameters, for ``dr.freeze(..., state_fn=...)``.
@@ -385,7 +390,9 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents = self.contents(scene, sensor)
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
-            context = self.render_context(scene, contents, wanted, film.arrivals())
+            with dr.resume_grad():
+                velocities = Velocities.of_job(contents, film)
+            context = self.render_context(scene, contents, wanted, film.arrivals(), velocities=velocities)
             lanes = None if context.record_room is None else context.record_room.lanes
             sampler = self.sampler_of(scene, sensor)
             launches, samples = passes_of(sampler, film, seed, int(spp), context.most_events(), lanes)
@@ -524,7 +531,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         if self.warns_of_edges:
             self._warn_of_edges(scene, sensor, effects)
-        return contents, Wanted(effects, sensor, contents)
+        return contents, Wanted(effects, sensor, contents, film.knows_rates)
 
     def _warn_of_edges(self, scene, sensor, effects):
         """Warn once a scene of the gaps in the derivative of each attached parameter."""

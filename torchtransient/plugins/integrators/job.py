@@ -292,5 +292,5 @@ class IncomingAdjoint:
             if rays.laser is not None:
                 row = rays.laser // film.laser_scan_width
                 base += row * strides[2] + (rays.laser - row * film.laser_scan_width) * strides[3]
-            transient = (flat, *strides[-2:])
+            transient = (flat, *strides[-2 - film.knows_rates :])
         return film.create_adjoint_block(transient, base, steady, match)

@@ -264,16 +264,19 @@ class TransientNLOSPath(base.TransientIntegrator):
         return division if wall is not None else replace(division, why_not=NOT_FLAT)
 
     def render_context(
-        self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None
+        self, scene: Any, contents: Any, wanted: Any = None, window: Any = None, settings: Any = None,
+        velocities: Any = None,
     ) -> Any:
         table = self.scan_table(scene, contents)
         if settings is None:
             settings = self.settings()
-            division = self.division(scene, contents, wanted, table)
+            # What a scan shares knows no rates.
+            own = Division(range(0), settings.max_depth)
+            division = self.division(scene, contents, wanted, table) if velocities is None else own
             # Paths that have nothing to find beyond end before.
             most = settings.max_depth if wanted is not None else max(division.longest, 1)
             settings = replace(settings, division=division, max_depth=most)
-        return RenderContext(scene, contents, settings, self.strategies(contents, table), wanted, window)
+        return RenderContext(scene, contents, settings, self.strategies(contents, table), wanted, window, velocities)
 
     def shared_light(self, context: Any, film: Any) -> Any:
         division, parts = context.division, []

@@ -67,9 +67,9 @@ class TransientPath(TransientIntegrator):
             )
         self.spp_boundary = whole_number(props, "spp_boundary", 0, least=1) if "spp_boundary" in props else None
 
-    def render_context(self, scene, contents, wanted=None, window=None, settings=None):
+    def render_context(self, scene, contents, wanted=None, window=None, settings=None, velocities=None):
         if self.connections == "ordinary" or wanted is not None or settings is not None:
-            return super().render_context(scene, contents, wanted, window, settings)
+            return super().render_context(scene, contents, wanted, window, settings, velocities)
         reason = why_not(contents, contents.sensor.film())
         if reason is not None:
             raise SceneError(f"connections='ellipsoidal': {reason}, or leave the ordinary connections.")

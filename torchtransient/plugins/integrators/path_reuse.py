@@ -97,12 +97,12 @@ class TransientPathReuse(path.TransientPath):
 
     # --------------------------------------------------------------------------------------------- preparation
 
-    def render_context(self, scene, contents, wanted=None, window=None, settings=None):
+    def render_context(self, scene, contents, wanted=None, window=None, settings=None, velocities=None):
         if wanted is not None or settings is not None or self.max_depth < LEAST_DEPTH:
-            return super().render_context(scene, contents, wanted, window, settings)
+            return super().render_context(scene, contents, wanted, window, settings, velocities)
         sharing = Sharing(scene, contents, self.group_size, self.suffixes)
         if not sharing.possible:
-            return super().render_context(scene, contents, wanted, window)
+            return super().render_context(scene, contents, wanted, window, velocities=velocities)
         sensor = contents.sensor
         film = sensor.film()
         sharing.order, sharing.real = pixel_order(scene, contents, sensor, film, self.group_size)

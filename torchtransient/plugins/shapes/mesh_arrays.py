@@ -10,7 +10,8 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.mitsuba_compat import mesh_of_arrays
+from torchtransient.plugins.mitsuba_compat import VELOCITY, mesh_of_arrays
+from torchtransient.plugins.parameter_effect import ParameterEffect, declare_effects
 
 
 def mesh_arrays(props: Any) -> Any:
@@ -18,7 +19,8 @@ def mesh_arrays(props: Any) -> Any:
 
     ``vertices``: (V, 3), metres, before ``to_world``; ``faces``: (F, 3), whole numbers, wound against the clock as seen
     from outside. ``normals``: (V, 3), directions at the vertices before ``to_world``; without them there is one normal
-    a triangle. ``texcoords``: (V, 2). ``to_world``, ``face_normals``, ``flip_normals`` and children (BSDF, emitter,
+    a triangle. ``texcoords``: (V, 2). ``vertex_velocity``: (V, 3), m/s in the world, for films that measure how fast path
+    lengths change. ``to_world``, ``face_normals``, ``flip_normals`` and children (BSDF, emitter,
     sensor, media) as Mitsuba's meshes have them. Parameters are those of every mesh, ``vertex_positions`` in world
     space among them. Raises SceneError for missing arrays, sizes that do not fit, numbers that are not finite and faces
     of vertices that are not there. Not supported: other attributes of vertices and faces.
@@ -39,7 +41,11 @@ def mesh_arrays(props: Any) -> Any:
     if normals is not None and "to_world" in props:
         normals = normals @ np.linalg.inv(transform[:3, :3])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    return mesh_of_arrays(props, placed, faces, normals, texcoords)
+    velocities = _at_vertices(props, VELOCITY, len(vertices))
+    mesh = mesh_of_arrays(props, placed, faces, normals, texcoords)
+    if velocities is not None:
+        mesh.add_attribute(VELOCITY, 3, np.ravel(velocities).astype(np.float32).tolist())
+    return mesh
 
 
 # Arrays of a mesh have rows of so many numbers.
@@ -73,3 +79,4 @@ def _rows(props: Any, name: str) -> np.ndarray:
 
 
 register("shape", "mesh_arrays", mesh_arrays)
+declare_effects("Mesh", {VELOCITY: ParameterEffect(moves_length=True, role="velocity")})

@@ -27,12 +27,13 @@ class Carry:
     w: Any      # Vector3f    direction at the far end of the segment, for ``si.wi`` there
     p: Any      # Point3f     far end of the segment, where a segment strategy places it (``material_points``)
     n: Any      # Normal3f    normal there, likewise
+    rate: Any   # Float       value 0, derivative that of the rate so far, of films that measure rates
 
     @staticmethod
     def zeros() -> Carry:
         """Return a Carry of zeros."""
         vectors = (mi.Vector3f(0) for _ in range(6))
-        return Carry(mi.Spectrum(0), mi.Float(0), mi.Float(0), *vectors)
+        return Carry(mi.Spectrum(0), mi.Float(0), mi.Float(0), *vectors, mi.Float(0))
 
 
 def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) -> Carry:

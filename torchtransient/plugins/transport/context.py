@@ -52,6 +52,7 @@ class RenderContext:
         strategies: (segment, scattering, list of connections), see :mod:`.strategy`.
         wanted: :class:`Wanted` derivatives, None in a render.
         window: :class:`~..films.block.ArrivalWindow` of the film, None if its steady image counts all arrivals.
+        velocities: :class:`.velocities.Velocities` of films that measure rates, None for all others.
 
     Attributes:
         finds_light: some connection can have an event at the last vertex of a path.
@@ -62,14 +63,16 @@ class RenderContext:
         record_room: :class:`.record.RecordRoom` of the records of derivatives, None in a render.
     """
 
-    def __init__(self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None):
+    def __init__(
+        self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None, velocities=None
+    ):
         self.scene, self.contents, self.wanted = scene, contents, wanted
         self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
         self.division, self.sharing = settings.division, settings.sharing
         self.hide_emitters = settings.hide_emitters
         self.discard_direct_light = settings.discard_direct_light
         self.camera_unwarp = settings.camera_unwarp
-        self.window = window
+        self.window, self.velocities = window, velocities
         # The motion of surfaces matters only where path lengths change.
         self.surfaces = AttachedSurfaces.from_contents(contents) if wanted is not None and wanted.geometry else None
         self.segment, self.scattering, self.connections = strategies
@@ -120,6 +123,7 @@ class RenderContext:
     def tables(self) -> list[Any]:
         """Return the arrays that strategies and surfaces computed from parameters."""
         tables = [] if self.surfaces is None else self.surfaces.tables()
+        tables += [] if self.velocities is None else self.velocities.tables()
         return tables + [table for strategy in self.strategies() for table in strategy.tables()]
 
     @property
@@ -177,6 +181,7 @@ class Wanted:
         effects: (plugin, key, effect) of the attached parameters, see :mod:`torchtransient.plugins.parameters`.
         sensor: sensor of the job.
         contents: :class:`.scene_contents.SceneContents`.
+        rates: the film measures rates.
 
     Attributes:
         nodes: pointers of the plugins with attached parameters.
@@ -197,17 +202,21 @@ class Wanted:
             ``o - d (n.o) / (n.d)`` for a shift ``o`` of the ray, in place of an attached ray, which Dr.Jit
             back-propagates through every shape.
         extinction: the extinction of a medium changes.
+        rate: the rate of a path changes.
         carried: fields of the :class:`.carry.Carry` that derivatives pass through, without those of the segments.
     """
 
-    def __init__(self, effects: Sequence[tuple[Any, str, ParameterEffect]], sensor: Any, contents: Any) -> None:
+    def __init__(
+        self, effects: Sequence[tuple[Any, str, ParameterEffect]], sensor: Any, contents: Any, rates: bool = False
+    ) -> None:
         def moved(role):
             return [node for node, _, effect in effects if effect.role == role]
 
         sensors = {one.ptr for one in sensors_of(sensor)}
         carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
         self.nodes = frozenset(node.ptr for node, _, _ in effects)
-        self.geometry = any(effect.moves_length for _, _, effect in effects)
+        self.geometry = any(effect.moves_length and effect.role != "velocity" for _, _, effect in effects)
+        self.rate = rates and any(effect.moves_length for _, _, effect in effects)
         self.silhouettes = any(moves_edges(key, effect) for _, key, effect in effects)
         self.shapes = frozenset(shape.ptr for shape in moved("shape"))
         self.light, self.index = bool(moved("emitter")), bool(moved("index"))
@@ -230,6 +239,8 @@ class Wanted:
             self.carried += ("d",)
         if self.index:
             self.carried += ("η",)
+        if self.rate:
+            self.carried += ("rate",)
         if contents.media is not None:
             contents.media.check_spheres(self.sphere_lights)
             contents.media.check_sun(self.sky is not None)

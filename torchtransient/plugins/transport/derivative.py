@@ -18,7 +18,7 @@ from torchtransient.plugins.polarized import light_type, rotation_tangent
 from torchtransient.plugins.sensors.origin import sensor_rotation
 from torchtransient.plugins.transport.carry import Carry, adjoint_of, attach, choose, inner, total_of, with_fields
 from torchtransient.plugins.transport.record import RecordedVertex, read_ahead
-from torchtransient.plugins.transport.strategy import VertexEnd
+from torchtransient.plugins.transport.strategy import VertexEnd, rate_of
 
 
 def attached_carry(v, names, tangents=None):
@@ -35,7 +35,7 @@ def attached_carry(v, names, tangents=None):
     # Of its ends only the derivatives are read.
     carry = Carry(
         β=mi.Spectrum(v.β), slope=zero, η=mi.Float(v.η), o=o, d=d, x=mi.Point3f(o), w=mi.Vector3f(d), p=mi.Point3f(o),
-        n=mi.Normal3f(d),
+        n=mi.Normal3f(d), rate=zero,
     )  # fmt: skip
     return attach(carry, names, tangents)
 
@@ -81,12 +81,14 @@ def step_back(context, layout, store, block, ray, k, live, adjoint, following):
         objective = inner(adjoint, step.carry, context.carried)
         for term in terms:
             if layout.arrivals is None or term.arrival is None:
-                A, slope = block.read(term.opl, term.active)
+                A, slope, *by_rate = block.read(term.opl, term.active, **rate_of(term))
             else:
                 A, slope = layout.arrivals.adjoint(store, block, term.arrival, term.active)
             objective += total_of(A, term.value)
             if wanted.geometry:
                 objective += total_of(slope, dr.detach(term.value)) * term.slope
+            if wanted.rate:
+                objective += total_of(by_rate[0], dr.detach(term.value)) * term.rate_slope
         dr.backward_from(dr.select(live, objective, 0))
         before = adjoint_of(carry, context.carried)
     return choose(live, before, adjoint, context.carried), vertex.end
@@ -181,7 +183,7 @@ def vertex_tangents(context, v, tangent):
         tangent: tangent of the Carry that arrives there.
 
     Returns:
-        (detached events with ``d_value`` and ``d_opl``, tangent of the next Carry).
+        (detached events with ``d_value``, ``d_opl`` and, where rates change, ``d_rate``; tangent of the next Carry).
     """
     wanted = context.wanted
     with dr.resume_grad():
@@ -194,12 +196,15 @@ def vertex_tangents(context, v, tangent):
             terms += connection.attached(context, vertex, step, wanted)
         values = [term.value for term in terms]
         slopes = [term.slope for term in terms]
+        slopes_of_rates = [term.rate_slope for term in terms] if wanted.rate else []
         carried = [getattr(step.carry, name) for name in context.carried]
-        found = tangents_of(values + slopes + carried)
-    n = len(terms)
-    for term, d_value, d_opl in zip(terms, found[:n], found[n : 2 * n], strict=True):
-        term.value, term.d_value, term.d_opl, term.slope = dr.detach(term.value), d_value, d_opl, None
-    return terms, with_fields(Carry.zeros(), context.carried, found[2 * n :])
+        found = iter(tangents_of(values + slopes + slopes_of_rates + carried))
+    for name in ("d_value", "d_opl", "d_rate")[: 2 + wanted.rate]:
+        for term in terms:
+            setattr(term, name, next(found))
+    for term in terms:
+        term.value, term.slope, term.rate_slope = dr.detach(term.value), None, None
+    return terms, with_fields(Carry.zeros(), context.carried, list(found))
 
 
 def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
@@ -224,7 +229,10 @@ def step_on(context, layout, store, block, events, ray, k, live, tangent, dL):
     terms, tangent = vertex_tangents(context, v, tangent)
     for term in terms:
         dL = dL + dr.select(live, term.d_value, 0)
-        block.put_slope(events, term.opl, term.d_value, term.value * term.d_opl, term.active)
+        rate = rate_of(term)
+        if rate:
+            rate["value_d_rate"] = term.value * getattr(term, "d_rate", 0)
+        block.put_slope(events, term.opl, term.d_value, term.value * term.d_opl, term.active, **rate)
     return tangent, dL
 
 

@@ -73,7 +73,7 @@ class EmitterFound(Connection):
     def attached(self, context, vertex, step, wanted):
         terms = [self._here(context, vertex, wanted)]
         if self.sun is not None:
-            terms.append(self._sun_ahead(context, vertex, step))
+            terms.append(self._sun_ahead(context, vertex, step, wanted))
         return terms
 
     def _here(self, context, vertex, wanted):
@@ -89,7 +89,10 @@ class EmitterFound(Connection):
             hit &= v.before(context.scattering.name, "delta", at_sensor=True) | ~elsewhere
         Le = dr.select(hit, mis * mi.unpolarized_spectrum(emitter.eval(si, hit)), 0)
         value = first_column(vertex.carry.β) * Le
-        return EventTerm(value=value, slope=vertex.slope, opl=v.τ, active=hit, arrival=v.arrival(self.name))
+        term = EventTerm(value=value, slope=vertex.slope, opl=v.τ, active=hit, arrival=v.arrival(self.name))
+        if context.velocities is not None:
+            term.rate, term.rate_slope = v.rate, vertex.rate_slope
+        return term
 
     def _claimed(self, context, emitter, d, wanted):
         """Return a mask of lights in direction ``d`` that another strategy alone differentiates, None for none."""
@@ -97,7 +100,7 @@ class EmitterFound(Connection):
         claims = [c for c in claims if c is not None]
         return reduce(or_, claims) if claims else None
 
-    def _sun_ahead(self, context, vertex, step):
+    def _sun_ahead(self, context, vertex, step, wanted):
         """Return the term of sunlight along a path that escapes into the sun: the drawn direction turns with it."""
         following = vertex.v.after()
         mis = following.record_of(self.name)["mis"]
@@ -114,7 +117,13 @@ class EmitterFound(Connection):
         value = product(vertex.carry.β, dr.select(lit, value, 0))
         length = context.contents.distant.length(vertex.scattered_si.p, d)
         slope = vertex.scattered_slope + slope_only(step.carry.η * length)
-        return EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))
+        term = EventTerm(value=value, slope=slope, opl=following.τ, active=lit, arrival=following.arrival(self.name))
+        if context.velocities is not None:
+            term.rate = following.rate
+        if wanted.rate:
+            moves = context.velocities.of_vertex(vertex, vertex.scattered_si, lit)
+            term.rate_slope = vertex.rate_slope - slope_only(dr.select(lit, step.carry.η * dr.dot(moves, d), 0))
+        return term
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -263,7 +272,11 @@ class EmitterSampled(Connection):
         slope = vertex.scattered_slope
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * length)
-        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))]
+        term = EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))
+        if context.velocities is not None:
+            end = context.velocities.of_light(light.ds.emitter, light.p, lit)
+            set_rate(context, vertex, term, end, d, vertex.carry.η * towards.eta, wanted)
+        return [term]
 
     def _light(self, context, si, u, lit, wanted):
         """Return the sampled point of a light, attached: ``p, n, uv``, its ``area`` element, masks of its kind."""
@@ -365,6 +378,21 @@ class EmitterSampled(Connection):
         if wanted.sphere_lights:
             value = dr.select(light.cone, mi.unpolarized_spectrum(light.cone_weight), value)
         return dr.replace_grad(light.weight, value)
+
+
+def set_rate(context, vertex, term, end, d, η, wanted):
+    """Set the rate of a term whose last segment leads from the vertex to a point of a light.
+
+    Args:
+        vertex: attached vertex.
+        end: attached velocity of that point.
+        d, η: attached direction and index of the segment.
+    """
+    rate = η * dr.dot(end - context.velocities.of_vertex(vertex, vertex.scattered_si, term.active), d)
+    rate = dr.select(term.active, rate, 0)
+    term.rate = vertex.v.rate + dr.detach(rate)
+    if wanted.rate:
+        term.rate_slope = vertex.rate_slope + slope_only(rate)
 
 
 def is_light(value):

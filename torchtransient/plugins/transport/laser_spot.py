@@ -21,6 +21,7 @@ from torchtransient.plugins.polarized import (
 )
 from torchtransient.plugins.sampling.hidden_elements import packed_columns
 from torchtransient.plugins.transport.carry import slope_only
+from torchtransient.plugins.transport.emitter_connections import set_rate
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal
 
 
@@ -136,7 +137,10 @@ class LaserSpot(Connection):
         if wanted.geometry:
             slope = slope + slope_only(vertex.carry.η * towards.eta * length + leg)
         value = product(vertex.carry.β, value)
-        return [EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=vertex.v.arrival(self.name))]
+        term = EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=vertex.v.arrival(self.name))
+        if context.velocities is not None:  # the spot rests where the beam meets the wall
+            set_rate(context, vertex, term, mi.Vector3f(0), d, vertex.carry.η * towards.eta, wanted)
+        return [term]
 
 
 class GeneralSpot:

@@ -51,6 +51,9 @@ class SensorSampled(Connection):
         return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
+    def end_velocity(self, context, proposal):
+        return context.velocities.of_sensor(proposal.ds.p)
+
     def connect(self, context, path, vertex, proposal, answer, zeros):
         ds = proposal.ds
         value = in_sensor_frame(first_row(product(vertex.β, answer.matrix)), mi.Vector3f(ds.d)) * proposal.importance

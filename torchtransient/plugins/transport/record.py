@@ -94,6 +94,7 @@ class RecordLayout:
     @staticmethod
     def _of_walk(context):
         fields = {"β": mi.Spectrum, "τ": mi.Float64, "rr": mi.Float, "goes_on": mi.Bool}
+        fields |= {} if context.velocities is None else {"rate": mi.Float}
         return fields | ({"η": mi.Float} if context.index_changes else {})
 
     def bytes_of_vertex(self):
@@ -140,6 +141,7 @@ class RecordedVertex(Local):
 
     Attributes:
         β, τ, η: throughput before its segment, optical path length up to it, index along the segment.
+        rate: rate of the path up to it, None without velocities.
         rr, goes_on: factor of Russian roulette, mask of paths that continue.
         ray, pi: ray and PreliminaryIntersection3f that found it.
         next: :class:`.strategy.VertexEnd` of the next vertex, set by the derivative.
@@ -149,7 +151,7 @@ class RecordedVertex(Local):
         super().__init__(layout=layout, store=store, k=k, active=active, primary_ray=primary_ray, next=None)
         # Dr.Jit does not merge equal reads of thread-local memory: each array is read once a vertex.
         self._read = {}
-        self.η = mi.Float(1)
+        self.η, self.rate = mi.Float(1), None
         vars(self).update(self.record_of("walk"))
         self.ray, self.pi = layout.context.segment.restore(self, primary_ray)
 

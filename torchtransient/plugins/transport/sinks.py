@@ -10,6 +10,7 @@ import mitsuba as mi
 from torchtransient.plugins.films.colour import mean_of
 from torchtransient.plugins.polarized import light_type
 from torchtransient.plugins.transport.carry import total_of
+from torchtransient.plugins.transport.strategy import rate_of
 
 
 class Sink:
@@ -70,7 +71,9 @@ class FilmSink(Sink):
 
     def event(self, state, event):
         state["L"] = state["L"] + event.value
-        before, after = self.block.put(state["block"], event.opl, event.value, event.active, event.crowded)
+        before, after = self.block.put(
+            state["block"], event.opl, event.value, event.active, event.crowded, **rate_of(event)
+        )
         state["before"] = state["before"] + before
         state["after"] = state["after"] + after
 
@@ -102,7 +105,7 @@ class AdjointSumSink(Sink):
         return {"sum": mi.Float(0)}
 
     def event(self, state, event):
-        A, _ = self.block.read(event.opl, event.active)
+        A, *_ = self.block.read(event.opl, event.active, **rate_of(event))
         state["sum"] = state["sum"] + dr.select(event.active, total_of(A, event.value), 0)
 
 

@@ -67,6 +67,7 @@ class Vertex(Local):
         scattered_si: ``si`` with the wavelengths behind the surface (scattering).
         connectable: mask, a connection can find light from here (scattering).
         scattered_τ: ``τ`` and the delay, where connections start to count (loop).
+        v, rate: velocity, and rate of the path up to the vertex, of films that measure rates (loop).
     """
 
 
@@ -131,11 +132,13 @@ class Event(Local):
         active: mask of lanes that have the event.
         depth: smallest ``max_depth`` of a render that contains it, UInt32.
         crowded: static; most lanes have the event at once, so that sums search no lanes with equal addresses.
+        rate: derivative of ``opl`` by time, m/s (loop); None where the film does not measure it.
 
     Further attributes are the connection's own record.
     """
 
     crowded = False
+    rate = None
 
 
 class EventTerm(Local):
@@ -149,9 +152,16 @@ class EventTerm(Local):
         active: mask of lanes that have the event.
         arrival: ``v.arrival(name)`` of the recorded event of a connection, active wherever the term is; None for other
             terms, for which the film is read at ``opl``.
+        rate: detached rate, m/s; None where the film does not measure it.
+        rate_slope: Float, zero with the derivative of the rate, where ``wanted.rate``.
     """
 
-    arrival = None
+    arrival = rate = rate_slope = None
+
+
+def rate_of(event: Any) -> dict[str, Any]:
+    """Return the rate of an event or a term as the keyword of film blocks, nothing where the film measures none."""
+    return {} if event.rate is None else {"rate": event.rate}
 
 
 @dataclass
@@ -178,12 +188,15 @@ class AttachedVertex(Local):
         end: :class:`VertexEnd` (segment).
         carry: :class:`.carry.Carry` with the throughput at the vertex (segment).
         slope: Float, zero with the derivative of the optical path length up to the vertex (segment).
+        rate_slope: Float, zero with the derivative of the rate up to the vertex, where ``wanted.rate`` (segment).
         damping_radius: distance below which points are dragged along, with moving geometry (segment).
         bsdf, delay: as of :class:`Vertex` (scattering).
         scattered_si: ``si`` with the wavelengths behind the surface (scattering).
         scattered_slope, scattered_opl: slope and optical path length behind the delay (scattering).
         rotation: rotation of Stokes vectors to the frame of the segment (scattering).
     """
+
+    rate_slope = None
 
 
 class Strategy:
@@ -452,6 +465,10 @@ class Connection(Strategy):
                 unless no attached parameter changes them.
         """
         raise NotImplementedError
+
+    def end_velocity(self, context: Any, proposal: Any) -> Any:
+        """Return the velocity of the point that a proposal leads to (Vector3f, m/s)."""
+        return context.velocities.of_light(proposal.ds.emitter, proposal.ds.p, proposal.active)
 
     def density(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
         """Return the density with which the strategy samples a point of a light, None if it samples no points.

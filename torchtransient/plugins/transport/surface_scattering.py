@@ -403,10 +403,15 @@ class Surface(Scattering):
                 far_away = slope_only(context.contents.distant.length(si.p, following.d))
                 longer = dr.select(smooth & ~ahead, far_away, longer)
             slope = slope + η * longer
+        rate = mi.Float(0)
+        if wanted.rate:
+            leaving = dr.select(mirrored, d_out, out) if context.contents.delta else out
+            moves = context.velocities.of_vertex(vertex, si, v.goes_on)
+            rate = vertex.rate_slope - slope_only(dr.select(v.goes_on, η * dr.dot(moves, leaving), 0))
         p, n = (motion.p, motion.n) if "p" in context.carried else (mi.Point3f(0), mi.Normal3f(0))
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w, p=p,
-            n=n,
+            n=n, rate=rate,
         )  # fmt: skip
         return Local(carry=carry, inv_pdf=inv_pdf, ahead=ahead)
 

@@ -195,7 +195,10 @@ class Vacuum(Segment):
         if not wanted.slides_position_only:
             ray.o, ray.d = carry.o, carry.d
         si = self.attached_surface(context, v, carry, ray, wanted, v.active)
-        return self.arrived(context, v, carry, ray, si, wanted)
+        vertex = self.arrived(context, v, carry, ray, si, wanted)
+        if wanted.rate:
+            self.add_rate(context, vertex)
+        return vertex
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
         """Return the SurfaceInteraction3f of a recorded vertex, attached to its ray and to the surface.
@@ -244,6 +247,20 @@ class Vacuum(Segment):
                 length = dr.select(v.k == 0, 0, length)
             vertex.slope = carry.slope + slope_only(carry.η * length)
         return vertex
+
+    @staticmethod
+    def add_rate(context, vertex):
+        """Add what the end of a segment adds to the rate, and of the first segment its start too.
+
+        The vertex that another segment leaves has counted its own part.
+        """
+        velocities, v, carry = context.velocities, vertex.v, vertex.carry
+        first = v.k == 0
+        moves = velocities.of_vertex(vertex, vertex.si, v.active & vertex.sid.is_valid())
+        moves -= dr.select(first, velocities.of_sensor(carry.o), 0)
+        longer = carry.η * dr.dot(moves, carry.w)
+        longer = dr.select(first, 0, longer) if context.camera_unwarp else longer
+        vertex.rate_slope = carry.rate + slope_only(longer)
 
     def motion(self, context, vertex, following, ahead):
         δ = displacement(vertex.scattered_si.p, ahead)

@@ -32,6 +32,9 @@ class Path:
     prev_pdf: Any          # Float      density of the ray's direction, per solid angle
     prev_unconnected: Any  # Bool       no connection can find what lies ahead (sensor, delta lobe)
     active: Any            # Bool       the path has a further vertex
+    # Of films that measure rates, None for all others.
+    rate: Any = None       # Float      derivative of τ by time, m/s
+    prev_v: Any = None     # Vector3f   velocity of the vertex that the ray left
 
 
 def start(context, ray, first_opl, η) -> Path:
@@ -43,6 +46,7 @@ def start(context, ray, first_opl, η) -> Path:
         first_opl: optical path length before the ray's origin, minus the film's start, metres (Float64).
         η: index of refraction at the ray's origin.
     """
+    velocities = context.velocities
     return Path(
         ray=mi.Ray3f(ray),
         leg=None,
@@ -55,6 +59,8 @@ def start(context, ray, first_opl, η) -> Path:
         prev_pdf=mi.Float(1),
         prev_unconnected=mi.Bool(True),
         active=mi.Bool(context.max_depth > 0),
+        rate=None if velocities is None else mi.Float(0),
+        prev_v=None if velocities is None else mi.Vector3f(velocities.of_sensor(ray.o)),
     )
 
 
@@ -147,6 +153,8 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     if (taken_over := context.taken_over(path, vertex)) is not None:
         vertex.goes_on &= ~taken_over
     vertex.scattered_τ = vertex.delay.after(vertex.τ)
+    if context.velocities is not None:
+        context.velocities.arrive(context, path, vertex)
 
     # ------------------------------------------------------------------------- events
     proposals = [c.propose(context, path, vertex, sampler) for c in connections]
@@ -155,6 +163,8 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     for c, proposal, answer in zip(connections, proposals, answers, strict=True):
         event = c.connect(context, path, vertex, proposal, answer, sink.zeros)
         event.value = dr.select(event.active, event.value, 0)
+        if context.velocities is not None:
+            event.rate = context.velocities.of_event(context, c, vertex, proposal, answer)
         sink.event(state, event)
         samples[c.name] = Local(proposal=proposal, event=event)
     if last:
@@ -173,6 +183,8 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     β, goes_on, rr = roulette(context, path, vertex, step, sampler, onward, sink.zeros)
     samples[context.segment.name], samples[context.scattering.name] = vertex, step
     samples["walk"] = Local(β=path.β, τ=vertex.τ, η=path.η, rr=rr, goes_on=goes_on)
+    if context.velocities is not None:
+        samples["walk"].rate = vertex.rate
     sink.vertex(state, path, samples)
 
     # ------------------------------------------------------------------------- next segment
@@ -180,6 +192,8 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     path.prev_p, path.prev_n = vertex.at.p, vertex.at.n
     path.prev_pdf, path.prev_unconnected = step.pdf, step.unconnected
     path.β, path.η, path.τ = β, path.η * step.eta, vertex.scattered_τ
+    if context.velocities is not None:
+        path.rate, path.prev_v = vertex.rate, vertex.v
     path.leg = leg if leg is not None else context.segment.depart(context, ray, vertex, β, sampler, goes_on)
 
 

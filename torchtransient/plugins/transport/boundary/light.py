@@ -77,6 +77,8 @@ class LightPass(BoundaryPass):
             through.set(term.chains.draw(sampler.next_1d()), numbers, dr.detach(middle.η))
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
+        if context.velocities is not None:
+            path.prev_v = context.velocities.of_light(ds.emitter, ds.p, active & ~light.far)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
         path.β, path.active = attenuated(mi.Spectrum(1), dr.select(active, β, 0)), active
         path.leg = lit.segment.depart(lit, ray, place, path.β, sampler, active)

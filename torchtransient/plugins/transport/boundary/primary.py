@@ -85,6 +85,8 @@ class PrimaryPass(BoundaryPass):
             "ray": ray, "β": β, "η": dr.detach(rays.η), "τ": term.integrator.first_opl(term.film, rays),
             "prev_p": ray.o, "active": active, "medium": medium,
         }  # fmt: skip
+        if context.velocities is not None:
+            first["prev_v"] = context.velocities.of_sensor(ray.o)
         return both_sides(context, mode, sampler, view, b, past, first, factor, speeds, needed)
 
 

@@ -115,7 +115,7 @@ class BoundaryTerm:
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
         sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
         strategies = segment, scattering, sensors
-        return RenderContext(context.scene, context.contents, settings, strategies, None, context.window)
+        return RenderContext(context.scene, context.contents, settings, strategies, None, context.window, context.velocities)
 
     def tables(self):
         """Return the attached arrays: ends of edges, and tables of the strategies of light paths."""

@@ -103,6 +103,9 @@ class VertexPass(BoundaryPass):
             "ray": path.ray, "β": β, "η": η, "τ": τ, "prev_p": x, "prev_n": vertex.at.n,
             "depth": target + 1, "active": active, "medium": medium,
         }  # fmt: skip
+        if context.velocities is not None:
+            context.velocities.arrive(context, path, vertex)
+            first |= {"rate": vertex.rate, "prev_v": vertex.v}
         lit = None
         if context.finds_light:  # Elsewhere a density of zero leaves out emission.
             dragged_along = b.dist < radius

@@ -10,7 +10,7 @@ from torchtransient.plugins.transport.boundary.sides import in_memory
 from torchtransient.plugins.transport.carry import total_of
 from torchtransient.plugins.transport.derivative import tangents_of
 from torchtransient.plugins.transport.sinks import AdjointSumSink, FilmSink, Sink
-from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.strategy import Local, rate_of
 from torchtransient.plugins.transport.walk import walk
 
 
@@ -105,7 +105,7 @@ class PixelSums(Sink):
         term = self.mode.term
         row, column, weight, inside = term.pixel(event.uv, self.u)
         active, place = event.active & inside, Local(row=row, column=column, laser=None)
-        A, _ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active)
+        A, *_ = self.mode.block(seen_along(self.middle, event.d), place).read(event.opl, active, **rate_of(event))
         value = dr.select(active, total_of(A, event.value) * weight, 0)
         name = self.NAMES[event.speed]
         state[name] = state[name] + dr.select(event.first, value, 0)
@@ -194,7 +194,7 @@ class PixelFilmSink(Sink):
         base, pixel = mode._indices(place)
         scale = dr.select(event.first, self.scales[event.speed], self.scales[1]) * (weight * share)
         channels = [dr.select(active, c, 0) for c in match.to_channels(event.value * scale)]
-        film.put(mode.job.band, base, event.opl, channels, active)
+        film.put(mode.job.band, base, event.opl, channels, active, **rate_of(event))
         if film.keeps_steady:
             for c, value in enumerate(channels):
                 index = pixel * film.channel_count() + c

@@ -1,0 +1,205 @@
+"""Films of rates: light over optical path length and over how fast that length changes."""
+
+from __future__ import annotations
+
+import abc
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.chirps import Chirps
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.plugins._registry import register
+from torchtransient.plugins.films.block import FilmBlock
+from torchtransient.plugins.films.histogram import TransientHDRFilm
+from torchtransient.plugins.films.temporal_filters import make_temporal_filter
+from torchtransient.plugins.properties import number, whole_number
+
+
+class Row:
+    """Share of an arrival in one of a pixel's histograms.
+
+    Attributes:
+        number: number of the histogram, UInt32.
+        inside: mask, the histogram exists.
+        shift: what is added to the arrival's length, metres (Float64).
+        k: derivative of ``shift`` by the rate, seconds.
+        weight, slope: share of the arrival, and its derivative by the rate.
+    """
+
+    def __init__(self, number, inside, shift, k, weight, slope):
+        self.number, self.inside, self.shift, self.k, self.weight, self.slope = number, inside, shift, k, weight, slope
+
+
+class HistogramRows(TransientHDRFilm):
+    """Base of films with several histograms a pixel, ``(H, W, rows, T, C)``, by the rate of an arrival.
+
+    A subclass says with ``rows_of`` which of them an arrival goes to.
+    """
+
+    knows_rates = True
+    knows_exclusive_lanes = False
+
+    def __init__(self, props):
+        super().__init__(props)
+        if not self.keeps_steady or self.exhaustive_scan:
+            raise SceneError(f"{self.plugin}: expected no exhaustive_scan, and steady not to be false.")
+
+    @abc.abstractmethod
+    def row_count(self) -> int:
+        """Return the number of histograms of a pixel."""
+
+    @abc.abstractmethod
+    def rows_of(self, rate) -> list[Row]:
+        """Return the rows that an arrival of ``rate`` (Float, m/s) goes to; their weights sum to one for each row that
+        takes all light.
+        """
+
+    # What an arrival counts in the sum over all rows.
+    share = 1.0
+
+    def cube_shape(self):
+        size = self.crop_size()
+        return (int(size[1]), int(size[0]), self.row_count(), self.temporal_bins, self.channel_count())
+
+    def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+        return FilmBlock(self, job.band, base, match, False, origin)
+
+    def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None, rate=None):
+        """Add an arrival to its rows, see :meth:`~.base.TimeResolvedFilm.put`; ``rate``: m/s, Float."""
+        before, after, stride = mi.Float(0), mi.Float(0), self.temporal_bins * self.channel_count()
+        for row in self.rows_of(rate):
+            values, inside = [v * row.weight for v in value], active & row.inside
+            place, opl = base + row.number * stride, opl_from_start + row.shift
+            early, late = super().put(band, place, opl, values, inside, crowded=crowded)
+            before += dr.select(row.inside, early, 0) * row.weight * self.share
+            after += dr.select(row.inside, late, 1) * row.weight * self.share
+        return before, after
+
+    def put_slope(
+        self, band, base, opl_from_start, d_value, value_d_opl, active, laser=None, rate=None, value_d_rate=None
+    ):
+        """Add the derivative of an event, see :meth:`~.base.TimeResolvedFilm.put_slope`.
+
+        Args:
+            value_d_rate: contribution times derivative of the rate, by channel.
+        """
+        stride = self.temporal_bins * self.channel_count()
+        for row in self.rows_of(rate):
+            d = [row.weight * a + row.slope * b for a, b in zip(d_value, value_d_rate, strict=True)]
+            moved = [row.weight * (a + row.k * b) for a, b in zip(value_d_opl, value_d_rate, strict=True)]
+            place, opl = base + row.number * stride, opl_from_start + row.shift
+            super().put_slope(band, place, opl, d, moved, active & row.inside)
+
+    def read(self, adjoint, base, opl_from_start, active, steady=None, rate=None):
+        """Read the adjoint of :meth:`put` at an arrival.
+
+        Returns:
+            ``A``, its slope by the length and its slope by the rate, lists over channels.
+        """
+        flat, row_stride, *strides = adjoint
+        A, by_opl, by_rate = ([mi.Float(0)] * self.channel_count() for _ in range(3))
+        for row in self.rows_of(rate):
+            place, opl = base + row.number * row_stride, opl_from_start + row.shift
+            a, slope = super().read((flat, *strides), place, opl, active & row.inside)
+            for c in range(self.channel_count()):
+                A[c] += row.weight * a[c]
+                by_opl[c] += row.weight * slope[c]
+                by_rate[c] += row.weight * row.k * slope[c] + row.slope * a[c]
+        return A, by_opl, by_rate
+
+
+class RateHDRFilm(HistogramRows):
+    r"""Film over optical path length and rate (:monosp:`rate_hdr_film`): a histogram for each bin of the rate.
+
+    The rate ``d opl / dt`` (m/s, positive where paths get longer) is that of material points, see
+    :mod:`~..transport.velocities`: what waves feel whose phase the scatterers carry. Their Doppler shift is ``- rate /
+    wavelength``.
+
+    Parameters beside those of ``transient_hdr_film``: ``rate_start``, ``rate_width`` (m/s), ``rate_bins`` (int): bins
+    ``[rate_start + k rate_width, rate_start + (k + 1) rate_width)``, over which the temporal filter spreads arrivals as
+    over the lengths. Layout ``(H, W, rate_bins, T, C)``.
+
+    Not supported: exhaustive scans, ``steady`` = false.
+    """
+
+    plugin = "rate_hdr_film"
+    measures = "rates"
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.rate_start, self.rate_width = number(props, "rate_start"), number(props, "rate_width")
+        self.rate_bins = whole_number(props, "rate_bins", 0, least=0)
+        if not (self.rate_bins and self.rate_width > 0):
+            raise SceneError(f"{self.plugin}: expected rate_bins of at least 1 and a positive rate_width, in m/s.")
+
+    def traverse(self, cb):
+        super().traverse(cb)
+        for name in ("rate_start", "rate_width", "rate_bins"):
+            cb.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
+
+    def row_count(self):
+        return self.rate_bins
+
+    def take_filter(self, name, stddev):
+        super().take_filter(name, stddev)
+        self._rate_filter = make_temporal_filter(self.temporal_filter, self.gaussian_stddev)
+
+    @property
+    def has_slope(self) -> bool:
+        """The temporal filter has a slope; that of a pulse is along the lengths alone."""
+        return self._rate_filter.has_slope
+
+    def rows_of(self, rate):
+        rows, scale = [], 1 / self.rate_width
+        first, taps = self._rate_filter.weights((mi.Float64(rate) - self.rate_start) * scale)
+        for offset, weight, slope in taps:
+            row = first + offset
+            inside = (row >= 0) & (row < self.rate_bins)
+            number_ = mi.UInt32(dr.select(inside, row, 0))
+            rows.append(Row(number_, inside, mi.Float64(0), 0.0, weight, slope * scale))
+        return rows
+
+
+class BeatHDRFilm(HistogramRows):
+    r"""Film of the beats of frequency-modulated light (:monosp:`beat_hdr_film`): two spectra a pixel.
+
+    ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps up
+    and down, see :class:`torchtransient.Chirps`. The axis of the film is that of a target at rest: the beat of an
+    arrival on the up chirp is that of a length ``opl + k rate``, on the down chirp of ``opl - k rate``, with ``k`` the
+    frequency of the light times duration over bandwidth, and spread by the line shape of the window. Layout ``(H, W, 2,
+    T, C)``.
+
+    Not supported: exhaustive scans, ``steady`` = false, a further impulse response.
+    """
+
+    plugin = "beat_hdr_film"
+    measures = "beats"
+    share = 0.5
+
+    def __init__(self, props):
+        names = ("chirp_bandwidth", "chirp_duration", "chirp_wavelength")
+        try:
+            self.chirps = Chirps(*(number(props, name) for name in names), window=str(props.get("chirp_window", "hann")))
+        except TorchTransientError as error:
+            raise SceneError(f"{self.plugin}: {error}") from error
+        super().__init__(props)
+        self.pulses = [*self.pulses, self.chirps.line_shape]
+        self._filters.clear()
+        self.take_filter("", None)
+        # In memory: kernels do not depend on them.
+        self._scales = [dr.opaque(mi.Float64, sign * self.chirps.rate_scale_s) for sign in (1, -1)]
+
+    def row_count(self):
+        return 2
+
+    def rows_of(self, rate):
+        one, zero = mi.Float(1), mi.Float(0)
+        return [
+            Row(mi.UInt32(n), mi.Bool(True), k * mi.Float64(rate), mi.Float(k), one, zero)
+            for n, k in enumerate(self._scales)
+        ]
+
+
+register("film", "rate_hdr_film", RateHDRFilm)
+register("film", "beat_hdr_film", BeatHDRFilm)

@@ -1,0 +1,220 @@
+"""Velocities of what a path meets, and the rate at which its optical length changes.
+
+With vertices ``x_i`` as material points of velocity ``v_i``, and the direction ``u_i`` from ``x_i`` to ``x_{i+1}`` along
+a segment of index ``eta_i``,
+
+    tau = sum eta_i |x_{i+1} - x_i|,        rate = d tau / dt = sum eta_i (v_{i+1} - v_i) . u_i.
+
+At mirrors and smooth glass the vertex slides over its surface, but by Fermat's principle the length does not change to
+first order when it does: the sum is right there, too.
+
+The rate is that of waves whose phase the scatterers carry (FMCW, laser Doppler, speckle). Envelopes see the derivative
+of the whole image by time, with its weights and outlines: those are poses at several times.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from torchtransient.checks import some_of
+from torchtransient.errors import SceneError
+from torchtransient.plugins.kernel_arrays import PointerTable
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_instance
+from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
+
+# Rows of the table before those of the bodies: rest, and the sensor.
+REST, SENSOR, FIRST = 0, 1, 2
+
+
+class Movers:
+    """Bodies of a scene that move, looked up once.
+
+    Attributes:
+        motions: ``rigid_motion`` plugins, each once.
+        shapes, emitters, media: bodies of that kind and the numbers of their motions.
+        sensors: number of the motion by the sensor's pointer.
+        meshes: meshes with velocities at their vertices.
+
+    Raises:
+        SceneError: for motions of what is not there, of several at once, or that has none.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        shapes = shapes_of_scene(scene)
+        bodies: dict[str, list[Any]] = {}
+        for body in [*shapes, *scene.emitters(), *scene.sensors(), *_media_of(scene, shapes)]:
+            bodies.setdefault(body.id(), []).append(body)
+        own = {shape.ptr for shape in scene.shapes()}
+        pairs = [(s, m) for s in shapes for name, m in objects_of(s) if name == "velocity" and is_motion(m)]
+        for _, motion in objects_of(scene):
+            if is_motion(motion):
+                if motion.of not in bodies:
+                    known = some_of(sorted(name for name in bodies if name))
+                    raise SceneError(
+                        f"rigid_motion {motion.id()!r}: expected 'of' as the name of a shape, an emitter, a sensor or "
+                        f"a medium, one of {known}, got {motion.of!r}."
+                    )
+                pairs += [(body, motion) for body in bodies[motion.of]]
+        self.motions = list({motion.ptr: motion for _, motion in pairs}.values())
+        numbers = {motion.ptr: FIRST + n for n, motion in enumerate(self.motions)}
+        moving: dict[int, int] = {}
+        self.shapes, self.emitters, self.media, self.sensors = [], [], [], {}
+        for body, motion in pairs:
+            number = numbers[motion.ptr]
+            _check(body, own)
+            if moving.setdefault(body.ptr, number) != number:
+                raise SceneError(f"{body.id()!r}: expected one rigid_motion, got several.")
+            if isinstance(body, mi.Shape):
+                self.shapes.append((body, number))
+            elif isinstance(body, mi.Medium):
+                self.media.append((body, number))
+            elif isinstance(body, mi.Sensor):
+                self.sensors[body.ptr] = number
+            else:
+                self.emitters.append((body, number))
+        by_shape = {shape.ptr: number for shape, number in self.shapes}
+        for emitter in scene.emitters():
+            shape = emitter.get_shape()
+            if shape is not None and shape.ptr in by_shape:
+                self.emitters.append((emitter, by_shape[shape.ptr]))
+        for sensor in scene.sensors():
+            shape = sensor.get_shape()
+            if shape is not None and shape.ptr in by_shape:
+                self.sensors.setdefault(sensor.ptr, by_shape[shape.ptr])
+        self.meshes = [shape for shape in shapes if has_velocities(shape)]
+        lights = [mesh.id() for mesh in self.meshes if mesh.is_emitter() or mesh.ptr not in own]
+        if lights:
+            raise SceneError(
+                f"{some_of(lights)}: {VELOCITY} of a light, or inside of a shape group, is not supported; expected a "
+                "mesh of the scene that does not shine. A light or an instance takes a 'velocity' of type "
+                "'rigid_motion'."
+            )
+
+    def __bool__(self) -> bool:
+        return bool(self.motions or self.meshes)
+
+
+def _media_of(scene: Any, shapes: list[Any]) -> list[Any]:
+    found = [sensor.get_medium() for sensor in scene.sensors()]
+    for shape in shapes:
+        if shape.is_medium_transition():
+            found += [shape.interior_medium(), shape.exterior_medium()]
+    return list({medium.ptr: medium for medium in found if medium is not None}.values())
+
+
+def is_motion(plugin: Any) -> bool:
+    """Return True for a ``rigid_motion``."""
+    return hasattr(plugin, "rows") and hasattr(plugin, "of")
+
+
+def _check(body: Any, own: set[int]) -> None:
+    """Raise SceneError for a body that cannot have a motion."""
+    if isinstance(body, mi.Shape) and body.ptr not in own:
+        raise SceneError(f"{body.id()!r}: a shape inside of a group has no motion of its own; give it to its instances.")
+    if isinstance(body, mi.Emitter):
+        flags = body.flags()
+        if mi.has_flag(flags, mi.EmitterFlags.Infinite) or mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
+            raise SceneError(f"{body.id()!r}: light from infinity has no place that moves; expected a near emitter.")
+
+
+class Velocities:
+    """Velocities of one job. A plain object, which Dr.Jit loops leave alone.
+
+    Velocities are Vector3f, m/s; attached where their motions and the points are.
+    """
+
+    @staticmethod
+    def of_job(contents: Any, film: Any) -> Velocities | None:
+        """Return the velocities of a job; None where the film measures no rates.
+
+        Args:
+            contents: :class:`.scene_contents.SceneContents`.
+            film: film of the job.
+        """
+        return Velocities(contents.movers, contents.sensor) if film.knows_rates else None
+
+    def __init__(self, movers: Movers, sensor: Any) -> None:
+        rows = [(mi.Vector3f(0), mi.Vector3f(0))] * FIRST + [motion.rows() for motion in movers.motions]
+        number = movers.sensors.get(sensor.ptr)
+        if number is not None:
+            rows[SENSOR] = rows[number]
+        self.sensor_moves = number is not None
+        self.table = dr.concat([mi.Float(part[k]) for row in rows for part in row for k in range(3)])
+        self._shapes, self._emitters, self._media = (
+            PointerTable([body for body, _ in found], [number for _, number in found]) if found else None
+            for found in (movers.shapes, movers.emitters, movers.media)
+        )
+        self._instances = any(is_instance(shape) for shape, _ in movers.shapes)
+        self._meshes = PointerTable.marking(movers.meshes)
+
+    def tables(self) -> list[Any]:
+        """Return the arrays that were computed from parameters."""
+        return [self.table]
+
+    # ---------------------------------------------------------------------------------------------------- velocities
+
+    def _row(self, row: Any, p: Any, active: Any) -> Any:
+        active &= row > 0
+        linear, angular = (dr.gather(mi.Vector3f, self.table, row * 2 + k, active) for k in (0, 1))
+        return linear + dr.cross(angular, mi.Vector3f(p))
+
+    def _listed(self, table: PointerTable | None, plugin: Any, p: Any, active: Any) -> Any:
+        if table is None:
+            return mi.Vector3f(0)
+        with dr.suspend_grad():
+            row = table.look_up(plugin, active)
+        return self._row(row, p, active)
+
+    def of_sensor(self, p: Any) -> Any:
+        """Return the velocity of the sensor's point ``p``."""
+        return self._row(mi.UInt32(SENSOR), p, mi.Bool(True)) if self.sensor_moves else mi.Vector3f(0)
+
+    def of_light(self, emitter: Any, p: Any, active: Any) -> Any:
+        """Return the velocity of the point ``p`` of a light; ``emitter`` is None for one outside of the scene."""
+        return mi.Vector3f(0) if emitter is None else self._listed(self._emitters, emitter, p, active)
+
+    def of_medium(self, medium: Any, p: Any, active: Any) -> Any:
+        """Return the velocity of a medium at the point ``p``."""
+        return self._listed(self._media, medium, p, active)
+
+    def of_surface(self, si: Any, active: Any) -> Any:
+        """Return the velocity of the material point at a SurfaceInteraction3f."""
+        v = self._listed(self._shapes, si.shape, si.p, active)
+        if self._instances:
+            v += self._listed(self._shapes, si.instance, si.p, active)
+        if self._meshes is not None:
+            with dr.suspend_grad():
+                bends = active & self._meshes.lists(si.shape)
+            v += dr.select(bends, mi.Vector3f(si.shape.eval_attribute_3(VELOCITY, si, bends)), 0)
+        return v
+
+    def of_vertex(self, vertex: Any, si: Any, active: Any) -> Any:
+        """Return the velocity of a vertex.
+
+        Args:
+            vertex: :class:`.strategy.Vertex` or :class:`.strategy.AttachedVertex`.
+            si: its SurfaceInteraction3f, at the point itself in a medium.
+        """
+        scatter = getattr(vertex, "scatter", None)
+        if scatter is None:
+            return self.of_surface(si, active)
+        v = self.of_surface(si, active & ~scatter)
+        return v + self.of_medium(vertex.mei.medium, vertex.mei.p, active & scatter)
+
+    # --------------------------------------------------------------------------------------------------------- primal
+
+    def arrive(self, context: Any, path: Any, vertex: Any) -> None:
+        """Set the velocity ``v`` of a vertex, and the ``rate`` of the path up to it."""
+        vertex.v = self.of_vertex(vertex, vertex.si, vertex.valid)
+        longer = path.η * dr.dot(vertex.v - path.prev_v, path.ray.d)
+        vertex.rate = path.rate + (dr.select(path.depth == 0, 0, longer) if context.camera_unwarp else longer)
+
+    def of_event(self, context: Any, connection: Any, vertex: Any, proposal: Any, answer: Any) -> Any:
+        """Return the rate of the whole path of an event, Float."""
+        if proposal is None:
+            return vertex.rate
+        v = connection.end_velocity(context, proposal)
+        return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.v, proposal.d)

@@ -1,0 +1,89 @@
+"""Motions of bodies in a description: `rigid_motion` children of whatever moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torchtransient.checks import shown
+from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.plugins.mitsuba_compat import VELOCITY
+from torchtransient.scene.nodes import children, name_children
+
+PLUGIN = "rigid_motion"
+# Child of a body that says how it moves, and end of the name of the motion.
+CHILD = "velocity"
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Velocity of a body, as numbers: metres, seconds and radians, in the world."""
+
+    of: str
+    linear: tuple[float, float, float]
+    angular: tuple[float, float, float]
+    center: tuple[float, float, float]
+
+
+def body_motions(motions: Mapping[str, Any]) -> list[BodyMotion]:
+    """Return motions as numbers. Raises ArgumentError for anything but motions."""
+    found = []
+    for name, motion in motions.items():
+        if not all(hasattr(motion, part) for part in ("linear", "angular", "center")):
+            raise ArgumentError(f"scene.moving: expected a tt.Motion for {name!r}, got {shown(motion)}.")
+        parts = ([float(x) for x in getattr(motion, part)] for part in ("linear", "angular", "center"))
+        found.append(BodyMotion(str(name), *map(tuple, parts)))  # type: ignore[arg-type]
+    return found
+
+
+def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
+    """Make the motions of bodies children of the scene, ``NAME.velocity``; Mitsuba refuses them of most plugins.
+
+    Args:
+        state: ``mitsuba.parser.ParserState``, changed in place.
+        motions: motions that take the place of described ones.
+    """
+    import mitsuba as mi
+
+    moving = [(node, key, index) for node in state.nodes for key, index in _motions_of(state, node)]
+    if not moving and not motions:
+        return
+    name_children(state)
+    for node, key, index in moving:
+        name, props = node.props.id(), state.nodes[index].props
+        if not name:
+            raise SceneError(f"{PLUGIN}: expected a named {node.props.plugin_name()} around it; give that an id.")
+        if props.get("of", name) != name:
+            raise SceneError(f"{PLUGIN}: one motion of {props['of']!r} and {name!r}; describe one for each.")
+        del node.props[key]
+        props["of"] = name
+        props.set_id(f"{name}.{CHILD}")
+        state.root.props[f"{name}_{CHILD}"] = mi.Properties.ResolvedReference(index)
+    described = {state.nodes[index].props.get("of", ""): index for _, index in children(state, state.root)}
+    for motion in motions:
+        index = described.get(motion.of)
+        if index is None or state.nodes[index].props.plugin_name() != PLUGIN:
+            node = mi.parser.SceneNode()
+            node.type, node.props = mi.ObjectType.Texture, mi.Properties(PLUGIN)
+            node.props.set_id(f"{motion.of}.{CHILD}")
+            node.props["of"] = motion.of
+            state.nodes.append(node)
+            if len(state.node_paths):
+                state.node_paths = [*state.node_paths, f"{motion.of}.{CHILD}"]
+            index = len(state.nodes) - 1
+            state.root.props[f"{motion.of}_{CHILD}"] = mi.Properties.ResolvedReference(index)
+        for part in ("linear", "angular", "center"):
+            state.nodes[index].props[part] = mi.ScalarVector3f(getattr(motion, part))
+
+
+def _motions_of(state: Any, node: Any) -> list[tuple[str, int]]:
+    if node.props.plugin_name() == "scene":
+        return []
+    found = children(state, node)
+    return [(key, index) for key, index in found if key == CHILD and state.nodes[index].props.plugin_name() == PLUGIN]
+
+
+def has_velocities(state: Any) -> bool:
+    """Return True if some body of a parsed scene has a velocity."""
+    return any(node.props.plugin_name() == PLUGIN or VELOCITY in node.props for node in state.nodes)
