@@ -157,7 +157,7 @@ class Velocities:
     # ---------------------------------------------------------------------------------------------------- velocities
 
     def _row(self, row: Any, p: Any, active: Any) -> Any:
-        active &= row > 0
+        active = active & (row > 0)  # not in place: the mask is the caller's
         linear, angular = (dr.gather(mi.Vector3f, self.table, row * 2 + k, active) for k in (0, 1))
         return linear + dr.cross(angular, mi.Vector3f(p))
 
