@@ -20,6 +20,11 @@ FILMS = {
     "transient_hdr_film": {"temporal_bins": 4, "bin_width_opl": 1.0},
     "phasor_hdr_film": {"frequencies": "0 1"},
     "gated_hdr_film": {"gates": "rectangular 1 2"},
+    "rate_hdr_film": {"temporal_bins": 4, "bin_width_opl": 1.0, "rate_start": -1.0, "rate_width": 0.5, "rate_bins": 4},
+    "beat_hdr_film": {
+        "temporal_bins": 4, "bin_width_opl": 1.0, "chirp_bandwidth": 1e9, "chirp_duration": 1e-5,
+        "chirp_wavelength": 1550e-9,
+    },
 }
 PULSED = {"type": "transient_hdr_film", "temporal_bins": 40, "pulse": "gaussian", "pulse_fwhm_opl": 0.05}
 

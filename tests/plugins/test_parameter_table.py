@@ -327,7 +327,7 @@ def test_precedence(own_rows):
 
 def test_roles_are_checked():
     with pytest.raises(PluginRegistrationError, match=r"'speed' of Sphere.*shape, normal"):
-        declare_effects("Sphere", {"speed": ParameterEffect(role="velocity")})
+        declare_effects("Sphere", {"speed": ParameterEffect(role="temperature")})
 
 
 # -------------------------------------------------------------------------------------------------------- the tracker

@@ -97,6 +97,7 @@ class Numbers(Sink):
 def walked(connection, most, vertices=False, leg=None, window=lambda active, τ, p: active):
     """(number of vertices, what is kept) of four lanes."""
     world = SimpleNamespace(
+        velocities=None,
         segment=Line(), scattering=Turning(), connections=[connection], max_depth=most, in_time=window,
         finds_light=connection.finds_light, dark_at_first=connection.dark_at_first, plays_roulette=False,
         taken_over=lambda path, vertex: None,

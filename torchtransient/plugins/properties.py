@@ -50,7 +50,7 @@ def number(props: Any, name: str, default: float | None = None) -> float:
 def vector(props: Any, name: str, default: Sequence[float]) -> list[float]:
     """Return three finite numbers. Raises SceneError."""
     given = np.array(props.get(name, default), dtype=np.float64).reshape(-1)
-    if len(given) != 3 or not np.isfinite(given).all():  # noqa: PLR2004 (dimensions of space)
+    if len(given) != 3 or not np.isfinite(given).all():
         raise SceneError(f"{props.plugin_name()}: {name}: expected three finite numbers, got {shown(given.tolist())}.")
     return [float(x) for x in given]
 

@@ -395,7 +395,8 @@ class RowsOfHistograms(FilmLayout):
         given: Any = self.settings
         if not isinstance(given, self.kind):
             raise ArgumentError(
-                f"{self.argument}: expected a tt.{self.kind.__name__}, got {type(given).__name__}; write {self.example}."
+                f"{self.argument}: expected a tt.{self.kind.__name__}, got {type(given).__name__}; write "
+                f"{self.example}."
             )
         axis: Any = self.attributes()["axis"]
         if axis is not None:
@@ -541,14 +542,14 @@ def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
     """Return the film that keyword arguments ask for, None without one.
 
     Args:
-        arguments: ``time_axis``, ``frequencies``, ``gates``, ``rates``, ``chirps``: at most one that is not None, beside
-            the time axis of a film that has one.
+        arguments: ``time_axis``, ``frequencies``, ``gates``, ``rates``, ``chirps``: at most one that is not None,
+            beside the time axis of a film that has one.
 
     Raises:
         ArgumentError: for several, and for wrong settings, as the layouts raise it.
     """
     given = [found for kind in FILMS if (found := kind.from_arguments(arguments)) is not None]
-    if len(given) == 2 and isinstance(given[0], Histogram) and given[1].has_bins:  # noqa: PLR2004 (whose axis it is)
+    if len(given) == 2 and isinstance(given[0], Histogram) and given[1].has_bins:
         del given[0]
     if len(given) > 1:
         names, films = ", ".join(kind.argument for kind in FILMS), [f"a {kind.measures} film" for kind in FILMS]

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
-from torchtransient.chirps import Chirps
 from torchtransient.checks import Numbers, flag, is_one_of, shown
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.modules import CopiesParametrized

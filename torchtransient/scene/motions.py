@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchtransient.checks import shown
+from torchtransient.checks import shown, some_of
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.mitsuba_compat import VELOCITY
 from torchtransient.scene.nodes import children, name_children
@@ -61,9 +61,13 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
         props.set_id(f"{name}.{CHILD}")
         state.root.props[f"{name}_{CHILD}"] = mi.Properties.ResolvedReference(index)
     described = {state.nodes[index].props.get("of", ""): index for _, index in children(state, state.root)}
+    names = {node.props.id() for node in state.nodes}
     for motion in motions:
-        index = described.get(motion.of)
-        if index is None or state.nodes[index].props.plugin_name() != PLUGIN:
+        if motion.of not in names:
+            known = some_of(sorted(name for name in names if name and not name.startswith("_")))
+            raise SceneError(f"scene.moving: expected the name of a body, one of {known}, got {motion.of!r}.")
+        index = described.get(motion.of, -1)
+        if index < 0 or state.nodes[index].props.plugin_name() != PLUGIN:
             node = mi.parser.SceneNode()
             node.type, node.props = mi.ObjectType.Texture, mi.Properties(PLUGIN)
             node.props.set_id(f"{motion.of}.{CHILD}")

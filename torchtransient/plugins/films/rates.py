@@ -164,8 +164,8 @@ class RateHDRFilm(HistogramRows):
 class BeatHDRFilm(HistogramRows):
     r"""Film of the beats of frequency-modulated light (:monosp:`beat_hdr_film`): two spectra a pixel.
 
-    ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps up
-    and down, see :class:`torchtransient.Chirps`. The axis of the film is that of a target at rest: the beat of an
+    ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps
+    up and down, see :class:`torchtransient.Chirps`. The axis of the film is that of a target at rest: the beat of an
     arrival on the up chirp is that of a length ``opl + k rate``, on the down chirp of ``opl - k rate``, with ``k`` the
     frequency of the light times duration over bandwidth, and spread by the line shape of the window. Layout ``(H, W, 2,
     T, C)``.
@@ -180,7 +180,8 @@ class BeatHDRFilm(HistogramRows):
     def __init__(self, props):
         names = ("chirp_bandwidth", "chirp_duration", "chirp_wavelength")
         try:
-            self.chirps = Chirps(*(number(props, name) for name in names), window=str(props.get("chirp_window", "hann")))
+            numbers = [number(props, name) for name in names]
+            self.chirps = Chirps(*numbers, window=str(props.get("chirp_window", "hann")))
         except TorchTransientError as error:
             raise SceneError(f"{self.plugin}: {error}") from error
         super().__init__(props)

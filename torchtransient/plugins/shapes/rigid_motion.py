@@ -49,7 +49,8 @@ class RigidMotion(mi.Texture):
         return mi.Color3f(self.linear + dr.cross(self.angular, mi.Vector3f(si.p) - self.center))
 
     def to_string(self):
-        return f"RigidMotion[of = {self.of!r}, linear = {self.linear}, angular = {self.angular}, center = {self.center}]"
+        values = ", ".join(f"{name} = {getattr(self, name)}" for name in PARAMETERS)
+        return f"RigidMotion[of = {self.of!r}, {values}]"
 
 
 register("texture", "rigid_motion", RigidMotion)

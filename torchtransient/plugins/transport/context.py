@@ -64,8 +64,9 @@ class RenderContext:
     """
 
     def __init__(
-        self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None, velocities=None
-    ):
+        self, scene: Any, contents: Any, settings: PathSettings, strategies: Any, wanted=None, window=None,
+        velocities=None,
+    ):  # fmt: skip
         self.scene, self.contents, self.wanted = scene, contents, wanted
         self.max_depth, self.rr_depth, self.min_depth = settings.max_depth, settings.rr_depth, settings.min_depth
         self.division, self.sharing = settings.division, settings.sharing

@@ -1,7 +1,7 @@
 """Velocities of what a path meets, and the rate at which its optical length changes.
 
-With vertices ``x_i`` as material points of velocity ``v_i``, and the direction ``u_i`` from ``x_i`` to ``x_{i+1}`` along
-a segment of index ``eta_i``,
+With vertices ``x_i`` as material points of velocity ``v_i``, and the direction ``u_i`` from ``x_i`` to ``x_{i+1}``
+along a segment of index ``eta_i``,
 
     tau = sum eta_i |x_{i+1} - x_i|,        rate = d tau / dt = sum eta_i (v_{i+1} - v_i) . u_i.
 
@@ -44,57 +44,64 @@ class Movers:
 
     def __init__(self, scene: Any) -> None:
         shapes = shapes_of_scene(scene)
-        bodies: dict[str, list[Any]] = {}
-        for body in [*shapes, *scene.emitters(), *scene.sensors(), *_media_of(scene, shapes)]:
-            bodies.setdefault(body.id(), []).append(body)
-        own = {shape.ptr for shape in scene.shapes()}
-        pairs = [(s, m) for s in shapes for name, m in objects_of(s) if name == "velocity" and is_motion(m)]
-        for _, motion in objects_of(scene):
-            if is_motion(motion):
-                if motion.of not in bodies:
-                    known = some_of(sorted(name for name in bodies if name))
-                    raise SceneError(
-                        f"rigid_motion {motion.id()!r}: expected 'of' as the name of a shape, an emitter, a sensor or "
-                        f"a medium, one of {known}, got {motion.of!r}."
-                    )
-                pairs += [(body, motion) for body in bodies[motion.of]]
+        pairs = _motions(scene, shapes)
         self.motions = list({motion.ptr: motion for _, motion in pairs}.values())
         numbers = {motion.ptr: FIRST + n for n, motion in enumerate(self.motions)}
-        moving: dict[int, int] = {}
-        self.shapes, self.emitters, self.media, self.sensors = [], [], [], {}
+        found: dict[int, int] = {}
         for body, motion in pairs:
-            number = numbers[motion.ptr]
-            _check(body, own)
-            if moving.setdefault(body.ptr, number) != number:
+            if found.setdefault(body.ptr, numbers[motion.ptr]) != numbers[motion.ptr]:
                 raise SceneError(f"{body.id()!r}: expected one rigid_motion, got several.")
-            if isinstance(body, mi.Shape):
-                self.shapes.append((body, number))
-            elif isinstance(body, mi.Medium):
-                self.media.append((body, number))
-            elif isinstance(body, mi.Sensor):
-                self.sensors[body.ptr] = number
-            else:
-                self.emitters.append((body, number))
-        by_shape = {shape.ptr: number for shape, number in self.shapes}
-        for emitter in scene.emitters():
-            shape = emitter.get_shape()
-            if shape is not None and shape.ptr in by_shape:
-                self.emitters.append((emitter, by_shape[shape.ptr]))
-        for sensor in scene.sensors():
-            shape = sensor.get_shape()
-            if shape is not None and shape.ptr in by_shape:
-                self.sensors.setdefault(sensor.ptr, by_shape[shape.ptr])
+        bodies = list({body.ptr: body for body, _ in pairs}.values())
+
+        def of_kind(kind: Any) -> list[tuple[Any, int]]:
+            return [(body, found[body.ptr]) for body in bodies if isinstance(body, kind)]
+
+        self.shapes, self.emitters, self.media = of_kind(mi.Shape), of_kind(mi.Emitter), of_kind(mi.Medium)
+        self.sensors = {sensor.ptr: number for sensor, number in of_kind(mi.Sensor)}
+        # What is part of a shape moves with it.
+        for part in (*scene.emitters(), *scene.sensors()):
+            shape = part.get_shape()
+            if shape is not None and shape.ptr in found:
+                if isinstance(part, mi.Sensor):
+                    self.sensors.setdefault(part.ptr, found[shape.ptr])
+                else:
+                    self.emitters.append((part, found[shape.ptr]))
         self.meshes = [shape for shape in shapes if has_velocities(shape)]
-        lights = [mesh.id() for mesh in self.meshes if mesh.is_emitter() or mesh.ptr not in own]
-        if lights:
+        own = {shape.ptr for shape in scene.shapes()}
+        wrong = [mesh.id() for mesh in self.meshes if mesh.is_emitter() or mesh.ptr not in own]
+        if wrong:
             raise SceneError(
-                f"{some_of(lights)}: {VELOCITY} of a light, or inside of a shape group, is not supported; expected a "
-                "mesh of the scene that does not shine. A light or an instance takes a 'velocity' of type "
-                "'rigid_motion'."
+                f"{some_of(wrong)}: {VELOCITY} of a light, or inside of a shape group, is not supported; expected a "
+                "mesh of the scene that does not shine. Lights and instances take a 'velocity' of type 'rigid_motion'."
             )
 
     def __bool__(self) -> bool:
         return bool(self.motions or self.meshes)
+
+
+def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
+    """Return (body, ``rigid_motion``) of all bodies that have one. Raises SceneError for bodies that cannot."""
+    bodies: dict[str, list[Any]] = {}
+    for body in (*shapes, *scene.emitters(), *scene.sensors(), *_media_of(scene, shapes)):
+        bodies.setdefault(body.id(), []).append(body)
+    pairs = [(shape, held) for shape in shapes for _, held in objects_of(shape) if is_motion(held) and not held.of]
+    for _, motion in objects_of(scene):
+        if is_motion(motion):
+            if motion.of not in bodies:
+                raise SceneError(
+                    f"rigid_motion {motion.id()!r}: expected the name of a shape, an emitter, a sensor or a medium, "
+                    f"one of {some_of(sorted(filter(None, bodies)))}, got {motion.of!r}."
+                )
+            pairs += [(body, motion) for body in bodies[motion.of]]
+    own = {shape.ptr for shape in scene.shapes()}
+    for body, _ in pairs:
+        if isinstance(body, mi.Shape) and body.ptr not in own:
+            raise SceneError(f"{body.id()!r}: expected the motion of its instances; it is inside of a shape group.")
+        if isinstance(body, mi.Emitter):
+            far = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection
+            if any(mi.has_flag(body.flags(), flag) for flag in far):
+                raise SceneError(f"{body.id()!r}: expected a near light; light from infinity has no place that moves.")
+    return pairs
 
 
 def _media_of(scene: Any, shapes: list[Any]) -> list[Any]:
@@ -110,20 +117,14 @@ def is_motion(plugin: Any) -> bool:
     return hasattr(plugin, "rows") and hasattr(plugin, "of")
 
 
-def _check(body: Any, own: set[int]) -> None:
-    """Raise SceneError for a body that cannot have a motion."""
-    if isinstance(body, mi.Shape) and body.ptr not in own:
-        raise SceneError(f"{body.id()!r}: a shape inside of a group has no motion of its own; give it to its instances.")
-    if isinstance(body, mi.Emitter):
-        flags = body.flags()
-        if mi.has_flag(flags, mi.EmitterFlags.Infinite) or mi.has_flag(flags, mi.EmitterFlags.DeltaDirection):
-            raise SceneError(f"{body.id()!r}: light from infinity has no place that moves; expected a near emitter.")
-
-
 class Velocities:
     """Velocities of one job. A plain object, which Dr.Jit loops leave alone.
 
     Velocities are Vector3f, m/s; attached where their motions and the points are.
+
+    Attributes:
+        sensor_moves: the sensor has a velocity.
+        shapes: shapes that have a motion.
     """
 
     @staticmethod
@@ -141,7 +142,7 @@ class Velocities:
         number = movers.sensors.get(sensor.ptr)
         if number is not None:
             rows[SENSOR] = rows[number]
-        self.sensor_moves = number is not None
+        self.sensor_moves, self.shapes = number is not None, [shape for shape, _ in movers.shapes]
         self.table = dr.concat([mi.Float(part[k]) for row in rows for part in row for k in range(3)])
         self._shapes, self._emitters, self._media = (
             PointerTable([body for body, _ in found], [number for _, number in found]) if found else None

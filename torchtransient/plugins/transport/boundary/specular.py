@@ -88,7 +88,10 @@ class Chains:
         segment, _, connections = integrator.strategies(context.contents)
         self._lobes = KnownLobes()
         strategies = segment, self._lobes, connections
-        self.context = RenderContext(context.scene, context.contents, integrator.settings(), strategies, velocities=context.velocities)
+        velocities = context.velocities
+        self.context = RenderContext(
+            context.scene, context.contents, integrator.settings(), strategies, velocities=velocities
+        )
         numbers = places.numbers(sampler)
         rays = places.rays_at(context, sampler, sampler.next_2d() * places.size, numbers)
         found = self.follow(context, rays, sampler, mi.UInt32(self.longest), mi.Bool(True))

@@ -30,11 +30,13 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from torchtransient.errors import GradientError
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import topology_of
 from torchtransient.plugins.integrators.job import passes_of, seed_array
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
+from torchtransient.plugins.transport.boundary.moving_edges import has_delta_lobe
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.specular import (
     RAYS,
@@ -104,6 +106,7 @@ class BoundaryTerm:
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
         if sees_chains(context, self.sensor):
+            _check_chains_rest(context)
             with context.contents.hidden_from_mitsuba():
                 self.chains = Chains(integrator, context, self.places, self.independent(self._seed_of_chains, RAYS))
             self.through = SensorThroughChain(self.chains) if context.max_depth > 2 else None
@@ -115,7 +118,8 @@ class BoundaryTerm:
         self.to_sensor = SensorSampled(self.places, integrator.camera_unwarp)
         sensors = [self.to_sensor] if self.through is None else [self.to_sensor, self.through]
         strategies = segment, scattering, sensors
-        return RenderContext(context.scene, context.contents, settings, strategies, None, context.window, context.velocities)
+        window, velocities = context.window, context.velocities
+        return RenderContext(context.scene, context.contents, settings, strategies, None, window, velocities)
 
     def tables(self):
         """Return the attached arrays: ends of edges, and tables of the strategies of light paths."""
@@ -175,3 +179,13 @@ class BoundaryTerm:
             weight = rfilter.eval(h.x) * rfilter.eval(h.y) * (n * n / (integral * integral))
         inside = dr.all((cell >= 0) & (cell < size))
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
+
+
+def _check_chains_rest(context):
+    """Raise GradientError where the film measures rates, and mirrors or the sensor have a velocity."""
+    velocities = context.velocities
+    if velocities is not None and (velocities.sensor_moves or any(map(has_delta_lobe, velocities.shapes))):
+        raise GradientError(
+            "films of rates: derivatives at edges that are seen in mirrors or through glass are those of mirrors, "
+            "glass and sensors without a velocity. Take the velocity away, or leave moving edges out: boundary=False."
+        )
