@@ -2,8 +2,9 @@
 
 A rendered spectrum is the expected power of the beat in each bin: the variance of a circular Gaussian field, since
 light of rough surfaces arrives with random phases. A bin has the width c / B, which is one mode of a chirp: fields of
-different bins, chirps and pixels are drawn independently. Windows other than a rectangle make those of neighbouring
-bins alike in part, which is left out.
+different bins, chirps and pixels are drawn independently. That is right for light that is spread over several bins. The
+bins of a single line, of a flat surface that faces the lidar, in truth rise and fall together: positions that are read
+between bins are noisier here.
 
 Sources: Goodman, "Speckle phenomena in optics" (2007), chapters 3 and 4; Fink, "Coherent detection signal-to-noise"
 (Appl. Opt. 14, 1975); Jiang & Luu, "Heterodyne detection with a weak local oscillator" (Appl. Opt. 47, 2008), for
