@@ -58,7 +58,7 @@ HEAVY = {
 SENSING = {
     "base": 0, "numerics": 1, "response": 2, "counts": 2,
     "optics": 3, "timing": 3, "itof": 3, "dead_time": 3, "estimation": 3,
-    "cameras": 4, "spad": 4, "correlated_noise": 5, "pixels": 6, "chain": 7, "devices": 8,
+    "cameras": 4, "coherent": 4, "spad": 4, "correlated_noise": 5, "pixels": 6, "chain": 7, "devices": 8,
 }  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES = {"file": 800, "function": 160}

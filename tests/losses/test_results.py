@@ -124,6 +124,16 @@ def test_results_on_two_axes(case):
     assert bool(torch.isfinite(bare(case)(a, result(y, axis=rounded))))
 
 
+def test_rates_and_beats_of_a_film():
+    """Light over the rates of path lengths and spectra of beats, which losses element by element compare."""
+    x, y = torch.rand(2, 1, 4, BINS, 2, 2)
+    for name in ("rates", "beats"):
+        found = losses.squared_loss(result(x, name), result(y, name))
+        torch.testing.assert_close(found, losses.squared_loss(x, y), rtol=0, atol=0)
+        with pytest.raises(UnitError, match="results on one axis"):
+            losses.squared_loss(result(x, name), result(y, name, TimeAxis(0.0, 1.0, BINS)))
+
+
 def test_frequencies_are_an_axis():
     x = torch.randn(1, 5, 2, 2, dtype=torch.complex64)
     bands = BAND, dataclasses.replace(BAND, start_opl=3)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import pytest
 import torch
 from scipy import stats
 
-from torchtransient import losses
+from torchtransient import RateAxis, losses
 from torchtransient.errors import ShapeError, UnitError
 
 WIDTH = 0.03
@@ -60,6 +61,23 @@ def test_triangle_inequality_and_time_anywhere():
     exhaustive = (x.reshape(1, 25, 1, 2, 3, 1) for x in (a, b))
     found = losses.wasserstein_loss(*exhaustive, WIDTH, dim=-5)
     torch.testing.assert_close(found, distance[0].mean())
+
+
+def test_over_rates():
+    """Light (C, R, T, Y, X) whose rates are two bins higher, at each arrival and of all of them: in m/s."""
+    rates = RateAxis(-2.0, 0.25, 12)
+    light = torch.zeros(1, 12, 6, 2, 3, dtype=torch.float64)
+    light[0, 3:5, 1:4] = 1.0 + torch.rand(2, 3, 2, 3, generator=torch.Generator().manual_seed(4))
+    faster = light.roll(2, 1)
+    compare = functools.partial(losses.wasserstein_loss, bin_width_opl=rates.bin_width, dim=-4, reduction="none")
+    found = compare(light, faster)
+    assert found.shape == (1, 6, 2, 3)
+    torch.testing.assert_close(found[0, 1:4], torch.full((3, 2, 3), 0.5, dtype=torch.float64))
+    assert float(found[0, 4:].abs().max()) < 1e-12
+    spectra = losses.wasserstein_loss(light.sum(2), faster.sum(2), rates.bin_width)
+    assert float(spectra) == pytest.approx(0.5)
+    total = losses.cumulative_loss(light, faster, rates.bin_width, dim=-4, reduction="sum")
+    assert float(total) == pytest.approx(0.5 * float(light.sum()))
 
 
 def test_the_gradient_sees_pulses_that_do_not_overlap():

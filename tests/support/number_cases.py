@@ -305,6 +305,7 @@ def _pictures() -> dict[str, Case]:
     phasor = torch.complex(PICTURE, PICTURE)[:, :, :8, :8]
     video = folder() / "v.gif"
     transient, steady = LIGHT[..., :4, :4], LIGHT[:, 0, :4, :4]
+    rates = LIGHT[..., :4, :4].expand(4, 8, 4, 4).unsqueeze(0)
     frames = v.frames(transient, axis=AXIS)
     cells = [v.Cell(f"{n}", {"a": np.zeros((2, 2, 3))}) for n in range(4)]
     return {
@@ -332,6 +333,10 @@ def _pictures() -> dict[str, Case]:
         "vis.exposure_of": Case(v.exposure_of, steady, quantile=0.9),
         "vis.exposure_of_video": Case(v.exposure_of_video, transient, quantile=0.9),
         "vis.tone_map": Case(v.tone_map, steady, exposure=1.0, gamma=2.0, stops=5.0),
+        "vis.range_doppler": Case(
+            v.range_doppler, rates, axis=AXIS, rate_axis=tt.RateAxis(-1.0, 0.5, 4), pixel=(1, 1), decades=3.0
+        ),
+        "vis.speed_picture": Case(v.speed_picture, rates, rate_axis=tt.RateAxis(-1.0, 0.5, 4), limit=1.0),
         "vis.volume_views": Case(v.volume_views, torch.rand(4, 4, 4), gamma=2.0),
     }
 

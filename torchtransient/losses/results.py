@@ -69,10 +69,10 @@ Picture = Tensor | HasSteady
 Volume = Tensor | HasValues
 DepthMap = Tensor | HasDepth
 
-LIGHT = ("transient", "phasor", "gated")
+LIGHT = ("transient", "phasor", "gated", "rates", "beats")
 TRANSIENT, PHASOR, STEADY, VALUES, DEPTH = ("transient",), ("phasor",), ("steady",), ("values",), ("depth_m",)
 # What says where on its axis a tensor lies: two results are compared on one.
-_AXES = {"transient": "axis", "phasor": "frequencies", "gated": "gates"}
+_AXES = {"transient": "axis", "rates": "axis", "beats": "axis", "phasor": "frequencies", "gated": "gates"}
 _EVERY = (*LIGHT, *STEADY, *VALUES, *DEPTH)
 _IMAGES = -3
 # Of the width of a bin or of a frequency: axes that went through files and units are equal but for rounding.

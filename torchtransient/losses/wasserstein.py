@@ -53,8 +53,9 @@ def wasserstein_loss(
 
     Light counts as at the middle of its bin; negative bins, of captures less their background, enter the same formula.
     Computed by cumulative sums of differences. `bin_width_opl`: None takes that of results with an axis. `dim`: where
-    time is (`losses.layouts`). `mask` (..., C, T, Y, X): bins that do not count are empty in both. `reduction="none"`:
-    without time, (..., C, Y, X). Raises ShapeError, UnitError.
+    time is (`losses.layouts`), or another axis of equal bins, whose width and unit the distance then has: -4 of rates
+    (C, R, T, Y, X), with the width of their bins in m/s. `mask` (..., C, T, Y, X): bins that do not count are empty in
+    both. `reduction="none"`: without time, (..., C, Y, X). Raises ShapeError, UnitError.
     """
     where = "wasserstein_loss"
     check_held(reduction, dim, where)

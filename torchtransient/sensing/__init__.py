@@ -17,6 +17,10 @@ from torchtransient.sensing.chain.compose import Compose as Compose
 from torchtransient.sensing.chain.pixel_groups import PixelGroups as PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera as StreakCamera
 from torchtransient.sensing.chain.streak import SweepJitter as SweepJitter
+from torchtransient.sensing.coherent.beats import BeatNoise as BeatNoise
+from torchtransient.sensing.coherent.beats import Speckle as Speckle
+from torchtransient.sensing.coherent.range_and_speed import fold_beats as fold_beats
+from torchtransient.sensing.coherent.range_and_speed import range_and_speed as range_and_speed
 from torchtransient.sensing.correlated_noise.afterpulse_delays import AfterpulseDelays as AfterpulseDelays
 from torchtransient.sensing.correlated_noise.afterpulse_delays import MeasuredDelays as MeasuredDelays
 from torchtransient.sensing.correlated_noise.afterpulse_delays import PowerLawDelays as PowerLawDelays

@@ -21,6 +21,8 @@ from torchtransient.vis.phasors import domain_colors as domain_colors
 from torchtransient.vis.phasors import phasor_picture as phasor_picture
 from torchtransient.vis.phasors import phasor_video as phasor_video
 from torchtransient.vis.polarization import polarization_picture as polarization_picture
+from torchtransient.vis.rates import range_doppler as range_doppler
+from torchtransient.vis.rates import speed_picture as speed_picture
 from torchtransient.vis.scans import peak_time_map as peak_time_map
 from torchtransient.vis.scans import scan_layout as scan_layout
 from torchtransient.vis.scans import transients_grid as transients_grid

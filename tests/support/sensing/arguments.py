@@ -6,9 +6,11 @@ import torch
 
 from torchtransient import sensing
 from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.chirps import Chirps
 
 AXIS = TimeAxis.from_seconds(0.0, 1e-10, 12)
 RESPONSE = sensing.GaussianResponse(3e-10)
+CHIRPS = Chirps(1e9, 1e-5, 1550e-9)
 OPTICS = sensing.Optics(f_number=2.0)
 SPAD = sensing.SynchronousSPAD(100)
 
@@ -38,6 +40,7 @@ CALLS = {
         {"probability": number(0.1), "tau_s": number(1e-9), "dead_time_s": number(1e-10), "bin_width_s": number(1e-10),
          "period_s": number(2e-9), "background": rand(2, 3)}, {}),
     "Analyzers": ({"rows": ROWS}, {}),
+    "BeatNoise": ({"photons_per_unit": number(20.0), "looks": number(4.0)}, {}),
     "CodedHistogram": ({"codes": rand(3, 12)}, {}),
     "CoincidencePixel": (
         {"window_s": number(1e-9), "weights": rand(4), "bin_width_s": number(1e-10)},
@@ -82,6 +85,7 @@ CALLS = {
     "PixelSkew": ({"delay_s": 1e-10 * rand(2, 3), "bin_width_s": number(1e-10)}, {}),
     "PolarizationMosaic": ({"rows": ROWS.reshape(2, 2, 4)}, {}),
     "PowerLawDelays": ({"exponent": number(1.2), "longest_s": number(1e-6)}, {}),
+    "Speckle": ({"looks": number(4.0)}, {}),
     "SpatialPSF": ({"psf": rand(3, 3)}, {}),
     "StreakCamera": (
         {"time_fwhm_s": number(2e-10), "spatial_fwhm_px": number(1.5), "phosphor_fwhm_px": number(1.0),
@@ -129,6 +133,7 @@ CALLS = {
     "equi_depth_edges": ({"counts": COUNTS}, {"depth": 2}),
     "first_photon_log_prob": ({"counts": COUNTS, "rate": 0.1 * LIGHT, "dead_bins": number(3.0)}, {"cycles": 1000}),
     "first_photon_probabilities": ({"rate": LIGHT}, {}),
+    "fold_beats": ({"beats": LIGHT}, {"axis": CHIRPS.time_axis((0.0, 0.4))}),
     "first_return": ({"histogram": COUNTS, "threshold": number(5.0)}, {}),
     "fixed_pattern": ({"spread": number(0.1), "center": number(1.0)}, {"shape": (2, 3)}),
     "frames_to_rate": ({"counts": COUNTS}, {"frames": 100}),
@@ -166,6 +171,9 @@ CALLS = {
     "project_physical": ({"stokes": STOKES}, {}),
     "random_code_widths": ({"dnl_std": number(0.01)}, {"num_bins": 12}),
     "range_deviation_m": ({"response_fwhm_s": number(1e-10), "detections": 100 * rand(3)}, {}),
+    "range_and_speed": (
+        {"beats": torch.stack([LIGHT, LIGHT.flip(1)], 1), "threshold": number(0.0)},
+        {"chirps": CHIRPS, "axis": CHIRPS.time_axis((0.0, 0.4))}),
     "read_itof": (
         {"taps": TAPS, "frequencies_hz": number(60e6), "max_depth_m": number(2.4), "min_depth_m": number(0.0)},
         {"num_taps": 4}),
@@ -212,5 +220,5 @@ OTHERS = {
 DECIDE = {
     ("multi_return", "threshold"), ("first_return", "threshold"), ("unwrap_depth", "min_depth_m"),
     ("unwrap_depth", "max_depth_m"), ("straight_through", "sample"),
-    ("read_itof", "min_depth_m"), ("read_itof", "max_depth_m"),
+    ("range_and_speed", "threshold"), ("read_itof", "min_depth_m"), ("read_itof", "max_depth_m"),
 }  # fmt: skip

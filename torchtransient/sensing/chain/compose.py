@@ -33,6 +33,7 @@ from torchtransient.sensing.chain.first_photon_moves import (
     moving_together,
     multinomial_log_prob,
 )
+from torchtransient.sensing.coherent.beats import BeatNoise, Speckle
 from torchtransient.sensing.itof.itof import ItofCorrelation
 
 
@@ -41,9 +42,9 @@ class Compose(Sensor):
 
     Stages are sensors, or other modules of one tensor; stages in an ``nn.Sequential`` or an ``nn.ModuleList`` are taken
     as if they were given one by one. The input is a transient (..., C, T, H, W), or what a renderer
-    returns (an object with ``transient``, ``phasor`` and ``axis``): its axis is compared with those of the stages, and
-    a phasor image goes to an `ItofCorrelation` in front. ``grad``: set this policy in every random stage; None leaves
-    them as they are.
+    returns (an object with ``transient``, ``phasor``, ``beats`` and ``axis``): its axis is compared with those of the
+    stages, a phasor image goes to an `ItofCorrelation` in front, spectra of beats to `Speckle` or `BeatNoise`.
+    ``grad``: set this policy in every random stage; None leaves them as they are.
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
     order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
@@ -196,6 +197,7 @@ class Compose(Sensor):
     def _opened(self, output: Any) -> tuple[Tensor, int]:
         """The tensor of a renderer's output, and how many stages it has passed already."""
         transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
+        beats = getattr(output, "beats", None)
         if getattr(output, "gates", None) is not None:
             raise ShapeError(
                 f"Compose: expected a transient over time, got the images of {len(output.gates)} time gates, which are "
@@ -206,6 +208,14 @@ class Compose(Sensor):
             self.check_axis(output.axis)
             return transient, 0
         first = unrolled(self.stages)[0]
+        if isinstance(beats, Tensor):
+            if isinstance(first, Sensor) and not isinstance(first, (BeatNoise, Speckle)):
+                raise ShapeError(
+                    f"Compose: expected a transient for {type(first).__name__}, got spectra of beats, which are for "
+                    "Speckle and BeatNoise. Render with time_axis=... and without chirps."
+                )
+            self.check_axis(output.axis)
+            return beats, 0
         if isinstance(phasor, Tensor) and isinstance(output.frequencies, FrequencyAxis):
             if isinstance(first, Compose):
                 raise ShapeError("Compose: expected ItofCorrelation as the first stage itself, not in a chain.")

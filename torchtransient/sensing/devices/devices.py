@@ -37,6 +37,7 @@ from torchtransient.sensing.cameras.gated import GatedIntegration
 from torchtransient.sensing.chain.compose import Compose
 from torchtransient.sensing.chain.pixel_groups import PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera, SweepJitter
+from torchtransient.sensing.coherent.beats import BeatNoise, Speckle
 from torchtransient.sensing.correlated_noise.afterpulse_delays import MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing, hot_pixel_rates
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
@@ -111,6 +112,7 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
             PowerLawDelays, ZoneSum,
             Compose, PiecewiseLinearCode, SpatialPSF, ambient_photon_rate, binary_code, circular_analyzers, defocus_psf,
+            BeatNoise, Speckle,
         )
     },
     "PixelGroups.by_value": PixelGroups.by_value,

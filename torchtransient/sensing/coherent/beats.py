@@ -1,0 +1,142 @@
+"""Noise of the spectra of beats: speckle of rough surfaces, shot noise of the local oscillator.
+
+A rendered spectrum is the expected power of the beat in each bin: the variance of a circular Gaussian field, since
+light of rough surfaces arrives with random phases. A bin has the width c / B, which is one mode of a chirp: fields of
+different bins, chirps and pixels are drawn independently. That is right for light that is spread over several bins. The
+bins of a single line, of a flat surface that faces the lidar, in truth rise and fall together: positions that are read
+between bins are noisier here.
+
+Sources: Goodman, "Speckle phenomena in optics" (2007), chapters 3 and 4; Fink, "Coherent detection signal-to-noise"
+(Appl. Opt. 14, 1975); Jiang & Luu, "Heterodyne detection with a weak local oscillator" (Appl. Opt. 47, 2008), for
+diffuse and mirror-like targets in the limit of a strong one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchtransient.errors import UnitError
+from torchtransient.sensing.base.layout import check_number, check_transient
+from torchtransient.sensing.base.policies import GradPolicy, standard_normal
+from torchtransient.sensing.base.sensor import RandomSensor
+
+# Photons below which a field grows like its power in place of the root, whose slope is infinite at zero.
+_FAINT = 1e-4
+
+
+class _Averaged(RandomSensor):
+    """A draw of spectra (..., T, H, W), of which ``looks`` are averaged; pathwise under every policy but "expected"."""
+
+    def __init__(self, looks: float, grad: GradPolicy) -> None:
+        super().__init__(grad)
+        self.looks = check_number(looks, "looks", type(self).__name__, low=1.0)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.expected(x) if self.grad == "expected" else self.gaussian(x, generator)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            return self.gaussian(x, generator)
+
+
+class Speckle(_Averaged):
+    """Fully developed speckle: spectra (..., C, T, H, W) times independent Gamma numbers of mean 1, variance 1 / looks.
+
+    The field of a bin is circular Gaussian with the expected power as variance; its square, averaged over ``looks``
+    independent fields (chirps of a rough surface that moves on, polarizations, pixels), has the contrast
+    ``1 / sqrt(looks)``. ``looks``: 1 and more, also an effective number that is not whole.
+
+    The draw is linear in the input: every policy but ``expected`` gives its ordinary gradient, which is unbiased for
+    any loss. Raises UnitError for fewer looks, and for negative power and NaN in a draw.
+    """
+
+    gives = "the same"
+
+    def __init__(self, looks: float = 1, *, grad: GradPolicy = "expected") -> None:
+        super().__init__(looks, grad)
+
+    def expected(self, x: Tensor) -> Tensor:
+        return check_transient(x, "Speckle")
+
+    def variance(self, x: Tensor) -> Tensor:
+        return check_transient(x, "Speckle").square() / self.looks
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A draw, differentiable in `x`: no normal surrogate."""
+        _check_power(check_transient(x, "Speckle"), "Speckle")
+        return x * (_gamma(self.looks, x, generator) / self.looks)
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        """Logarithm of the density of spectra whose expectation is `x`, time summed: (..., C, H, W).
+
+        Behind a `BeatNoise` of as many looks, speckled light has this density with the expectation of the `BeatNoise`:
+        ``speckle.log_prob(measured, noise.expected(beats))``. Bins without light, which have no density, are left out.
+        """
+        y, x = check_transient(measurement, "Speckle"), check_transient(x, "Speckle")
+        lit = x > 0
+        mean = torch.where(lit, x, 1.0)
+        k = self.looks
+        # xlogy: of one look, and no power at all, the first term is none
+        terms = torch.xlogy(torch.full_like(y, k - 1), y) - k * (mean.log() + y / mean) + k * math.log(k)
+        return torch.where(lit, terms - math.lgamma(k), 0.0).sum(-3)
+
+
+class BeatNoise(_Averaged):
+    """Shot noise of a strong local oscillator: power spectra in photons, with one photon of noise in each mode.
+
+    A bin of n photons, ``photons_per_unit`` times the light (..., C, T, H, W), is measured as ``|sqrt(n) + z|^2`` with
+    circular Gaussian noise z of variance one: its signal-to-noise ratio is the number of detected photons in a chirp,
+    `efficiency power duration / (h c / wavelength)`, with quadratures or without. ``looks`` spectra of n photons each
+    are averaged. Mean n + 1, variance (1 + 2 n) / looks; 2 looks times the measurement has a noncentral chi-squared
+    distribution of 2 looks degrees of freedom. A bin is one mode, c / B wide (`tt.Chirps.time_axis`).
+
+    The input is power without speckle, or what `Speckle` of as many looks has drawn. Not modelled: noise of the laser's
+    phase and intensity, of amplifiers, and a weak local oscillator.
+
+    Every policy but ``expected`` gives the gradient of the draw, unbiased for any loss; below 1e-4 photons the field
+    grows like the power, so that the slope is finite at zero. Raises UnitError for numbers out of range, and for
+    negative power and NaN in a draw.
+    """
+
+    gives = "counts"
+
+    def __init__(self, photons_per_unit: float = 1.0, looks: float = 1, *, grad: GradPolicy = "expected") -> None:
+        super().__init__(looks, grad)
+        self.photons_per_unit = check_number(photons_per_unit, "photons_per_unit", "BeatNoise", open_low=True)
+
+    def expected(self, x: Tensor) -> Tensor:
+        return self._photons(x) + 1
+
+    def variance(self, x: Tensor) -> Tensor:
+        return (1 + 2 * self._photons(x)) / self.looks
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A draw, differentiable in `x`: no normal surrogate."""
+        n = self._photons(x)
+        _check_power(n, "BeatNoise")
+        field = torch.where(n < _FAINT, n / math.sqrt(_FAINT), n.clamp_min(_FAINT).sqrt())
+        # The sum over looks of |field + noise|^2 is the same if one look holds all of the field. Its real part comes
+        # first; left are the square of its imaginary part, Gamma(1/2), and those of the other looks, Gamma(1) each.
+        noise = math.sqrt(0.5) * standard_normal(n, generator)
+        rest = _gamma(self.looks - 0.5, n, generator)
+        return n + (2 / math.sqrt(self.looks)) * field * noise + (noise.square() + rest) / self.looks
+
+    def _photons(self, x: Tensor) -> Tensor:
+        return check_transient(x, "BeatNoise") * self.photons_per_unit
+
+
+def _gamma(shape: float, like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Gamma numbers of unit scale in the shape, dtype and on the device of ``like``."""
+    return torch._standard_gamma(torch.full_like(like, shape, requires_grad=False), generator=generator)
+
+
+def _check_power(x: Tensor, where: str) -> None:
+    low, high = torch.aminmax(x.detach()) if x.numel() else (x.new_zeros(()), x.new_zeros(()))
+    if not bool(low >= 0) or not bool(torch.isfinite(high)):
+        raise UnitError(
+            f"{where}: expected finite power >= 0, got values from {float(low):g} to {float(high):g}. Films make no "
+            "others with a temporal_filter of box or tent."
+        )
