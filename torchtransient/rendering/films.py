@@ -35,7 +35,7 @@ class FilmLayout(abc.ABC):
     # Word of the plugin's `measures`: the attribute of a RenderOutput, and the name in a result file.
     measures: ClassVar[str]
     plugin: ClassVar[str]
-    # Letter of the dimension between channels and rows.
+    # Letters of the dimensions between channels and rows.
     letter: ClassVar[str]
     # Name of the settings: the keyword of TransientRenderer and tt.plan, of films that have one. A call that asks for
     # the film, written out for messages ("film=..." of films without a keyword).
@@ -63,6 +63,11 @@ class FilmLayout(abc.ABC):
     @abc.abstractmethod
     def count(self) -> int:
         """Number of entries along the film's own dimension."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the dimensions between channels and rows."""
+        return (self.count,)
 
     @property
     def settings(self) -> Any:
@@ -390,6 +395,8 @@ class RowsOfHistograms(FilmLayout):
 
     has_bins: ClassVar[bool] = True
     kind: ClassVar[type]
+    # Names of the settings' fields as properties of the plugin.
+    properties: ClassVar[dict[str, str]]
 
     def __post_init__(self) -> None:
         given: Any = self.settings
@@ -408,12 +415,22 @@ class RowsOfHistograms(FilmLayout):
         assert isinstance(axis, TimeAxis)  # of a built film
         return axis.num_bins
 
+    @property
+    @abc.abstractmethod
+    def row_count(self) -> int:
+        """Number of histograms of a pixel."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.row_count, self.count)
+
     def attributes(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def plain(self) -> dict[str, Any]:
-        axis = self.attributes()["axis"]
-        return asdict(self.settings) | ({} if axis is None else Histogram(axis).plain())
+        axis, settings = self.attributes()["axis"], asdict(self.settings)
+        named = {f"{self.argument}_{name}": value for name, value in settings.items()}
+        return named | ({} if axis is None else Histogram(axis).plain())
 
     def describe(self, temporal_filter: str) -> str:
         words = ", ".join(f"{name}={value}" for name, value in self.attributes().items())
@@ -428,6 +445,18 @@ class RowsOfHistograms(FilmLayout):
         axis = self.attributes()["axis"]
         if axis is not None:
             Histogram(axis).write(props)
+        for name, prop in self.properties.items():
+            props[prop] = getattr(self.settings, name)
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        given = {name: props[prop] for name, prop in cls.properties.items() if prop in props}
+        axis = Histogram.from_properties(props)
+        assert axis is not None
+        try:
+            return cls(cls.kind(**given), axis.axis)  # type: ignore[call-arg]
+        except (TypeError, TorchTransientError) as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
 
     def describes(self, film: FilmInterface) -> bool:
         if film.measures != self.measures:
@@ -441,19 +470,19 @@ class RowsOfHistograms(FilmLayout):
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        if measured(output, cls.measures) is None:
-            return None
-        return cls(*(measured(output, field.name) for field in fields(cls)))
+        found = [measured(output, name) for name in (cls.measures, *(field.name for field in fields(cls)))]
+        return None if any(value is None for value in found) else cls(*found[1:])
 
     def entries(self) -> dict[str, Any]:
-        return self.plain()
+        axis = self.attributes()["axis"]
+        return self.plain() | ({} if axis is None else Histogram(axis).entries())
 
     @classmethod
     def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
         if cls.measures not in values:
             return None
-        names = [field.name for field in fields(cls.kind)]
-        plain = {name: value.item() if hasattr(value := values[name], "item") else value for name in names}
+        given = {field.name: values[f"{cls.argument}_{field.name}"] for field in fields(cls.kind)}
+        plain = {name: value.item() if hasattr(value, "item") else value for name, value in given.items()}
         axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         return cls(cls.kind(**plain), axis)  # type: ignore[call-arg]
 
@@ -479,6 +508,7 @@ class Rates(RowsOfHistograms):
     output: ClassVar[str] = "rates"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = RateAxis
+    properties: ClassVar[dict[str, str]] = {"start": "rate_start", "bin_width": "rate_width", "num_bins": "rate_bins"}
 
     rate_axis: RateAxis
     axis: TimeAxis | None = None
@@ -487,13 +517,9 @@ class Rates(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(RateAxis(film.rate_start, film.rate_width, film.rate_bins), Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        axis = self.rate_axis
-        props["rate_start"], props["rate_width"], props["rate_bins"] = axis.start, axis.bin_width, axis.num_bins
-
-
-_CHIRPS = {"bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength"}
+    @property
+    def row_count(self) -> int:
+        return self.rate_axis.num_bins
 
 
 @dataclass(frozen=True)
@@ -517,6 +543,10 @@ class Beats(RowsOfHistograms):
     output: ClassVar[str] = "beats"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = Chirps
+    properties: ClassVar[dict[str, str]] = {
+        "bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength",
+        "window": "chirp_window",
+    }  # fmt: skip
 
     chirps: Chirps
     axis: TimeAxis | None = None
@@ -525,11 +555,9 @@ class Beats(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(film.chirps, Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        for name, prop in _CHIRPS.items():
-            props[prop] = getattr(self.chirps, name)
-        props["chirp_window"] = self.chirps.window
+    @property
+    def row_count(self) -> int:
+        return 2
 
 
 # ------------------------------------------------------------------------------------------------------ list of films
