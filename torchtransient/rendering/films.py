@@ -82,6 +82,10 @@ class FilmLayout(abc.ABC):
         """Return the settings as plain data for JSON."""
         return self.settings
 
+    def resolution_opl(self) -> float | None:
+        """Return the width of bins that a plan takes, metres; None for the width of the scene's film."""
+        return None
+
     def describe(self, temporal_filter: str) -> str:
         """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
         return f"{self.argument}={self.settings}"
@@ -464,6 +468,10 @@ class RowsOfHistograms(FilmLayout):
         built = self.from_film(film).attributes()
         return all(value is None or built[name] == value for name, value in self.attributes().items())
 
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """Return all light, which the steady image holds, and that of the time window."""
+        return Histogram(self.attributes()["axis"]).parts(arrivals)
+
     def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
         cube = cube.reshape(*leading, *cube.shape[-5:])
         return _stokes_first(cube.movedim((-1, -3, -2), (-5, -4, -3)), -5, components)
@@ -555,9 +563,18 @@ class Beats(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(film.chirps, Histogram.from_film(film).axis)
 
+    @classmethod
+    def seen(cls, film: Any, arrivals: Arrivals) -> Arrivals:
+        """Return the arrivals of a pilot run at the places of their beats, of both spectra."""
+        k = film.chirps.rate_scale_s
+        return arrivals.shifted((k, -k))
+
     @property
     def row_count(self) -> int:
         return 2
+
+    def resolution_opl(self) -> float:
+        return self.chirps.resolution_opl
 
 
 # ------------------------------------------------------------------------------------------------------ list of films
