@@ -48,6 +48,8 @@ class FilmLayout(abc.ABC):
     # The film has bins of time: a temporal filter, an axis that a plan can find, a steady image that can be left out.
     has_bins: ClassVar[bool] = False
     is_complex: ClassVar[bool] = False
+    # The film measures how fast paths get longer.
+    knows_rates: ClassVar[bool] = False
     # The film spreads arrivals by a pulse and an impulse response.
     takes_pulse: ClassVar[bool] = False
     # Remedy for a response over time without a slope (`jump`): the end of an error message.
@@ -398,6 +400,7 @@ class RowsOfHistograms(FilmLayout):
     """
 
     has_bins: ClassVar[bool] = True
+    knows_rates: ClassVar[bool] = True
     kind: ClassVar[type]
     # Names of the settings' fields as properties of the plugin.
     properties: ClassVar[dict[str, str]]

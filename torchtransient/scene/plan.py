@@ -571,7 +571,7 @@ class Finder:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
         self._note_edges([table[key] for key in self.draft.parameters])
-        moving = needing_slope(table, self.draft.parameters)
+        moving = needing_slope(table, self.draft.parameters, kind.knows_rates)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
         if not kind.has_bins:
             film = self.draft.film_choice or self.draft.described_film
