@@ -327,7 +327,8 @@ class TransientRenderer(CopiesParametrized):
         """Temporal filter of renders, with "auto" resolved; empty for a film without one."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
-        return filter_for(needing_slope(self._infos, self._keys, self.film.knows_rates), self._scene_filter, self._pulsed)
+        moving = needing_slope(self._infos, self._keys, self.film.knows_rates)
+        return filter_for(moving, self._scene_filter, self._pulsed)
 
     @opaque
     def variation(
