@@ -93,7 +93,7 @@ def test_motions_of_files_are_written(tmp_path):
 
 def test_wrong_settings():
     for wrong in ({"rates": (0.0, 1.0, 3)}, {"chirps": 1e9}):
-        with pytest.raises(tt.errors.ArgumentError, match="recipe: .*: expected a "):
+        with pytest.raises(tt.errors.ArgumentError, match=r"recipe: .*: expected a "):
             recipe(**{"rates": None, **wrong})
     data = recipe().to_dict()
     with pytest.raises(SceneError, match="an entry is not what it should be"):
