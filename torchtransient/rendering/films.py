@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
@@ -91,6 +91,10 @@ class FilmLayout(abc.ABC):
     def describe(self, temporal_filter: str) -> str:
         """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
         return f"{self.argument}={self.settings}"
+
+    def over(self, axis: TimeAxis) -> FilmLayout:
+        """Return the same film, one with bins, over other bins of time."""
+        return Histogram(axis)
 
     def jump(self) -> str:
         """Return the name of a response over time that jumps and has no slope without a pulse; empty without one, and
@@ -442,6 +446,9 @@ class RowsOfHistograms(FilmLayout):
     def describe(self, temporal_filter: str) -> str:
         words = ", ".join(f"{name}={value}" for name, value in self.attributes().items())
         return f"{words}, temporal_filter={temporal_filter!r}"
+
+    def over(self, axis: TimeAxis) -> Self:
+        return replace(self, axis=axis)  # type: ignore[call-arg]
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:

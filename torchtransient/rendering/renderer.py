@@ -347,7 +347,7 @@ class TransientRenderer(CopiesParametrized):
             temporal_filter: "box", "tent", "gaussian" or "auto".
             integrator: plugin name of a transient integrator; it takes over the parameters of this renderer's.
             max_depth: longest path, in segments; -1 for no limit.
-            time_axis: bins in place of those of this renderer's histogram.
+            time_axis: bins in place of those of this renderer's film.
 
         Returns:
             The copy, with parameters of its own.
@@ -370,7 +370,7 @@ class TransientRenderer(CopiesParametrized):
         changes: dict[str, Any] = {
             "integrator": integrator,
             "max_depth": checked_depth(max_depth),
-            "film": requested_film(None, {"time_axis": time_axis}),
+            "film": None if time_axis is None else self.film.over(time_axis),
         }
         changes = {name: value for name, value in changes.items() if value is not None}
         if changes:
@@ -512,9 +512,9 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"errors: expected True, False or 'bins', got {shown(errors)}.")
         if errors is False:
             return None
-        if len(self._cube_shape) > 4:
-            what = "exhaustive scans" if self.film.measures == "transient" else f"{self.film.measures} films"
-            raise ArgumentError(f"errors: expected False for {what}, whose error bars are not followed.")
+        rows = len(self.film.shape) > 1
+        if len(self._cube_shape) > 4 + rows:
+            raise ArgumentError("errors: expected False for exhaustive scans, whose error bars are not followed.")
         with active_variant(self.scene.variant):
             integrator = self.scene.built(self._options).scene.integrator()
         shared = not getattr(integrator, "pixels_are_independent", False)
@@ -522,7 +522,7 @@ class TransientRenderer(CopiesParametrized):
         # Noise that pixels share adds up or cancels: a cell of several would not tell that of one.
         pixels = 1 if shared else pixels
         cells = ErrorCells(bins, pixels, pixels, shared)
-        return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex)
+        return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex, rows)
 
     @opaque
     def to_tolerance(
