@@ -291,7 +291,7 @@ def test_cost_of_settings(folder):
     }
     assert "recommended for 99.00%: transient: transient_path, owen" in result.stdout
     result = run("cost", "box.xml", "--spp", "4,8", "--sampler", "owen", "--error", 1e-9, "--quiet")
-    assert result.exit_code == 0 and "expected an error of transient that a measured setting reaches" in result.stdout
+    assert result.exit_code == 1 and "expected an error of transient that a measured setting reaches" in result.stdout
 
 
 @pytest.mark.slow
