@@ -50,6 +50,26 @@ def test_roulette_stays_where_nothing_else_ends_paths():
     assert plan.rr_depth is None
 
 
+def test_light_is_shared_up_to_the_depth_of_the_plan():
+    """Of a scene without a limit, too; one that is asked for leaves paths plain, and the plan says so."""
+    scene = box(max_depth=-1)
+    plan = tt.plan(scene, error="relative")
+    assert plan.integrator == "transient_path_reuse" and 0 < plan.max_depth < plan.rr_depth
+    assert plan.renderer(spp=4)(seed=0).stats.max_depth == plan.max_depth
+    unlimited = tt.plan(scene, error="relative", max_depth=-1)
+    assert (unlimited.integrator, unlimited.max_depth) == ("transient_path", -1)
+    assert any("path reuse: not used" in line and "no limit" in line for line in unlimited.reasons)
+
+
+def test_roulette_of_renderers_that_lift_the_bound_of_a_plan():
+    """Paths between walls that absorb nothing would not end."""
+    plan = tt.plan(box(8), error="relative", integrator="transient_path")
+    lifted = plan.renderer(max_depth=-1), plan.renderer().variation(max_depth=-1)
+    plain = tt.TransientRenderer(plan.scene, max_depth=-1, time_axis=plan.time_axis)(seed=0, spp=16).transient
+    for renderer in lifted:
+        torch.testing.assert_close(renderer(seed=0, spp=16).transient, plain)
+
+
 def test_dark_scenes():
     scene = plan_scenes.grey_room()
     del scene["light"]
@@ -75,6 +95,13 @@ def test_narrow_gates_are_connected_by_path_length(width, error):
     assert plan.connections == ("ellipsoidal" if width < 1 else None)
     out = plan.renderer(spp=16)(seed=0)
     assert out.gated.isfinite().all() and out.gated.sum() > 0
+
+
+@pytest.mark.parametrize("settings", [{"integrator": "transient_path"}, {"pilot": False, "max_depth": 8}])
+def test_connections_that_no_runs_decide_about(settings):
+    plan = tt.plan(box(8), "gates", gates=tt.Gate.rectangular(7.47, 7.53), **settings)
+    assert plan.connections is None
+    assert any("ellipsoidal connections: not used" in line for line in plan.reasons)
 
 
 @pytest.mark.parametrize("outputs", ["transient", "phasor"])
