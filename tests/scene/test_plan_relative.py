@@ -1,5 +1,7 @@
 """Plans for small errors: no Russian roulette, shared light, and ellipsoidal connections where they pay."""
 
+import re
+
 import pytest
 import torch
 
@@ -43,6 +45,28 @@ def test_paths_stay_plain(reason):
     plan = tt.plan(scene, error="relative", **settings)
     assert plan.integrator == "transient_path"
     assert plan.rr_depth > plan.max_depth
+
+
+def test_depths_of_late_light_are_said_with_what_they_rest_on():
+    """A gate that some twenty arrivals meet: none lies deeper, and of the gate's light a part does all the same."""
+    scene, gate = box(max_depth=-1), tt.Gate.rectangular(15.0, 15.06)
+    plan = tt.plan(scene, "gates", gates=gate, integrator="transient_path")
+    line = next(line for line in plan.reasons if line.startswith("max_depth"))
+    assert plan.pilot.tail == 0 and 5 < plan.pilot.events < 100 and f"its {plan.pilot.events} arrivals" in line
+    untold = float(re.search(r"cannot tell that from ([\d.e-]+)\)", line)[1])
+    with torch.no_grad():
+        all_of_it, kept = (
+            float(plan.renderer(max_depth=depth, spp=2048)(seed=0).gated.sum()) for depth in (64, plan.max_depth)
+        )
+    assert 1e-3 < 1 - kept / all_of_it < untold
+    assert "cannot tell" not in str(tt.plan(scene, integrator="transient_path"))
+
+
+def test_the_share_beyond_a_depth_for_late_light_is_in_the_report():
+    plan = tt.plan(box(max_depth=-1), error="relative", integrator="transient_path", tail=2e-3)
+    assert 0 < plan.pilot.tail < 2e-3
+    line = next(line for line in plan.reasons if line.startswith("max_depth"))
+    assert f"{plan.pilot.tail:.2g} +- " in line and "0.02 of that of any eighth" in line
 
 
 def test_roulette_stays_where_nothing_else_ends_paths():
