@@ -78,12 +78,12 @@ class Chirps:
 
     @property
     def rate_scale_s(self) -> float:
-        """Optical path length that a rate of 1 m/s looks like, k = f0 T / B, seconds: 1.9 for 1 GHz in 10 us."""
+        """Seconds that rates are turned into lengths with, k = f0 T / B; 1.9 for 1 GHz in 10 us at 1550 nm."""
         return SPEED_OF_LIGHT / self.wavelength_m * self.duration_s / self.bandwidth_hz
 
     @property
     def resolution_opl(self) -> float:
-        """Optical path length of one turn of the beat during a chirp, c / B, metres: a bin of the transform."""
+        """Optical path length of one turn of the beat during a chirp, c / B, metres; a bin of the transform."""
         return SPEED_OF_LIGHT / self.bandwidth_hz
 
     @property
@@ -97,7 +97,7 @@ class Chirps:
 
     @property
     def line_shape(self) -> Pulse:
-        """Power spectrum of a single arrival over optical path length: |transform of the window|^2, of unit integral.
+        """Power spectrum of a single arrival over optical path length, |transform of the window|^2, of unit integral.
 
         A table that ends where less than 1e-3 of the line lies outside: 4 c / B from its middle, 101 of a rectangular
         window.
