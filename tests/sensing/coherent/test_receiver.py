@@ -13,7 +13,7 @@ from scipy.signal import get_window
 
 from torchtransient import Chirps, TimeAxis
 from torchtransient.errors import UnitError
-from torchtransient.sensing import CoherentReceiver, Compose, range_and_speed
+from torchtransient.sensing import CoherentReceiver, Compose, GaussianResponse, ImpulseResponse, range_and_speed
 
 CHIRPS = Chirps(1e9, 10e-6, 1550e-9)
 LINE = CHIRPS.resolution_opl
@@ -128,6 +128,12 @@ def test_longer_chirps_have_the_same_beats():
     assert longer.rate_scale_s == pytest.approx(CHIRPS.rate_scale_s, rel=1e-12)
     assert longer.hertz_per_metre == pytest.approx(CHIRPS.hertz_per_metre, rel=1e-12)
     assert longer.resolution_opl == pytest.approx(LINE / 16) and longer.window == "hann"
+
+
+def test_stages_behind_have_the_bins_of_the_spectra():
+    receiver = CoherentReceiver(CHIRPS, AXIS)
+    later = ImpulseResponse(GaussianResponse(1e-9), receiver.spectrum_axis)
+    assert Compose([receiver, later]).expected(light_at(3.0)).shape[1] == receiver.spectrum_axis.num_bins
 
 
 def test_beats_with_a_line_are_refused():

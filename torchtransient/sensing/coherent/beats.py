@@ -158,7 +158,7 @@ class CoherentReceiver(RandomSensor):
         ArgumentError: for other objects than chirps and axes.
     """
 
-    gives = "counts"
+    gives = None  # spectra over bins of their own
     transform: Tensor
     window: Tensor
 
