@@ -140,7 +140,9 @@ def test_media_in_files(tmp_path):
 
 
 def test_mitsuba_reads_what_was_saved(tmp_path):
-    path = tt.load(two_walls(), variant=VARIANT).moving({"wall": COMES}).save(tmp_path / "moved.xml")
+    scene = two_walls()
+    scene["sensor"]["film"] |= {"type": "rate_hdr_film", "rate_start": -8.0, "rate_width": 0.25, "rate_bins": 64}
+    path = tt.load(scene, variant=VARIANT).moving({"wall": COMES}).save(tmp_path / "moved.xml")
     mi.set_variant(VARIANT)
     params = mi.traverse(mi.load_file(str(path)))
     found = next(params[key] for key in params.keys() if key.endswith("linear"))  # noqa: SIM118

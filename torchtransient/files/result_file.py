@@ -2,15 +2,15 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; `gated` float32 (...,
-C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`; `rates` float32
-(..., C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_bin_width` in m/s,
-`rates_num_bins`); or `beats` float32 (..., C, 2, T, H, W) with `edges_opl` and the chirps (`chirps_bandwidth_hz`,
-`chirps_duration_s`, `chirps_wavelength_m`, `chirps_window`). Polarized variants have the four Stokes components before
-C. The numbers of the axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`),
-`channels` (JSON: the names of the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`)
-are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second
-copy of it is needed.
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; `gated` float32 (..., C,
+G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`; `rates` float32 (...,
+C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_bin_width` in m/s, `rates_num_bins`);
+`beats` float32 (..., C, 2, T, H, W) with `edges_opl` and the chirps (`chirps_bandwidth_hz`, `chirps_duration_s`,
+`chirps_wavelength_m`, `chirps_window`); or `slow_phasor` complex64 (..., C, S, F, H, W) with `slow_times` float64 (S,),
+seconds, and `frequencies_per_metre`. Polarized variants have the four Stokes components before C. The numbers of the
+axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`), `channels` (JSON: the names of
+the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`) are attributes of the HDF5 file
+and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _READ = {
     **dict.fromkeys(("chirps_bandwidth_hz", "chirps_duration_s", "chirps_wavelength_m"), number_of),
 }  # fmt: skip
 _OF_ERRORS = ("differences", "squares", "steady_differences")
-_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", *_READ}
+_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", "slow_times", *_READ}
 _KNOWN |= {"cells", *_OF_ERRORS}
 
 
@@ -55,10 +55,10 @@ _KNOWN |= {"cells", *_OF_ERRORS}
 class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, or `rates` with `rate_axis` and `beats`
-    with `chirps`, both with `axis`; the others are None. `others`: tensors and settings of films that have no attribute
-    here, by name. A batch of results (``stack``, ``cat``, ``torch.utils.data.default_collate``) has the metadata of
-    each as a list under `batch`.
+    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `beats`
+    with `chirps`, both with `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
+    `others`: tensors and settings of films that have no attribute here, by name. A batch of results (``stack``,
+    ``cat``, ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
@@ -76,6 +76,8 @@ class Result(ErrorBars, TensorRecord):
     beats: torch.Tensor | None = None
     rate_axis: RateAxis | None = None
     chirps: Chirps | None = None
+    slow_phasor: torch.Tensor | None = None
+    slow_times: tuple[float, ...] | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
     differences: torch.Tensor | None = None
     squares: torch.Tensor | None = None

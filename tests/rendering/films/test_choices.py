@@ -18,7 +18,7 @@ from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
 from torchtransient.files.result_file import read_result, write_result
 from torchtransient.rendering import films
-from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, measured
+from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors, measured
 from torchtransient.rendering.output import RenderOutput, RenderStats
 
 VARIANT = "llvm_ad_rgb"
@@ -40,13 +40,14 @@ GIVEN = {
     "gates": (tt.Gate.rectangular(3, 4), tt.Gate.gaussian(7.0, 0.5), tt.Gate.tabulated([1, 2, 4], [0, 1, 0])),
     "rates": tt.RateAxis(-1.5, 0.5, 4),
     "chirps": tt.Chirps(1e9, 1e-5, 1550e-9, window="blackman"),
+    "slow_times": (0.0, 1e-3, 2.5e-3, 4e-3),
 }
 each = pytest.mark.parametrize("argument", GIVEN)
 
 
 def arguments_for(argument):
-    rows = {"time_axis": GIVEN["time_axis"]} if argument in ("rates", "chirps") else {}
-    return {argument: GIVEN[argument], **rows}
+    beside = next(kind.beside for kind in films.FILMS if kind.argument == argument)
+    return {name: GIVEN[name] for name in (argument, beside) if name}
 
 
 def choice_for(argument):
@@ -71,10 +72,10 @@ def output_of(choice, leading=(), components=1):
 
 
 def test_the_list():
-    assert list(films.FILMS) == [Histogram, Phasors, Gates, Rates, Beats]
+    assert list(films.FILMS) == [Histogram, Phasors, Gates, Rates, Beats, SlowPhasors]
     assert [type(choice_for(argument)) for argument in GIVEN] == list(films.FILMS)
     for name in ("measures", "plugin", "argument", "output", "letter"):
-        assert len({getattr(kind, name) for kind in films.FILMS}) == 5, name
+        assert len({getattr(kind, name) for kind in films.FILMS}) == 6, name
     assert all(plugins.kind_of(kind.plugin) == "film" for kind in films.FILMS)
 
 
@@ -108,7 +109,7 @@ def test_output_and_file(tmp_path, argument, ending, leading, components):
     choice = choice_for(argument)
     out = output_of(choice, leading, components)
     assert films.layout_of_output(out) == choice and not out.others
-    for name in ("transient", "phasor", "gated", "rates", "beats"):
+    for name in ("transient", "phasor", "gated", "rates", "beats", "slow_phasor"):
         assert (getattr(out, name) is None) == (name != choice.measures)
     back = read_result(write_result(tmp_path / f"a.{ending}", out))
     assert films.layout_of_output(back) == choice
@@ -155,7 +156,7 @@ def test_files_that_do_not_fit_together(tmp_path):
     with pytest.raises(StorageError, match=r"gated of shape .* G = 1"):
         read_result(path)
     np.savez(path, **{name: value for name, value in values.items() if name not in ("gates", "gated")})
-    with pytest.raises(StorageError, match="transient or phasor or gated or rates or beats"):
+    with pytest.raises(StorageError, match="transient or phasor or gated or rates or beats or slow_phasor"):
         read_result(path)
     with pytest.raises(StorageError, match="neither"):
         write_result(path, replace(output_of(choice_for("gates")), gated=None))
@@ -169,7 +170,7 @@ def test_files_that_do_not_fit_together(tmp_path):
 
 def test_one_film_is_asked_for():
     assert films.film_of_arguments({}) is None and films.film_of_arguments({"gates": None}) is None
-    with pytest.raises(ArgumentError, match="a gated film, a rates film or a beats film; give one of them"):
+    with pytest.raises(ArgumentError, match="a rates film, a beats film or a slow_phasor film; give one of them"):
         films.film_of_arguments({"time_axis": GIVEN["time_axis"], "gates": GIVEN["gates"]})
     with pytest.raises(ArgumentError, match="give one of them"):
         films.film_of_arguments({"rates": GIVEN["rates"], "chirps": GIVEN["chirps"]})

@@ -56,7 +56,7 @@ from torchtransient.plugins.transport.derivative import (
 from torchtransient.plugins.transport.record import RecordSink
 from torchtransient.plugins.transport.scene_contents import SceneCache, SceneContents
 from torchtransient.plugins.transport.sinks import FilmSink
-from torchtransient.plugins.transport.velocities import AT_REST, Velocities, unmeasured
+from torchtransient.plugins.transport.velocities import AT_REST, Velocities, movers_of, unmeasured
 from torchtransient.plugins.transport.walk import first_leg, start, walk
 
 UNLIMITED = 0xFFFFFFFF
@@ -401,7 +401,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents, wanted = self._wanted(scene, sensor, film)
             self._warn_of_rest(scene, contents, film)
             with dr.resume_grad():
-                velocities = Velocities.of_job(contents, film)
+                velocities = Velocities.of_job(scene, contents, film)
             context = self.render_context(scene, contents, wanted, film.arrivals(), velocities=velocities)
             lanes = None if context.record_room is None else context.record_room.lanes
             sampler = self.sampler_of(scene, sensor)
@@ -572,7 +572,7 @@ class TransientIntegrator(mi.CppADIntegrator):
     def _warn_of_rest(self, scene, contents, film):
         """Warn once a scene of films of rates where nothing moves."""
         seen = self._seen_scene(scene)
-        if film.knows_rates and not contents.movers and not seen.warned_of_rest:
+        if film.knows_rates and not seen.warned_of_rest and not movers_of(scene, contents):
             seen.warned_of_rest = True
             warnings.warn(AT_REST, TorchTransientWarning, stacklevel=level_of_user())
 

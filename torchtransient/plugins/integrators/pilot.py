@@ -129,7 +129,7 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots, roulette) ->
         deepest = settings.max_depth if getattr(integrator, "only_bounces", None) is not None else PILOT_DEPTH
         first = min(settings.rr_depth, PILOT_RR_DEPTH) if roulette else PILOT_DEPTH
         settings = replace(settings, max_depth=deepest, rr_depth=first)
-        velocities = Velocities.of_job(contents, film)
+        velocities = Velocities.of_job(scene, contents, film)
         context = integrator.render_context(scene, contents, settings=settings, velocities=velocities)
         walk(context, rays.sampler, integrator.primary_path(context, film, rays), sink)
         most = dr.max(sink.used)
