@@ -98,7 +98,8 @@ class HistogramRows(TransientHDRFilm):
             ``A``, its slope by the length and its slope by the rate, lists over channels.
         """
         flat, row_stride, *strides = adjoint
-        A, by_opl, by_rate = ([mi.Float(0)] * self.channel_count() for _ in range(3))
+        # Each an array of its own: sums change them in place.
+        A, by_opl, by_rate = ([mi.Float(0) for _ in range(self.channel_count())] for _ in range(3))
         for row in self.rows_of(rate):
             place, opl = base + row.number * row_stride, opl_from_start + row.shift
             a, slope = super().read((flat, *strides), place, opl, active & row.inside)
