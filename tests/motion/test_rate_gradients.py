@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.rates import VARIANT, plate, scene
+from support.rates import VARIANT, hidden_plate, plate, scene
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 RATES, AXIS = tt.RateAxis(-12.0, 0.5, 48), tt.TimeAxis(0.0, 0.2, 60)
@@ -189,3 +189,14 @@ def test_wind_and_the_colour_of_walls_behind_fog():
     loaded = tt.load(nodes, variant=VARIANT).moving({"back": MOTIONS["back"], "mist": wind})
     keys = ["mist.velocity.linear", "mist.velocity.angular", "back.velocity.linear", "back.bsdf.reflectance.value"]
     compare(renderer_of(loaded, keys))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["single", "confocal"])
+def test_a_hidden_plate(kind):
+    """Around a corner; its outline hides and uncovers nothing but itself."""
+    nodes, center, _ = hidden_plate(kind)
+    motion = tt.Motion(linear=(0.8, -0.5, -1.6), angular=(0.6, 1.5, 0.4), center=center)
+    loaded = tt.load(nodes, variant=VARIANT).moving({"hidden": motion})
+    keys = ["hidden.velocity.linear", "hidden.velocity.angular", "hidden.bsdf.reflectance.value", "hidden.to_world"]
+    compare(renderer_of(loaded, keys), step=3e-3, seeds=range(8))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.rates import AXIS, RATES, VARIANT, close, mean_length, mean_rate, plate, rates_of, scene
+from support.rates import AXIS, RATES, VARIANT, close, hidden_plate, mean_length, mean_rate, plate, rates_of, scene
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
@@ -274,6 +274,37 @@ def test_fog_that_blows():
     light = rates_of(walled, {"mist": tt.Motion(linear=wind, angular=whirl, center=center)}, spp=4096)
     assert float(mean_rate(light[:, 88:92])) == pytest.approx(0.0, abs=1e-4)
     assert float(mean_rate(light[:, :80])) == pytest.approx(expected, abs=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------ around a corner
+
+
+@pytest.mark.parametrize("kind", ["single", "confocal"])
+def test_a_hidden_plate_that_moves_and_turns(kind):
+    """Mean rates of the points of a relay wall against quadrature over the plate; noise is 1e-3 m/s."""
+    nodes, center, normal = hidden_plate(kind)
+    v, w, c, n = np.array([0.8, -0.5, -1.6]), np.array([0.6, 1.5, 0.4]), np.array(center), np.array(normal)
+    n = n / np.linalg.norm(n)
+    axis = tt.TimeAxis(1.0, 0.05, 60)
+    motions = {"hidden": tt.Motion(linear=v, angular=w, center=c)}
+    found = mean_rate(rates_of(nodes, motions, spp=1 << 14, axis=axis)).numpy()
+    pose, fine, points = np.array(look_at(center, tuple(c + n))), 100, 4
+    g = 0.3 * ((np.arange(fine) + 0.5) / fine * 2 - 1)
+    x, y = (a.reshape(-1, 1) for a in np.meshgrid(g, g))
+    hidden = c + x * pose[:3, 0] + y * pose[:3, 1]
+    speeds = v + np.cross(w, hidden - c)
+    expected = np.zeros((points, points))
+    for row, column in np.ndindex(points, points):
+        # Within a cell of the wall the rate is linear enough for its middle.
+        seen = np.array([(column + 0.5) / points - 0.5, (row + 0.5) / points - 0.5, 0.0])
+        spot = seen if kind == "confocal" else np.array([-0.2, 0.1, 0.0])
+        there, back = hidden - seen, spot - hidden
+        r, s = np.linalg.norm(there, axis=1), np.linalg.norm(back, axis=1)
+        u, d = there / r[:, None], back / s[:, None]
+        weight = u[:, 2] * -(u @ n) * (d @ n) * -d[:, 2] / r**2 / s**2
+        expected[row, column] = (weight * (speeds * (u - d)).sum(1)).sum() / weight.sum()
+    assert np.ptp(expected) > 0.5
+    assert np.abs(found - expected).max() < 5e-3
 
 
 # -------------------------------------------------------------------------------------------------------------- beats

@@ -53,3 +53,20 @@ def mean_length(light, axis=AXIS):
 def close(found, expected, tolerance=1e-4):
     """Return True where all numbers agree to the tolerance."""
     return bool((torch.as_tensor(found) - torch.as_tensor(expected)).abs().max() < tolerance)
+
+
+def hidden_plate(kind, points=4):
+    """A capture around a corner of a plate that faces the relay wall askew: (description, its centre, its normal)."""
+    origin, spot, center = (-0.5, 0.0, 0.25), (-0.2, 0.1, 0.0), (0.1, 0.05, 1.0)
+    normal = (0.2, 0.1, -1.0)
+    film = {"type": "transient_hdr_film", "width": points, "height": points, "rfilter": {"type": "box"}}
+    meter = {"type": "nlos_capture_meter", "sensor_origin": list(origin), "film": film}
+    wall = {"type": "rectangle", "to_world": scale([0.5, 0.5, 1.0]), "sensor": meter,
+            "bsdf": {"type": "diffuse", "reflectance": 0.9}}  # fmt: skip
+    integrator = {"type": "transient_nlos_path", "capture_type": kind, "max_depth": 3,
+                  "nlos_laser_sampling": True, "nlos_hidden_geometry_sampling": True}  # fmt: skip
+    towards = tuple(c + n for c, n in zip(center, normal, strict=True))
+    description = {"type": "scene", "integrator": integrator, "wall": wall,
+                   "laser": {"type": "laser_beam", "to_world": look_at(origin, spot)},
+                   "hidden": plate(center, towards, half=0.3)}  # fmt: skip
+    return description, center, normal
