@@ -1,22 +1,22 @@
-"""Find axis, speed and pose of a turning fan from one frame of a coherent lidar: a network guesses, the renderer corrects.
+"""Find axis, speed and pose of a turning fan in a frame of a coherent lidar: a network guesses, the renderer corrects.
 
-The frame is what an FMCW lidar records in one pair of chirps: for each of 32 x 32 pixels the spectrum of the beat of the
-up chirp and that of the down chirp, in which a metre per second looks like 1.9 m of path. Unknown are the angular
-velocity, three numbers, and the pose of the fan at that instant, six numbers. The axis is free and need not be the
-normal of the fan, as that of a rotor is that tumbles with its drone.
+The frame is what an FMCW lidar records in one pair of chirps: for each of 32 x 32 pixels the spectrum of the beat of
+the up chirp and that of the down chirp, in which 1 m/s looks like 1.9 m of path. Unknown are the angular velocity,
+three numbers, and the pose of the fan at that instant, six numbers. The axis is free and need not be the normal of the
+fan, as that of a rotor is not that tumbles with its drone.
 
-A lidar cannot see a turn about its line of sight, and light that comes from elsewhere only turns the blind direction
-into the bisector of both lines. So there are two lights, one beside the sensor and one apart from it, whose beats lie
-in the same spectra: the blind directions of the two differ, and nothing has to say which line is whose.
+A lidar cannot see a turn about its line of sight. With its light elsewhere it cannot see, but for perspective, a turn
+about the bisector of both lines. So there are two lights, one beside the sensor and one apart from it: their blind
+directions differ. Both beats lie in the same spectra, and nothing says which line is whose.
 
-The loss is the unbalanced Wasserstein distance over the spectra of each pixel, which has a slope from where lines do
-not overlap, then the squared difference.
+The loss is the unbalanced Wasserstein distance over the spectra of each pixel, which has a slope where lines do not
+overlap, then the squared difference.
 
-    python training_examples/fit_spin.py --seeds 10 --output demo_output
+    python training_examples/fit_spin.py --output demo_output
 
-Prints errors of every seed before and after, and how many end within 1 degree and 1 %. `--no-network` starts in the
-middle of the fans that are known to occur, `--off` says how far from there the true ones are, `--looks` has speckle in
-the measured frame, `--one-light` leaves the light beside the sensor out.
+Prints errors of every seed before and after, and how many end within 1 degree and 1 %. `--off` says how far the true
+fans are from the middle of those that are known to occur, `--no-network` starts there, `--one-light` leaves out the
+light beside the sensor, `--looks` has speckle in the measured frames, `--distance 0` takes squares from the first step.
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ from torchtransient.scenes.parts import diffuse, perspective, transient_film, tr
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
+KEYS = ["fan.to_world", "fan.velocity.angular", "fan.velocity.center"]
 RESOLUTION = 32
 CHIRPS = tt.Chirps(bandwidth_hz=1e9, duration_s=10e-6, wavelength_m=1550e-9)
 AXIS = CHIRPS.time_axis((1.5, 4.5), (-6.5, 6.5))
-RATES, LENGTHS = tt.RateAxis(-13.0, 0.25, 104), tt.TimeAxis(4.0, 0.08, 70)
+RATES, LENGTHS = tt.RateAxis(-10.0, 0.2, 100), tt.TimeAxis(4.0, 0.08, 70)
 MIDDLE = translate([0.0, 0.0, 0.2]) @ rotate([1.0, 0.5, 0.2], 20.0)
 POSE = AxisAnglePose(torch.tensor(MIDDLE).float())
 NORMAL = torch.tensor(MIDDLE[:3, 2]).float()
@@ -96,15 +97,14 @@ def scene_of(one_light: bool) -> tt.Scene:
 
 def renderer_of(scene: tt.Scene, spp: int) -> tt.TransientRenderer:
     """Up and down beats of 32 x 32 pixels, bins of 30 cm."""
-    keys = ["fan.to_world", "fan.velocity.angular", "fan.velocity.center"]
-    return tt.TransientRenderer(scene, keys, chirps=CHIRPS, time_axis=AXIS, spp=spp, spp_boundary=spp)
+    return tt.TransientRenderer(scene, KEYS, chirps=CHIRPS, time_axis=AXIS, spp=spp, spp_boundary=spp)
 
 
 def values_of(numbers: Tensor) -> dict[str, Tensor]:
     """Pose and velocity of nine numbers, from the middle: turn and shift of the fan, change of the angular velocity."""
     pose = POSE(numbers[:6])
     angular = SPEED * (NORMAL + numbers[6:])
-    return {"fan.to_world": pose, "fan.velocity.angular": angular, "fan.velocity.center": pose[:3, 3]}
+    return dict(zip(KEYS, (pose, angular, pose[:3, 3]), strict=True))
 
 
 def angular_numbers(speed: Tensor, sine: Tensor, direction: Tensor) -> Tensor:
@@ -157,14 +157,20 @@ class Guess(nn.Module):
         return self.layers(roots / self.level) * self.unit
 
 
-def trained(renderer: tt.TransientRenderer, off: float, frames: int, steps: int) -> Guess:
+def frame_of(
+    renderer: tt.TransientRenderer, numbers: Tensor, looks: int, *, seed: int, spp: int | None = None
+) -> Tensor:  # fmt: skip
+    """A measured frame (1, 2, T, H, W), with speckle of so many looks."""
+    with torch.no_grad():
+        beats = renderer(values_of(numbers), seed=seed, spp=spp).beats
+    return tt.sensing.Speckle(looks).sample(beats, torch.Generator().manual_seed(seed)) if looks else beats
+
+
+def trained(renderer: tt.TransientRenderer, *, off: float, looks: int, frames: int, steps: int) -> Guess:
     """The network, after it has seen so many simulated frames."""
     numbers = random_numbers(frames, off, torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        renders = tqdm(numbers, desc="fit_spin, frames", unit="frame", leave=False)
-        roots = torch.cat(
-            [seen(renderer(values_of(nine), seed=LEARNT_SEED + i).beats) for i, nine in enumerate(renders)]
-        )
+    renders = tqdm(numbers, desc="fit_spin, frames", unit="frame", leave=False)
+    roots = torch.cat([seen(frame_of(renderer, nine, looks, seed=LEARNT_SEED + i)) for i, nine in enumerate(renders)])
     torch.manual_seed(0)
     network = Guess(roots.shape[1], float(roots.square().mean().sqrt()), off * UNIT)
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=1e-2)
@@ -190,14 +196,12 @@ def errors(found: dict[str, Tensor], truth: dict[str, Tensor]) -> tuple[float, f
 
 def fit_spin(
     renderer: tt.TransientRenderer, network: Guess | None, seed: int, *, off: float, looks: int, steps: int,
-    target_spp: int,
+    distance: float, target_spp: int,
 ) -> Fit:  # fmt: skip
     """Run the fit of a seed, from the network's guess or, without one, from the middle."""
     truth = values_of(true_numbers(seed, off))
+    target = frame_of(renderer, true_numbers(seed, off), looks, seed=TARGET_SEED + seed, spp=target_spp)
     with torch.no_grad():
-        target = renderer(truth, seed=TARGET_SEED + seed, spp=target_spp).beats
-        if looks:
-            target = tt.sensing.Speckle(looks).sample(target, torch.Generator().manual_seed(seed))
         start = torch.zeros(9) if network is None else network(seen(target))[0]
         guess = values_of(start)
         first = renderer(guess, seed=0).beats
@@ -214,7 +218,7 @@ def fit_spin(
         progress.set_postfix(axis=f"{degrees:.2f} deg", speed=f"{percent:.2f} %")
         optimizer.zero_grad()
         beats = renderer(values, seed=seed * 100_000 + step).beats
-        if step < 0.4 * steps:
+        if step < distance * steps:
             loss = tt.losses.wasserstein_loss(beats, target, AXIS.bin_width_opl, creation_cost_opl=CREATION_OPL)
         else:
             loss = (beats - target).square().sum()
@@ -229,41 +233,49 @@ def fit_spin(
     return result
 
 
-def speeds_of(renderer: tt.TransientRenderer, values: dict[str, Tensor]) -> tuple[tt.RenderOutput, Tensor]:
-    """Light over rates and lengths, and the mean speed of approach in each pixel (H, W), m/s."""
-    out = renderer(values, seed=TARGET_SEED - 2)
-    spectrum = out.rates.sum((0, 2))
-    mean = torch.einsum("rhw,r->hw", spectrum, RATES.centers.float()) / spectrum.sum(0)
-    return out, -mean / 2
+def mean_speeds(rates: Tensor) -> Tensor:
+    """Mean speed of approach (H, W) of the light of each pixel, m/s, of (1, R, T, H, W)."""
+    spectrum = rates.sum((0, 2))
+    return -torch.einsum("rhw,r->hw", spectrum, RATES.centers.float()) / (2 * spectrum.sum(0))
 
 
 def draw(scene: tt.Scene, fits: Sequence[Fit], folder: Path) -> None:
-    """One seed's speeds and spectra, errors of all seeds over the steps; range-Doppler maps in files of their own."""
-    keys = ["fan.to_world", "fan.velocity.angular", "fan.velocity.center"]
-    renderer = tt.TransientRenderer(scene, keys, rates=RATES, time_axis=LENGTHS, spp=64)
+    """Speeds and spectra of the worst guess of a speed, errors of all seeds; range-Doppler maps in their own files."""
+    renderer = tt.TransientRenderer(scene, KEYS, rates=RATES, time_axis=LENGTHS, spp=64)
+    shown = max(fits, key=lambda fit: fit.errors[0][1])
     figure = figure_type()(figsize=(13, 5.4), layout="constrained")
-    images, curves = figure.subfigures(1, 2, width_ratios=[1.6, 1])
-    top, bottom = images.subplots(2, 3)
-    extent = (-0.5, RESOLUTION - 0.5, AXIS.start_opl, AXIS.end_opl)
-    brightest = float(fits[0].frames["measured"].max()) ** 0.5
+    images, curves = figure.subfigures(1, 2, width_ratios=[1.7, 1])
+    rows = images.subplots(2, 3)
     names = {"guess": "guess", "found": "found", "truth": "measured"}
-    for above, below, (name, frame) in zip(top, bottom, names.items(), strict=True):
-        with torch.no_grad():
-            out, speeds = speeds_of(renderer, fits[0].values[name])
-        tt.vis.range_doppler(out, folder / f"fit_spin_range_doppler_{name}.png", title=f"fan and wall: {name}")
-        picture = above.imshow(speeds, cmap="RdBu", vmin=-4, vmax=4)
+    with torch.no_grad():
+        rates = {name: renderer(shown.values[name], seed=TARGET_SEED - 2) for name in names}
+    fastest = float(mean_speeds(rates["truth"].rates).abs().max())
+    measured = shown.frames["measured"][0, 0, :, RESOLUTION // 2].sqrt()
+    lit = (measured.amax(1) > 0.05 * measured.max()).nonzero()
+    edges = AXIS.edges_opl
+    first, last = max(int(lit[0]) - 8, 0), min(int(lit[-1]) + 8, AXIS.num_bins)
+    extent = (-0.5, RESOLUTION - 0.5, float(edges[first]), float(edges[last]))
+    for (above, below), (name, frame) in zip(rows.T, names.items(), strict=True):
+        tt.vis.range_doppler(rates[name], folder / f"fit_spin_range_doppler_{name}.png", title=name)
+        picture = above.imshow(mean_speeds(rates[name].rates), cmap="RdBu", vmin=-fastest, vmax=fastest)
         above.set(xticks=[], yticks=[], title=name)
-        column = fits[0].frames[frame][0, 0, :, RESOLUTION // 2].sqrt()
-        below.imshow(column, cmap="magma", vmin=0, vmax=brightest, extent=extent, aspect="auto", origin="lower")
-        below.set(xlabel="column", ylabel="path + k rate [m]")
-    images.colorbar(picture, ax=list(top), shrink=0.8, label="speed of approach [m/s]")
-    bottom[0].set_title("up chirp, one row")
-    panels = curves.subplots(2, 1)
-    for axes, number, limit, label in ((panels[0], 0, GOOD_DEG, "axis [degrees]"), (panels[1], 1, GOOD_PERCENT, "speed [%]")):
+        spectra = shown.frames[frame][0, 0, first:last, RESOLUTION // 2].sqrt()
+        below.imshow(
+            spectra, cmap="magma", vmin=0, vmax=float(measured.max()), extent=extent, aspect="auto", origin="lower",
+            interpolation="none",
+        )  # fmt: skip
+        below.set(xlabel="column", title=frame)
+    rows[0, 0].set_ylabel("mean speed")
+    rows[1, 0].set_ylabel("up chirp: path + k rate [m]")
+    images.colorbar(picture, ax=list(rows[0]), shrink=0.8, label="approach [m/s]")
+    for axes, number, limit, unit in zip(
+        curves.subplots(2, 1), (0, 1), (GOOD_DEG, GOOD_PERCENT), ("axis [degrees]", "speed [%]"), strict=True
+    ):
         for fit in fits:
-            axes.semilogy([max(four[number], 1e-3) for four in fit.errors], linewidth=1)
+            axes.semilogy([four[number] for four in fit.errors], linewidth=1)
         axes.axhline(limit, color="0.6", linewidth=0.8, linestyle="--")
-        axes.set(xlabel="step", ylabel=label, title="error" if number == 0 else "")
+        axes.set(xlabel="step", ylabel=unit, ylim=(3e-3, 60), title=f"error, dashes: {limit:g}")
+        axes.label_outer()
     save_figure(figure, folder / "fit_spin.png", "fit_spin")
 
 
@@ -274,6 +286,7 @@ def main(argv: Sequence[str] | None = None) -> list[Fit]:
     parser.add_argument("--off", type=float, default=0.4, help="how far the true ones are, 0.2: 20 %% (%(default)s)")
     parser.add_argument("--looks", type=int, default=0, help="speckle of so many looks; 0: none (%(default)s)")
     parser.add_argument("--steps", type=int, default=100, help="steps of Adam (%(default)s)")
+    parser.add_argument("--distance", type=float, default=0.4, help="share of them by Wasserstein (%(default)s)")
     parser.add_argument("--spp", type=int, default=16, help="samples per pixel of a step (%(default)s)")
     parser.add_argument("--target-spp", type=int, default=1024, help="samples per pixel of the frame (%(default)s)")
     parser.add_argument("--frames", type=int, default=400, help="frames that the network learns from (%(default)s)")
@@ -290,19 +303,21 @@ def main(argv: Sequence[str] | None = None) -> list[Fit]:
     renderer = renderer_of(scene, options.spp)
     network = None
     if not options.no_network:
-        network = trained(renderer, options.off, options.frames, options.network_steps)
+        network = trained(
+            renderer, off=options.off, looks=options.looks, frames=options.frames, steps=options.network_steps
+        )
     fits = []
     for seed in range(options.seeds):
         fit = fit_spin(
             renderer, network, seed, off=options.off, looks=options.looks, steps=options.steps,
-            target_spp=options.target_spp,
+            distance=options.distance, target_spp=options.target_spp,
         )  # fmt: skip
         fits.append(fit)
         before, after = fit.errors[0], fit.errors[-1]
         print(
-            f"fit_spin, seed {seed}: axis from {before[0]:.1f} to {after[0]:.3f} degrees, speed from {before[1]:.1f} to "
-            f"{after[1]:.3f} %, fan from {before[2]:.1f} mm and {before[3]:.1f} degrees to {after[2]:.2f} mm and "
-            f"{after[3]:.3f} degrees",
+            f"fit_spin, seed {seed}: axis from {before[0]:.1f} to {after[0]:.3f} degrees, "
+            f"speed from {before[1]:.1f} to {after[1]:.3f} %, "
+            f"fan from {before[2]:.1f} mm and {before[3]:.1f} degrees to {after[2]:.2f} mm and {after[3]:.3f} degrees",
             flush=True,
         )
     good = sum(fit.good for fit in fits)
