@@ -25,6 +25,7 @@ FILMS = {
         "temporal_bins": 4, "bin_width_opl": 1.0, "chirp_bandwidth": 1e9, "chirp_duration": 1e-5,
         "chirp_wavelength": 1550e-9,
     },
+    "slow_phasor_hdr_film": {"frequencies": "0 1", "slow_times": "0 0.5"},
 }
 PULSED = {"type": "transient_hdr_film", "temporal_bins": 40, "pulse": "gaussian", "pulse_fwhm_opl": 0.05}
 

@@ -151,7 +151,10 @@ PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.gated", (("film", "gated_hdr_film"),)),
-    PluginModule("torchtransient.plugins.films.rates", (("film", "rate_hdr_film"), ("film", "beat_hdr_film"))),
+    PluginModule(
+        "torchtransient.plugins.films.rates",
+        (("film", "rate_hdr_film"), ("film", "beat_hdr_film"), ("film", "slow_phasor_hdr_film")),
+    ),
     PluginModule("torchtransient.plugins.integrators.base"),
     PluginModule("torchtransient.plugins.integrators.path", (("integrator", "transient_path"),)),
     PluginModule(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import torch
 
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.checks import finite, shown
 from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
@@ -50,6 +51,8 @@ class FilmLayout(abc.ABC):
     is_complex: ClassVar[bool] = False
     # The film spreads arrivals by a pulse and an impulse response.
     takes_pulse: ClassVar[bool] = False
+    # Keyword of another film that this one takes beside its own, empty for none.
+    beside: ClassVar[str] = ""
     # Remedy for a response over time without a slope (`jump`): the end of an error message.
     slope_remedy: ClassVar[str] = ""
 
@@ -389,6 +392,7 @@ class RowsOfHistograms(FilmLayout):
     """
 
     has_bins: ClassVar[bool] = True
+    beside: ClassVar[str] = "time_axis"
     kind: ClassVar[type]
 
     def __post_init__(self) -> None:
@@ -422,7 +426,7 @@ class RowsOfHistograms(FilmLayout):
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
         value = arguments.get(cls.argument)
-        return None if value is None else cls(value, arguments.get(Histogram.argument))  # type: ignore[call-arg]
+        return None if value is None else cls(value, arguments.get(cls.beside))  # type: ignore[call-arg]
 
     def write(self, props: Any) -> None:
         axis = self.attributes()["axis"]
@@ -436,8 +440,7 @@ class RowsOfHistograms(FilmLayout):
         return all(value is None or built[name] == value for name, value in self.attributes().items())
 
     def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-        cube = cube.reshape(*leading, *cube.shape[-5:])
-        return _stokes_first(cube.movedim((-1, -3, -2), (-5, -4, -3)), -5, components)
+        return rows_channels_first(cube, leading, components)
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
@@ -532,10 +535,91 @@ class Beats(RowsOfHistograms):
         props["chirp_window"] = self.chirps.window
 
 
+@dataclass(frozen=True)
+class SlowPhasors(FilmLayout):
+    """Phasors at slow times, those of each pulse of a radar: complex64 (C, S, F, H, W).
+
+    Args:
+        slow_times: times of the pulses, seconds; poses are those of 0.
+        frequencies: as of :class:`Phasors`.
+
+    Raises:
+        ArgumentError: without frequencies.
+        UnitError, ShapeError: for other numbers.
+    """
+
+    measures: ClassVar[str] = "slow_phasor"
+    plugin: ClassVar[str] = "slow_phasor_hdr_film"
+    letter: ClassVar[str] = "S x F"
+    argument: ClassVar[str] = "slow_times"
+    example: ClassVar[str] = "slow_times=[...], frequencies=tt.FrequencyAxis(...)"
+    plural: ClassVar[str] = "slow phasors"
+    output: ClassVar[str] = "slow_phasor"
+    is_complex: ClassVar[bool] = True
+    beside: ClassVar[str] = "frequencies"
+
+    slow_times: tuple[float, ...]
+    frequencies: FrequencyAxis
+
+    def __post_init__(self) -> None:
+        given: Any = self.slow_times
+        values = given.tolist() if hasattr(given, "tolist") else given
+        if not isinstance(values, Iterable) or not (times := tuple(finite("slow_times", t) for t in values)):
+            raise ArgumentError(f"slow_times: expected times in seconds, got {shown(given)}; write {self.example}.")
+        if self.frequencies is None:
+            raise ArgumentError(f"slow_times: expected frequencies beside them; write {self.example}.")
+        object.__setattr__(self, "slow_times", times)
+        object.__setattr__(self, "frequencies", Phasors(self.frequencies).frequencies)
+
+    @property
+    def count(self) -> int:
+        return self.frequencies.num_frequencies
+
+    def attributes(self) -> dict[str, Any]:
+        return {"slow_times": self.slow_times, "frequencies": self.frequencies}
+
+    def plain(self) -> dict[str, Any]:
+        return {"slow_times": list(self.slow_times), "frequencies": Phasors(self.frequencies).plain()}
+
+    @classmethod
+    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
+        value = arguments.get(cls.argument)
+        return None if value is None else cls(value, arguments.get(cls.beside))  # type: ignore[arg-type]
+
+    @classmethod
+    def from_film(cls, film: Any) -> Self:
+        return cls(film.slow_times, Phasors.from_film(film).frequencies)
+
+    def write(self, props: Any) -> None:
+        Phasors(self.frequencies).write(props)
+        props["slow_times"] = ", ".join(map(repr, self.slow_times))
+
+    def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+        pairs = torch.view_as_complex(cube.reshape(*cube.shape[:-1], -1, 2))
+        return rows_channels_first(pairs, leading, components)
+
+    @classmethod
+    def from_output(cls, output: Any) -> Self | None:
+        if measured(output, cls.measures) is None:
+            return None
+        return cls(measured(output, "slow_times"), measured(output, "frequencies"))
+
+    def entries(self) -> dict[str, Any]:
+        times = torch.tensor(self.slow_times, dtype=torch.float64).numpy()
+        return {"slow_times": times, **Phasors(self.frequencies).entries()}
+
+    @classmethod
+    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
+        if cls.measures not in values:
+            return None
+        axis = FrequencyAxis(tuple(values["frequencies_per_metre"].tolist()), float(values["start_opl"]))
+        return cls(tuple(values["slow_times"].tolist()), axis)
+
+
 # ------------------------------------------------------------------------------------------------------ list of films
 
 # A new film is added here, one of a user's own too. The first one is that of a plan that is asked for no other.
-FILMS: list[type[FilmLayout]] = [Histogram, Phasors, Gates, Rates, Beats]
+FILMS: list[type[FilmLayout]] = [Histogram, Phasors, Gates, Rates, Beats, SlowPhasors]
 
 
 def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
@@ -549,8 +633,8 @@ def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
         ArgumentError: for several, and for wrong settings, as the layouts raise it.
     """
     given = [found for kind in FILMS if (found := kind.from_arguments(arguments)) is not None]
-    if len(given) == 2 and isinstance(given[0], Histogram) and given[1].has_bins:
-        del given[0]
+    beside = {found.beside for found in given}
+    given = [found for found in given if found.argument not in beside]
     if len(given) > 1:
         names, films = ", ".join(kind.argument for kind in FILMS), [f"a {kind.measures} film" for kind in FILMS]
         raise ArgumentError(f"{names}: a film is {', '.join(films[:-1])} or {films[-1]}; give one of them.")
@@ -664,6 +748,21 @@ def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], componen
     """
     pairs = torch.view_as_complex(cube.reshape(*cube.shape[:-1], -1, 2))
     return cube_channels_first(pairs, leading, components)
+
+
+def rows_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
+    """Return several arrays a pixel in the order of torch, as :func:`cube_channels_first`.
+
+    Args:
+        cube: (H, W, rows, entries, C).
+        leading: sizes of the dimensions of items.
+        components: Stokes components that the film's channels are made of; more than one come before C.
+
+    Returns:
+        (C, rows, entries, H, W) behind ``leading``.
+    """
+    cube = cube.reshape(*leading, *cube.shape[-5:])
+    return _stokes_first(cube.movedim((-1, -3, -2), (-5, -4, -3)), -5, components)
 
 
 def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:

@@ -114,7 +114,8 @@ class RenderStats:
 
 # Fields that belong to a film: None in the output of another one.
 _OF_FILMS = (
-    "transient", "phasor", "gated", "rates", "beats", "axis", "frequencies", "gates", "rate_axis", "chirps",
+    "transient", "phasor", "gated", "rates", "beats", "slow_phasor", "axis", "frequencies", "gates", "rate_axis",
+    "chirps", "slow_times",
 )  # fmt: skip
 
 
@@ -131,7 +132,8 @@ class RenderOutput(ErrorBars, TensorRecord):
     - ``gated``: float32 (C, G, H, W), the light as each of ``gates`` sees it; ``steady`` is the sum over the gates;
     - ``rates``: float32 (C, R, T, H, W), the light by the bins of ``rate_axis`` (how fast its path gets longer) and of
       ``axis``;
-    - ``beats``: float32 (C, 2, T, H, W), expected power spectra of the beat of ``chirps``, up and down, over ``axis``.
+    - ``beats``: float32 (C, 2, T, H, W), expected power spectra of the beat of ``chirps``, up and down, over ``axis``;
+    - ``slow_phasor``: complex64 (C, S, F, H, W), phasors of ``frequencies`` at each of ``slow_times``.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
     variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
@@ -163,6 +165,8 @@ class RenderOutput(ErrorBars, TensorRecord):
     beats: torch.Tensor | None = None
     rate_axis: RateAxis | None = None
     chirps: Chirps | None = None
+    slow_phasor: torch.Tensor | None = None
+    slow_times: tuple[float, ...] | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
     differences: torch.Tensor | None = None
     squares: torch.Tensor | None = None

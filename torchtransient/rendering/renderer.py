@@ -79,13 +79,16 @@ class TransientRenderer(CopiesParametrized):
             slashes, since torch forbids dots; ``renderer.values`` maps keys to parameters. ``tt.parametrize`` keeps
             them in range.
         time_axis: replaces the one of the scene's films; phasor films become histograms. At most one of ``time_axis``,
-            ``frequencies``, ``gates``, ``rates``, ``chirps`` and ``film``, but for the axis of rates and chirps.
+            ``frequencies``, ``gates``, ``rates``, ``chirps``, ``slow_times`` and ``film``, but for the axis of rates
+            and chirps and the frequencies of slow times.
         frequencies: a :class:`FrequencyAxis`, or numbers in cycles per metre; the films become phasor films, and
             ``out.phasor`` takes the place of ``out.transient``.
         gates: :class:`Gate` objects; the films become gated films with ``out.gated``.
         rates: bins of the rate of path lengths (:class:`RateAxis`), in scenes where things move (``scene.moving``); the
             films become rate films with ``out.rates`` over the bins of ``time_axis``, or of the scene's histogram.
         chirps: :class:`Chirps` of a frequency-modulated lidar; the films become beat films with ``out.beats``.
+        slow_times: times in seconds, beside ``frequencies``: phasors at each of them, as a radar's pulses see things
+            that move, ``out.slow_phasor``.
         film: the same as an object of ``torchtransient.rendering.films``; films of one's own are asked for so.
         max_depth: replaces the integrator's. Where that is no limit, calls whose values can be differentiated by use a
             bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond which
@@ -152,6 +155,7 @@ class TransientRenderer(CopiesParametrized):
         gates: Sequence[Gate] | None = None,
         rates: RateAxis | None = None,
         chirps: Chirps | None = None,
+        slow_times: Numbers | None = None,
         steady: bool = True,
         film: FilmLayout | None = None,
         physics: str = "warn",
@@ -161,6 +165,7 @@ class TransientRenderer(CopiesParametrized):
     ):
         super().__init__()
         named = {"time_axis": time_axis, "frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
+        named["slow_times"] = slow_times
         film = requested_film(film, named)
         if isinstance(effects, Effects):
             scene = effects.planned_scene(scene)

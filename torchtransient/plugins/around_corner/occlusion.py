@@ -50,7 +50,7 @@ from torchtransient.plugins.transport.geometry_terms import displacement
 from torchtransient.plugins.transport.laser_spot import LaserSpot
 from torchtransient.plugins.transport.light_tracing import FromLight
 from torchtransient.plugins.transport.material_points import MaterialVacuum
-from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal
+from torchtransient.plugins.transport.strategy import Connection, Event, Local, Proposal, rate_of
 from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.walk import first_leg
 
@@ -100,7 +100,7 @@ class MutualOcclusion:
             with dr.resume_grad():
                 objective = mi.Float(0)
                 for term in self._terms(rays, self._array(rays, pixel), job):
-                    A, _ = block.read(term.opl, term.active)
+                    A, *_ = block.read(term.opl, term.active, **rate_of(term))
                     objective += total_of(A, term.value) * term.outwards
                 if dr.grad_enabled(objective):
                     dr.backward_from(objective)
@@ -120,7 +120,10 @@ class MutualOcclusion:
             events, total = block.begin(), light_type()(0)
             for term, outwards in zip(terms, tangents, strict=True):
                 value = term.value * outwards
-                block.put_slope(events, term.opl, value, light_type()(0), term.active)
+                rate = rate_of(term)
+                if rate:
+                    rate["value_d_rate"] = light_type()(0)
+                block.put_slope(events, term.opl, value, light_type()(0), term.active, **rate)
                 total += value
             block.end(events)
             film.add_steady(pixel, match.to_channels(total))
@@ -207,6 +210,7 @@ class MutualOcclusion:
             active &= si.is_valid() & (beyond > distance * (1 - BEFORE))
             beyond = dr.select(active, beyond, 1)
             value, opl, active = self._light(place, si, from_spot, active)
+            rate = self._rate(place, si, active)
             weight = -edge.weight * spans / distance
             if not self.spots.confocal:
                 weight *= self._seen_otherwise(
@@ -214,7 +218,15 @@ class MutualOcclusion:
                 )
             value = dr.select(active, value * weight, 0)
         outwards = dr.dot(n, (edge.p - Q) / distance - (y.p - Q) / beyond)
-        return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active)
+        return Local(value=value, outwards=dr.select(active, outwards, 0), opl=opl, active=active, rate=rate)
+
+    def _rate(self, place: Local, si: Any, active: Any) -> Any:
+        """Return the rate of light by way of a hidden point (Float), None for films that measure none."""
+        velocities = self.context.velocities
+        if velocities is None:
+            return None
+        there, on = dr.normalize(si.p - place.seen.p), dr.normalize(place.lit.p - si.p)
+        return dr.dot(velocities.of_surface(si, active), there - on) * place.η
 
     def _light(self, place: Local, si: Any, from_spot: bool, active: Any) -> tuple[Any, Any, Any]:
         """Return (light by way of a hidden point per solid angle around the viewpoint, arrival, which lanes have some).
@@ -379,7 +391,10 @@ class LateOutlines(BoundaryTerm):
         # Paths begin behind edges.
         spots.dark_at_first = False
         strategies = MaterialVacuum(), scattering, [spots]
-        late = RenderContext(context.scene, context.contents, self.settings, strategies, context.wanted, context.window)
+        late = RenderContext(
+            context.scene, context.contents, self.settings, strategies, context.wanted, context.window,
+            context.velocities,
+        )  # fmt: skip
         super().__init__(integrator, late, sensor, film, seed, samples, tuple(self.kinds))
 
     def _light_context(self) -> RenderContext:
@@ -390,7 +405,8 @@ class LateOutlines(BoundaryTerm):
             scattering = FromLight(scattering)
         self.to_scan = ScanSampled()
         strategies = MaterialVacuum(), scattering, [self.to_scan]
-        return RenderContext(context.scene, context.contents, self.settings, strategies, None, context.window)
+        window, velocities = context.window, context.velocities
+        return RenderContext(context.scene, context.contents, self.settings, strategies, None, window, velocities)
 
     def tables(self) -> list[Any]:
         return [*super().tables(), *(table for table in self.context.tables() if dr.grad_enabled(table))]

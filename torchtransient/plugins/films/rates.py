@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import abc
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -10,18 +10,19 @@ import mitsuba as mi
 from torchtransient.chirps import Chirps
 from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.plugins._registry import register
-from torchtransient.plugins.films.block import FilmBlock
+from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.histogram import TransientHDRFilm
+from torchtransient.plugins.films.phasor import PhasorHDRFilm
 from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 from torchtransient.plugins.properties import number, whole_number
 
 
 class Row:
-    """Share of an arrival in one of a pixel's histograms.
+    """Share of an arrival in one of a pixel's arrays.
 
     Attributes:
-        number: number of the histogram, UInt32.
-        inside: mask, the histogram exists.
+        number: number of the array, UInt32.
+        inside: mask, the array exists.
         shift: what is added to the arrival's length, metres (Float64).
         k: derivative of ``shift`` by the rate, seconds.
         weight, slope: share of the arrival, and its derivative by the rate.
@@ -31,85 +32,100 @@ class Row:
         self.number, self.inside, self.shift, self.k, self.weight, self.slope = number, inside, shift, k, weight, slope
 
 
-class HistogramRows(TransientHDRFilm):
-    """Base of films with several histograms a pixel, ``(H, W, rows, T, C)``, by the rate of an arrival.
+def sheared(scales, rate):
+    """Return rows of all the light, one at ``opl + k rate`` for each ``k`` of ``scales`` (Float64, seconds)."""
+    return [
+        Row(mi.UInt32(n), mi.Bool(True), k * mi.Float64(rate), mi.Float(k), mi.Float(1), mi.Float(0))
+        for n, k in enumerate(scales)
+    ]
 
-    A subclass says with ``rows_of`` which of them an arrival goes to.
+
+def film_of_rows(base):
+    """Return the class of films with several arrays of a film a pixel, by the rate of an arrival.
+
+    A function, since classes of Mitsuba have one base. A subclass says with ``row_count`` how many rows there are and
+    with ``rows_of(rate)`` which (:class:`Row`) an arrival of ``rate`` (Float, m/s) goes to.
+
+    Args:
+        base: class of a film with one array, ``(H, W, entries, channels)``; the rows come before the entries.
     """
 
-    knows_rates = True
-    knows_exclusive_lanes = False
+    class FilmOfRows(base):
+        knows_rates = True
+        knows_exclusive_lanes = False
+        # What an arrival counts in the sum over all rows.
+        share = 1.0
 
-    def __init__(self, props):
-        super().__init__(props)
-        if not self.keeps_steady or self.exhaustive_scan:
-            raise SceneError(f"{self.plugin}: expected no exhaustive_scan, and steady not to be false.")
+        def __init__(self, props):
+            super().__init__(props)
+            if not self.keeps_steady or self.exhaustive_scan:
+                raise SceneError(f"{self.plugin}: expected no exhaustive_scan, and steady not to be false.")
 
-    @abc.abstractmethod
-    def row_count(self) -> int:
-        """Return the number of histograms of a pixel."""
+        def cube_shape(self):
+            shape = super().cube_shape()
+            return (*shape[:2], self.row_count(), *shape[2:])
 
-    @abc.abstractmethod
-    def rows_of(self, rate) -> list[Row]:
-        """Return the rows that an arrival of ``rate`` (Float, m/s) goes to; their weights sum to one for each row that
-        takes all light.
-        """
+        def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
+            return FilmBlock(self, job.band, base, match, False, origin)
 
-    # What an arrival counts in the sum over all rows.
-    share = 1.0
+        def create_adjoint_block(self, response, base, steady, match):
+            return AdjointBlock(self, response, base, steady, match)
 
-    def cube_shape(self):
-        size = self.crop_size()
-        return (int(size[1]), int(size[0]), self.row_count(), self.temporal_bins, self.channel_count())
+        def lanes_at_most(self, most_events):
+            return None  # events are not kept
 
-    def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
-        return FilmBlock(self, job.band, base, match, False, origin)
+        def put(self, band, base, opl_from_start, value, active, rate, **options):
+            """Add an arrival to its rows, see :meth:`~.base.TimeResolvedFilm.put`; ``rate``: m/s, Float."""
+            return _put(self, super().put, band, base, opl_from_start, value, active, rate, options)
 
-    def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None, rate=None):
-        """Add an arrival to its rows, see :meth:`~.base.TimeResolvedFilm.put`; ``rate``: m/s, Float."""
-        before, after, stride = mi.Float(0), mi.Float(0), self.temporal_bins * self.channel_count()
-        for row in self.rows_of(rate):
-            values, inside = [v * row.weight for v in value], active & row.inside
-            place, opl = base + row.number * stride, opl_from_start + row.shift
-            early, late = super().put(band, place, opl, values, inside, crowded=crowded)
-            before += dr.select(row.inside, early, 0) * row.weight * self.share
-            after += dr.select(row.inside, late, 1) * row.weight * self.share
-        return before, after
+        def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active, rate, value_d_rate):
+            """Add the derivative of an event; ``value_d_rate``: contribution times derivative of the rate."""
+            slopes = d_value, value_d_opl, value_d_rate
+            _put_slope(self, super().put_slope, band, base, opl_from_start, slopes, active, rate)
 
-    def put_slope(
-        self, band, base, opl_from_start, d_value, value_d_opl, active, laser=None, rate=None, value_d_rate=None
-    ):
-        """Add the derivative of an event, see :meth:`~.base.TimeResolvedFilm.put_slope`.
+        def read(self, adjoint, base, opl_from_start, active, steady=None, rate=None):
+            """Return ``A``, its slope by the length and its slope by the rate, lists over channels."""
+            return _read(self, super().read, adjoint, base, opl_from_start, active, rate)
 
-        Args:
-            value_d_rate: contribution times derivative of the rate, by channel.
-        """
-        stride = self.temporal_bins * self.channel_count()
-        for row in self.rows_of(rate):
-            d = [row.weight * a + row.slope * b for a, b in zip(d_value, value_d_rate, strict=True)]
-            moved = [row.weight * (a + row.k * b) for a, b in zip(value_d_opl, value_d_rate, strict=True)]
-            place, opl = base + row.number * stride, opl_from_start + row.shift
-            super().put_slope(band, place, opl, d, moved, active & row.inside)
-
-    def read(self, adjoint, base, opl_from_start, active, steady=None, rate=None):
-        """Read the adjoint of :meth:`put` at an arrival.
-
-        Returns:
-            ``A``, its slope by the length and its slope by the rate, lists over channels.
-        """
-        flat, row_stride, *strides = adjoint
-        A, by_opl, by_rate = ([mi.Float(0)] * self.channel_count() for _ in range(3))
-        for row in self.rows_of(rate):
-            place, opl = base + row.number * row_stride, opl_from_start + row.shift
-            a, slope = super().read((flat, *strides), place, opl, active & row.inside)
-            for c in range(self.channel_count()):
-                A[c] += row.weight * a[c]
-                by_opl[c] += row.weight * slope[c]
-                by_rate[c] += row.weight * row.k * slope[c] + row.slope * a[c]
-        return A, by_opl, by_rate
+    return FilmOfRows
 
 
-class RateHDRFilm(HistogramRows):
+def _stride(film):
+    return film.entries_per_array() // film.row_count()
+
+
+def _put(film, put, band, base, opl, value, active, rate, options):
+    before, after = mi.Float(0), mi.Float(0)
+    for row in film.rows_of(rate):
+        values, inside = [v * row.weight for v in value], active & row.inside
+        early, late = put(band, base + row.number * _stride(film), opl + row.shift, values, inside, **options)
+        before += dr.select(row.inside, early, 0) * row.weight * film.share
+        after += dr.select(row.inside, late, 1) * row.weight * film.share
+    return before, after
+
+
+def _put_slope(film, put_slope, band, base, opl, slopes, active, rate):
+    d_value, value_d_opl, value_d_rate = slopes
+    for row in film.rows_of(rate):
+        d = [row.weight * a + row.slope * b for a, b in zip(d_value, value_d_rate, strict=True)]
+        moved = [row.weight * (a + row.k * b) for a, b in zip(value_d_opl, value_d_rate, strict=True)]
+        put_slope(band, base + row.number * _stride(film), opl + row.shift, d, moved, active & row.inside)
+
+
+def _read(film, read, adjoint, base, opl, active, rate):
+    flat, row_stride, *strides = adjoint
+    A, by_opl, by_rate = ([mi.Float(0)] * film.channel_count() for _ in range(3))
+    for row in film.rows_of(rate):
+        a, slope = read((flat, *strides), base + row.number * row_stride, opl + row.shift, active & row.inside)
+        for c in range(film.channel_count()):
+            # Not in place: the zeros are one array.
+            A[c] = A[c] + row.weight * a[c]
+            by_opl[c] = by_opl[c] + row.weight * slope[c]
+            by_rate[c] = by_rate[c] + row.weight * row.k * slope[c] + row.slope * a[c]
+    return A, by_opl, by_rate
+
+
+class RateHDRFilm(film_of_rows(TransientHDRFilm)):
     r"""Film over optical path length and rate (:monosp:`rate_hdr_film`): a histogram for each bin of the rate.
 
     The rate ``d opl / dt`` (m/s, positive where paths get longer) is that of material points, see
@@ -161,7 +177,7 @@ class RateHDRFilm(HistogramRows):
         return rows
 
 
-class BeatHDRFilm(HistogramRows):
+class BeatHDRFilm(film_of_rows(TransientHDRFilm)):
     r"""Film of the beats of frequency-modulated light (:monosp:`beat_hdr_film`): two spectra a pixel.
 
     ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps
@@ -195,12 +211,41 @@ class BeatHDRFilm(HistogramRows):
         return 2
 
     def rows_of(self, rate):
-        one, zero = mi.Float(1), mi.Float(0)
-        return [
-            Row(mi.UInt32(n), mi.Bool(True), k * mi.Float64(rate), mi.Float(k), one, zero)
-            for n, k in enumerate(self._scales)
-        ]
+        return sheared(self._scales, rate)
+
+
+class SlowPhasorHDRFilm(film_of_rows(PhasorHDRFilm)):
+    r"""Phasors at slow times (:monosp:`slow_phasor_hdr_film`): those of each pulse of a radar.
+
+    ``sum of radiance * exp(-2 pi i nu (opl + t rate - start_opl))`` for each ``t`` of ``slow_times`` (numbers with
+    commas, seconds), to first order in time. Other parameters are those of ``phasor_hdr_film``. Layout ``(H, W, times,
+    F, 2 C)``. Every arrival is added frequency by frequency.
+
+    Not supported: exhaustive scans.
+    """
+
+    plugin = "slow_phasor_hdr_film"
+    measures = "slow_phasor"
+
+    def __init__(self, props):
+        super().__init__(props)
+        given = str(props.get("slow_times", "")).replace(",", " ").split()
+        try:
+            self.slow_times = tuple(float(word) for word in given)
+        except ValueError:
+            self.slow_times = ()
+        if not self.slow_times or not all(map(math.isfinite, self.slow_times)):
+            words = " ".join(given)
+            raise SceneError(f"{self.plugin}: slow_times: expected finite numbers with commas, got {words!r}.")
+        self._scales = [dr.opaque(mi.Float64, t) for t in self.slow_times]
+
+    def row_count(self):
+        return len(self.slow_times)
+
+    def rows_of(self, rate):
+        return sheared(self._scales, rate)
 
 
 register("film", "rate_hdr_film", RateHDRFilm)
 register("film", "beat_hdr_film", BeatHDRFilm)
+register("film", "slow_phasor_hdr_film", SlowPhasorHDRFilm)

@@ -270,9 +270,11 @@ class TransientNLOSPath(base.TransientIntegrator):
         table = self.scan_table(scene, contents)
         if settings is None:
             settings = self.settings()
-            # What a scan shares knows no rates.
-            own = Division(range(0), settings.max_depth)
-            division = self.division(scene, contents, wanted, table) if velocities is None else own
+            if velocities is None:
+                division = self.division(scene, contents, wanted, table)
+            else:  # what a scan shares knows no rates
+                division = Division(range(0), settings.max_depth)
+                _check_rest(velocities, contents.sensor)
             # Paths that have nothing to find beyond end before.
             most = settings.max_depth if wanted is not None else max(division.longest, 1)
             settings = replace(settings, division=division, max_depth=most)
@@ -402,6 +404,15 @@ def _choice(props: Any, name: str, shared: str) -> str:
     if value not in ("auto", shared, "paths"):
         raise SceneError(f"transient_nlos_path: {name}: expected auto, {shared} or paths, got {value!r}.")
     return value
+
+
+def _check_rest(velocities: Any, sensor: Any) -> None:
+    """Raise SceneError for a wall or a sensor with a velocity: spots of the laser would slide over the wall."""
+    wall = sensor.get_shape()
+    if velocities.sensor_moves or (wall is not None and any(shape.ptr == wall.ptr for shape in velocities.shapes)):
+        raise SceneError(
+            "transient_nlos_path: expected velocities of hidden things; the wall, its sensor and the laser rest."
+        )
 
 
 def _scanned(scene: Any, sensor: Any) -> Any:
