@@ -56,7 +56,7 @@ OF_DEVICES = frozenset(
         "f_number", "filter_bandwidth_m", "spectral_irradiance_w_m2_nm",
         "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
         "spads", "coincidence", "photons_per_unit", "looks", "window_s", "exponent", "longest_s", "counted_from",
-        "background",
+        "background", "bandwidth_hz", "duration_s",
     )
 )  # fmt: skip
 # Those among them that may be maps of pixels.
