@@ -2,12 +2,15 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; or `gated` float32 (...,
-C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`. Polarized variants
-have the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
-metres, `num_bins`), `channels` (JSON: the names of the C channels), `format`, `metadata` (JSON) and `checksums` (JSON,
-see `checksums.py`) are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in
-parts, so that no second copy of it is needed.
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; `gated` float32 (..., C,
+G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`; `rates` float32 (...,
+C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_bin_width` in m/s, `rates_num_bins`);
+`beats` float32 (..., C, 2, T, H, W) with `edges_opl` and the chirps (`chirps_bandwidth_hz`, `chirps_duration_s`,
+`chirps_wavelength_m`, `chirps_window`); or `slow_phasor` complex64 (..., C, S, F, H, W) with `slow_times` float64 (S,),
+seconds, and `frequencies_per_metre`. Polarized variants have the four Stokes components before C. The numbers of the
+axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`), `channels` (JSON: the names of
+the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`) are attributes of the HDF5 file
+and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -23,8 +26,9 @@ import torch
 
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
@@ -37,9 +41,13 @@ FORMAT = "torchtransient result 2"
 # Those of the first version have no checksums.
 FORMATS = ("torchtransient result 1", FORMAT)
 _WHAT = "result file"
-_READ = {"start_opl": number_of, "bin_width_opl": number_of, "num_bins": whole_of, "gates": text_of}
+_READ = {
+    **dict.fromkeys(("start_opl", "bin_width_opl", "rates_start", "rates_bin_width"), number_of),
+    **dict.fromkeys(("num_bins", "rates_num_bins"), whole_of), **dict.fromkeys(("gates", "chirps_window"), text_of),
+    **dict.fromkeys(("chirps_bandwidth_hz", "chirps_duration_s", "chirps_wavelength_m"), number_of),
+}  # fmt: skip
 _OF_ERRORS = ("differences", "squares", "steady_differences")
-_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", *_READ}
+_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", "slow_times", *_READ}
 _KNOWN |= {"cells", *_OF_ERRORS}
 
 
@@ -47,9 +55,10 @@ _KNOWN |= {"cells", *_OF_ERRORS}
 class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
-    and settings of films that have no attribute here, by name. A batch of results (``stack``, ``cat``,
-    ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
+    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `beats`
+    with `chirps`, both with `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
+    `others`: tensors and settings of films that have no attribute here, by name. A batch of results (``stack``,
+    ``cat``, ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
@@ -63,6 +72,12 @@ class Result(ErrorBars, TensorRecord):
     channels: tuple[str, ...] = ()
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
+    rates: torch.Tensor | None = None
+    beats: torch.Tensor | None = None
+    rate_axis: RateAxis | None = None
+    chirps: Chirps | None = None
+    slow_phasor: torch.Tensor | None = None
+    slow_times: tuple[float, ...] | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
     differences: torch.Tensor | None = None
     squares: torch.Tensor | None = None
@@ -153,16 +168,17 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
     film = layout_of_entries({**values, **{name: read(values, name) for name, read in _READ.items() if name in values}})
     # Files of earlier versions call gated images a transient.
     response = tensor_in(values[film.measures if film.measures in values else "transient"])
-    if response.ndim < 4 or response.shape[-3] != film.count:
+    shape = film.shape
+    if response.ndim < 3 + len(shape) or response.shape[-2 - len(shape) : -2] != shape:
         raise StorageError(
             f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
-            f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
+            f"(..., C, {film.letter}, H, W) with {film.letter} = {' x '.join(map(str, shape))}."
         )
     if response.is_complex() != film.is_complex or steady.is_complex() or torch.bool in (
         response.dtype, steady.dtype
     ):  # fmt: skip
         raise ValueError(f"{film.measures} is of {response.dtype}, steady of {steady.dtype}")
-    image = (*response.shape[:-3], *response.shape[-2:])
+    image = (*response.shape[: -2 - len(shape)], *response.shape[-2:])
     if steady.shape != image:
         raise ValueError(f"steady is of shape {tuple(steady.shape)}, {film.measures} of {tuple(response.shape)}")
     if channels and len(channels) != steady.shape[-3]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
@@ -36,7 +36,7 @@ class FilmLayout(abc.ABC):
     # Word of the plugin's `measures`: the attribute of a RenderOutput, and the name in a result file.
     measures: ClassVar[str]
     plugin: ClassVar[str]
-    # Letter of the dimension between channels and rows.
+    # Letters of the dimensions between channels and rows.
     letter: ClassVar[str]
     # Name of the settings: the keyword of TransientRenderer and tt.plan, of films that have one. A call that asks for
     # the film, written out for messages ("film=..." of films without a keyword).
@@ -49,6 +49,8 @@ class FilmLayout(abc.ABC):
     # The film has bins of time: a temporal filter, an axis that a plan can find, a steady image that can be left out.
     has_bins: ClassVar[bool] = False
     is_complex: ClassVar[bool] = False
+    # The film measures how fast paths get longer.
+    knows_rates: ClassVar[bool] = False
     # The film spreads arrivals by a pulse and an impulse response.
     takes_pulse: ClassVar[bool] = False
     # Keyword of another film that this one takes beside its own, empty for none.
@@ -68,6 +70,11 @@ class FilmLayout(abc.ABC):
         """Number of entries along the film's own dimension."""
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the dimensions between channels and rows."""
+        return (self.count,)
+
+    @property
     def settings(self) -> Any:
         """Value of the keyword ``argument``: the field of the dataclass."""
         return getattr(self, fields(self)[0].name)
@@ -80,9 +87,17 @@ class FilmLayout(abc.ABC):
         """Return the settings as plain data for JSON."""
         return self.settings
 
+    def resolution_opl(self) -> float | None:
+        """Return the width of bins that a plan takes, metres; None for the width of the scene's film."""
+        return None
+
     def describe(self, temporal_filter: str) -> str:
         """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
         return f"{self.argument}={self.settings}"
+
+    def over(self, axis: TimeAxis) -> FilmLayout:
+        """Return the same film, one with bins, over other bins of time."""
+        return Histogram(axis)
 
     def jump(self) -> str:
         """Return the name of a response over time that jumps and has no slope without a pulse; empty without one, and
@@ -392,8 +407,11 @@ class RowsOfHistograms(FilmLayout):
     """
 
     has_bins: ClassVar[bool] = True
+    knows_rates: ClassVar[bool] = True
     beside: ClassVar[str] = "time_axis"
     kind: ClassVar[type]
+    # Names of the settings' fields as properties of the plugin.
+    properties: ClassVar[dict[str, str]]
 
     def __post_init__(self) -> None:
         given: Any = self.settings
@@ -412,16 +430,29 @@ class RowsOfHistograms(FilmLayout):
         assert isinstance(axis, TimeAxis)  # of a built film
         return axis.num_bins
 
+    @property
+    @abc.abstractmethod
+    def row_count(self) -> int:
+        """Number of histograms of a pixel."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.row_count, self.count)
+
     def attributes(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def plain(self) -> dict[str, Any]:
-        axis = self.attributes()["axis"]
-        return asdict(self.settings) | ({} if axis is None else Histogram(axis).plain())
+        axis, settings = self.attributes()["axis"], asdict(self.settings)
+        named = {f"{self.argument}_{name}": value for name, value in settings.items()}
+        return named | ({} if axis is None else Histogram(axis).plain())
 
     def describe(self, temporal_filter: str) -> str:
         words = ", ".join(f"{name}={value}" for name, value in self.attributes().items())
         return f"{words}, temporal_filter={temporal_filter!r}"
+
+    def over(self, axis: TimeAxis) -> Self:
+        return replace(self, axis=axis)  # type: ignore[call-arg]
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
@@ -432,6 +463,18 @@ class RowsOfHistograms(FilmLayout):
         axis = self.attributes()["axis"]
         if axis is not None:
             Histogram(axis).write(props)
+        for name, prop in self.properties.items():
+            props[prop] = getattr(self.settings, name)
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        given = {name: props[prop] for name, prop in cls.properties.items() if prop in props}
+        axis = Histogram.from_properties(props)
+        assert axis is not None
+        try:
+            return cls(cls.kind(**given), axis.axis)  # type: ignore[call-arg]
+        except (TypeError, TorchTransientError) as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
 
     def describes(self, film: FilmInterface) -> bool:
         if film.measures != self.measures:
@@ -439,24 +482,28 @@ class RowsOfHistograms(FilmLayout):
         built = self.from_film(film).attributes()
         return all(value is None or built[name] == value for name, value in self.attributes().items())
 
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """Return all light, which the steady image holds, and that of the time window."""
+        return Histogram(self.attributes()["axis"]).parts(arrivals)
+
     def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
         return rows_channels_first(cube, leading, components)
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        if measured(output, cls.measures) is None:
-            return None
-        return cls(*(measured(output, field.name) for field in fields(cls)))
+        found = [measured(output, name) for name in (cls.measures, *(field.name for field in fields(cls)))]
+        return None if any(value is None for value in found) else cls(*found[1:])
 
     def entries(self) -> dict[str, Any]:
-        return self.plain()
+        axis = self.attributes()["axis"]
+        return self.plain() | ({} if axis is None else Histogram(axis).entries())
 
     @classmethod
     def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
         if cls.measures not in values:
             return None
-        names = [field.name for field in fields(cls.kind)]
-        plain = {name: value.item() if hasattr(value := values[name], "item") else value for name in names}
+        given = {field.name: values[f"{cls.argument}_{field.name}"] for field in fields(cls.kind)}
+        plain = {name: value.item() if hasattr(value, "item") else value for name, value in given.items()}
         axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         return cls(cls.kind(**plain), axis)  # type: ignore[call-arg]
 
@@ -482,6 +529,7 @@ class Rates(RowsOfHistograms):
     output: ClassVar[str] = "rates"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = RateAxis
+    properties: ClassVar[dict[str, str]] = {"start": "rate_start", "bin_width": "rate_width", "num_bins": "rate_bins"}
 
     rate_axis: RateAxis
     axis: TimeAxis | None = None
@@ -490,13 +538,9 @@ class Rates(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(RateAxis(film.rate_start, film.rate_width, film.rate_bins), Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        axis = self.rate_axis
-        props["rate_start"], props["rate_width"], props["rate_bins"] = axis.start, axis.bin_width, axis.num_bins
-
-
-_CHIRPS = {"bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength"}
+    @property
+    def row_count(self) -> int:
+        return self.rate_axis.num_bins
 
 
 @dataclass(frozen=True)
@@ -520,6 +564,10 @@ class Beats(RowsOfHistograms):
     output: ClassVar[str] = "beats"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = Chirps
+    properties: ClassVar[dict[str, str]] = {
+        "bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength",
+        "window": "chirp_window",
+    }  # fmt: skip
 
     chirps: Chirps
     axis: TimeAxis | None = None
@@ -528,11 +576,18 @@ class Beats(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(film.chirps, Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        for name, prop in _CHIRPS.items():
-            props[prop] = getattr(self.chirps, name)
-        props["chirp_window"] = self.chirps.window
+    @classmethod
+    def seen(cls, film: Any, arrivals: Arrivals) -> Arrivals:
+        """Return the arrivals of a pilot run at the places of their beats, of both spectra."""
+        k = film.chirps.rate_scale_s
+        return arrivals.shifted((k, -k))
+
+    @property
+    def row_count(self) -> int:
+        return 2
+
+    def resolution_opl(self) -> float:
+        return self.chirps.resolution_opl
 
 
 @dataclass(frozen=True)
@@ -556,6 +611,7 @@ class SlowPhasors(FilmLayout):
     plural: ClassVar[str] = "slow phasors"
     output: ClassVar[str] = "slow_phasor"
     is_complex: ClassVar[bool] = True
+    knows_rates: ClassVar[bool] = True
     beside: ClassVar[str] = "frequencies"
 
     slow_times: tuple[float, ...]
@@ -574,6 +630,10 @@ class SlowPhasors(FilmLayout):
     @property
     def count(self) -> int:
         return self.frequencies.num_frequencies
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self.slow_times), self.count)
 
     def attributes(self) -> dict[str, Any]:
         return {"slow_times": self.slow_times, "frequencies": self.frequencies}
@@ -600,9 +660,8 @@ class SlowPhasors(FilmLayout):
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        if measured(output, cls.measures) is None:
-            return None
-        return cls(measured(output, "slow_times"), measured(output, "frequencies"))
+        found = [measured(output, name) for name in (cls.measures, "slow_times", "frequencies")]
+        return None if any(value is None for value in found) else cls(*found[1:])
 
     def entries(self) -> dict[str, Any]:
         times = torch.tensor(self.slow_times, dtype=torch.float64).numpy()
