@@ -13,7 +13,7 @@ from torchtransient.chirps import Chirps
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
-from torchtransient.rendering.films import FilmLayout
+from torchtransient.rendering.film_layout import FilmLayout
 from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 

@@ -35,7 +35,7 @@ from torchtransient.rendering.arguments import (
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.batches import with_differences
 from torchtransient.rendering.error_bars import CELL_BINS, CELL_PIXELS, BatchErrors, ErrorCells
-from torchtransient.rendering.films import FilmLayout, steady_channels_first
+from torchtransient.rendering.film_layout import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import (
     SEED_RANGE,
     Item,

@@ -17,8 +17,9 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
 from torchtransient.files.result_file import read_result, write_result
-from torchtransient.rendering import films
-from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors, measured
+from torchtransient.rendering import film_layout, films
+from torchtransient.rendering.film_layout import measured
+from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors
 from torchtransient.rendering.output import RenderOutput, RenderStats
 
 VARIANT = "llvm_ad_rgb"
@@ -304,15 +305,15 @@ def test_layouts_of_torch(leading, components):
 
     steady, cube, pairs = drawn("hwsc"), drawn("hwtsc"), drawn("hwlmtsc")
     layouts = (
-        (films.steady_channels_first, steady, "hwsc", "schw"),
-        (films.cube_channels_first, cube, "hwtsc", "scthw"),
-        (films.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
+        (film_layout.steady_channels_first, steady, "hwsc", "schw"),
+        (film_layout.cube_channels_first, cube, "hwtsc", "scthw"),
+        (film_layout.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
     )
     for function, values, letters, order in layouts:
         found = function(joined(values), leading, components).numpy()
         np.testing.assert_array_equal(found, expected(values, letters, order))
     waves = cube[..., None] * np.array([2.0, -3.0])
-    found = films.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
+    found = film_layout.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
     np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
 
 
