@@ -370,7 +370,7 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult)\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|RenderOutput|Plan|Overview|ToleranceResult)\(.*\)": "results",
     r"accuracy\.(SamplesNeeded|GradientEstimate|Recommendation)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
