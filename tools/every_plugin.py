@@ -83,6 +83,9 @@ def sensors() -> dict[str, dict[str, Any]]:
         "rate_hdr_film": {
             **camera, "film": {"type": "rate_hdr_film", "rate_start": -1.0, "rate_width": 1.0, "rate_bins": 2}
         },
+        "slow_phasor_hdr_film": {
+            **camera, "film": {"type": "slow_phasor_hdr_film", "frequencies": "0.5, 1.0", "slow_times": "0.0, 0.1"}
+        },
         "beat_hdr_film": {
             **camera,
             "film": {

@@ -64,6 +64,14 @@ def test_what_stands_still_has_no_rate():
     assert float(mean_rate(light)) == pytest.approx(0.0, abs=1e-5)
 
 
+def test_films_without_rates_do_not_feel_velocities():
+    """The light of the same samples is the same, bit by bit."""
+    loaded = tt.load(corner_of_three(), variant=VARIANT)
+    moving = loaded.moving(dict.fromkeys(("a", "sensor", "lamp"), tt.Motion(linear=(1.0, 2.0, 3.0))))
+    still, found = (tt.render(one, time_axis=AXIS, spp=16, seed=0) for one in (loaded, moving))
+    assert torch.equal(still.transient, found.transient) and float(still.transient.sum()) > 0
+
+
 @pytest.mark.parametrize("degrees", [0.0, 60.0])
 def test_a_wall_that_slides_in_its_plane(degrees):
     """Nothing of the picture changes, but material points move along the line of sight: 2 v sin(tilt)."""
