@@ -38,10 +38,13 @@ TEXEL_BLOCK = 15
 
 @dataclass(frozen=True)
 class Sizes:
-    """Pixels, samples per pixel of the pictures and of a step, bounces, steps of the recovery, windows of time."""
+    """Pixels, samples per pixel of the light, of gradients and target, of a step, bounces, steps of the recovery,
+    windows of time.
+    """
 
     width: int
     height: int
+    spp_light: int
     spp: int
     spp_step: int
     max_depth: int
@@ -87,6 +90,16 @@ def window_slice(window: tuple[float, float]) -> slice:
     """The bins between two path lengths in metres."""
     first, last = (round((opl - AXIS.start_opl) / AXIS.bin_width_opl) for opl in window)
     return slice(first, last)
+
+
+def light_on_its_way(scene: tt.Scene, sizes: Sizes) -> tt.RenderOutput:
+    """Light over time, from paths that neighbouring pixels share: the noise of late bins is that of many more paths."""
+    plan = tt.plan(
+        scene, integrator="transient_path_reuse", time_axis=AXIS, max_depth=sizes.max_depth, temporal_filter="box",
+        pilot=False,
+    )  # fmt: skip
+    with torch.no_grad():
+        return plan.renderer(spp=sizes.spp_light)(seed=0, progress=True)
 
 
 def window_gradients(renderer: tt.TransientRenderer, key: str, sizes: Sizes) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -232,8 +245,9 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
         "--resolution", type=int, default=90, help="width in pixels; the height is 16/9 of it (%(default)s)"
     )
     parser.add_argument(
-        "--spp", type=int, default=64, help="samples per pixel of pictures, gradients, target (%(default)s)"
+        "--spp-light", type=int, default=256, help="samples per pixel of the light on its way (%(default)s)"
     )
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel of gradients and target (%(default)s)")
     parser.add_argument("--spp-step", type=int, default=16, help="samples per pixel and step (%(default)s)")
     parser.add_argument(
         "--max-depth", type=int, default=12, help="segments of a path; the scene's own is 65 (%(default)s)"
@@ -246,19 +260,17 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
     parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
     if parser.parse_known_args(argv)[0].smoke:
         # Most of a small run is compiled code: a window more is a kernel more.
-        parser.set_defaults(resolution=18, spp=8, spp_step=4, max_depth=4, steps=1, windows=1)
+        parser.set_defaults(resolution=18, spp_light=8, spp=8, spp_step=4, max_depth=4, steps=1, windows=1)
     options = parser.parse_args(argv)
     height = options.resolution * 16 // 9
     steps = (options.spp_step, options.max_depth, options.steps, options.windows)
-    sizes = Sizes(options.resolution, height, options.spp, *steps)
+    sizes = Sizes(options.resolution, height, options.spp_light, options.spp, *steps)
     with tempfile.TemporaryDirectory() as folder:
         path = unpack(options.archive, Path(folder))
         scene = tt.load(path, "llvm_ad_rgb", resx=sizes.width, resy=sizes.height, max_depth=sizes.max_depth)
         key = floor_key(scene)
+        draw_light(light_on_its_way(scene, sizes), options.output / "staircase_light.png")
         renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
-        with torch.no_grad():
-            light = renderer(seed=0, spp=sizes.spp, progress=True)
-        draw_light(light, options.output / "staircase_light.png")
         texture, gradients = window_gradients(renderer, key, sizes)
         draw_gradients(texture, gradients, options.output / "staircase_gradient.png")
         result = recover(scene, key, sizes)

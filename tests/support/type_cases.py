@@ -28,8 +28,8 @@ def _pictures() -> dict[str, Case]:
         "vis.median_pixel": Case(v.median_pixel, STEADY),
         "vis.normals_picture": Case(v.normals_picture, torch.rand(3, 4, 5)),
         "vis.peak_time": Case(v.peak_time, LIGHT, AXIS),
-        "vis.plot_fit": Case(
-            v.plot_fit, {"a": STEADY}, [2.0, 1.0], {"b": [0.5, 0.6]}, truth={"b": 0.7}, path=folder() / "f.png"
+        "vis.FitMonitor": Case(
+            v.FitMonitor, {"a": torch.ones(2)}, target=LIGHT, pixels=[(0, 1)], truth={"a": [0.5, 0.6]}
         ),
         "vis.plot_shape_fit": fit,
         "vis.scan_layout": Case(v.scan_layout, scan),

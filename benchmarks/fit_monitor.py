@@ -1,0 +1,83 @@
+"""What `tt.vis.FitMonitor` adds to a training step, in CPU seconds of one thread, loops with and without it in turns.
+
+`page`: losses, parameters, light and noise of gradients, for a page at the end. `log`: a TensorBoard log and its figure
+too, `notebook`: the figure shown with IPython; both without their first figure, and as far as the packages are
+installed. Fits of the Cornell box, from small to large films, nine albedos.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from _runner import arguments, environment, interleave, ratio, report, summary
+
+import torchtransient as tt
+
+KEYS = [f"{paint}.reflectance.value" for paint in ("white", "red", "green")]
+
+
+def loop(
+    resolution: int, spp: int, steps: int, variant: str, settings: dict[str, Any] | None
+) -> Callable[[int], float]:
+    """CPU seconds of one step, in a loop that goes on from call to call."""
+    bins = {"start_opl": 3.6, "bin_width_opl": 0.08, "num_bins": 80, "max_depth": 6}
+    box = tt.scenes.cornell_box(resolution, **bins)
+    renderer = tt.TransientRenderer(tt.load(box, variant=variant), KEYS, spp=spp, physics="ignore")
+    with torch.no_grad():
+        target = renderer(seed=1_000_003, spp=4 * spp)
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=1e-3)
+    monitor, number = None, 0
+    if settings is not None:
+        pixels = [(resolution // 2, resolution // 3), (resolution // 4, resolution // 2)]
+        monitor = tt.vis.FitMonitor(renderer, target=target, pixels=pixels, **settings)
+
+    def run(_: int) -> float:
+        nonlocal number
+        begin = time.process_time()
+        for _ in range(steps):
+            optimizer.zero_grad()
+            out = renderer(seed=number)
+            loss = (out.transient - target.transient).square().mean()
+            loss.backward()
+            optimizer.step()
+            if monitor is not None:
+                monitor.step(loss=loss, output=out)
+            number += 1
+        return (time.process_time() - begin) / steps
+
+    return run
+
+
+def main() -> None:
+    options = arguments(__doc__, peer=False).parse_args()
+    repeats = options.repeats or (2 if options.quick else 15)
+    tt.threads(1)
+    torch.set_num_threads(1)
+    cases, ratios = {}, []
+    with tempfile.TemporaryDirectory() as folder:
+        sides: dict[str, dict[str, Any] | None] = {"plain": None, "page": {}}
+        if importlib.util.find_spec("tensorboard"):
+            sides["log"] = {"log_dir": folder}
+        if importlib.util.find_spec("IPython"):
+            sides["notebook"] = {"live": True}
+        for resolution, spp in ((8, 4),) if options.quick else ((8, 4), (32, 16), (96, 16)):
+            steps = 20 if resolution < 96 else 10
+            name = f"{resolution} x {resolution} x 80, {spp} samples"
+            runs = {
+                f"{name}: {side}": loop(resolution, spp, steps, options.variant, given) for side, given in sides.items()
+            }
+            seconds = interleave(runs, repeats)
+            cases.update({key: summary(values) for key, values in seconds.items()})
+            anchor, *others = seconds
+            ratios.extend(ratio(seconds, other, anchor) for other in others)
+    results = {"cases": cases, "ratios": ratios, "environment": environment(options.variant)}
+    report("fit_monitor", {"repeats": repeats, "quick": options.quick}, results, options.json)
+
+
+if __name__ == "__main__":
+    main()
