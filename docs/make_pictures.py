@@ -21,9 +21,11 @@ AXIS = {"num_bins": 200, "start_opl": 3.6, "bin_width_opl": 0.03}
 
 def surfaces() -> None:
     """Pictures of intensity over time."""
-    scene = tt.load(tt.scenes.cornell_box(resolution=128, mirror=True, sampler="multijitter", **AXIS), "llvm_ad_rgb")
+    description = tt.scenes.cornell_box(resolution=128, mirror=True, **AXIS)
+    # Neighbouring pixels share late light, of which independent paths see a few bright samples.
+    description["integrator"]["type"] = "transient_path_reuse"
     with torch.no_grad():
-        out = tt.render(scene, spp=2048, seed=0)
+        out = tt.render(tt.load(description, "llvm_ad_rgb"), spp=4096, seed=0, progress=True)
     tt.vis.peak_time_picture(out, OUT / "peak_time.png")
     styles = [
         tt.vis.rainbow(out),
@@ -99,7 +101,34 @@ def gradients() -> None:
         figure.savefig(OUT / file, dpi=80)
 
 
-PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients)}
+def fit() -> None:
+    """The figure of a fit: nine albedos of the Cornell box."""
+    keys = [f"{paint}.reflectance.value" for paint in ("white", "red", "green")]
+    box = tt.scenes.cornell_box(64, start_opl=4.2, bin_width_opl=0.04, num_bins=150, max_depth=8)
+    scene = tt.load(box, "llvm_ad_rgb")
+    with torch.no_grad():
+        truth = tt.TransientRenderer(scene, keys)
+        target = truth(seed=1_000_003, spp=1024)
+    renderer = tt.TransientRenderer(scene, {key: torch.full((3,), 0.5) for key in keys}, spp=32)
+    values = {key: value.detach() for key, value in truth.values.items()}
+    monitor = tt.vis.FitMonitor(renderer, target=target, pixels=[(24, 0), (24, 32)], truth=values, every=2)
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05, betas=(0.8, 0.95))
+    weight = 1 / (target.steady + target.steady.mean()).square()[:, None]
+    for step in range(41):
+        optimizer.zero_grad()
+        out = renderer(seed=step)
+        loss = (weight * (out.transient - target.transient).square()).mean()
+        loss.backward()
+        monitor.step(loss, out)
+        optimizer.step()
+        with torch.no_grad():
+            for value in renderer.parameters():
+                value.clamp_(0.001, 0.999)
+    monitor.figure().savefig(OUT / "fit.png", dpi=75)
+    to_palette(OUT / "fit.png")
+
+
+PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients, fit)}
 
 if __name__ == "__main__":
     OUT.mkdir(parents=True, exist_ok=True)

@@ -19,8 +19,11 @@ def _pictures() -> dict[str, Case]:
         losses=[2.0, 1.0],
     )  # fmt: skip
     fit.base["errors"] = {"a": [3.0]}
+    monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
         "vis.Cell": Case(v.Cell, "a", images={"b": DARK}, curve=np.ones(3)),
+        "vis.FitMonitor.save": Case(monitor.save, folder() / "fit.png"),
+        "vis.FitMonitor.step": Case(monitor.step, 1.0),
         "vis.cyclic": Case(v.cyclic, 0.3, value=0.5),
         "vis.cyclic_map": Case(v.cyclic_map, kind="even"),
         "vis.depth_picture": Case(v.depth_picture, torch.rand(3, 4)),

@@ -257,5 +257,9 @@ def test_refused(tmp_path):
     monitor = tt.vis.FitMonitor({}, target=TARGET, live=False)
     with pytest.raises(ShapeError, match="target's"):
         monitor.step(1.0, TARGET[..., :4])
+    with pytest.raises(ShapeError, match="one number"):
+        monitor.step(torch.ones(2))
+    with pytest.raises(ArgumentError, match="one number"):
+        monitor.step({"data": "small"})
     with pytest.raises(StorageError, match="missing"):
         monitor.save(tmp_path / "missing" / "fit.html")

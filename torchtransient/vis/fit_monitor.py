@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import count, mapping, numbers, path_of, several
+from torchtransient.checks import as_number, count, mapping, numbers, path_of, several, shown
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError
 from torchtransient.vis.colour_maps import symmetric_limit
 from torchtransient.vis.files import figure_type, save_figure, to_bytes
@@ -34,7 +34,7 @@ MOST_CURVES = 12
 MOST_MOMENTS = 60
 MOST_PIXELS = 128
 # Figures of notebooks and TensorBoard take this share of the time of the loop, after the first.
-SHARE = 0.02
+SHARE = 0.01
 # Weight of the pairs before, in means over pairs of gradients.
 _KEPT = 0.8
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22")
@@ -92,7 +92,7 @@ class FitMonitor:
 
     Call :meth:`step` once in each step, after ``backward``. In a notebook one figure is shown and brought up to date,
     ``log_dir`` makes a TensorBoard log, and :meth:`save` writes a page for a browser. After the first figure, those of
-    notebooks and logs are drawn so rarely that they take 2 % of the loop's time; pages are drawn when they are saved.
+    notebooks and logs are drawn so rarely that they take 1 % of the loop's time; pages are drawn when they are saved.
     Needs matplotlib and Pillow (extra ``vis``).
 
     The noise of a gradient is the part of its square that changes from one step to the next: half the square of the
@@ -171,12 +171,13 @@ class FitMonitor:
             step: number of the step; None counts on.
 
         Raises:
-            ShapeError: for an output that is no light, or not of the target's size.
+            ArgumentError: for a loss that is no number.
+            ShapeError: for a loss of several, an output that is no light, or not of the target's size.
         """
         number = self._next if step is None else count("FitMonitor.step: step", step, 0, ArgumentError)
         self._next = number + 1
         losses = loss if isinstance(loss, Mapping) else {"loss": loss}
-        self._pending.append((number, {k: v.detach() if isinstance(v, Tensor) else v for k, v in losses.items()}))
+        self._pending.append((number, {name: _number(name, value) for name, value in losses.items()}))
         if number % self._every == 0:
             self._look(number, output)
         if (number + 1) % self._every == 0:
@@ -410,6 +411,18 @@ class FitMonitor:
 
     def _exposure(self) -> float:
         return exposure_of((self._target or self._lights[0]).image)
+
+
+def _number(name: str, loss: Any) -> Tensor | float:
+    """A loss as it is; tensors stay on their device until they are looked at."""
+    if isinstance(loss, Tensor):
+        if loss.numel() != 1:
+            raise ShapeError(f"FitMonitor.step: expected {name!r} as one number, got {shown(loss)}.")
+        return loss.detach()
+    number = as_number(loss)
+    if number is None:
+        raise ArgumentError(f"FitMonitor.step: expected {name!r} as one number, got {shown(loss)}.")
+    return number
 
 
 def _curves(tracks: Mapping[str, _Track]) -> list[Curve]:
