@@ -308,7 +308,12 @@ def _pictures() -> dict[str, Case]:
     rates = LIGHT[..., :4, :4].expand(4, 8, 4, 4).unsqueeze(0)
     frames = v.frames(transient, axis=AXIS)
     cells = [v.Cell(f"{n}", {"a": np.zeros((2, 2, 3))}) for n in range(4)]
+    monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
+        "vis.FitMonitor": Case(
+            v.FitMonitor, {"a": torch.ones(2)}, target=LIGHT, pixels=[(1, 1)], truth={"a": [0.5, 0.6]}, every=3
+        ),
+        "vis.FitMonitor.step": Case(monitor.step, loss=1.0, step=3),
         "vis.contact_sheet": Case(v.contact_sheet, cells, columns=3),
         "vis.plot_overview": Case(v.plot_overview, transient, steady, AXIS, path=folder() / "o.png", pixel=(1, 1)),
         "vis.phasor_picture": Case(v.phasor_picture, phasor, frequencies=BAND, which=(1,), percentile=90.0),

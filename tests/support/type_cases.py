@@ -23,7 +23,6 @@ def _pictures() -> dict[str, Case]:
     return {
         "vis.Cell": Case(v.Cell, "a", images={"b": DARK}, curve=np.ones(3)),
         "vis.FitMonitor.save": Case(monitor.save, folder() / "fit.png"),
-        "vis.FitMonitor.step": Case(monitor.step, 1.0),
         "vis.cyclic": Case(v.cyclic, 0.3, value=0.5),
         "vis.cyclic_map": Case(v.cyclic_map, kind="even"),
         "vis.depth_picture": Case(v.depth_picture, torch.rand(3, 4)),
@@ -31,9 +30,6 @@ def _pictures() -> dict[str, Case]:
         "vis.median_pixel": Case(v.median_pixel, STEADY),
         "vis.normals_picture": Case(v.normals_picture, torch.rand(3, 4, 5)),
         "vis.peak_time": Case(v.peak_time, LIGHT, AXIS),
-        "vis.FitMonitor": Case(
-            v.FitMonitor, {"a": torch.ones(2)}, target=LIGHT, pixels=[(0, 1)], truth={"a": [0.5, 0.6]}
-        ),
         "vis.plot_shape_fit": fit,
         "vis.scan_layout": Case(v.scan_layout, scan),
     }
