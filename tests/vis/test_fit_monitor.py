@@ -123,6 +123,21 @@ def test_a_renderer_is_watched_by_its_keys(tmp_path):
     torch.testing.assert_close(last, out.transient[:, :, 4, 4].sum(0).detach(), rtol=1e-4, atol=1e-6)
 
 
+def test_parameters_made_of_two(tmp_path):
+    """Length and direction of a weight have gradients of their own."""
+    layer = torch.nn.utils.parametrizations.weight_norm(torch.nn.Linear(3, 2, bias=False))
+    monitor = tt.vis.FitMonitor(layer, every=2, live=False)
+    for step in range(5):
+        layer.zero_grad()
+        loss = layer(torch.ones(4, 3) + step).square().mean()
+        loss.backward()
+        monitor.step(loss)
+    _, noise, *weights = saved(monitor, tmp_path)["panels"]
+    assert [curve["label"] for curve in noise["curves"]] == [panel["title"] for panel in weights]
+    assert [panel["title"] for panel in weights] == ["weight0", "weight1"]
+    assert [len(panel["curves"]) for panel in weights] == [2, 6]
+
+
 def test_a_figure_shows_the_state(tmp_path):
     monitor = fitted()
     figure = monitor.figure()

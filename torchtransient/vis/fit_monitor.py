@@ -211,8 +211,8 @@ class FitMonitor:
     def _leaves(self) -> Iterator[tuple[str, Tensor]]:
         if isinstance(self._parameters, nn.Module):
             for name, leaf in self._parameters.named_parameters():
-                # Of parametrized ones "parametrizations.KEY.original0".
-                yield name.removeprefix("parametrizations.").split(".original")[0].replace("/", "."), leaf
+                # Of parametrized ones "parametrizations.KEY.original"; "original0", "original1" where there are two.
+                yield name.replace("parametrizations.", "").replace(".original", "").replace("/", "."), leaf
         else:
             yield from self._parameters.items()
 
