@@ -31,6 +31,8 @@ AXIS = tt.TimeAxis(start_opl=2.0, bin_width_opl=0.1, num_bins=120)
 # The gate of the recovery: the light that comes from the lamp by way of the floor alone.
 FLOOR_AXIS = tt.TimeAxis(start_opl=7.0, bin_width_opl=0.1, num_bins=16)
 WINDOWS = ((7.0, 7.3), (7.3, 7.6), (7.6, 8.0), (8.0, 10.0))
+# Bins of the film, until the light has crossed the floor, and bins of a frame.
+FILM_BINS, FRAME_BINS = 75, 3
 MOMENTS = (3.0, 4.0, 5.0, 6.0, 7.3, 8.0)
 TARGET_SEED = 1_000_003
 TEXEL_BLOCK = 15
@@ -205,6 +207,12 @@ def draw_light(out: tt.RenderOutput, path: Path) -> None:
     save(figure, path)
 
 
+def film_light(out: tt.RenderOutput, path: Path) -> None:
+    """The front of light on its way down the stairs, as a GIF."""
+    axis = tt.TimeAxis(AXIS.start_opl, AXIS.bin_width_opl, FILM_BINS)
+    tt.vis.video(out.transient[:, :FILM_BINS], path, axis=axis, every=FRAME_BINS, fps=8, scale=2)
+
+
 def draw_gradients(texture: torch.Tensor, gradients: list[torch.Tensor], path: Path) -> None:
     """The floor's texture and, for every window of time, how much each texel adds to the light in it."""
     from matplotlib.figure import Figure
@@ -269,7 +277,9 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
         path = unpack(options.archive, Path(folder))
         scene = tt.load(path, "llvm_ad_rgb", resx=sizes.width, resy=sizes.height, max_depth=sizes.max_depth)
         key = floor_key(scene)
-        draw_light(light_on_its_way(scene, sizes), options.output / "staircase_light.png")
+        light = light_on_its_way(scene, sizes)
+        draw_light(light, options.output / "staircase_light.png")
+        film_light(light, options.output / "staircase_light.gif")
         renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
         texture, gradients = window_gradients(renderer, key, sizes)
         draw_gradients(texture, gradients, options.output / "staircase_gradient.png")
