@@ -73,7 +73,7 @@ def fit_albedo(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
     with torch.no_grad():
         target = truth(seed=TARGET_SEED, spp=target_spp).transient
         first = renderer(seed=0, spp=target_spp).transient
-    pixels = [(resolution // 3, 0), (resolution // 3, resolution // 2)]
+    pixels = [(resolution // 3, resolution // 8), (resolution // 3, resolution // 2)]
     paints = {key: value.detach() for key, value in truth.values.items()}
     monitor = tt.vis.FitMonitor(renderer, target=target, pixels=pixels, truth=paints)
     fit = Fit(renderer.axis, albedos_of(truth), target, first, first, monitor)
