@@ -64,7 +64,7 @@ def main() -> None:
         if importlib.util.find_spec("tensorboard"):
             sides["log"] = {"log_dir": folder}
         for resolution, spp in ((8, 4),) if options.quick else ((8, 4), (32, 16), (96, 16)):
-            steps = 10 if options.quick or resolution == 96 else 100
+            steps = 10 if options.quick else {8: 100, 32: 20, 96: 10}[resolution]
             name = f"{resolution} x {resolution} x 80, {spp} samples"
             runs = {
                 f"{name}: {side}": loop(resolution, spp, steps, options.variant, given) for side, given in sides.items()

@@ -1,4 +1,4 @@
-"""Render and draw the figures of docs/pictures.md: `python docs/make_pictures.py [PART ...]`, twenty minutes on two cores.
+"""Render and draw the figures of docs/pictures.md: `python docs/make_pictures.py [PART ...]`, 20 minutes on two cores.
 
 Everything is a render, of a Cornell box or of two balls; nothing is drawn by hand.
 """
