@@ -388,6 +388,6 @@ LEFT = {
     r"nlos\.read_capture\(.*\)": "files/captures",
     r"data\.scene_labels\(.*\)": "rendering/test_labels.py",
     r"data\.ShardWriter\.(put|fail)\(.*\)": "what tt.data.generate gives",
-    r"training\.worker_init\(worker\)|vis\.Frames\(make\)|vis\.plot_fit\(truth\)": "given by torch; no number",
+    r"training\.worker_init\(worker\)|vis\.Frames\(make\)": "given by torch; no number",
     r"sensing\..*": "sensing/test_given.py and the tests of each sensor",
 }
