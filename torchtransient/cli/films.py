@@ -104,7 +104,7 @@ def _rates(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | No
         start, width, bins = given.split(":")
         numbers = float(start), float(width), int(bins)
     except ValueError:
-        raise UnitError(f"--rates: expected START:WIDTH:BINS in m/s, such as -10:0.5:40, got '{given}'.") from None
+        raise UnitError(f"--rates: expected START:WIDTH:BINS in m/s, such as -10.25:0.5:41, got '{given}'.") from None
     return Rates(RateAxis(*numbers), axis)
 
 

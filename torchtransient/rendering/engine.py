@@ -377,7 +377,8 @@ class Images:
         name = sampler_plugin(sampler)
         job.log.append(RunLog(job.items, seconds, integrator, spp, before, after, total, calls, depth, name))
         if job.watch.enabled:
-            job.watch.check_window(sum(total), sum(before), sum(after))
+            rates = film.measures == "rates"
+            job.watch.check_window(sum(total), sum(before), sum(after), rates)
         return self._steady, self._response
 
 

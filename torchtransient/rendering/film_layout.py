@@ -41,6 +41,8 @@ class FilmLayout(abc.ABC):
     # The film has bins of time: a temporal filter, an axis that a plan can find, a steady image that can be left out.
     has_bins: ClassVar[bool] = False
     is_complex: ClassVar[bool] = False
+    # The film spreads every arrival by a line of its own, which has a slope over time.
+    has_line: ClassVar[bool] = False
     # The film measures how fast paths get longer.
     knows_rates: ClassVar[bool] = False
     # The film spreads arrivals by a pulse and an impulse response.

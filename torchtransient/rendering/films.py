@@ -398,6 +398,7 @@ class Beats(RowsOfHistograms):
 
     measures: ClassVar[str] = "beats"
     plugin: ClassVar[str] = "beat_hdr_film"
+    has_line: ClassVar[bool] = True
     letter: ClassVar[str] = "2 x T"
     argument: ClassVar[str] = "chirps"
     example: ClassVar[str] = "chirps=tt.Chirps(bandwidth_hz=..., duration_s=..., wavelength_m=...)"

@@ -181,7 +181,8 @@ class RenderOutput(ErrorBars, TensorRecord):
     @property
     def outside(self) -> tuple[float, float]:
         """Shares of the light before and after the time window, over all items of the render; of polarized light of
-        S0. Zero where that light is not followed: without a window, and with ``steady=False``.
+        S0. Of a film of rates, light at other rates than those of the axis counts as after it. Zero where that light is
+        not followed: without a window, and with ``steady=False``.
         """
         before, after, total = map(sum, (self.stats.energy_before, self.stats.energy_after, self.stats.energy_total))
         return (before / total, after / total) if total > 0 and before + after > 0 else (0.0, 0.0)

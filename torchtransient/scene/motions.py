@@ -9,11 +9,13 @@ from typing import Any
 from torchtransient.checks import shown, some_of
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.plugins.mitsuba_compat import VELOCITY
-from torchtransient.scene.nodes import children, name_children
+from torchtransient.scene.nodes import children, name_children, node_kind
 
 PLUGIN = "rigid_motion"
 # Child of a body that says how it moves, and end of the name of the motion.
 CHILD = "velocity"
+# Kinds of nodes; those of plugins written in Python may be unknown before they are built.
+_BODIES = ("Shape", "Emitter", "Sensor", "Medium", "Unknown")
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
         props.set_id(f"{name}.{CHILD}")
         state.root.props[f"{name}_{CHILD}"] = mi.Properties.ResolvedReference(index)
     described = {state.nodes[index].props.get("of", ""): index for _, index in children(state, state.root)}
-    names = {node.props.id() for node in state.nodes}
+    names = {node.props.id() for node in state.nodes if node_kind(node) in _BODIES}
     for motion in motions:
         if motion.of not in names:
             known = some_of(sorted(name for name in names if name and not name.startswith("_")))

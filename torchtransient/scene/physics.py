@@ -140,12 +140,13 @@ class PhysicsWatch:
             for about, message in self.installed(scene, sensor).items():
                 self.warn(about, message)
 
-    def check_window(self, total: float, before: float, after: float) -> None:
+    def check_window(self, total: float, before: float, after: float, rates: bool = False) -> None:
         """Check the share of the light that a render's time window misses.
 
         Args:
             total: all light, in units of the steady image.
             before, after: light before and after the window, in the same units.
+            rates: what lies outside of the axis of rates counts as after the window.
         """
         if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._warned):
             return
@@ -153,7 +154,8 @@ class PhysicsWatch:
             self.warn(
                 self.window_name,
                 f"the window misses {(before + after) / total:.1%} of the light: {before / total:.1%} arrives before "
-                f"it, {after / total:.1%} after it. tt.plan(scene) finds a window; a start_opl that is earlier, more "
+                f"it, {after / total:.1%} after it{' or at other rates than those of the rate axis' if rates else ''}. "
+                f"tt.plan(scene) finds a window; a start_opl that is earlier, more "
                 "bins or wider ones hold more. RenderOutput.stats has the energies.",
             )
 

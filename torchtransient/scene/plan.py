@@ -515,7 +515,8 @@ class Finder:
             if (last - first) / width > MOST_BINS:
                 width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
         if self.spread != (0.0, 0.0):
-            how += f", widened by pulse and response from {self.spread[0]:g} to {self.spread[1]:+g} m"
+            what = "the lines of the chirps" if self.draft.film.kind.has_line else "pulse and response"
+            how += f", widened by {what} from {self.spread[0]:g} to {self.spread[1]:+g} m"
         first, last = first + self.spread[0], last + self.spread[1]
         axis = axis_over(first, last, width, num_bins)
         if reach:
@@ -587,7 +588,7 @@ class Finder:
                 raise SceneError(unknown_key(key, list(table)))
         self._note_edges([table[key] for key in self.draft.parameters])
         moving = needing_slope(table, self.draft.parameters, kind.knows_rates)
-        pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
+        pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed or kind.has_line)
         if not kind.has_bins:
             film = self.draft.film_choice or self.draft.described_film
             jump = "" if film is None or pulsed else film.jump()
