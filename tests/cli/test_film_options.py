@@ -44,7 +44,7 @@ def test_command_line(options, expected):
         ({"frequencies": "1, two"}, r"--frequencies: expected numbers with commas, got '1, two'"),
         ({"frequencies": "1", "gates": "rectangular 1 2"}, "--frequencies and --gates ask for different films"),
         ({"gates": "round 1 2"}, "kind out of"),
-        ({"rates": "-10:0.5"}, r"--rates: expected START:WIDTH:BINS in m/s, such as -10:0\.5:40, got '-10:0\.5'"),
+        ({"rates": "-10:0.5"}, r"--rates: expected START:WIDTH:BINS in m/s, such as -10\.25:0\.5:41, got '-10:0\.5'"),
         ({"rates": "-10:0.5:many"}, "--rates: expected START:WIDTH:BINS"),
         ({"rates": "-10:0:4"}, "bin_width"),
         ({"chirps": "1e9:1e-5"}, "--chirps: expected BANDWIDTH:DURATION:WAVELENGTH"),
