@@ -21,9 +21,9 @@ from torchtransient.sensing import (
     first_photon_probabilities,
     sample_detections,
 )
-from torchtransient.sensing.dead_time.dead_time_inverse import armed_time
+from torchtransient.sensing.dead_time.clocked_counts import armed_time
 from torchtransient.sensing.numerics.draws import fast_poisson, sample_first_photons, sample_multinomial
-from torchtransient.sensing.numerics.running_sums import sum_before
+from torchtransient.sensing.numerics.time_convolution import sum_before
 
 BINS = 48
 

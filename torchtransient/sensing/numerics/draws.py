@@ -1,14 +1,21 @@
-"""Many binomial, multinomial and Poisson draws at once, for histograms of a whole image.
+"""Poisson, binomial and multinomial draws for whole histograms, exact and on several cores.
 
-torch draws these distributions on one core. Large draws on the CPU are therefore cut into a fixed number of pieces,
-each with a generator seeded from the one given, and done by as many threads as `torch.get_num_threads()` says: the
-result depends on the generator, never on the number of threads.
+torch draws these distributions on one core, a binomial number in 40 to 120 ns. Here large draws on the CPU are cut into
+a fixed number of pieces, each with a generator seeded from the one given, and done by `torch.get_num_threads()`
+threads: results depend on the generator, not on the number of threads. Rare events (`thin`), splits of counts into two
+places (`halve`) and counts of one small probability (`add_passing`) are drawn by comparisons and tables that settle
+most entries, and in double precision where those do not.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+import os
+import threading
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,18 +23,39 @@ from torch import Tensor
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
 from torchtransient.sensing.base.layout import TIME
-from torchtransient.sensing.numerics.thinning import halve
-from torchtransient.sensing.numerics.worker_threads import side_by_side
 
 Result = TypeVar("Result")
 
-_PIECES = 4
-_BLOCK = 1 << 16  # pairs of bins at a time, so that temporaries stay in the cache
-_SMALL_IMAGE = 1 << 12  # pixels, below which several images are drawn side by side
+WHOLE_FLOAT32 = 2.0**24  # above, float32 skips integers
+
+# threads
+_LOCK = threading.Lock()
+_POOLS: dict[int, ThreadPoolExecutor] = {}
+_OWN = threading.local()
+_PIECES = 4  # of a large draw
 _WORTH_THREADS = 1 << 17  # numbers to draw, above which starting threads costs less than it saves
+
+# tables
+_VALUES = 1 << 16  # of a random number of 16 bits
+_BORDER = 1e-9  # beside the border of two results, more than the rounding of the distribution function
+_FEW_TRIALS = 127  # of an entry: their numbers fit into a byte. With more, torch.binomial is cheaper than two tables
+_RARE, _RARE_TRIALS = 0.05, 511  # up to this probability so many trials have results that fit into a byte
+
+# thinning
+_WORTH_TABLES = 1 << 15  # draws, below which many short operations cost more than they save
+_WORTH_ONE_TABLE = 1 << 13  # ... of one probability, which may be new in every call
+_ENTRIES = 1 << 17  # at a time, so that temporaries stay in the cache
+_ROUNDING = 2e-6  # of probabilities and uniform numbers in single precision
+_HEAVY = 6.0  # expected events of an entry, above which torch.binomial is cheaper than inversion
+_GRID = 65536.0  # steps of a 16 bit number
+_LARGE = 1500  # trials, above which torch.binomial is cheaper than repeated table lookups
+_MOST_MISFITS = 0.6  # share of entries with too many counts, above which tables do not pay
+
+# multinomials
+_PAIRS = 1 << 16  # of bins at a time, so that temporaries stay in the cache
+_SMALL_IMAGE = 1 << 12  # pixels, below which several images are drawn as one wide one
 _SMALL_DRAW = 1 << 14  # bins of all pixels, up to which few counts are drawn one by one
 _FEW_COUNTS = 1 << 13
-WHOLE_FLOAT32 = 2.0**24  # above, float32 skips whole numbers
 
 
 def check_rates(rate: Tensor, where: str) -> Tensor:
@@ -42,6 +70,70 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
             "clamp or use softplus where a network gives the rate."
         )
     return rate
+
+
+# -------------------------------------------------------------------------------------------------------------- threads
+
+
+def _alone() -> None:
+    torch.get_num_threads()  # a first look takes over the number of the process, which would undo the next line
+    torch.set_num_threads(1)
+    _OWN.works_alone = True
+
+
+def _forget() -> None:
+    """In a forked process: the threads stayed behind, and somebody may have held the lock."""
+    global _LOCK
+    _LOCK = threading.Lock()
+    _POOLS.clear()
+    _OWN.works_alone = False
+
+os.register_at_fork(after_in_child=_forget)
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    with _LOCK:
+        if threads not in _POOLS:
+            pool, all_there = ThreadPoolExecutor(threads), threading.Barrier(threads)
+
+            def begin(_: int) -> None:
+                _alone()
+                all_there.wait()
+
+            before = torch.get_num_threads()
+            try:
+                list(pool.map(begin, range(threads)))
+            except BaseException:
+                all_there.abort()  # those that did start would wait for the others, and the process for them
+                raise
+            finally:
+                # the number of a thread is also that of the process, until it is set again
+                torch.set_num_threads(before)
+            _POOLS[threads] = pool
+        return _POOLS[threads]
+
+
+def parallel_map(job: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
+    """`job` of the first of all `arguments`, of the second, ..., by as many threads as `torch.get_num_threads()` says.
+
+    Every job runs in the caller's inference and grad mode. The threads are kept for later calls. Called from one of
+    them, or where no more threads can be had (as at the end of the interpreter), it does everything in the caller's.
+    """
+    threads = min(torch.get_num_threads(), len(arguments[0]))
+    if threads < 2 or getattr(_OWN, "works_alone", False):
+        return list(map(job, *arguments))
+    inferring, watched = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def run(*given: Any) -> Result:
+        # modes are per thread, and what was made in inference mode can only be written to in it
+        with torch.inference_mode(inferring), torch.set_grad_enabled(watched):
+            return job(*given)
+
+    try:
+        pending = [_pool(threads).submit(run, *given) for given in zip(*arguments, strict=True)]
+    except RuntimeError:
+        return list(map(job, *arguments))
+    return [one.result() for one in pending]
 
 
 def by_pieces(
@@ -70,7 +162,7 @@ def _in_threads(
         with torch.no_grad():  # grad mode is per thread
             return job(*given, own)
 
-    return side_by_side(run, arguments, seeds)
+    return parallel_map(run, arguments, seeds)
 
 
 def _in_columns(
@@ -88,6 +180,372 @@ def _in_columns(
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """`torch.poisson` on several cores. Means have to be finite and >= 0, in float32 or float64."""
     return _in_columns(lambda m, g: torch.poisson(m, generator=g), mean, generator)
+
+
+# ------------------------------------------------------------------------------------------- tables of binomial numbers
+
+
+class BinomialTables:
+    """Binomial numbers of `probabilities` (S,) float64 in [0, 1) and of 0 ... `most` trials, on the CPU.
+
+    `cells`: stretches of the uniform number, a power of 2 up to 65536. `most`: with so many trials results above 127
+    must be out of reach (probability below 1e-20).
+    """
+
+    def __init__(self, probabilities: Tensor, most: int, cells: int) -> None:
+        self._most, self._cells = most, cells
+        below = _distribution(probabilities, most)
+        rows, self._results = below.shape
+        row = torch.arange(rows, device="cpu").unsqueeze(1)
+        # one ascending list of all rows: row r lies between r and r + 1
+        self._below = (below + row).reshape(-1)
+        place = below * cells
+        started = torch.zeros(rows, cells + 1, dtype=torch.int8, device="cpu")
+        one = torch.ones(1, dtype=torch.int8, device="cpu").expand(below.numel())
+        started.view(-1).scatter_add_(0, (row * (cells + 1) + place.ceil().long()).view(-1), one)
+        number = started[:, :-1].cumsum(1, dtype=torch.int8)
+        for shift in (-_BORDER, _BORDER):
+            cell = (place + shift * cells).floor().long()
+            number.view(-1)[(cell + row * cells)[(cell >= 0) & (cell < cells)]] = -1
+        self._number = number.view(-1)
+
+    def draw(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Numbers (K,) int32 of `trials` (K,) int32, each of the probability number `which` (K,) int32."""
+        if int(trials.max()) <= self._most:
+            return self._of_few(which, trials, generator).to(torch.int32)
+        number = self._of_few(which, trials.clamp_max(self._most), generator).to(torch.int32)
+        more = (trials > self._most).nonzero().squeeze(-1)
+        others = which[more] if isinstance(which, Tensor) else which
+        number[more] += self.draw(others, trials[more] - self._most, generator)
+        return number
+
+    def _of_few(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Numbers (K,) int8 of at most as many trials as the table has."""
+        cell, number = self._look(self._row(which, trials), generator)
+        unsure = (number < 0).nonzero().squeeze(-1)
+        if unsure.numel():
+            number[unsure] = self._exactly(self._row(which, trials)[unsure], cell[unsure], generator)
+        return number
+
+    def draw_some(self, trials: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Places (J,) int64 of the numbers above 0 (a few of 0 among them), and these (J,) int32, for one probability.
+
+        `trials` (K,) int32.
+        """
+        if int(trials.max()) > self._most:
+            number = self.draw(0, trials, generator)
+            place = number.nonzero().squeeze(-1)
+            return place, number.index_select(0, place)
+        cell, number = self._look(trials, generator)
+        place = number.nonzero().squeeze(-1)
+        some = number.index_select(0, place)
+        unsure = (some < 0).nonzero().squeeze(-1)
+        if unsure.numel():
+            among = place[unsure]
+            some[unsure] = self._exactly(trials[among], cell[among], generator)
+        return place, some.to(torch.int32)
+
+    def _row(self, which: Tensor | int, trials: Tensor) -> Tensor:
+        return trials if isinstance(which, int) and which == 0 else trials + which * (self._most + 1)
+
+    def _look(self, row: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Cells, and what the table says in them: -1 where it does not tell."""
+        cell = sixteen_bits(row, generator).to(torch.int32).bitwise_and_(self._cells - 1)
+        return cell, self._number.index_select(0, cell.add(row, alpha=self._cells))
+
+    def _exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
+        """The number by the rest of the uniform number, somewhere in the cell."""
+        u = torch.rand(row.shape, dtype=torch.float64, device="cpu", generator=generator)
+        u = u.add_(cell).mul_(1 / self._cells).add_(row)
+        k = torch.searchsorted(self._below, u, right=True) - row * self._results
+        # the end of a row is rounded
+        return k.clamp_(min=0).minimum(row % (self._most + 1)).to(torch.int8)
+
+
+class LagTable:
+    """Draws of 0 ... K - 1 with `probabilities` (K,) float64 whose sum is 1, on the CPU. K at most 32767."""
+
+    def __init__(self, probabilities: Tensor) -> None:
+        self._below = probabilities.cumsum(0)[:-1]
+        place = self._below * _VALUES
+        started = torch.bincount(place.ceil().long().clamp_(max=_VALUES), minlength=_VALUES + 1)
+        self._number = started.cumsum(0)[:_VALUES].to(torch.int16)
+        for shift in (-_BORDER, _BORDER):
+            cell = (place + shift * _VALUES).floor().long()
+            self._number[cell[(cell >= 0) & (cell < _VALUES)]] = -1
+
+    def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(N,) int64 for `like` (N,)."""
+        cell = sixteen_bits(like, generator).to(torch.int32).bitwise_and_(_VALUES - 1)
+        number = self._number.index_select(0, cell).long()
+        unsure = (number < 0).nonzero().squeeze(-1)
+        if unsure.numel():
+            u = torch.rand(unsure.shape, dtype=torch.float64, device="cpu", generator=generator)
+            number[unsure] = torch.searchsorted(self._below, u.add_(cell[unsure]).mul_(1 / _VALUES), right=True)
+        return number
+
+
+def sixteen_bits(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """One int16, uniform over all its values, for each entry of `like`: four out of every random 64 bits."""
+    words = torch.empty((like.numel() + 3) // 4, dtype=torch.int64, device=like.device)
+    return words.random_(-(2**63), None, generator=generator).view(torch.int16)[: like.numel()]
+
+
+def _distribution(probabilities: Tensor, most: int) -> Tensor:
+    """P(K <= k) for all probabilities and n = 0 ... `most`, one a row, and all k within reach: float64."""
+    mean = most * float(probabilities.max())
+    results = min(most, math.ceil(mean + 10 * math.sqrt(mean) + 25))
+    n = torch.arange(most + 1, dtype=torch.float64, device="cpu").unsqueeze(1)
+    k = torch.arange(results + 1, dtype=torch.float64, device="cpu")
+    ways = torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)  # none of k > n
+    p = probabilities.view(-1, 1, 1)
+    chance = torch.exp(ways + torch.xlogy(k, p) + (n - k) * torch.log1p(-p))
+    return chance.cumsum_(-1).clamp_(max=1.0).view(-1, results + 1)
+
+
+@functools.lru_cache(maxsize=32)
+def binomial_table(probability: float, *, small: bool = False) -> BinomialTables:
+    """The table of one probability in [0, 1/2]. `small`: one that is made in less time, for fewer entries."""
+    most = _RARE_TRIALS if probability <= _RARE and not small else _FEW_TRIALS
+    return BinomialTables(torch.tensor([probability], dtype=torch.float64, device="cpu"), most, 256 if small else 1024)
+
+
+@functools.cache
+def _coarse() -> BinomialTables:
+    return BinomialTables(torch.arange(17, dtype=torch.float64, device="cpu") / 32, _FEW_TRIALS, 4096)
+
+
+@functools.cache
+def _fine() -> BinomialTables:
+    return BinomialTables(torch.arange(64, dtype=torch.float64, device="cpu") / 1024, _FEW_TRIALS, 512)
+
+
+def draw_lower_share(
+    trials: Tensor, share: Tensor, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Binomial numbers for a probability just below `share` (K,), in [0, 1/2], and what is missing: three (K,).
+
+    (number int32, trials left, probability, below 1.1e-3, with which each of those still has to be added to it).
+    `trials` (K,) int32.
+    """
+    # a share in steps of 1/32, then what is left of it in steps of 1/1024: trials pass the first time or the second
+    number, rest, left = torch.zeros_like(trials), share, trials
+    for table, steps in ((_coarse(), 32), (_fine(), 1024)):
+        which = (rest * steps).to(torch.int32)
+        lower = which * (1 / steps)
+        rest = (rest - lower).div_(1 - lower)
+        drawn = table.draw(which, left, generator)
+        left = left - drawn
+        number += drawn
+    return number, left, rest
+
+
+# ----------------------------------------------------------------------------------------------- rare events and splits
+
+
+class Events(NamedTuple):
+    """Events of the entries that may have any, ascending: `place` (K,) int64 in the flattened input, `number` (K,).
+
+    Most numbers are at least 1. Entries that are left out have none.
+    """
+
+    place: Tensor
+    number: Tensor
+
+
+class _Candidates(NamedTuple):
+    """Entries that may have events: place, trials, probability of each, first 16 bits of their uniform number."""
+
+    place: Tensor
+    many: Tensor
+    share: Tensor
+    bits: Tensor
+
+
+def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator | None = None) -> Events:
+    """How many of `counts` pass, each with `probability`, for the few entries that have any. Binomial, no gradient.
+
+    `counts`: any shape, float32 or float64, whole numbers >= 0. `probability`: a number or one for each entry, in
+    [0, 1]. `number` is of the dtype of `counts`.
+    """
+    flat = counts.detach().reshape(-1)
+    p = torch.as_tensor(probability, dtype=torch.float64, device=flat.device).detach().reshape(-1)
+    if p.numel() == 1 and flat.device.type == "cpu" and flat.numel() >= _WORTH_ONE_TABLE and 0 <= float(p) <= 0.5:
+        return _thin_by_table(flat, float(p), generator)
+    found = []
+    for begin in range(0, max(flat.numel(), 1), _ENTRIES):
+        at = slice(begin, begin + _ENTRIES)
+        candidates = _sift(flat[at], p if p.numel() == 1 else p[at], generator)
+        found.append(candidates._replace(place=candidates.place + begin))
+    return _decide(_joined(found), flat.dtype, generator)
+
+
+def add_passing(counts: Tensor, probability: float, into: Tensor, generator: torch.Generator | None = None) -> None:
+    """Add to `into` how many of `counts` pass, each with `probability` in [0, 1/2]. Binomial, no gradient.
+
+    Both of one shape, float32 or float64, `into` contiguous; meant for some 1e5 entries at a time.
+    """
+    if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
+        trials, large, others = _apart(counts.reshape(-1), probability, generator)
+        table = binomial_table(probability, small=counts.numel() < _ENTRIES // 4)
+        into.view(-1).add_(table.draw(0, trials, generator)).index_add_(0, large, others)
+        return
+    events = thin(counts, probability, generator)
+    into.view(-1).scatter_add_(0, events.place, events.number)
+
+
+def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator | None) -> Events:
+    places, numbers = [], []
+    table = binomial_table(probability, small=flat.numel() < _ENTRIES // 4)
+    for begin in range(0, flat.numel(), _ENTRIES):
+        trials, large, others = _apart(flat[begin : begin + _ENTRIES], probability, generator)
+        place, number = table.draw_some(trials, generator)
+        places.append(place.add_(begin))
+        numbers.append(number.to(flat.dtype))
+        if large.numel():
+            places.append(large + begin)
+            numbers.append(others)
+    place, number = torch.cat(places), torch.cat(numbers)
+    if place.numel() and not bool((place[1:] > place[:-1]).all()):
+        place, order = place.sort()
+        number = number[order]
+    return Events(place, number)
+
+
+def _apart(
+    counts: Tensor, probability: float, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Trials (K,) int32 without those of large counts; the places of these, and their numbers from torch.binomial."""
+    low, high = torch.aminmax(counts)
+    if not float(low) >= 0:
+        raise UnitError(f"thin: expected counts >= 0, got {float(low):g}. Look for NaN or a difference upstream.")
+    trials = counts.to(torch.int32)
+    if float(high) <= _LARGE:
+        return trials, counts[:0].long(), counts[:0]
+    large = (counts > _LARGE).nonzero().squeeze(-1)
+    trials[large] = 0
+    many = counts[large]
+    return trials, large, torch.binomial(many, torch.full_like(many, probability), generator=generator)
+
+
+def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
+    """The entries that may have events, by 16 random bits each: P(any) <= n p. `p`: as many as `n`, or one."""
+    # one step more than the bound covers what rounding takes
+    steps = (n * p.to(n.dtype)).mul_(_GRID).sub_(_GRID / 2 - 2).clamp_(max=_GRID / 2 - 1).to(torch.int16)
+    bits = sixteen_bits(n, generator)
+    place = (bits <= steps).nonzero().squeeze(-1)
+    return _Candidates(place, n[place], p if p.numel() == 1 else p[place], bits[place])
+
+
+def _joined(parts: list[_Candidates]) -> _Candidates:
+    place, many, share, bits = zip(*parts, strict=True)
+    one_share = all(s.numel() == 1 for s in share) and len(parts) > 1
+    return _Candidates(torch.cat(place), torch.cat(many), share[0] if one_share else torch.cat(share), torch.cat(bits))
+
+
+def _decide(chosen: _Candidates, dtype: torch.dtype, generator: torch.Generator | None) -> Events:
+    """Binomial numbers of the candidates.
+
+    The number is at least k where u < P(K >= k). With the binomial moments x = n p, y = n (n - 1) p^2 / 2 and
+    z = n (n - 1) (n - 2) p^3 / 6, Bonferroni's inequalities say that P(K >= 1) lies in [x - y, x - y + z], P(K >= 2)
+    in [y - 2 z, y] and P(K >= 3) below z. In single precision and with room for its rounding they decide most
+    entries; the others are looked at in double precision.
+    """
+    n, p = chosen.many.float(), chosen.share.float()
+    finer = torch.rand(n.shape, dtype=torch.float32, device=n.device, generator=generator)
+    u = finer.add(chosen.bits).add_(_GRID / 2).mul_(1 / _GRID)
+    x = n * p
+    y = (x - p).mul_(x).mul_(0.5)
+    z = (x - 2 * p).mul_(y).mul_(1 / 3)
+    below, above = u + _ROUNDING, u.sub_(_ROUNDING)
+    x.sub_(y)
+    one = (below < x).logical_and_(above >= y)
+    zero = above >= x.add_(z)
+    two = (above >= z).logical_and_(below < y.sub_(z, alpha=2))
+    number = one.to(dtype).add_(two, alpha=2)
+    unsure = zero.logical_or_(one).logical_or_(two).logical_not_().nonzero().squeeze(-1)
+    if unsure.numel():
+        many = chosen.many[unsure].double()
+        share = (chosen.share if chosen.share.numel() == 1 else chosen.share[unsure]).double().expand(many.shape)
+        exact = (finer[unsure].double() + chosen.bits[unsure]).add_(_GRID / 2).div_(_GRID)
+        number[unsure] = _count_down(many, share, exact, generator).to(dtype)
+    return Events(chosen.place, number)
+
+
+def _count_down(many: Tensor, share: Tensor, u: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Binomial by inversion from the top, in float64: every round follows the entries that have more events.
+
+    Entries with many events take a fresh draw instead: of none of them has `u` decided anything yet.
+    """
+    number = torch.where(share < 1, torch.zeros_like(many), many)
+    heavy = many * share > _HEAVY
+    light = heavy.logical_or(share >= 1).logical_not_()
+    drawn = heavy.nonzero().squeeze(-1)
+    if drawn.numel():
+        number[drawn] = torch.binomial(many[drawn], share[drawn], generator=generator)
+    log_none = many * torch.log1p(-share)
+    tail = -torch.expm1(log_none)
+    where = ((u < tail) & light).nonzero().squeeze(-1)
+    odds = share / (1 - share)
+    chance = log_none.exp_()
+    u, tail, many, odds, chance = (v[where] for v in (u, tail, many, odds, chance))
+    k = 0
+    while where.numel():
+        k += 1
+        number[where] = float(k)
+        chance = chance * odds * ((many - (k - 1)) / k)
+        tail = tail - chance
+        more = ((u < tail) & (many > k)).nonzero().squeeze(-1)
+        where, u, tail, many, odds, chance = (v[more] for v in (where, u, tail, many, odds, chance))
+    return number
+
+
+def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """How many of `counts` go to the first of two places that gets each with probability `share`: binomial.
+
+    No gradient. Exact for any share in [0, 1], cheap for counts up to 127; other draws, few draws, and all draws
+    on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype, float32 or float64.
+
+    Tables give the number for a share just below the one that is meant, or below its complement; of the trials that
+    are left each is added with the small probability that is missing.
+    """
+    n, p = counts.detach(), share.detach()
+    if n.device.type != "cpu" or n.numel() < _WORTH_TABLES:
+        return torch.binomial(n, p.contiguous(), generator=generator)
+    flat, shares = n.reshape(-1), p.reshape(-1)
+    out = torch.empty_like(flat)
+    found: list[_Candidates] = []
+    for begin in range(0, flat.numel(), _ENTRIES):
+        at = slice(begin, begin + _ENTRIES)
+        many, p = flat[at], shares[at]
+        less = torch.minimum(p, 1 - p)
+        # NaN fits nowhere and is torch.binomial's to refuse
+        if float(many.amax()) <= _FEW_TRIALS and float(less.amin()) >= 0:
+            unfit = flat[:0].long()
+        else:
+            unfit = (many <= _FEW_TRIALS).logical_and_(less >= 0).logical_not_().nonzero().squeeze(-1)
+        if unfit.numel() > _MOST_MISFITS * many.numel():
+            out[at] = torch.binomial(many, p, generator=generator)
+            continue
+        trials = many.to(torch.int32)
+        if unfit.numel():
+            trials[unfit], less[unfit] = 0, 0.0
+        number, left, missing = draw_lower_share(trials, less, generator)
+        likely = p > 0.5
+        candidates = _sift(left.to(flat.dtype), missing, generator)
+        # not `where`, which guesses at every entry
+        out[at] = trials.sub_(number, alpha=2).mul_(likely).add_(number)
+        if unfit.numel():
+            out[at][unfit] = torch.binomial(many[unfit], p[unfit], generator=generator)
+        found.append(candidates._replace(place=(candidates.place + begin) * 2 + likely[candidates.place]))
+    if found:
+        added = _decide(_joined(found), flat.dtype, generator)
+        place = added.place >> 1
+        out[place] += added.number * (1 - (added.place & 1) * 2)
+    return out.view(n.shape)
+
+
+# ----------------------------------------------------------------------------------------------- multinomial histograms
 
 
 def _distribute(
@@ -116,7 +574,7 @@ def _distribute(
     if number is None:
         number = torch.binomial(torch.full_like(total[0], float(trials)), total[0], generator=generator)
     counts = number.unsqueeze(0).to(weights.dtype)
-    together = max(_BLOCK // max(weights.shape[1], 1), 1)
+    together = max(_PAIRS // max(weights.shape[1], 1), 1)
     while weights.shape[0] > counts.shape[0]:
         finer = levels.pop()
         even = finer.shape[0] // 2

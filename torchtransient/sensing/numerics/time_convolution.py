@@ -1,22 +1,21 @@
-"""Convolution along time with a kernel of bins, directly or by FFT, into an open or a periodic window."""
+"""Convolutions and running sums along the time axis of (..., C, T, H, W)."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.axes import fast_length
-from torchtransient.checks import count, is_one_of, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.sensing.base.layout import TIME, check_transient, reals, without_autocast
+from torchtransient.checks import count
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.base.layout import TIME, check_choice, check_transient, reals, without_autocast
 
 Boundary = Literal["zero", "periodic"]
 Method = Literal["auto", "direct", "fft"]
-
 # Up to here a direct convolution is as fast as the transform, and it keeps the relative precision of faint late bins.
 _DIRECT_TAPS = 192
 # Short kernels over images: whole images are added, shifted in time, which leaves the layout as it is.
@@ -24,13 +23,7 @@ _DIRECT_TAPS = 192
 _SHIFTED_TAPS = 96
 _SHIFTED_TAPS_BACKWARD = 24
 _SHIFTED_PIXELS = 64
-
-
-def check_choice(value: str, choices: object, name: str, where: str) -> None:
-    """ShapeError unless `value` is one of the strings of a Literal type."""
-    allowed = get_args(choices)
-    if not is_one_of(value, allowed):
-        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {shown(value)}.")
+_WIDE = 64  # images at least this large are summed row by row: torch.cumsum strides through memory along time
 
 
 @without_autocast
@@ -147,3 +140,54 @@ def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: i
     slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
     value = y.detach()
     return y - torch.where((value < 0) & (value >= -slack), value, 0.0)
+
+
+# --------------------------------------------------------------------------------------------------------- running sums
+
+
+def _sum_before(x: Tensor, reverse: bool) -> Tensor:
+    if x.device.type != "cpu" or x.shape[-1] * x.shape[-2] < _WIDE:
+        wide = x.to(torch.float64)
+        if reverse:
+            return wide.flip(TIME).cumsum(TIME).flip(TIME) - wide
+        return wide.cumsum(TIME) - wide
+    out = torch.empty(x.shape, dtype=torch.float64, device=x.device)
+    bins = x.shape[TIME]
+    total = torch.zeros_like(x.select(TIME, 0), dtype=torch.float64)
+    for k in range(bins - 1, -1, -1) if reverse else range(bins):
+        out.select(TIME, k).copy_(total)
+        total += x.select(TIME, k)
+    return out
+
+
+class _SumBefore(torch.autograd.Function):
+    @staticmethod
+    def forward(x: Tensor, reverse: bool) -> Tensor:
+        return _sum_before(x, reverse)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.dtype, ctx.reverse = inputs[0].dtype, inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return _apply(gradients[0], not ctx.reverse).to(ctx.dtype), None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return _sum_before(tangents[0], ctx.reverse)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, reverse: bool) -> tuple[Tensor, int]:
+        # time is counted from the end, so a batch in front changes nothing
+        return _apply(x.movedim(in_dims[0] or 0, 0), reverse), 0
+
+
+def _apply(x: Tensor, reverse: bool) -> Tensor:
+    result: Tensor = _SumBefore.apply(x, reverse)  # type: ignore[no-untyped-call]
+    return result
+
+
+def sum_before(x: Tensor) -> Tensor:
+    """Sum of all earlier bins along the time axis of (..., T, H, W), float64, differentiable any number of times."""
+    return _apply(x, False)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import MOST_MADE
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import (
@@ -323,3 +324,27 @@ class PhotonBudget(Sensor):
             cycles=self.cycles,
             exposure_s=self.exposure_s,
         )
+
+
+def hot_pixel_rates(
+    height: int,
+    width: int,
+    *,
+    median_hz: float,
+    log_std: float = 0.5,
+    hot_fraction: float = 0.01,
+    hot_factor: float = 100.0,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """A map (H, W) float64 of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
+
+    `log_std`: standard deviation of the natural logarithm. For `PhotonBudget(dark_count_rate_hz=...)`.
+    """
+    median = check_number(median_hz, "median_hz", where := "hot_pixel_rates")
+    spread = check_number(log_std, "log_std", where)
+    fraction = check_number(hot_fraction, "hot_fraction", where, high=1.0)
+    factor = check_number(hot_factor, "hot_factor", where, low=1.0)
+    size = [check_count(side, "height and width", where, low=0, most=MOST_MADE) for side in (height, width)]
+    rates = median * torch.exp(spread * torch.randn(size, dtype=torch.float64, generator=generator))
+    hot = torch.rand(size, dtype=torch.float64, generator=generator) < fraction
+    return torch.where(hot, rates * factor, rates)

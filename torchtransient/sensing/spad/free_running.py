@@ -24,6 +24,7 @@ from torchtransient.sensing.base.layout import (
     bin_width_of,
     bins_of_period,
     check_bins,
+    check_choice,
     check_count,
     check_seconds,
     check_tensor,
@@ -32,18 +33,15 @@ from torchtransient.sensing.base.layout import (
 )
 from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
-from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins, whole_and_part
-from torchtransient.sensing.dead_time.free_running_draws import (
-    Path,
-    bin_chances,
-    draw_path,
-    log_likelihood,
-    path_log_prob,
+from torchtransient.sensing.dead_time.clocked_counts import StepCounts, draw_steps, safe_xlogy, steps_log_prob
+from torchtransient.sensing.dead_time.free_running import (
+    FreeRunningState,
+    sample_trains,
+    stationary_state,
+    stationary_steps,
 )
-from torchtransient.sensing.dead_time.free_running_ring import train_counts
-from torchtransient.sensing.dead_time.free_running_state import FreeRunningState, stationary_state
+from torchtransient.sensing.dead_time.renewal import check_dead_bins, split_dead_time
 from torchtransient.sensing.numerics.draws import check_rates
-from torchtransient.sensing.numerics.time_convolution import check_choice
 
 DeadTime = Literal["non_paralyzable", "paralyzable"]
 _SIDE_BY_SIDE = 1 << 10  # detectors drawn at a time
@@ -65,7 +63,7 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     """Stationary state for rates (..., T, H, W), in the same layout."""
     if rate.numel() == 0:
         empty = rate.to(torch.float64)
-        return FreeRunningState(empty, empty, empty, whole_and_part(torch.as_tensor(dead_bins))[0])
+        return FreeRunningState(empty, empty, empty, split_dead_time(torch.as_tensor(dead_bins))[0])
     wide = rate.to(torch.float64).movedim(TIME, -1)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     rows = stationary_state(wide.reshape(-1, wide.shape[-1]), dead)
@@ -233,12 +231,12 @@ class FreeRunningSPAD(RandomSensor):
                 f"{dead_time_s:g} s. Use narrower bins, or no dead time (ShotNoise) where it does not matter."
             )
 
-    def _path(self, x: Tensor, generator: torch.Generator | None) -> Path:
+    def _path(self, x: Tensor, generator: torch.Generator | None) -> StepCounts:
         """Periods of the non-paralyzable detector, each drawn on its own, step by step."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s))
             rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
-            return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
+            return draw_steps(stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
 
     def _train(self, x: Tensor, generator: torch.Generator | None, normal: bool) -> Tensor:
         with torch.no_grad():
@@ -252,7 +250,7 @@ class FreeRunningSPAD(RandomSensor):
             counts, left = torch.zeros_like(rows), self.trains
             while left:  # several rows of one light side by side: few pixels cost as much as one
                 number = min(left, max(1, _SIDE_BY_SIDE // rows.shape[0]))
-                found = train_counts(rows.repeat(number, 1), dead, periods, generator, normal=normal)
+                found = sample_trains(rows.repeat(number, 1), dead, periods, generator, normal=normal)
                 counts, left = counts + found.view(number, *rows.shape).sum(0), left - number
             return counts.view(wide.shape).movedim(-1, TIME).to(x.dtype)
 
@@ -279,7 +277,7 @@ class FreeRunningSPAD(RandomSensor):
         p, n = self.probabilities(x.double()), measurement.double()
         quiet = self.cycles - n
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
-        return (log_likelihood(n, p) + log_likelihood(quiet, 1 - p) + ways).sum(TIME)
+        return (safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p) + ways).sum(TIME)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.kind == "paralyzable":
@@ -288,7 +286,7 @@ class FreeRunningSPAD(RandomSensor):
 
         def log_prob() -> Tensor:
             rate = x.double()
-            return path_log_prob(path, bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles)
+            return steps_log_prob(path, stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles)
 
         record_score(log_prob, type(self).__name__)
         return path.counts.to(x.dtype)

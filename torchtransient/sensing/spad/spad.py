@@ -31,18 +31,20 @@ from torchtransient.sensing.base.layout import (
 )
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
-from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins, double_detections
-from torchtransient.sensing.dead_time.dead_time_draws import (
-    DrawnRows,
-    draw_cycles,
-    gaussian_cycles,
+from torchtransient.sensing.dead_time.clocked import mean_detections, second_detections
+from torchtransient.sensing.dead_time.clocked_counts import (
+    DrawnCycles,
+    armed_time,
+    check_cycles,
+    coates_of_rows,
+    cycles_log_prob,
+    draw_cycle_steps,
+    normal_cycles,
     sample_cycles,
-    score_of_cycles,
 )
-from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles, rates_of_counts
-from torchtransient.sensing.dead_time.dead_time_means import detected_columns
+from torchtransient.sensing.dead_time.renewal import check_dead_bins
 from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons
-from torchtransient.sensing.numerics.running_sums import sum_before
+from torchtransient.sensing.numerics.time_convolution import sum_before
 
 
 @in_single
@@ -100,7 +102,7 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     if rate.numel() == 0:
         return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    return _of_columns(detected_columns(_columns(rate), dead), rate)
+    return _of_columns(mean_detections(_columns(rate), dead), rate)
 
 
 @in_single
@@ -119,7 +121,7 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
     if dead_bins is not None and counts.numel():
         refuse_cut_off(dead_bins, "dead_bins", "coates")
         dead = float(one_number(dead_bins, "dead_bins", "coates"))
-        rate, valid = rates_of_counts(_rows(counts), number, dead)
+        rate, valid = coates_of_rows(_rows(counts), number, dead)
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
     usable = ~(armed <= 0.5)  # NaN stays NaN
@@ -156,13 +158,13 @@ def sample_detections(
 
 def _drawn(
     rate: Tensor, cycles: int, dead_bins: float, generator: torch.Generator | None
-) -> tuple[Tensor, list[DrawnRows]]:
+) -> tuple[Tensor, list[DrawnCycles]]:
     check_dead_bins(dead_bins)
     check_rates(rate, "sample_detections")
     if rate.numel() == 0:
         return rate.clone(), []
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    counts, drawn = draw_cycles(_rows(rate), dead, cycles, generator)
+    counts, drawn = draw_cycle_steps(_rows(rate), dead, cycles, generator)
     return _image(counts, rate).to(rate.dtype), drawn
 
 
@@ -247,7 +249,7 @@ class SynchronousSPAD(RandomSensor):
         if self.dead_bins is not None and self.dead_bins < 1 and x.numel():
             # a cycle may fire twice in a bin
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            variance = variance + 2 * _image(double_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
+            variance = variance + 2 * _image(second_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
         return variance * self.cycles
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -256,7 +258,7 @@ class SynchronousSPAD(RandomSensor):
             if rate.numel() == 0:
                 return rate * self.cycles
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            return _image(gaussian_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
+            return _image(normal_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
         p = self.probabilities(x)
         return p * self.cycles + multinomial_noise(p, self.cycles, generator)
 
@@ -276,7 +278,7 @@ class SynchronousSPAD(RandomSensor):
 
         def log_prob() -> Tensor:
             rate, dead = _rows(self._gated(x)), torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            return score_of_cycles(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
+            return cycles_log_prob(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
 
         record_score(log_prob, type(self).__name__)
         return measurement
