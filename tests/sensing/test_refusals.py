@@ -15,8 +15,8 @@ from torchtransient.sensing.base.pixel_maps import check_map
 from torchtransient.sensing.base.policies import ScoreFunction
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector
+from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelays
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
-from torchtransient.sensing.correlated_noise.triggered_counts import AfterpulseDelays
 from torchtransient.sensing.counts.added_counts import AddedCounts
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
 from torchtransient.sensing.dead_time.free_running import _balance

@@ -19,7 +19,7 @@ from torchtransient.sensing import (
     afterpulse_kernel,
     hot_pixel_rates,
 )
-from torchtransient.sensing.correlated_noise import triggered_counts
+from torchtransient.sensing.correlated_noise import crosstalk
 
 BINS = 40
 
@@ -146,7 +146,7 @@ def test_counts_below_zero_trigger_nothing():
 
 def test_frames_that_are_followed_some_at_a_time(monkeypatch):
     """Each has crosstalk of its own detections, and all of it, however many fit into a block."""
-    monkeypatch.setattr(triggered_counts, "_ENTRIES", 3 * 2 * 3 + 1)
+    monkeypatch.setattr(crosstalk, "_BLOCK", 3 * 2 * 3 + 1)
     x = torch.full((100, 2, 3), 20.0)
     stage = Crosstalk(0.1, diagonal_ratio=0.5)
     found = stage.sample(x.unsqueeze(0), torch.Generator().manual_seed(0))[0] - x

@@ -13,8 +13,8 @@ from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.cameras.electronics import PixelElectronics
 from torchtransient.sensing.cameras.gated import GatedIntegration
 from torchtransient.sensing.chain.chain_walk import branches_of, in_order, numbered
+from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.correlated_noise.triggered_counts import Afterpulsing
 from torchtransient.sensing.itof.itof_pixels import TapDifference
 from torchtransient.sensing.optics.photon_budget import PhotonBudget
 from torchtransient.sensing.optics.spatial_psf import LensBlur, SpatialPSF

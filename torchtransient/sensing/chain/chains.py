@@ -11,8 +11,9 @@ from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import Sensor
 from torchtransient.sensing.chain.compose import Compose
+from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.correlated_noise.triggered_counts import Afterpulsing, Crosstalk
+from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk
 from torchtransient.sensing.optics.photon_budget import PhotonBudget
 from torchtransient.sensing.response.impulse_response import ImpulseResponse
 from torchtransient.sensing.response.responses import Response

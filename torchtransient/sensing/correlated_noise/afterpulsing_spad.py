@@ -32,7 +32,7 @@ from torchtransient.sensing.base.pixel_maps import kept_map, over_time
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import common_bins
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector, cycles_of
-from torchtransient.sensing.correlated_noise.triggered_counts import Afterpulsing
+from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing
 from torchtransient.sensing.dead_time.clocked import (
     PHOTONS,
     DeadTimeBlocks,
@@ -77,7 +77,7 @@ def _twice(x: Tensor) -> Tensor:
 
 
 class _LossyChain:
-    """x -> step of the share `kept` of x, and what it needs to be undone."""
+    """Step of the share `kept` of the lines of a renewal chain, and the inverse of 1 minus it."""
 
     def __init__(self, loss: Tensor, kept: Tensor, part: Tensor, whole: int) -> None:
         self.chain, self.kept = RenewalChain(loss, whole, part), kept
@@ -112,7 +112,7 @@ def _step(given: Sequence[Tensor], whole: int, x: Tensor) -> Tensor:
 
 
 class _Trapped(torch.autograd.Function):
-    """Both modes by the implicit function theorem."""
+    """Lines of trapped carriers, with both modes by the implicit function theorem."""
 
     @staticmethod
     def forward(ctx: Any, loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
@@ -158,11 +158,20 @@ class _Trapped(torch.autograd.Function):
 
 
 def trapped_carrier_lines(loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
-    """Stationary lines (R, 2 T) of all that is lost at the rates `loss` (R, T) > 0 while armed.
+    """Stationary lines of the loss of an armed detector that holds trapped carriers; differentiable once in all four
+    tensors.
 
-    Of it the shares `kept` (R, T) come back after the dead time (`whole` bins and `part` of one), and so do the lines
-    `source` (R, 2 T). float64, differentiable once in all four tensors. Raises TorchTransientError where it does not
-    converge.
+    Args:
+        loss: (R, T) > 0, rate at which the state is left while armed, float64.
+        kept: (R, T), share of the loss that returns after the dead time.
+        source: lines (R, 2 T) that are put in after the dead time.
+        part, whole: dead time in bins, split.
+
+    Returns:
+        Lines (R, 2 T).
+
+    Raises:
+        TorchTransientError: if the iteration does not converge.
     """
     x: Tensor = _Trapped.apply(loss, kept, source, part, whole)  # type: ignore[no-untyped-call]
     return x
@@ -172,20 +181,23 @@ def trapped_carrier_lines(loss: Tensor, kept: Tensor, source: Tensor, part: Tens
 
 
 class Train(Protocol):
-    """A detector whose detections are on straight lines, in pieces of bins."""
+    """Detector whose detections are on straight lines, in pieces of bins."""
 
     def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Rates (R, N) -> (pieces that it is armed in each (R, N), lines of detections (R, 2, N))."""
+        """Rates (R, N) -> time armed in each piece (R, N), lines of detections (R, 2, N)."""
         ...
 
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of what is also lost at the rate `lost` (R, 1), comes back by the share `back` (R, 1) of detections
-        and is put by the lines `source` (R, 2, N)."""
+        """The same of a state with trapped carriers.
+
+        It is also left at the rate `lost` (R, 1), returns by the share `back` (R, 1) of detections and is put in by the
+        lines `source` (R, 2, N).
+        """
         ...
 
 
 def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
-    """`bin_response`; of few photons one matrix times their powers, in a quarter of the time."""
+    """`bin_response`; for few photons one matrix times their powers, in a quarter of the time."""
     if largest > _SERIES or part.requires_grad:
         return bin_response(loss, part, largest)
     series = response_series(float(part), series_degree(largest))[0].to(loss.device)
@@ -205,7 +217,7 @@ def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
 
 @dataclass(frozen=True)
 class ClockedTrain:
-    """Armed at the start of a cycle, without carriers of this cycle."""
+    """Detector armed at the start of a cycle, without carriers of this cycle."""
 
     whole: int
     part: Tensor
@@ -256,7 +268,7 @@ class ClockedTrain:
 
 @dataclass(frozen=True)
 class FreeRunningTrain:
-    """A detector that runs free, in its stationary state."""
+    """Free-running detector in its stationary state."""
 
     whole: int
     part: Tensor
@@ -276,7 +288,7 @@ class FreeRunningTrain:
 
 
 def _safe_ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole, at least 0, and 0 where nothing is."""
+    """part / whole, at least 0, and 0 where whole is 0."""
     some = whole > 1e-200
     return torch.where(some, part / torch.where(some, whole, torch.ones_like(whole)), 0.0).clamp_min(0)
 
@@ -290,11 +302,19 @@ def carrier_hazard(
     tau: Tensor,
     dead: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """(Rate of carriers that fire an armed detector (P, N), pieces of time that it is armed (P, N)), per piece.
+    """Rate of carriers that fire an armed detector, by rounds over generations of carriers.
 
-    `first` (P, N): photons; `photons`: all else that fires it, from the detections of the round before; None: these.
-    `gate` (N,): share of carriers that are seen. `seen`, `tau` (K,): carriers of a detection and their mean delays
-    beyond the dead time `dead`, in pieces.
+    Args:
+        train: detector.
+        photons: rate of all else that fires it, from the detections of the round before; None: `first`.
+        first: (P, N) photons per piece.
+        gate: (N,) share of carriers that are seen, or None.
+        seen: (K,) carriers of a detection.
+        tau: (K,) mean delays beyond the dead time, in pieces.
+        dead: dead time in pieces.
+
+    Returns:
+        Hazard per piece (P, N), and time armed (P, N) in pieces.
     """
     kinds, (pixels, pieces) = tau.shape[0], first.shape
     one, stay = (1 / tau).view(1, kinds, 1), torch.exp(-dead / tau).view(1, kinds, 1)
@@ -340,17 +360,19 @@ def carrier_hazard(
 
 
 def _generations(seen: Tensor) -> int:
+    """Rounds until the carriers of a generation are negligible."""
     most = float(seen.detach().sum())
     return max(2, math.ceil(math.log(_LEFT) / math.log(most))) if most > _LEFT else 1
 
 
 def _merge_pieces(hazard: Tensor, waited: Tensor, pieces: int) -> Tensor:
-    """Per piece while armed -> per `pieces` of them while armed."""
+    """Hazard per piece -> hazard per `pieces` of them, weighted by the time armed."""
     shape = (hazard.shape[0], -1, pieces)
     return pieces * _safe_ratio((hazard * waited).view(shape).sum(-1), waited.view(shape).sum(-1))
 
 
 def _subdivide(value: Tensor, pieces: int) -> Tensor:
+    """Values of bins -> values of `pieces` equal parts."""
     return (value / pieces).repeat_interleave(pieces, -1)
 
 
@@ -363,10 +385,19 @@ def clocked_hazard(
     earlier: Callable[[Tensor, Tensor | slice], Tensor],
     steps: int = 1,
 ) -> Tensor:
-    """Carriers set free per cycle while a detector is armed, (P, steps T): in `steps` (2^k) equal parts of bins.
+    """Rate of carriers that fire an armed detector that is armed at the start of cycles.
 
-    The detector is armed at the start of cycles. `rate` (P, T) photons; `gate` (T,) multiplies them and carriers;
-    `earlier(detections, rows)`: carriers of other cycles. `tau` (K,) in bins.
+    Args:
+        rate: (P, T) photons per cycle and bin, float64.
+        dead_bins: dead time in bins, scalar float64.
+        gate: (T,), multiplies photons and carriers, or None.
+        seen: (K,) carriers of a detection.
+        tau: (K,) mean delays beyond the dead time, in bins.
+        earlier: function of detections and rows, giving the carriers of other cycles.
+        steps: equal parts of a bin, a power of 2.
+
+    Returns:
+        (P, steps T) per cycle and part of a bin.
     """
     size = rate.shape[-1]
     least = max(steps, 1 if float(dead_bins) >= 1 - 1e-9 else 2)
@@ -408,7 +439,11 @@ def clocked_hazard(
 
 
 def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
-    """The same of a detector that runs free, for rates (P, T) per period; 0 in the dark."""
+    """Rate of carriers that fire an armed free-running detector, 0 in the dark.
+
+    Args, Returns:
+        As `clocked_hazard`, for rates per period.
+    """
     dark = rate.sum(-1, keepdim=True) < DARK
     safe = torch.where(dark, 0.1, rate)
     found = rate.new_zeros(rate.shape[0], steps * rate.shape[-1])
@@ -426,35 +461,38 @@ def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tens
 
 
 class AfterpulsingSPAD(WrappedDetector):
-    """A `SynchronousSPAD` or `FreeRunningSPAD` with afterpulses: rates (..., C, T, H, W) in, counts out.
+    """SPAD with afterpulses that obey its dead time: rates (..., C, T, H, W) per cycle and bin in, counts out.
 
-    Carriers that are set free act on the detector as photons do: they fire it when it is armed and are lost when it is
-    dead; those that fire start a dead time and leave carriers of their own. Their rate while the detector is armed,
-    `released(x)`, is added to that of the photons, and means, draws and all four policies are the detector's own.
-
-    `afterpulsing`: an `Afterpulsing`, of the detector's bins and dead time. One detection per cycle (`SynchronousSPAD`
-    without dead time) leaves the detector dead to the end of the cycle: only afterpulses of later cycles are seen. A
-    closed gate stops them, too. With a `period_s` beyond the window the `background` of the Afterpulsing, counts of a
-    bin of the whole exposure, goes on outside of it; inside a `MacroPixel` or `CoincidencePixel` it is that of the
-    whole pixel, of which every SPAD has its share.
+    Released carriers act as photons do: they fire an armed detector and are lost on a dead one; those that fire start a
+    dead time and leave carriers of their own. Their rate while the detector is armed, `released(x)`, is added to that
+    of the photons; means, draws and all four policies are the detector's own. A SynchronousSPAD without dead time is
+    dead to the end of the cycle: only afterpulses of later cycles are seen. A closed gate stops afterpulses, too. With
+    a `period_s` beyond the window the `background` of the Afterpulsing, counts of a bin of the whole exposure, goes on
+    outside of it; inside a `MacroPixel` or `CoincidencePixel` it is that of the whole pixel, of which every SPAD has
+    its share.
 
     Exponential delays of a detector with dead time (SynchronousSPAD, or FreeRunningSPAD "non_paralyzable"): each
-    carrier is followed from its detection on (carrier_hazard), so that one set free right after the dead time finds
+    carrier is followed from its detection on (`carrier_hazard`), so that one released right after the dead time finds
     the detector armed, and all older carriers that are still trapped count. Pairs of carriers are exact, three and more
     by their pairs; means are within 1.5 times the noise of events for probabilities up to 0.3, delays of 0.3 to 300
     bins. Several exponentials are independent. Delays below 1.2 bins are followed in parts of bins, at the cost of as
     many bins (8 at most); `log_prob`, `variance` and pixels of several SPADs take them as constant inside a bin.
 
-    Other laws of delays, "paralyzable" detectors and detectors without dead time of their own (one detection a cycle):
-    releases are independent of whether a photon has fired the detector since. That is right for one detection a cycle;
-    else off by up to a third of the probability in total variation, totals by a quarter, where most carriers are set
-    free right after the dead time (see docs/photon_counting.md).
+    Other laws of delays, "paralyzable" detectors and detectors without dead time of their own: releases are independent
+    of whether a photon has fired the detector since. Exact for one detection a cycle; else off by up to a third of the
+    probability in total variation, totals by a quarter, where most carriers are released right after the dead time
+    (docs/photon_counting.md).
 
     Draws have the variance of the detector at that rate: afterpulses vary as photons do, short by twice their share in
     dim light (variance over mean of totals 0.83 for 1.41 with a probability of 0.3, 0.7 for 0.8 with 0.05).
 
-    Raises UnitError for a dead time or bins that are not the detector's, and for periods that do not go with the
-    window.
+    Args:
+        detector: SynchronousSPAD or FreeRunningSPAD.
+        afterpulsing: of the detector's bins and dead time.
+        grad: gradient policy; None: that of the detector.
+
+    Raises:
+        UnitError: for another dead time or other bins than the detector's, and periods that do not fit the window.
     """
 
     detector: SynchronousSPAD | FreeRunningSPAD
@@ -488,7 +526,7 @@ class AfterpulsingSPAD(WrappedDetector):
         self.afterpulsing.check_bins(x)
 
     def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
-        """In the frequencies of a period, and of two windows for what has to be left out; the period in bins."""
+        """Transfer functions of a period, and of two windows for the part to be left out; period in bins."""
         check_transient(x, "AfterpulsingSPAD")
         bins = x.shape[TIME]
         period = self.afterpulsing.period_bins or bins
@@ -504,7 +542,7 @@ class AfterpulsingSPAD(WrappedDetector):
         return round_period, same_cycle, period
 
     def _released(self, detected: Tensor, transfers: tuple[Tensor, Tensor | None, int]) -> Tensor:
-        """Carriers set free per cycle and bin, of which those in a dead cycle are left out: float64."""
+        """Independent releases per cycle and bin, float64, without those in a dead cycle."""
         bins = detected.shape[TIME]
         round_period, same_cycle, period = transfers
         rows = detected.movedim(TIME, -1).contiguous().double()
@@ -514,7 +552,7 @@ class AfterpulsingSPAD(WrappedDetector):
         return free.movedim(-1, TIME)
 
     def _from_outside(self, x: Tensor, round_period: Tensor, period: int) -> Tensor | float:
-        """Carriers of the constant counts outside of the window, per cycle and bin: float64."""
+        """Releases of the constant counts outside of the window, per cycle and bin, float64."""
         given = self.afterpulsing.background
         if period == x.shape[TIME] or (not isinstance(given, Tensor) and given == 0):
             return 0.0
@@ -527,7 +565,7 @@ class AfterpulsingSPAD(WrappedDetector):
 
     @property
     def _follows_carriers(self) -> bool:
-        """Whether what a detection meets is known for each of its carriers."""
+        """True if each carrier is followed from its detection on."""
         spad = self.detector
         dead = spad.dead_bins is not None if isinstance(spad, SynchronousSPAD) else spad.kind == "non_paralyzable"
         return self.afterpulsing.delays is None and dead
@@ -535,7 +573,7 @@ class AfterpulsingSPAD(WrappedDetector):
     def _of_armed(
         self, x: Tensor, transfers: tuple[Tensor, Tensor | None, int], outside: Tensor | float, steps: int
     ) -> Tensor:
-        """Carriers set free per cycle, part of a bin (there are `steps`) and armed detector: float64."""
+        """Releases per cycle, part of a bin and armed detector, float64."""
         module, spad, bins = self.afterpulsing, self.detector, x.shape[TIME]
         if x.numel() == 0:
             return x.double().repeat_interleave(steps, TIME)
@@ -550,7 +588,7 @@ class AfterpulsingSPAD(WrappedDetector):
             given = outside.expand(x.shape).movedim(TIME, -1).reshape(rows.shape) if isinstance(outside, Tensor) else 0
 
             def earlier(detected: Tensor, at: Tensor | slice) -> Tensor:
-                """Of other cycles, which know nothing of this one."""
+                """Releases of other cycles, which are independent of this one."""
                 free = filter_rows(detected, round_period, period, 0, bins)
                 free = (free - filter_rows(detected, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
                 return free + given[at] if isinstance(given, Tensor) else free
@@ -564,7 +602,14 @@ class AfterpulsingSPAD(WrappedDetector):
 
     @in_single
     def released(self, x: Tensor) -> Tensor:
-        """Rate of carriers that fire an armed detector, per cycle and bin, in the shape and dtype of `x`."""
+        """Rate of carriers that fire an armed detector.
+
+        Args:
+            x: rate of photons per cycle and bin, (..., C, T, H, W).
+
+        Returns:
+            Per cycle and bin, in shape and dtype of `x`.
+        """
         return self._free(x, 1)
 
     def _free(self, x: Tensor, steps: int) -> Tensor:
@@ -583,18 +628,18 @@ class AfterpulsingSPAD(WrappedDetector):
 
     @in_single
     def rate(self, x: Tensor) -> Tensor:
-        """Photons and carriers set free."""
+        """Rate of photons and released carriers."""
         return x + self.released(x)
 
     def _steps(self) -> int:
-        """Parts of a bin in which the rate of carriers is taken as constant."""
+        """Parts of a bin in which the rate of carriers is constant."""
         if not self._follows_carriers:
             return 1
         seen, tau = self.afterpulsing.seen(), self.afterpulsing.tau_s.detach().reshape(-1)
         tau_bins = float(tau[seen > _FEW].min()) / self.afterpulsing.bin_width_s if bool((seen > _FEW).any()) else 1e9
         return 1 << min(_MOST_STEPS, max(0, math.ceil(math.log2(_STEP / tau_bins))))
 
-    def _means_in_steps(self, x: Tensor, measure: Callable[[_Detector, Tensor], Tensor]) -> Tensor:
+    def _in_steps(self, x: Tensor, measure: Callable[[_Detector, Tensor], Tensor]) -> Tensor:
         """`measure(detector, rate)` in parts of bins, added up."""
         steps = self._steps()
         if steps == 1:
@@ -605,25 +650,25 @@ class AfterpulsingSPAD(WrappedDetector):
 
     @in_single
     def probabilities(self, x: Tensor) -> Tensor:
-        return self._means_in_steps(x, lambda spad, rate: spad.probabilities(rate))
+        return self._in_steps(x, lambda spad, rate: spad.probabilities(rate))
 
     @in_single
     def expected(self, x: Tensor) -> Tensor:
-        return self._means_in_steps(x, lambda spad, rate: spad.expected(rate))
+        return self._in_steps(x, lambda spad, rate: spad.expected(rate))
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self._means_in_steps(x, lambda spad, rate: spad.gaussian(rate, generator))
+        return self._in_steps(x, lambda spad, rate: spad.gaussian(rate, generator))
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return self._means_in_steps(x, lambda spad, rate: spad.sample(rate, generator))
+            return self._in_steps(x, lambda spad, rate: spad.sample(rate, generator))
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self._means_in_steps(x, lambda spad, rate: spad(rate, generator=generator))
+        return self._in_steps(x, lambda spad, rate: spad(rate, generator=generator))
 
 
 def _in_parts(detector: _Detector, steps: int) -> _Detector:
-    """The detector with bins cut in `steps`."""
+    """Copy of the detector with bins cut in `steps`."""
     other = copy.copy(detector)
     if other.bin_width_s is not None:
         other.bin_width_s = other.bin_width_s / steps

@@ -38,7 +38,7 @@ _STATES = 1 << 24  # numbers that are held at a time while bins are cut
 
 
 class _LevelCounts(torch.autograd.Function):
-    """How many rows are to be cut in 1, 2, 4, ... pieces, and whether torch.func.vmap hides which they are."""
+    """Numbers of rows of levels 0, 1, 2, ..., and a flag of torch.func.vmap, under which rows cannot be told."""
 
     @staticmethod
     def forward(level: Tensor, mapped: bool) -> Tensor:
@@ -60,7 +60,7 @@ class _LevelCounts(torch.autograd.Function):
 
 
 def _level_counts(level: Tensor) -> list[int]:
-    """`_LevelCounts`, straight away where nothing is mapped over: calls of autograd take as long as small images."""
+    """List of `_LevelCounts`, without autograd where nothing is mapped over: it costs as much as small images."""
     if torch._C._functorch.is_functorch_wrapped_tensor(level):
         # One by one: torch 2.6 makes no list inside of torch.func.
         hidden: Tensor = _LevelCounts.apply(level, False)  # type: ignore[no-untyped-call]
@@ -69,7 +69,14 @@ def _level_counts(level: Tensor) -> list[int]:
 
 
 def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tensor, list[int], bool]:
-    """(level of each row (P,), levels that there are, whether they are hidden): rows are cut in `least` 2^level."""
+    """Levels of rows (P, T), whose bins are cut in `least` 2^level pieces of at most `photons` photons.
+
+    Returns:
+        Level of each row (P,); levels that occur; whether torch.func.vmap hides which rows they belong to.
+
+    Raises:
+        TorchTransientError: if a bin would need more than `MOST_PIECES`.
+    """
     peak = torch.nan_to_num(rate.detach().amax(-1), nan=0.0) / (photons * least)
     level = torch.ceil(torch.log2(peak.clamp(1, 2.0**40)) - 1e-9).long()
     found = _level_counts(level)
@@ -83,12 +90,12 @@ def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tu
 
 
 def highest_level(level: Tensor) -> int:
-    """The largest of whole numbers >= 0, of all that is mapped over inside of torch.func.vmap; 0 of none."""
+    """Largest of integers >= 0 (0 of none), of all rows that are mapped over inside of torch.func.vmap."""
     return len(_level_counts(level)) - 2
 
 
 def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
-    """(indices of rows, None for all; pieces of their bins) of every level that there is."""
+    """Yield (indices of rows, None for all; pieces of their bins) for every level that occurs."""
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, _ = subdivision_levels(rate, least, photons)
     for k in present:
@@ -111,14 +118,14 @@ class CycleMeans:
 
     @property
     def late(self) -> Tensor:
-        """Of the detections: those that are armed again `whole` + 1 pieces later; the others after `whole`."""
+        """Detections (P, N) that are rearmed `whole` + 1 pieces later; the others after `whole`."""
         first = 1 - self.part
         soon = first * self.count - ROOT3 * first * self.part * self.slope
         return torch.minimum((self.count - soon).clamp_min(0), self.count)
 
 
 class DeadTimeBlocks:
-    """Stretches of one dead time each: what comes back in one, out of the lines of the two before it."""
+    """Stretches of one dead time each; the inflow of one comes from the lines of the two before it."""
 
     def __init__(self, bins: int, whole: int, pieces: int) -> None:
         self.pieces, self.whole, self.size = pieces, whole, bins * pieces
@@ -137,7 +144,7 @@ class DeadTimeBlocks:
         return value.index_select(-1, index)
 
     def inflow(self, length: int) -> Tensor | None:
-        """(P, 4, length), or None before the first dead time is over."""
+        """Inflow (P, 4, length), None within the first dead time."""
         if self._before is None:
             return None
         young = torch.stack(self._before, 1)
@@ -146,6 +153,7 @@ class DeadTimeBlocks:
         return torch.cat([young, old], 1)[..., :length]
 
     def keep(self, count: Tensor, slope: Tensor) -> None:
+        """Append the lines of a stretch."""
         if self._before is not None:
             self._last = (self._before[0][..., -1:], self._before[1][..., -1:])
         self._before = (count, slope)
@@ -154,7 +162,7 @@ class DeadTimeBlocks:
 def armed_probabilities(
     start: Tensor, rate: Tensor, joined: Tensor | None, stretch: int = _STRETCH
 ) -> tuple[Tensor, Tensor]:
-    """Armed at the start of every piece of a stretch, and at its end: A[k + 1] = A[k] exp(-rate[k]) + joined[k]."""
+    """Armed at the start of pieces, and at the end of the last: A[k + 1] = A[k] exp(-rate[k]) + joined[k]."""
     found = []
     for begin in range(0, rate.shape[-1], stretch):
         flux = rate[..., begin : begin + stretch].cumsum(-1)
@@ -168,9 +176,13 @@ def armed_probabilities(
 
 
 def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | None = PHOTONS) -> CycleMeans:
-    """For rates (P, T) per cycle and bin, at least 0, and a scalar dead time in bins, float64, bins cut in `pieces`.
+    """Means of one cycle, piece by piece, differentiable in rate and dead time.
 
-    `largest`: a bound of the photons in a piece, None where it is not known.
+    Args:
+        rate: (P, T) per cycle and bin, float64, >= 0.
+        dead_bins: dead time in bins, scalar float64.
+        pieces: of a bin.
+        largest: known bound of the photons in a piece, or None.
     """
     whole, part = split_dead_time(dead_bins.to(rate.device, torch.float64) * pieces)
     walk = DeadTimeBlocks(rate.shape[-1], whole, pieces)
@@ -192,7 +204,7 @@ def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | N
 
 
 def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
-    """Detections per cycle and bin, rows (P, T)."""
+    """Detections (P, T) per cycle and bin by `cycle_means`."""
     dead, bins = check_dead_bins(dead_bins), rate.shape[-1]
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, hidden = subdivision_levels(rate, least)
@@ -219,7 +231,7 @@ def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
 
 
 def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
-    """Chance that a cycle fires twice in a bin, (P, T), for a dead time of half a bin to one bin; thrice it cannot."""
+    """Probability (P, T) of two detections in a bin, for dead times of half a bin to one bin (never three)."""
     twice = torch.zeros_like(rate)
     for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
         own = rate if rows is None else rate[rows]
@@ -239,6 +251,7 @@ def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
 
 
 def series_degree(largest: float) -> int:
+    """Degree at which terms of exp(largest) fall below rounding."""
     degree = 3
     while largest**degree / math.factorial(degree) > _SMALLEST_TERM:
         degree += 1
@@ -248,10 +261,16 @@ def series_degree(largest: float) -> int:
 @functools.lru_cache(maxsize=64)
 @torch.inference_mode(False)
 def response_series(part: float, degree: int) -> tuple[Tensor, Tensor]:
-    """Power series (3, 5, D + 1) for (armed at the end, detections, slope), and derivatives (2, 5, D + 1) of two.
+    """Power series in the rate of `renewal.bin_response`, cached: do not change in place.
 
-    Of the inflow, ordered (older line's constant, its slope, younger line's constant, its slope), and of the armed.
-    As `renewal_chain.bin_response`, up to the power D = `degree` of the rates. Remembered: not to be changed in place.
+    Args:
+        part: fraction of a piece in the dead time.
+        degree: highest power D.
+
+    Returns:
+        (3, 5, D + 1) for (armed at the end, detections, slope) and (2, 5, D + 1), derivatives of the last two, of the
+        inflow (older line's constant and slope, younger line's constant and slope) and of the detectors armed at the
+        start.
     """
     first = 1 - part
     waited = torch.zeros(5, degree + 1, dtype=torch.float64)
@@ -278,10 +297,17 @@ def response_series(part: float, degree: int) -> tuple[Tensor, Tensor]:
 
 
 class DetectionScan:
-    """Of columns (T, P) of photons per bin, the bins cut in `pieces` of at most `largest` photons, float64.
+    """Recursion over columns (T, P) of photons per bin, in place and without a graph, and its adjoint.
 
-    States are (N + 1, 3, P) for N pieces: (armed at the end, detections, slope) of piece k in place k + 1; place 0 is
-    the start of the cycle. `whole` pieces and `part` of one are the dead time.
+    Per piece (armed at its end, detections, their slope) are linear in (four parts of the inflow, armed at its start).
+    The 3 x 5 coefficients are power series of the photons in a piece: one matrix times their powers. States are (N + 1,
+    3, P) for N pieces, those of piece k in place k + 1; place 0 is the start of the cycle.
+
+    Args:
+        rate: (T, P) float64.
+        whole, part: dead time in pieces, split.
+        pieces: of a bin.
+        largest: photons of a piece, at most.
     """
 
     def __init__(self, rate: Tensor, whole: int, part: float, pieces: int, largest: float) -> None:
@@ -293,12 +319,12 @@ class DetectionScan:
         self._derivative = derivative.to(rate.device).view(10, -1)
 
     def blocks(self, wider: int = 1) -> list[tuple[int, int]]:
-        """(begin, end) of pieces, or of those `wider` times as wide: whole bins."""
+        """(begin, end) of pieces, or of those `wider` times as wide, in whole bins that fit into the cache."""
         bins, pieces = max(1, _PIECES_AT_ONCE // (self.pieces * max(1, self.columns))), self.pieces // wider
         return [(k * pieces, min(k + bins, self.bins) * pieces) for k in range(0, self.bins, bins)]
 
     def responses(self, begin: int, end: int, derivative: bool = False) -> tuple[Tensor, Tensor]:
-        """(3, 5, L, P) for L pieces, and (2, 5, L, P) of slopes or nothing."""
+        """Coefficients (3, 5, L, P) of L pieces, and their derivatives (2, 5, L, P) if asked for."""
         rate = self.rate[begin // self.pieces : end // self.pieces]
         if self.pieces > 1:
             rate = rate / self.pieces
@@ -316,7 +342,7 @@ class DetectionScan:
         return cut(self._series, 3), cut(self._derivative, 2) if derivative else flat[:0]
 
     def stretches(self, begin: int, end: int) -> Iterator[tuple[int, int]]:
-        """Of at most one dead time, those before the end of the first one apart."""
+        """Yield stretches of at most one dead time, cut at the end of the first one."""
         while begin < end:
             to = min(end, begin + self.whole)
             if begin < self.whole < to:
@@ -331,7 +357,7 @@ class DetectionScan:
         return [old[:, 1], old[:, 2], young[:, 1], young[:, 2]]
 
     def forward(self) -> Tensor:
-        """The states."""
+        """States (N + 1, 3, P)."""
         states = self.rate.new_empty(self.size + 1, 3, self.columns)
         states[0] = 0
         states[0, 0] = 1
@@ -382,7 +408,7 @@ class DetectionScan:
             before = state[0]
 
     def adjoint(self, states: Tensor, weights: Tensor) -> Tensor:
-        """Of a sum of states with `weights` (as states; overwritten), derivatives with respect to the rates (T, P)."""
+        """Derivatives (T, P) in the rates of a sum of states with `weights` (as states; overwritten)."""
         found = torch.empty_like(self.rate)
         for begin, end in reversed(self.blocks()):
             response, derivative = self.responses(begin, end, True)
@@ -426,7 +452,7 @@ class DetectionScan:
 
 
 def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, DetectionScan]]:
-    """(Columns, walk over them), bins cut as finely as the columns need."""
+    """Yield (columns, scan over them), bins cut as finely as the columns need."""
     dead = check_dead_bins(dead_bins)
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, _ = subdivision_levels(rate.T, least)
@@ -447,7 +473,18 @@ def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | 
 
 
 def mean_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
-    """Detections per cycle and bin for rates (T, P), float64; differentiable in both."""
+    """Mean detections per cycle and bin, differentiable to any order.
+
+    First derivatives in the light take the adjoint of the scan; others (in the dead time, forward mode, higher orders)
+    the recursion in differentiable steps, which takes longer.
+
+    Args:
+        rate: (T, P) per cycle and bin, float64.
+        dead_bins: dead time in bins, scalar float64.
+
+    Returns:
+        (T, P) float64.
+    """
     keep = torch.is_grad_enabled() and rate.requires_grad
     watched = torch.is_grad_enabled() or torch.compiler.is_compiling()
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
@@ -471,7 +508,7 @@ def _light_gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) -
 
 
 def _jvp(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor | None, ...]) -> Tensor:
-    """The derivative along a direction, as the derivative of the (linear) gradient in its weights."""
+    """Derivative along a direction, as the derivative of the (linear) gradient in its weights."""
     value, pull, *_ = torch.func.vjp(of, *at)
     along = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(at, along, strict=True))
     found: Tensor = torch.func.vjp(pull, torch.zeros_like(value))[1](along)[0]
@@ -479,7 +516,7 @@ def _jvp(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor 
 
 
 class _Detected(torch.autograd.Function):
-    """Columns (T, P) of rates -> detections per cycle, and the states of the walk where they are wanted and few."""
+    """Detections (T, P) per cycle of rates (T, P), and the states of the scan where they are kept."""
 
     @staticmethod
     def forward(rate: Tensor, dead_bins: Tensor, keep: bool) -> tuple[Tensor, Tensor]:
@@ -524,7 +561,7 @@ class _Detected(torch.autograd.Function):
 
 
 class _Adjoint(torch.autograd.Function):
-    """Weights (T, P) of the detections -> derivatives (T, P) of their sum with respect to the rates."""
+    """Derivatives (T, P) in the rates of the sum of detections with weights (T, P)."""
 
     @staticmethod
     def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
@@ -557,7 +594,7 @@ class _Adjoint(torch.autograd.Function):
 
 
 def _batch_as_columns(batch: int, in_dims: tuple[int | None, ...], *inputs: Tensor) -> list[Tensor]:
-    """The columns of a batch beside one another; one dead time for all of them."""
+    """Columns of a batch beside one another, with one dead time for all of them."""
     given = []
     for place, x in zip(in_dims, inputs, strict=False):
         if x.ndim < 2:

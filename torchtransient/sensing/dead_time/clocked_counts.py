@@ -65,7 +65,7 @@ class StepProbabilities:
 
 @dataclass(frozen=True)
 class StepCounts:
-    """How many detectors took which step, same layout as StepProbabilities."""
+    """Numbers of detectors that took each step, in the layout of StepProbabilities."""
 
     begin: Tensor | None
     armed: Tensor  # at the start of the bin
@@ -80,11 +80,12 @@ class StepCounts:
 
     @property
     def counts(self) -> Tensor:
+        """Detections, (..., T, H, W)."""
         return self.fired + self.soon
 
 
 def bounded_ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole, 0 where nothing is, within [0, 1]."""
+    """part / whole within [0, 1], 0 where whole is 0."""
     some = whole > 1e-13
     share = part / torch.where(some, whole, torch.ones_like(whole))
     return torch.where(some, share, 0.0).clamp(0, 1)
@@ -93,13 +94,16 @@ def bounded_ratio(part: Tensor, whole: Tensor) -> Tensor:
 def step_probabilities(
     rate: Tensor, detected: Tensor, armed: Tensor, late: Tensor, back: Tensor, begin: Tensor | None, whole: int
 ) -> StepProbabilities:
-    """Of bins with these means; `back`: armed again in the bin."""
+    """Step probabilities of bins with these means; `back`: rearmed in the bin."""
     fire, soon = firing_probabilities(-torch.expm1(-rate), detected, armed, back)
     return StepProbabilities(begin=begin, fire=fire, soon=soon, late=bounded_ratio(late, detected), whole=whole)
 
 
 def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Tensor) -> tuple[Tensor, Tensor]:
-    """Chances to be detected when armed at the start, nearly `fire`, and when armed again in the bin."""
+    """Probabilities to be detected when armed at the start (nearly `fire`), and when rearmed in the bin.
+
+    Where the straight lines leave too much or too little for the rearmed ones, one probability for both keeps the mean.
+    """
     rest = detected - armed * fire
     # straight lines can put a little too much or too little here; one chance for both keeps the mean
     whole_chance = bounded_ratio(detected, armed + back)
@@ -108,6 +112,7 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
 
 
 def draw_binomial(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Binomial numbers of `number` trials."""
     return torch.binomial(number, chance, generator=generator)
 
 
@@ -123,7 +128,14 @@ def draw_steps(
     generator: torch.Generator | None,
     draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = draw_binomial,
 ) -> StepCounts:
-    """`periods` detectors, each run over one period."""
+    """Draw the steps of `periods` independent detectors, each run over one period.
+
+    Args:
+        chances: step probabilities, (..., T, H, W).
+        periods: number of detectors.
+        generator: source of randomness.
+        draw: `draw_binomial` or `draw_normal`.
+    """
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
         armed = torch.full_like(chances.fire.select(TIME, 0), float(periods))
@@ -155,12 +167,12 @@ def draw_steps(
 
 
 def safe_xlogy(count: Tensor, chance: Tensor) -> Tensor:
-    """count log(chance), 0 for no count whatever the chance."""
+    """count log(chance), with value and gradient 0 for count 0 (torch.xlogy has a NaN gradient at chance 0)."""
     return count * torch.log(torch.where(count != 0, chance, 1.0))
 
 
 def steps_log_prob(path: StepCounts, chances: StepProbabilities, periods: int) -> Tensor:
-    """Log-probability (..., H, W) of the steps that were drawn, up to a number that does not depend on the light."""
+    """Log-probability (..., H, W) of drawn steps, up to a constant in the light."""
     total = torch.zeros_like(chances.fire.select(TIME, 0))
     if path.begin is not None and chances.begin is not None:
         dead = periods - path.begin.sum(TIME)  # all period long
@@ -181,7 +193,7 @@ def steps_log_prob(path: StepCounts, chances: StepProbabilities, periods: int) -
 
 @dataclass(frozen=True)
 class CycleSteps:
-    """Columns (N, P, 1), per cycle and piece: what a run through the pieces of a cycle needs."""
+    """Means and step probabilities of a cycle, columns (N, P, 1) of pieces."""
 
     armed: Tensor
     count: Tensor
@@ -192,7 +204,7 @@ class CycleSteps:
 
 @dataclass(frozen=True)
 class DrawnCycles:
-    """The steps of the rows (indices; None: all) whose bins were cut in `pieces` for the means."""
+    """Steps of rows (indices; None: all) whose bins are cut in `pieces` for the means."""
 
     rows: Tensor | None
     pieces: int
@@ -205,11 +217,12 @@ def _delay(x: Tensor, by: int) -> Tensor:
 
 
 def _columns(x: Tensor) -> Tensor:
+    """Rows (P, N) as columns (N, P, 1), with time as the third dimension from behind."""
     return x.T.unsqueeze(-1)  # time is the third dimension from behind
 
 
 def _merged_pieces(pieces: int, whole: int) -> int:
-    """Pieces that are drawn as one; a dead time is one of these at least."""
+    """Number of pieces drawn as one, at most a dead time."""
     wider = min(_MOST_MERGED, pieces, whole)
     while pieces % wider:
         wider -= 1
@@ -217,7 +230,7 @@ def _merged_pieces(pieces: int, whole: int) -> int:
 
 
 def _merge_states(states: Tensor, part: float, whole: int, wider: int) -> tuple[Tensor, Tensor, Tensor]:
-    """(detections, armed at the start, late ones after a row of zeros), (N, P) each, from the states of a walk."""
+    """Detections (N, P), armed at the start (N, P) and late ones (N + 1, P, first row 0) of merged pieces."""
     count, slope, armed = states[1:, 1], states[1:, 2], states[:-1, 0]
     late = torch.zeros_like(states[:, 1])
     if part:
@@ -234,7 +247,7 @@ def _merge_states(states: Tensor, part: float, whole: int, wider: int) -> tuple[
 
 
 def _cycle_steps(rate: Tensor, dead_bins: Tensor, pieces: int) -> CycleSteps:
-    """For rates (P, T) per cycle and bin."""
+    """Steps of rates (P, T) per cycle and bin, differentiable."""
     cycle = cycle_means(rate, dead_bins, pieces)
     wider = _merged_pieces(pieces, cycle.whole)
     shape = (rate.shape[0], -1, wider)
@@ -256,7 +269,17 @@ def _sum_pieces(counts: Tensor, pieces: int) -> Tensor:
 
 
 def sample_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch.Generator | None) -> Tensor:
-    """Counts (T, P) of `cycles` cycles for rates (T, P), float64: `draw_cycle_steps`, without what a score needs."""
+    """Draw counts of `cycles` cycles, without the steps that a score needs.
+
+    Args:
+        rate: (T, P) per cycle and bin, float64.
+        dead_bins: dead time in bins, scalar float64.
+        cycles: number of cycles.
+        generator: source of randomness.
+
+    Returns:
+        (T, P) float64.
+    """
     counts = torch.empty_like(rate)
     with torch.no_grad():
         for columns, walk in detection_scans(rate, dead_bins):
@@ -266,7 +289,7 @@ def sample_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch
 
 
 def _sample_scan(walk: DetectionScan, cycles: int, generator: torch.Generator | None) -> Tensor:
-    """Counts (N, P) of wider pieces."""
+    """Counts (N, P) of merged pieces."""
     wider = _merged_pieces(walk.pieces, walk.whole)
     count, armed, late = _merge_states(walk.forward(), walk.part, walk.whole, wider)
     size, whole, pieces = count.shape[0], walk.whole // wider, walk.pieces // wider
@@ -309,9 +332,9 @@ def _draw_pieces(
     again: Tensor,
     generator: torch.Generator | None,
 ) -> None:
-    """Counts (L, P) of consecutive pieces, and the cycles (P,) that are `able` to fire after each of them, in place.
+    """Draw counts (L, P) of consecutive pieces and update the cycles (P,) that are `able` to fire, in place.
 
-    `back`: cycles that come back in the last pieces, `again`: those of them that fire in the piece they come back in.
+    `back`: cycles rearmed in the last pieces; `again`: those of them that fire in the piece they are rearmed in.
     """
     alone = len(counts) - len(back)
     hits = []
@@ -328,7 +351,17 @@ def _draw_pieces(
 def draw_cycle_steps(
     rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch.Generator | None
 ) -> tuple[Tensor, list[DrawnCycles]]:
-    """Counts (P, T) of `cycles` cycles for rates (P, T), float64, and how they came about. Without gradient."""
+    """Draw counts of `cycles` cycles with the steps that led to them, without gradient.
+
+    Args:
+        rate: (P, T) per cycle and bin, float64.
+        dead_bins: dead time in bins, scalar float64.
+        cycles: number of cycles.
+        generator: source of randomness.
+
+    Returns:
+        Counts (P, T) float64, and the steps for `cycles_log_prob`.
+    """
     counts, drawn = torch.zeros_like(rate), []
     with torch.no_grad():
         for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
@@ -345,7 +378,7 @@ def _replace_rows(into: Tensor, rows: Tensor | None, values: Tensor) -> Tensor:
 
 
 def cycles_log_prob(drawn: list[DrawnCycles], rate: Tensor, dead_bins: Tensor, cycles: int) -> Tensor:
-    """Log-probability (P,) of the steps that were drawn, up to a number that does not depend on the light."""
+    """Log-probability (P,) of drawn steps, up to a constant in the light."""
     total = torch.zeros_like(rate[:, 0])
     for one in drawn:
         own = rate if one.rows is None else rate[one.rows]
@@ -355,10 +388,10 @@ def cycles_log_prob(drawn: list[DrawnCycles], rate: Tensor, dead_bins: Tensor, c
 
 
 def normal_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch.Generator | None) -> Tensor:
-    """Normal counts (P, T) with mean and covariance of the draws, differentiable in both.
+    """Normal counts (P, T) with mean and covariance of the draws, differentiable in rate and dead time.
 
-    Binomial steps of independent cycles: each adds its own noise, that of the mean number it draws from, and hands what
-    it got on. Means are linear in the steps, so the covariance is that of the counts, not nearly.
+    Binomial steps of independent cycles: each adds its own noise, that of the mean number it draws from. Means are
+    linear in the steps, so that the covariance is exact.
     """
     counts = torch.zeros_like(rate)
     for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
@@ -370,6 +403,7 @@ def normal_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch
 
 
 def _noise(steps: CycleSteps, cycles: int, generator: torch.Generator | None) -> Tensor:
+    """Noise (N, P, 1) of the counts of pieces, carried through the steps."""
     chances = steps.chances
 
     def noise(number: Tensor, chance: Tensor) -> tuple[Tensor, ...]:
@@ -399,7 +433,7 @@ def _noise(steps: CycleSteps, cycles: int, generator: torch.Generator | None) ->
 
 @dataclass(frozen=True)
 class ArmedCycles:
-    """Cycles, rows (P, L), float64: armed at the start of the bins, and what comes back in them, (P, 4, L) or None."""
+    """Cycles, rows (P, L) float64: armed at the start of bins, and inflow in them, (P, 4, L) or None."""
 
     armed: Tensor
     back: Tensor | None
@@ -407,11 +441,11 @@ class ArmedCycles:
 
     @property
     def cycles(self) -> Tensor:
-        """That can fire in the bin."""
+        """Cycles that can fire in the bin, (P, L)."""
         return self.armed if self.back is None else self.armed + _rearmed(self.back, self.part)
 
     def survivors(self, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Of `cycles`: not fired in the bin, and how that falls with the rate."""
+        """Cycles that do not fire in the bin at `rate`, and minus the derivative of that number."""
         left = self.armed * torch.exp(-rate)
         if self.back is None:
             return left, left
@@ -431,6 +465,7 @@ class ArmedCycles:
 
 
 def _rearmed(back: Tensor, part: Tensor) -> Tensor:
+    """Number (P, L) of rearmed cycles."""
     c, s, old_c, old_s = back.unbind(1)
     first = 1 - part
     return first * c + part * old_c - ROOT3 * first * part * (s - old_s)
@@ -445,7 +480,7 @@ def _check_whole_bins(dead_bins: float, where: str) -> None:
 
 
 def _invert_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[ArmedCycles, Tensor, Tensor]:
-    """(armed cycles, share of them that fired, rate that explains it) for rows (P, T)."""
+    """Armed cycles, share of them that fired, and the rate that explains it, for counts (P, T)."""
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
     whole, part = split_dead_time(dead)
     walk = DeadTimeBlocks(counts.shape[-1], whole, 1)
@@ -472,7 +507,7 @@ def _invert_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Armed
 
 
 def _solve_rate(here: ArmedCycles, share: Tensor, cycles: float) -> Tensor:
-    """The rate at which `share` of the cycles fire, by Newton's method from below; differentiable once."""
+    """Rate at which `share` of the cycles fires, by Newton from below; differentiable once."""
     trials = here.cycles
     usable = ~(trials <= 0.5)  # NaN stays NaN
     trials = torch.where(usable, trials, torch.ones_like(trials))
@@ -498,7 +533,19 @@ def _solve_rate(here: ArmedCycles, share: Tensor, cycles: float) -> Tensor:
 
 
 def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Tensor, Tensor]:
-    """Rows (P, T), float64: the rate per cycle and bin, and where the counts tell it."""
+    """Rate per cycle and bin behind a histogram of several detections per cycle (Coates, with dead time).
+
+    Args:
+        counts: (P, T) float64.
+        cycles: number of cycles.
+        dead_bins: dead time in bins, at least 1.
+
+    Returns:
+        Rate (P, T) float64, and a mask (P, T) of bins where counts tell it.
+
+    Raises:
+        UnitError: for a dead time below one bin.
+    """
     _check_whole_bins(dead_bins, "coates")
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
@@ -521,7 +568,7 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
 
 @dataclass(frozen=True)
 class ExposedCycles:
-    """Cycles that could fire in a bin, float64, any layout: armed at its start, and joining in it for parts of it."""
+    """Cycles that could fire in a bin, float64: armed at its start, and rearmed in it for parts of it."""
 
     armed: Tensor
     joined: tuple[Tensor, Tensor]  # from the end of the dead time of detections `whole` bins ago, and of one bin more
@@ -535,10 +582,10 @@ class ExposedCycles:
         return self.armed + young + old
 
     def sooner(self, rate: Tensor) -> Tensor:
-        """What those that join count for beyond their share of the bin, times the rate: short stays saturate less.
+        """Correction to `exposed` times the rate for short exposures, which saturate less.
 
-        Of those that join and fire at the rate r a share h(r), and h(r) / (1 - exp(-r)) rises from the mean `remaining`
-        to 1; the integral of that rise, taken as a r / (1 + b r) with its true slope and limit.
+        Of rearmed cycles a share h(r) fires at the rate r, and h(r) / (1 - exp(-r)) rises from the mean `remaining` to
+        1; returned is the integral of that rise, taken as a r / (1 + b r) with its true slope and limit.
         """
         total = torch.zeros_like(rate)
         for number, mean, second in zip(self.joined, self.remaining, self.second, strict=True):
@@ -550,7 +597,13 @@ class ExposedCycles:
 
 
 def armed_time(counts: Tensor, cycles: int, dead_bins: float) -> ExposedCycles:
-    """From the histogram (..., T, H, W) alone, linear in it; detections are taken to be even inside a bin."""
+    """Exposed cycles from a histogram alone, linear in it, detections taken as even inside a bin.
+
+    Args:
+        counts: (..., T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins.
+    """
     check_dead_bins(dead_bins)
     whole, rest = split_dead_time(torch.tensor(dead_bins, dtype=torch.float64))
     part = float(rest)
@@ -573,7 +626,7 @@ def armed_time(counts: Tensor, cycles: int, dead_bins: float) -> ExposedCycles:
 
 
 def check_cycles(quiet: Tensor, cycles: int, least: float, where: str) -> None:
-    """UnitError when fewer than `least` armed cycles are left over by the detections of a bin."""
+    """Raise UnitError where fewer than `least` armed cycles are left by the detections of a bin."""
     if bool((quiet < least).any()):
         raise UnitError(
             f"{where}: expected counts of at most {cycles} cycles, got a pixel with more detections "

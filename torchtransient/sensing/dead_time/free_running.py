@@ -61,7 +61,7 @@ _LATER = 32  # detections between checks of which pixels are done
 
 @dataclass(frozen=True)
 class FreeRunningState:
-    """Rows (P, T), per period, float64, differentiable."""
+    """Stationary state, rows (P, T) or (..., T, H, W), per period, float64, differentiable."""
 
     detected: Tensor
     armed: Tensor  # probability at the start of the bin
@@ -70,12 +70,18 @@ class FreeRunningState:
 
 
 def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
-    """For rates (P, T) per bin and period and a scalar dead time in bins, float64.
+    """Stationary state of detectors.
 
-    Detections that end being dead in light that changes by many photons a bin follow no straight lines: bins of such
-    pixels are cut. Where many photons in a bin meet a dead time that locks the phase, all detections crowd at an edge
-    of a bin; the straight lines of `renewal_chain` then go below zero. Such pixels are solved again with their bins cut
-    in 2, 4, ..., until counts settle. Raises TorchTransientError when they do not with 32 pieces.
+    Light that changes by many photons a bin, where a share of detections is rearmed, is cut in finer pieces: detections
+    there follow no straight lines. Where many photons in a bin meet a dead time that locks the phase, detections crowd
+    at an edge of a bin and the lines go below zero; such rows are cut in 2, 4, ... until counts settle.
+
+    Args:
+        rate: (P, T) per bin and period, float64.
+        dead_bins: dead time in bins, scalar float64.
+
+    Raises:
+        TorchTransientError: if counts do not settle with 32 pieces.
     """
     # a dark pixel has no phases; its limit is one photon, at most, per many periods
     dark = rate.sum(-1, keepdim=True) < DARK
@@ -93,7 +99,7 @@ def stationary_state(rate: Tensor, dead_bins: Tensor) -> FreeRunningState:
 
 
 def _armed_in_the_light(rate: Tensor, state: FreeRunningState) -> Tensor:
-    """(P,) whether a share of detections ends being dead in bins far brighter than the darkest."""
+    """Mask (P,) of rows with a share of detections rearmed in bins far brighter than the darkest."""
     detected, late = state.detected, state.late
     armed_anew = (detected - late).roll(state.whole, -1) + late.roll(state.whole + 1, -1)
     bright = rate - rate.amin(-1, keepdim=True) > _CONTRAST
@@ -101,9 +107,9 @@ def _armed_in_the_light(rate: Tensor, state: FreeRunningState) -> Tensor:
 
 
 def rows_by_contrast(rate: Tensor) -> Iterator[tuple[Tensor | None, int]]:
-    """(indices of rows, None for all; pieces of their bins), so that light changes by few photons a piece.
+    """Yield (indices of rows, None for all; pieces of their bins), such that light changes by few photons a piece.
 
-    What all bins have in common is left out: constant light is exact in bins of any width.
+    Constant light is exact in bins of any width: only the excess over the darkest bin counts.
     """
     peak = torch.nan_to_num(rate.amax(-1) - rate.amin(-1)) / _CONTRAST
     level = torch.ceil(torch.log2(peak.clamp(1, _FINEST / 2)) - 1e-9).long()
@@ -124,7 +130,7 @@ def _replace_rows(whole: FreeRunningState, part: FreeRunningState, rows: Tensor)
 
 
 def _solve_settled(safe: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
-    """Of rows above 0, bins cut in `pieces` or as many more as they need."""
+    """State of rows with light, bins cut in `pieces` or as many more as they need."""
     state = _solve_cut(safe, dead_bins, pieces)
     low, high = state.detected.aminmax(dim=-1)
     rows = (~(low >= -_BELOW_ZERO * high)).nonzero().flatten()
@@ -153,13 +159,13 @@ def detections_per_period(chain: RenewalChain, lines: Tensor) -> Tensor:
 
 
 def late_lines(lines: Tensor, part: Tensor) -> Tensor:
-    """Of detections on lines (P, 2 T): those that are armed again after one bin more than the whole dead time."""
+    """Detections (P, T) on lines (P, 2 T) that are rearmed one bin after the whole dead time."""
     bins = lines.shape[-1] // 2
     return part * lines[:, :bins] + ROOT3 * (1 - part) * part * lines[:, bins:]
 
 
 def clamped_state(chain: RenewalChain, lines: Tensor) -> FreeRunningState:
-    """Of lines (P, 2 N), which may dip below zero where detections crowd at an edge: what can be drawn from."""
+    """State of lines (P, 2 N) within the limits of probabilities; lines may dip below zero at edges."""
     count = lines[:, : chain.bins].clamp_min(0)
     late = torch.minimum(late_lines(lines, chain.part).clamp_min(0), count)
     armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
@@ -167,7 +173,7 @@ def clamped_state(chain: RenewalChain, lines: Tensor) -> FreeRunningState:
 
 
 def _solve_cut(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState:
-    """With every bin cut in `pieces` of equal rate, and put together again."""
+    """State with every bin cut in `pieces` of equal rate, put together again."""
     pixels, bins = rate.shape
     fine = (rate / pieces).repeat_interleave(pieces, -1) if pieces > 1 else rate
     whole, part = split_dead_time(dead_bins * pieces)
@@ -184,7 +190,7 @@ def _solve_cut(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState
 
 
 def stationary_steps(rate: Tensor, state: FreeRunningState) -> StepProbabilities:
-    """Chances whose run has the means of `state`, whose entries are (..., T, H, W) here, like `rate`."""
+    """Step probabilities of a run with the means of `state`, both (..., T, H, W)."""
     bins, whole = rate.shape[TIME], state.whole
     early = state.detected - state.late
     back_soon, back_late = early.roll(whole, TIME), state.late.roll(whole + 1, TIME)
@@ -201,9 +207,13 @@ def stationary_steps(rate: Tensor, state: FreeRunningState) -> StepProbabilities
 
 
 def first_armed(state: FreeRunningState, part: Tensor, generator: torch.Generator | None) -> Tensor:
-    """When each detector (P,) is armed for the first time, in pieces after the start: 0, or up to a dead time later.
+    """Draw the time at which each detector (P, 1) is armed for the first time, in pieces: 0, or up to a dead time
+    later.
 
-    `state`: the stationary one of pieces (P, N), whose dead time is `state.whole` of them and a `part` of one.
+    Args:
+        state: stationary state of pieces (P, N).
+        part: fraction of a piece in the dead time, beyond `state.whole`.
+        generator: source of randomness.
     """
     count = state.detected
     pixels, size = count.shape
@@ -237,10 +247,16 @@ def first_armed(state: FreeRunningState, part: Tensor, generator: torch.Generato
 def event_by_event(
     rate: Tensor, dead: Tensor, start: Tensor, periods: int, generator: torch.Generator | None
 ) -> Tensor:
-    """Counts (P, T) over `periods` periods for rates (P, T) per period, float64, above 0 in all.
+    """Draw counts (P, T) over `periods` periods, one exponential wait in units of flux per detection.
 
-    `dead`: in bins. `start` (P, 1): when detectors are armed for the first time, in bins. Detections are spread by the
-    light inside a bin, which is constant there.
+    Exact; the cost grows with the number of detections.
+
+    Args:
+        rate: (P, T) per period, float64, with light in every row; constant inside a bin.
+        dead: dead time in bins.
+        start: (P, 1), first time at which detectors are armed, in bins.
+        periods: number of periods.
+        generator: source of randomness.
     """
     pixels, bins = rate.shape
     counts = torch.zeros_like(rate)
@@ -303,6 +319,7 @@ class _StationaryTrain:
         return _whole_bins(self.state.detected, self.pieces)
 
     def of(self, rows: Tensor) -> _StationaryTrain:
+        """Detectors of these rows."""
         if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
             return self
         c, s = self.chances, self.state
@@ -330,10 +347,20 @@ def _stationary_train(rate: Tensor, dead_bins: Tensor, pieces: int) -> _Stationa
 def sample_trains(
     rate: Tensor, dead_bins: Tensor, periods: int, generator: torch.Generator | None, *, normal: bool = False
 ) -> Tensor:
-    """Counts (P, T) of detectors in the stationary state over `periods` periods, rates (P, T) per period, float64.
+    """Draw counts of detectors that start in the stationary state, over `periods` periods.
 
-    Whole numbers, or with `normal` normal numbers of the same mean and covariance. Without gradient. Raises
-    TorchTransientError for a phase that is remembered over more detections than can be drawn one by one.
+    Args:
+        rate: (P, T) per period, float64.
+        dead_bins: dead time in bins, scalar float64.
+        periods: number of periods.
+        generator: source of randomness.
+        normal: normal numbers of the same mean and covariance, instead of integers.
+
+    Returns:
+        (P, T) float64, without gradient.
+
+    Raises:
+        TorchTransientError: for a phase that is remembered over more detections than can be drawn event by event.
     """
     counts = torch.zeros_like(rate)
     dark = rate.sum(-1, keepdim=True) < DARK
@@ -359,6 +386,7 @@ def sample_trains(
 def _sample_counts(
     state: _StationaryTrain, rate: Tensor, dead_bins: Tensor, periods: int, generator: torch.Generator | None
 ) -> Tensor:
+    """Integer counts (P, T), period by period or event by event."""
     counts = torch.zeros_like(rate)
     number = periods * state.per_bin.sum(-1)
     one_by_one = number <= ONE_BY_ONE
@@ -387,7 +415,7 @@ def _sample_counts(
 def _independent_periods(
     state: _StationaryTrain, periods: int, generator: torch.Generator | None, *, normal: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Counts (P, T) of periods drawn on their own, and what has to be added to them."""
+    """Counts (P, T) of independent periods, and the correction that makes one train of them."""
     path = draw_steps(state.chances, periods, generator, draw_normal if normal else draw_binomial)
     counts = _whole_bins(_rows(path.counts), state.pieces)
     if periods == 1:
@@ -397,10 +425,10 @@ def _independent_periods(
 
 
 def _remembers_phase(state: _StationaryTrain, rate: Tensor, dead_bins: Tensor, periods: int) -> Tensor:
-    """Which rows (P,) would be left with less than nothing in some bins by what has to be added to independent periods.
+    """Mask (P,) of rows whose correction would leave less than no counts in some bins.
 
-    Normal numbers of their own decide: what is drawn may not depend on how it came out, and whole numbers would not
-    show what happens once in many trains.
+    Decided by normal numbers of their own: a choice by the draw itself would bias it, and integers would not show what
+    happens once in many trains.
     """
     mean = periods * state.per_bin
     bins = rate.shape[-1]
@@ -426,7 +454,7 @@ def _balance(
     periods: int,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """What has to be added to the counts (P, N) of independent periods, real numbers."""
+    """Correction (P, N), real numbers, to counts of independent periods: excess of ends over beginnings, detected."""
     if path.begin is None or chances.begin is None:
         raise AssertionError("a free-running detector begins in its stationary state")
     begin = _rows(path.begin)
@@ -446,6 +474,7 @@ def _balance(
     starts = torch.stack([(bins + chain.whole + k).div(chain.bins, rounding_mode="floor") for k in (0, 1)]).to(right)
 
     def states(lines: Tensor) -> Tensor:
+        """Detectors per period that the lines account for."""
         late = late_lines(lines, chain.part)
         dead = (lines[:, : chain.bins] - late) * starts[0] + late * starts[1]
         return dead.sum(-1, keepdim=True) + chain.at_start(chain.inflow(lines))[:, :1]
@@ -456,7 +485,7 @@ def _balance(
 
 
 def _add_rounded(counts: Tensor, more: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Counts with `more`, whole numbers >= 0 whose running sum is within one of the true one, wherever it rises."""
+    """Integers >= 0 whose running sum is within one of that of `counts` + `more`, wherever it rises."""
     start = torch.rand(counts[:, :1].shape, dtype=counts.dtype, device=counts.device, generator=generator)
     upto = counts.cumsum(-1) + torch.floor(more.cumsum(-1) + start)
     # a bin with too few to take away from leaves it to the next one, the last one to the first: the total is kept

@@ -43,7 +43,11 @@ _ROWS_OF_BLOCKS = 32
 
 
 def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> float:
-    """A dead time in bins as a number. Raises UnitError below half a bin, or where it is not finite."""
+    """Return a dead time in bins as a number.
+
+    Raises:
+        UnitError: below half a bin, or not finite.
+    """
     given = one_number(dead_bins, "dead_bins", where)
     value = float(given.detach()) if isinstance(given, Tensor) else given
     if not 0.5 - 1e-9 <= value < 1e9:
@@ -55,7 +59,7 @@ def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> floa
 
 
 def split_dead_time(dead: Tensor) -> tuple[int, Tensor]:
-    """Whole pieces of a dead time and the rest of it, differentiable."""
+    """Whole bins of a dead time in bins, and the fraction of one that is left, differentiable."""
     # a whole number that rounding has put just below itself is still that number
     whole = math.floor(float(dead.detach()) + 1e-9)
     part = dead - whole
@@ -67,14 +71,14 @@ def split_dead_time(dead: Tensor) -> tuple[int, Tensor]:
 
 @dataclass(frozen=True)
 class Moments:
-    """Integrals over z from 0 to 1: of z^power exp(-x z), and of z^power (1 - exp(-x z)) / x, for powers 0 and 1."""
+    """Integrals over z in [0, 1] of z^k exp(-x z) (`decay`) and of z^k (1 - exp(-x z)) / x (`hit`), k = 0 and 1."""
 
     decay: tuple[Tensor, Tensor]
     hit: tuple[Tensor, Tensor]
 
 
 def _series_weights(largest: float) -> list[float]:
-    """Of the powers of x, but for signs, as far as they count up to the largest x there is: dim light needs few."""
+    """Coefficients of powers of -x in `hit[1]`, as many as count for x up to `largest`."""
     weights = [1 / 3]
     # the relative error of derivatives is that of a term two orders lower
     while weights[-1] * largest ** max(len(weights) - 3, 0) > _SMALLEST_TERM and len(weights) < 24:
@@ -84,6 +88,7 @@ def _series_weights(largest: float) -> list[float]:
 
 
 def _series(x: Tensor, largest: float) -> Tensor:
+    """Power series of `hit[1]`, for x in [0, 1]."""
     weights = _series_weights(largest)
     series = torch.full_like(x, weights[-1])
     for weight in reversed(weights[:-1]):
@@ -92,9 +97,9 @@ def _series(x: Tensor, largest: float) -> Tensor:
 
 
 def moments(x: Tensor, largest: float | None = None) -> Moments:
-    """For x >= 0, float64. One of them is a series where x is small; the others follow by parts, adding up only.
+    """Moments of exponentials for x >= 0, float64: a series where x is small, recurrences that only add up otherwise.
 
-    `largest`: a bound of x that is known, for x that cannot be looked at (torch.func.vmap).
+    `largest`: known bound of x, for x that cannot be read (torch.func.vmap).
     """
     if largest is not None and largest <= _SERIES_BELOW:
         hit_1 = _series(x, largest)
@@ -113,7 +118,7 @@ def moments(x: Tensor, largest: float | None = None) -> Moments:
 
 
 def second_moment(x: Tensor) -> Tensor:
-    """Integral over z from 0 to 1 of z^2 exp(-x z), for x >= 0, float64: less the slope of the first moment."""
+    """Integral over z in [0, 1] of z^2 exp(-x z) for x >= 0, float64."""
     small = x < _SERIES_BELOW
     near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
     series = torch.zeros_like(x)
@@ -125,10 +130,10 @@ def second_moment(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class BinResponse:
-    """What a bin of constant rate does to the detectors that come back in it and to those armed at its start.
+    """Response of a bin of constant rate to detectors that are rearmed in it, and to those armed at its start.
 
-    Inflow has four parts, dimension 1 of (P, 4, T): constant and slope of the line from `whole` bins ago, then of that
-    from one bin earlier.
+    Inflow (rearmed detectors) has four parts, dimension 1 of (P, 4, T): constant and slope of the line from `whole`
+    bins ago, then of the line from one bin earlier.
     """
 
     kept: Tensor  # inflow still armed at the end of the bin
@@ -142,14 +147,17 @@ class BinResponse:
 
 
 def bin_response(rate: Tensor, part: Tensor, largest: float | None = None) -> BinResponse:
-    """For rates (P, T) per bin and the fraction of a bin in the dead time, float64, differentiable in both.
+    """Response of bins to their inflow, differentiable in both arguments.
 
-    `largest`: a bound of the rates, where it is known.
+    Args:
+        rate: (P, T) per bin, float64.
+        part: fraction of a bin in the dead time, scalar float64.
+        largest: known bound of the rates.
     """
     first = 1 - part  # inflow of the younger line lasts from `part` to the end of the bin, `first` long
 
     def parts(near: tuple[Tensor, Tensor], whole: tuple[Tensor, Tensor]) -> Tensor:
-        """From integrals of g(z) and z g(z), z the time to the end of the bin, up to `first` and over all of it."""
+        """Four parts from integrals of g(z), z g(z), z the time to the end of the bin, up to `first` and over all."""
         rest = whole[0] - near[0], whole[1] - near[1]
         young = (2 * first - 1) * near[0] - 2 * near[1]
         old = (2 * first + 1) * rest[0] - 2 * rest[1]
@@ -179,7 +187,14 @@ def bin_response(rate: Tensor, part: Tensor, largest: float | None = None) -> Bi
 
 
 class RenewalChain:
-    """One step of the chain and its transpose, for rates (P, T) per period, float64, on lines (P, 2 T)."""
+    """One step of the chain, from the lines of a detection to those of the next one.
+
+    Args:
+        rate: (P, T) per bin and period, float64.
+        whole, part: dead time in bins, split.
+
+    Lines are (P, 2 T) float64: counts of all bins, then slopes.
+    """
 
     def __init__(self, rate: Tensor, whole: int, part: Tensor) -> None:
         self.bins = rate.shape[-1]
@@ -193,7 +208,7 @@ class RenewalChain:
         self.blocks = self._blocks(before)
 
     def _blocks(self, before: Tensor) -> list[tuple[int, int, Tensor, Tensor]]:
-        """(begin, end, exp(-flux since begin), exp(+the same)) for stretches short enough for float64."""
+        """(begin, end, exp(-flux since begin), exp(+flux since begin)) of stretches short enough for float64."""
         begin, blocks = 0, []
         while begin < self.bins:
             flux = before[:, begin:] - before[:, begin : begin + 1]
@@ -205,7 +220,7 @@ class RenewalChain:
         return blocks
 
     def armed(self, rearmed: Tensor) -> Tensor:
-        """Armed at the start of bins, from those that join there: A[k] = A[k-1] exp(-rate[k-1]) + rearmed[k]."""
+        """Armed at the start of bins, (P, T), from rearmed ones: A[k] = A[k-1] exp(-rate[k-1]) + rearmed[k]."""
         parts, carry = [], torch.zeros_like(rearmed[:, :1])
         for begin, end, falling, rising in self.blocks:
             piece = falling * (carry + (rearmed[:, begin:end] * rising).cumsum(-1))
@@ -215,7 +230,7 @@ class RenewalChain:
         return torch.cat(parts, -1) + carry * self.rounds * self.reached
 
     def armed_transposed(self, weights: Tensor) -> Tensor:
-        """The transpose of `armed`."""
+        """Transpose of `armed`."""
         carry = (weights * self.reached).sum(-1, keepdim=True) * self.rounds
         parts = []
         # the last bin hands `carry` on through its own decay
@@ -229,12 +244,12 @@ class RenewalChain:
         return torch.cat(parts[::-1], -1)
 
     def inflow(self, lines: Tensor) -> Tensor:
-        """The four parts (P, 4, T) of what comes back in every bin."""
+        """Four parts (P, 4, T) of the detectors that are rearmed in every bin."""
         pair = lines.view(-1, 2, self.bins)
         return torch.cat([pair.roll(self.whole, -1), pair.roll(self.whole + 1, -1)], 1)
 
     def at_start(self, inflow: Tensor) -> Tensor:
-        """Armed at the start of every bin (P, T)."""
+        """Armed at the start of every bin, (P, T), from the inflow."""
         return self.armed((self.response.kept * inflow).sum(1).roll(1, -1))
 
     def step(self, lines: Tensor) -> Tensor:
@@ -246,6 +261,7 @@ class RenewalChain:
         return torch.cat([count, slope], -1)
 
     def transposed(self, weights: Tensor) -> Tensor:
+        """Transpose of `step`."""
         count, slope = weights.view(-1, 2, self.bins).unbind(1)
         bins = self.response
         kept = self.armed_transposed(bins.fire * count + bins.slope * slope).roll(-1, -1)
@@ -254,29 +270,33 @@ class RenewalChain:
         return pair.reshape(-1, 2 * self.bins)
 
     def waiting(self, lines: Tensor) -> Tensor:
-        """Bins that detectors wait, armed, until they detect, summed over the period: (P, 1)."""
+        """Time (P, 1) in bins that detectors are armed before the next detection, summed over the period."""
         back = self.inflow(lines)
         spent = self.at_start(back) * self.response.wait + (self.response.waited * back).sum(1)
         return spent.sum(-1, keepdim=True)
 
 
 class ConstantLight:
-    """Inverse of 1 - F + 1/T (sum of counts), F the step of the chain at one rate per pixel; lines (P, 2 T).
+    """Inverse of 1 - F + 1/T (sum of counts) for the step F in constant light, as a preconditioner for other light.
 
     In bright light phases turn almost rigidly with every detection, and 1 - F is nearly singular for patterns that the
-    dead time maps on themselves. Where they are and how fast they fade depends on dead time and mean wait alone.
+    dead time maps on themselves. Their place and decay depend on dead time and mean wait alone.
+
+    Args:
+        mean_wait: (P, 1) in bins.
+        bins: T.
+        whole, part: dead time in bins, split.
+        kept: (P, 1), share below 1 of detections that are followed: the inverse is then that of 1 - kept F.
     """
 
     def __init__(self, mean_wait: Tensor, bins: int, whole: int, part: Tensor, kept: Tensor | None = None) -> None:
-        """`mean_wait`: (P, 1), in bins. `kept` (P, 1): the share below 1 of what detections leave, then of 1 - kept F.
-        """
         self.bins = bins
         bin_ = bin_response(1 / mean_wait, part)
         turn = -2j * math.pi / bins * torch.arange(bins // 2 + 1, device=mean_wait.device, dtype=torch.float64)
         shifts = torch.exp(turn * (whole % bins)), torch.exp(turn * ((whole + 1) % bins))
 
         def moved(inflow: Tensor) -> Tensor:
-            """(P, 2, K): response to constants and slopes."""
+            """Response (P, 2, K) to constants and slopes."""
             return inflow[:, :2] * shifts[0] + inflow[:, 2:] * shifts[1]
 
         late = torch.exp(turn) / (1 - bin_.decay * torch.exp(turn))
@@ -317,12 +337,16 @@ def _identity(x: Tensor) -> Tensor:
 def gmres(
     operator: Operator, right: Tensor, start: Tensor, tolerance: float, precondition: Operator = _identity
 ) -> tuple[Tensor, Tensor]:
-    """Solve operator(x) = right for rows (P, T), float64, to |residual| <= tolerance |right| in every row.
+    """Solve operator(x) = right by restarted GMRES, every row its own system.
 
-    Returns x and |residual| / |right| (P,), which the caller has to look at: it stops after two restarts of 40 vectors
-    each. Both operators have to be linear and to act on every row alone; `precondition` is about the inverse of
-    `operator`, and applied from the right, so that residuals are true ones. Source: Saad and Schultz, SIAM J. Sci.
-    Stat. Comput. 7 (1986).
+    Args:
+        operator: linear function of (P, T), acting on every row alone.
+        right, start: (P, T) float64.
+        tolerance: of |residual| / |right| in every row.
+        precondition: approximate inverse of `operator`, applied from the right, so that residuals are true ones.
+
+    Returns:
+        x (P, T), and |residual| / |right| (P,), to be checked by the caller: it stops after two restarts of 40 vectors.
     """
     x = start
     scale = right.norm(dim=-1).clamp_min(1e-300)
@@ -340,7 +364,7 @@ def gmres(
 def _krylov_correction(
     operator: Operator, precondition: Operator, residual: Tensor, length: Tensor, goal: Tensor
 ) -> Tensor:
-    """The correction, before `precondition`, in the Krylov space of one restart."""
+    """Correction, before `precondition`, in the Krylov space of one restart."""
     rows, size = residual.shape
     basis = residual.new_empty(rows, _VECTORS + 1, size)
     basis[:, 0] = residual / length.clamp_min(1e-300).unsqueeze(-1)
@@ -365,7 +389,7 @@ def _krylov_correction(
 
 
 def _least_squares(table: Tensor, used: int, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Least squares of every row in its Krylov space: coefficients (P, used) and residual lengths (P,)."""
+    """Least squares of every row in its Krylov space: coefficients (P, used), residual lengths (P,)."""
     matrix = table[:, : used + 1, :used]
     right = torch.zeros_like(matrix[:, :, 0])
     right[:, 0] = length
@@ -381,11 +405,22 @@ def _least_squares(table: Tensor, used: int, length: Tensor) -> tuple[Tensor, Te
 
 
 def solve_banded(chain: RenewalChain, right: Tensor, pinned: Tensor, *, transposed: bool) -> Tensor:
-    """x of (1 - F + e e^T) x = right, F the step of the chain or its transpose; lines (P, 2 T).
+    """Solve (1 - F + e e^T) x = right directly, F the step of the chain or its transpose.
 
-    e is the count of the bin `pinned` (P,), different in every row if need be, one where the stationary counts are
-    large. 1 - F alone is singular. right = e gives the stationary lines up to a factor, and with the transpose any
-    `right` whose product with these is 0 gives a solution without the pin.
+    A bin is linked to the one before, through detectors that stay armed, and to two others, through rearmed ones.
+    Numbered by s k mod T, with s such that s dead times are nearly whole periods, all three are close by (about sqrt(T)
+    at worst, a few bins where phases lock). Block elimination takes T/width steps on blocks of that width, O(T width)
+    memory.
+
+    Args:
+        chain: the chain.
+        right: lines (P, 2 T).
+        pinned: (P,) bins whose count is e, where stationary counts are large; 1 - F alone is singular.
+        transposed: solve with the transpose.
+
+    Returns:
+        Lines (P, 2 T). right = e gives the stationary lines up to a factor; with the transpose, a `right` orthogonal to
+        these gives a solution without the pin.
     """
     found = []
     for rows in torch.split(torch.arange(right.shape[0], device=right.device), _ROWS_OF_BLOCKS):
@@ -395,7 +430,7 @@ def solve_banded(chain: RenewalChain, right: Tensor, pinned: Tensor, *, transpos
 
 
 def _numbering(bins: int, whole: int) -> tuple[Tensor, int]:
-    """Place of every bin in the new numbering, and the widest link in it."""
+    """Number of every bin that keeps linked bins close, and the widest link."""
     k = torch.arange(bins)
     best, width = k, bins
     for s in range(1, min(bins, int(2 * bins**0.5) + 2)):
@@ -471,7 +506,7 @@ def _solve_rows(chain: RenewalChain, right: Tensor, pinned: Tensor, transposed: 
 
 
 def _cyclic_tridiagonal(matrix: Tensor, right: Tensor) -> Tensor:
-    """Blocks (P, B, 3, b, b): diagonal, next, previous, B >= 3; right (P, B, b, 1)."""
+    """Solve blocks (P, B, 3, b, b) (diagonal, next, previous; B >= 3) for right sides (P, B, b, 1)."""
     last = matrix.shape[1] - 1
     diagonal, after, before = matrix.unbind(2)
     by_next: list[Tensor] = []
@@ -514,7 +549,7 @@ def _check_residual(residual: Tensor) -> None:
 
 
 def _solve_stationary(chain: RenewalChain) -> Tensor:
-    """Fixed point of the chain with counts that sum to 1, rows (P, 2 T)."""
+    """Fixed point (P, 2 T) of the chain with counts that sum to 1."""
     pi = torch.cat([chain.rate / chain.rate.sum(-1, keepdim=True), torch.zeros_like(chain.rate)], -1)
     for _ in range(_POWER_STEPS):
         pi = chain.step(pi)
@@ -578,9 +613,15 @@ def _solve_tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
 
 
 def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
-    """All that becomes of lines `right` (P, 2 T) whose counts sum to 0: themselves and every detection after them.
+    """Sum over all later detections of the chain started from `right`: (1 - F)^-1 right, up to a multiple of `pi`.
 
-    Up to a multiple of the stationary lines `pi`; its own counts sum to 0. Without gradient.
+    Args:
+        chain: the chain.
+        pi: its stationary lines (P, 2 T).
+        right: lines (P, 2 T) whose counts sum to 0.
+
+    Returns:
+        Lines (P, 2 T) whose counts sum to 0, without gradient.
     """
     found = []
     for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (chain.rate, pi, right)), strict=True):
@@ -591,9 +632,9 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
 
 
 def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Tensor, by_part: Tensor) -> Tensor:
-    """Derivative of one step of the chain from `pi` along changes of the rate and of the fraction of a bin.
+    """Derivative of one step from `pi` along changes of the rate and of the fraction of a bin.
 
-    Backward twice: the gradient is linear in its weights, and its derivative by these is the one looked for.
+    By two backward passes: the gradient is linear in its weights, and its derivative in those is the one sought.
     """
     with torch.enable_grad():
         leaves = rate.detach().requires_grad_(), part.detach().requires_grad_()
@@ -605,7 +646,7 @@ def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Ten
 
 
 class _StationaryPhases(torch.autograd.Function):
-    """rate (P, T) and the fraction of a bin -> stationary lines; both modes by the implicit function theorem."""
+    """Stationary lines of (rate, part), with both modes by the implicit function theorem."""
 
     @staticmethod
     def forward(ctx: Any, rate: Tensor, part: Tensor, whole: int) -> Tensor:
@@ -643,9 +684,17 @@ class _StationaryPhases(torch.autograd.Function):
 
 
 def stationary_phases(rate: Tensor, part: Tensor, whole: int) -> Tensor:
-    """Stationary lines (P, 2 T) of detections, counts summing to 1, for rates (P, T) per period, float64, rows above 0.
+    """Stationary distribution of detection phases, differentiable once in `rate` and `part`.
 
-    `whole`, `part`: the dead time in bins, split. Differentiable once in `rate` and `part`.
+    Args:
+        rate: (P, T) per bin and period, float64, with light in every row.
+        part, whole: dead time in bins, split.
+
+    Returns:
+        Lines (P, 2 T) whose counts sum to 1.
+
+    Raises:
+        TorchTransientError: if neither the iteration nor the direct solution reaches its residual.
     """
     pi: Tensor = _StationaryPhases.apply(rate, part, whole)  # type: ignore[no-untyped-call]
     return pi

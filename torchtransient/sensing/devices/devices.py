@@ -37,13 +37,9 @@ from torchtransient.sensing.cameras.gated import GatedIntegration
 from torchtransient.sensing.chain.compose import Compose
 from torchtransient.sensing.chain.pixel_groups import PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera, SweepJitter
+from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing, MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.correlated_noise.triggered_counts import (
-    Afterpulsing,
-    Crosstalk,
-    MeasuredDelays,
-    PowerLawDelays,
-)
+from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk
 from torchtransient.sensing.counts.shot_noise import ShotNoise
 from torchtransient.sensing.itof.itof import ItofCorrelation
 from torchtransient.sensing.itof.itof_codes import (

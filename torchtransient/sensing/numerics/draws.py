@@ -59,9 +59,13 @@ _FEW_COUNTS = 1 << 13
 
 
 def check_rates(rate: Tensor, where: str) -> Tensor:
-    """`rate` when all of it is finite and >= 0, else UnitError: torch.binomial never returns from a NaN count, and the
-    formulas of detectors that saturate give plausible counts of negative light. Not looked at where nobody can
-    (`floating.holds`).
+    """Return `rate` if all of it is finite and >= 0.
+
+    torch.binomial does not return from a NaN count, and formulas of saturating detectors give plausible counts of
+    negative light. Skipped where values cannot be read (`floating.holds`).
+
+    Raises:
+        UnitError: for negative, infinite or NaN rates, in the name of `where`.
     """
     low, high = torch.aminmax(rate.detach()) if rate.numel() else (rate.new_zeros(()), rate.new_zeros(()))
     if not holds((low >= 0) & torch.isfinite(high)):
@@ -76,13 +80,14 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
 
 
 def _alone() -> None:
+    """Let the operations of torch in this thread take no threads of their own."""
     torch.get_num_threads()  # a first look takes over the number of the process, which would undo the next line
     torch.set_num_threads(1)
     _OWN.works_alone = True
 
 
 def _forget() -> None:
-    """In a forked process: the threads stayed behind, and somebody may have held the lock."""
+    """Drop the pools of a forked process: threads do not survive the fork, and the lock may be held."""
     global _LOCK
     _LOCK = threading.Lock()
     _POOLS.clear()
@@ -92,6 +97,7 @@ os.register_at_fork(after_in_child=_forget)
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
+    """Pool of threads that work alone, made once for each number of threads."""
     with _LOCK:
         if threads not in _POOLS:
             pool, all_there = ThreadPoolExecutor(threads), threading.Barrier(threads)
@@ -114,10 +120,18 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def parallel_map(job: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-    """`job` of the first of all `arguments`, of the second, ..., by as many threads as `torch.get_num_threads()` says.
+    """Apply `job` to the arguments side by side, with as many threads as `torch.get_num_threads()`.
 
-    Every job runs in the caller's inference and grad mode. The threads are kept for later calls. Called from one of
-    them, or where no more threads can be had (as at the end of the interpreter), it does everything in the caller's.
+    Operations of torch inside the threads take one thread each: more threads than cores wait for each other, at up to
+    four times the processor time. Jobs run in the inference and grad mode of the caller. Nested calls, and calls while
+    the interpreter ends, run in the caller's thread.
+
+    Args:
+        job: function of one element of each argument.
+        arguments: sequences of one length.
+
+    Returns:
+        Results in the order of the arguments.
     """
     threads = min(torch.get_num_threads(), len(arguments[0]))
     if threads < 2 or getattr(_OWN, "works_alone", False):
@@ -139,9 +153,15 @@ def parallel_map(job: Callable[..., Result], *arguments: Sequence[Any]) -> list[
 def by_pieces(
     job: Callable[[Tensor, int, torch.Generator | None], Result], data: Tensor, generator: torch.Generator | None
 ) -> list[Result]:
-    """`job(piece, begin, generator)` of consecutive pieces along dimension 0, in threads for large data on the CPU.
+    """Apply `job(piece, begin, generator)` to pieces of `data` along dimension 0, in threads for large data on the CPU.
 
-    `begin` is the place of the piece's first entry along that dimension.
+    Args:
+        job: function of a piece, the index of its first entry along dimension 0, and its own generator.
+        data: tensor of any shape.
+        generator: source of the seeds of the pieces.
+
+    Returns:
+        Results of the pieces in order; the number of pieces does not depend on the number of threads.
     """
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[0] < _PIECES:
         return [job(data, 0, generator)]
@@ -155,6 +175,7 @@ def by_pieces(
 def _in_threads(
     job: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], generator: torch.Generator | None
 ) -> list[Result]:
+    """Apply `job` with a generator of its own for each tuple of arguments."""
     seeds = torch.randint(0, 2**63 - 1, (len(arguments),), generator=generator).tolist()
 
     def run(given: tuple[Any, ...], seed: int) -> Result:
@@ -168,7 +189,7 @@ def _in_threads(
 def _in_columns(
     draw: Callable[[Tensor, torch.Generator | None], Tensor], data: Tensor, generator: torch.Generator | None
 ) -> Tensor:
-    """`draw` over pieces of `data` along its last dimension; in threads for large tensors on the CPU."""
+    """Apply `draw` to pieces of `data` along its last dimension, in threads for large data on the CPU."""
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[-1] < _PIECES:
         return draw(data, generator)
     result = torch.empty_like(data, memory_format=torch.contiguous_format)
@@ -178,7 +199,7 @@ def _in_columns(
 
 
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """`torch.poisson` on several cores. Means have to be finite and >= 0, in float32 or float64."""
+    """Poisson numbers of finite means >= 0, float32 or float64, on several cores."""
     return _in_columns(lambda m, g: torch.poisson(m, generator=g), mean, generator)
 
 
@@ -186,10 +207,16 @@ def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tens
 
 
 class BinomialTables:
-    """Binomial numbers of `probabilities` (S,) float64 in [0, 1) and of 0 ... `most` trials, on the CPU.
+    """Binomial numbers of fixed probabilities by one lookup each, on the CPU.
 
-    `cells`: stretches of the uniform number, a power of 2 up to 65536. `most`: with so many trials results above 127
-    must be out of reach (probability below 1e-20).
+    A row of the table belongs to a probability and a number of trials, a cell of it to a stretch of the uniform number.
+    Most cells hold one result; where a border of two results lies inside a cell, more of the uniform number is drawn
+    and looked up in the distribution function, in double precision.
+
+    Args:
+        probabilities: (S,) float64 in [0, 1).
+        most: trials of the last row, such that results above 127 have probability below 1e-20.
+        cells: stretches of the uniform number, a power of 2 up to 65536.
     """
 
     def __init__(self, probabilities: Tensor, most: int, cells: int) -> None:
@@ -210,7 +237,7 @@ class BinomialTables:
         self._number = number.view(-1)
 
     def draw(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Numbers (K,) int32 of `trials` (K,) int32, each of the probability number `which` (K,) int32."""
+        """Numbers (K,) int32 of `trials` (K,) int32 with the probabilities of index `which`, (K,) int32 or one."""
         if int(trials.max()) <= self._most:
             return self._of_few(which, trials, generator).to(torch.int32)
         number = self._of_few(which, trials.clamp_max(self._most), generator).to(torch.int32)
@@ -220,7 +247,7 @@ class BinomialTables:
         return number
 
     def _of_few(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Numbers (K,) int8 of at most as many trials as the table has."""
+        """Numbers (K,) int8 of at most `most` trials."""
         cell, number = self._look(self._row(which, trials), generator)
         unsure = (number < 0).nonzero().squeeze(-1)
         if unsure.numel():
@@ -228,10 +255,7 @@ class BinomialTables:
         return number
 
     def draw_some(self, trials: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Places (J,) int64 of the numbers above 0 (a few of 0 among them), and these (J,) int32, for one probability.
-
-        `trials` (K,) int32.
-        """
+        """Places (J,) int64 and numbers (J,) int32 of the entries above 0 (and a few of 0), of one probability."""
         if int(trials.max()) > self._most:
             number = self.draw(0, trials, generator)
             place = number.nonzero().squeeze(-1)
@@ -249,12 +273,12 @@ class BinomialTables:
         return trials if isinstance(which, int) and which == 0 else trials + which * (self._most + 1)
 
     def _look(self, row: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Cells, and what the table says in them: -1 where it does not tell."""
+        """Cells (K,) and their results (K,), -1 where a border lies inside the cell."""
         cell = sixteen_bits(row, generator).to(torch.int32).bitwise_and_(self._cells - 1)
         return cell, self._number.index_select(0, cell.add(row, alpha=self._cells))
 
     def _exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
-        """The number by the rest of the uniform number, somewhere in the cell."""
+        """Results by the distribution function, with the uniform number completed inside its cell."""
         u = torch.rand(row.shape, dtype=torch.float64, device="cpu", generator=generator)
         u = u.add_(cell).mul_(1 / self._cells).add_(row)
         k = torch.searchsorted(self._below, u, right=True) - row * self._results
@@ -263,7 +287,7 @@ class BinomialTables:
 
 
 class LagTable:
-    """Draws of 0 ... K - 1 with `probabilities` (K,) float64 whose sum is 1, on the CPU. K at most 32767."""
+    """Draws of 0 ... K - 1 with `probabilities` (K,) float64 of sum 1, K at most 32767, on the CPU."""
 
     def __init__(self, probabilities: Tensor) -> None:
         self._below = probabilities.cumsum(0)[:-1]
@@ -275,7 +299,7 @@ class LagTable:
             self._number[cell[(cell >= 0) & (cell < _VALUES)]] = -1
 
     def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
-        """(N,) int64 for `like` (N,)."""
+        """Draws (N,) int64 for `like` (N,)."""
         cell = sixteen_bits(like, generator).to(torch.int32).bitwise_and_(_VALUES - 1)
         number = self._number.index_select(0, cell).long()
         unsure = (number < 0).nonzero().squeeze(-1)
@@ -286,13 +310,13 @@ class LagTable:
 
 
 def sixteen_bits(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """One int16, uniform over all its values, for each entry of `like`: four out of every random 64 bits."""
+    """Uniform int16 numbers, one for each entry of `like`: four from every 64 random bits."""
     words = torch.empty((like.numel() + 3) // 4, dtype=torch.int64, device=like.device)
     return words.random_(-(2**63), None, generator=generator).view(torch.int16)[: like.numel()]
 
 
 def _distribution(probabilities: Tensor, most: int) -> Tensor:
-    """P(K <= k) for all probabilities and n = 0 ... `most`, one a row, and all k within reach: float64."""
+    """P(K <= k), float64, a row for each probability and n = 0 ... `most`, a column for each k within reach."""
     mean = most * float(probabilities.max())
     results = min(most, math.ceil(mean + 10 * math.sqrt(mean) + 25))
     n = torch.arange(most + 1, dtype=torch.float64, device="cpu").unsqueeze(1)
@@ -305,7 +329,7 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
 
 @functools.lru_cache(maxsize=32)
 def binomial_table(probability: float, *, small: bool = False) -> BinomialTables:
-    """The table of one probability in [0, 1/2]. `small`: one that is made in less time, for fewer entries."""
+    """Table of one probability in [0, 1/2]; `small` takes less time to make, for fewer entries."""
     most = _RARE_TRIALS if probability <= _RARE and not small else _FEW_TRIALS
     return BinomialTables(torch.tensor([probability], dtype=torch.float64, device="cpu"), most, 256 if small else 1024)
 
@@ -323,10 +347,15 @@ def _fine() -> BinomialTables:
 def draw_lower_share(
     trials: Tensor, share: Tensor, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Binomial numbers for a probability just below `share` (K,), in [0, 1/2], and what is missing: three (K,).
+    """Draw binomial numbers with a probability just below `share`, in steps of 1/32, then of 1/1024 of what is left.
 
-    (number int32, trials left, probability, below 1.1e-3, with which each of those still has to be added to it).
-    `trials` (K,) int32.
+    Args:
+        trials: (K,) int32.
+        share: (K,) in [0, 1/2].
+        generator: source of randomness.
+
+    Returns:
+        Numbers (K,) int32, trials left (K,), and the probability (K,), below 1.1e-3, of each of those to be added.
     """
     # a share in steps of 1/32, then what is left of it in steps of 1/1024: trials pass the first time or the second
     number, rest, left = torch.zeros_like(trials), share, trials
@@ -344,17 +373,14 @@ def draw_lower_share(
 
 
 class Events(NamedTuple):
-    """Events of the entries that may have any, ascending: `place` (K,) int64 in the flattened input, `number` (K,).
-
-    Most numbers are at least 1. Entries that are left out have none.
-    """
+    """Entries that may have events, ascending: `place` (K,) int64 in the flattened input, `number` (K,), most >= 1."""
 
     place: Tensor
     number: Tensor
 
 
 class _Candidates(NamedTuple):
-    """Entries that may have events: place, trials, probability of each, first 16 bits of their uniform number."""
+    """Entries that may have events: place, trials, probability, first 16 bits of their uniform number."""
 
     place: Tensor
     many: Tensor
@@ -363,10 +389,18 @@ class _Candidates(NamedTuple):
 
 
 def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator | None = None) -> Events:
-    """How many of `counts` pass, each with `probability`, for the few entries that have any. Binomial, no gradient.
+    """Draw how many of `counts` pass, each with `probability`, as a list of the few entries that have any.
 
-    `counts`: any shape, float32 or float64, whole numbers >= 0. `probability`: a number or one for each entry, in
-    [0, 1]. `number` is of the dtype of `counts`.
+    Args:
+        counts: any shape, float32 or float64, integers >= 0.
+        probability: one number, or one for each entry, in [0, 1].
+        generator: source of randomness.
+
+    Returns:
+        Events whose `number` has the dtype of `counts`. Binomial, exact, without gradient.
+
+    Raises:
+        UnitError: for counts below 0 or NaN.
     """
     flat = counts.detach().reshape(-1)
     p = torch.as_tensor(probability, dtype=torch.float64, device=flat.device).detach().reshape(-1)
@@ -381,9 +415,13 @@ def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator
 
 
 def add_passing(counts: Tensor, probability: float, into: Tensor, generator: torch.Generator | None = None) -> None:
-    """Add to `into` how many of `counts` pass, each with `probability` in [0, 1/2]. Binomial, no gradient.
+    """Add to `into` how many of `counts` pass, each with `probability`. Binomial, exact, without gradient.
 
-    Both of one shape, float32 or float64, `into` contiguous; meant for some 1e5 entries at a time.
+    Args:
+        counts: float32 or float64, integers >= 0, some 1e5 entries.
+        probability: in [0, 1/2].
+        into: shape and dtype of `counts`, contiguous; changed in place.
+        generator: source of randomness.
     """
     if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
         trials, large, others = _apart(counts.reshape(-1), probability, generator)
@@ -395,6 +433,7 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
 
 
 def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator | None) -> Events:
+    """`thin` of one probability in [0, 1/2], by a table."""
     places, numbers = [], []
     table = binomial_table(probability, small=flat.numel() < _ENTRIES // 4)
     for begin in range(0, flat.numel(), _ENTRIES):
@@ -415,7 +454,7 @@ def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator 
 def _apart(
     counts: Tensor, probability: float, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Trials (K,) int32 without those of large counts; the places of these, and their numbers from torch.binomial."""
+    """Trials (K,) int32 with 0 in place of large counts; places and numbers of those, by torch.binomial."""
     low, high = torch.aminmax(counts)
     if not float(low) >= 0:
         raise UnitError(f"thin: expected counts >= 0, got {float(low):g}. Look for NaN or a difference upstream.")
@@ -429,7 +468,7 @@ def _apart(
 
 
 def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
-    """The entries that may have events, by 16 random bits each: P(any) <= n p. `p`: as many as `n`, or one."""
+    """Entries that may have events, by 16 random bits each: P(any) <= n p. `p`: one for each of `n`, or one."""
     # one step more than the bound covers what rounding takes
     steps = (n * p.to(n.dtype)).mul_(_GRID).sub_(_GRID / 2 - 2).clamp_(max=_GRID / 2 - 1).to(torch.int16)
     bits = sixteen_bits(n, generator)
@@ -444,12 +483,12 @@ def _joined(parts: list[_Candidates]) -> _Candidates:
 
 
 def _decide(chosen: _Candidates, dtype: torch.dtype, generator: torch.Generator | None) -> Events:
-    """Binomial numbers of the candidates.
+    """Binomial numbers of candidates.
 
-    The number is at least k where u < P(K >= k). With the binomial moments x = n p, y = n (n - 1) p^2 / 2 and
-    z = n (n - 1) (n - 2) p^3 / 6, Bonferroni's inequalities say that P(K >= 1) lies in [x - y, x - y + z], P(K >= 2)
-    in [y - 2 z, y] and P(K >= 3) below z. In single precision and with room for its rounding they decide most
-    entries; the others are looked at in double precision.
+    The number is at least k where u < P(K >= k). With the binomial moments x = n p, y = n (n - 1) p^2 / 2 and z = n (n
+    - 1) (n - 2) p^3 / 6, Bonferroni's inequalities bound P(K >= 1) by [x - y, x - y + z], P(K >= 2) by [y - 2 z, y] and
+    P(K >= 3) by z. In single precision, with a margin for its rounding, they settle most entries; the others are
+    settled in double precision.
     """
     n, p = chosen.many.float(), chosen.share.float()
     finer = torch.rand(n.shape, dtype=torch.float32, device=n.device, generator=generator)
@@ -473,9 +512,9 @@ def _decide(chosen: _Candidates, dtype: torch.dtype, generator: torch.Generator 
 
 
 def _count_down(many: Tensor, share: Tensor, u: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Binomial by inversion from the top, in float64: every round follows the entries that have more events.
+    """Binomial numbers by inversion from the top, float64: every round follows the entries that have more events.
 
-    Entries with many events take a fresh draw instead: of none of them has `u` decided anything yet.
+    Entries with many expected events take a fresh draw instead, since `u` has not settled anything of them.
     """
     number = torch.where(share < 1, torch.zeros_like(many), many)
     heavy = many * share > _HEAVY
@@ -501,13 +540,18 @@ def _count_down(many: Tensor, share: Tensor, u: Tensor, generator: torch.Generat
 
 
 def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """How many of `counts` go to the first of two places that gets each with probability `share`: binomial.
+    """Draw how many of `counts` go to the first of two places, each with probability `share`.
 
-    No gradient. Exact for any share in [0, 1], cheap for counts up to 127; other draws, few draws, and all draws
-    on other devices than the CPU, are those of `torch.binomial`. Same shapes and dtype, float32 or float64.
+    Tables draw with a probability just below the share, or its complement; of the trials left each is added with the
+    small missing probability. Counts above 127, few draws and other devices than the CPU take torch.binomial.
 
-    Tables give the number for a share just below the one that is meant, or below its complement; of the trials that
-    are left each is added with the small probability that is missing.
+    Args:
+        counts: any shape, float32 or float64, integers >= 0.
+        share: shape and dtype of `counts`, in [0, 1].
+        generator: source of randomness.
+
+    Returns:
+        Binomial numbers in shape and dtype of `counts`, exact, without gradient.
     """
     n, p = counts.detach(), share.detach()
     if n.device.type != "cpu" or n.numel() < _WORTH_TABLES:
@@ -553,9 +597,9 @@ def _distribute(
 ) -> Tensor:
     """Counts (T, P) of `trials` in bins by conditional binomials, halving the bins level by level.
 
-    `weights`: (T, P). `chance` turns the sum of the weights of neighbouring bins into the probability of their counts,
-    or that up to a factor which is 1 for all bins together. Neighbours part last: there are few counts then, and
-    their shares are nearly equal, which `halve` draws fast.
+    `weights` (T, P); `chance` turns the sum of weights of neighbouring bins into the probability of their counts, up to
+    a factor that is 1 for all bins together. Neighbours part last: counts are few then, with nearly equal shares, which
+    `halve` draws fast.
     """
     number: Tensor | None = None
     if weights.numel() <= _SMALL_DRAW and weights.device.type == "cpu":
@@ -591,10 +635,7 @@ def _distribute(
 
 
 def _one_by_one(number: Tensor, chances: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Counts (T, P), float64, of which every column has its `number` (P,), each looked up by itself.
-
-    `chances`: (T, P) float64 of an event up to the end of each bin.
-    """
+    """Counts (T, P) float64 of `number` (P,) events, each looked up in `chances` (T, P), cumulative over bins."""
     bins, pixels = chances.shape
     column = torch.arange(pixels, dtype=torch.float64)
     below = chances / chances[-1].clamp_min(torch.finfo(torch.float64).tiny)
@@ -615,6 +656,7 @@ def _first_of_two(weights: Tensor, chance: Callable[[Tensor], Tensor]) -> Tensor
 
 
 def _any_photon(rate: Tensor) -> Tensor:
+    """1 - exp(-rate), in a new tensor."""
     return rate.neg().expm1_().neg_()
 
 
@@ -623,22 +665,36 @@ def _as_it_is(probability: Tensor) -> Tensor:
 
 
 def sample_multinomial(trials: int, probabilities: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Multinomial counts of `trials` along time for probabilities (..., T, H, W) whose sum is at most 1.
+    """Draw multinomial counts along time by conditional binomials over a tree of bins: T binomials a pixel.
 
-    The rest of the probability is "no event" and not returned. Drawn by conditional binomials over a tree of bins,
-    T binomials a pixel and never a draw a trial, exact for any number of trials up to 2^53. Same shape and dtype as
-    `probabilities` (float32 or float64; above 2^24 trials float32 is drawn in float64 and rounded). No gradient.
-    Raises ShapeError for fewer than 3 dimensions, UnitError for negative or non-finite probabilities.
+    Args:
+        trials: number of trials, up to 2^53.
+        probabilities: (..., T, H, W), float32 or float64, sum over T at most 1; the rest is "no event".
+        generator: source of randomness.
+
+    Returns:
+        Counts in shape and dtype of `probabilities`, without gradient; above 2^24 trials float32 is drawn in float64.
+
+    Raises:
+        ShapeError: for fewer than 3 dimensions.
+        UnitError: for negative or non-finite probabilities.
     """
     return _sample_tree(trials, probabilities, _as_it_is, generator, "sample_multinomial")
 
 
 def sample_first_photons(cycles: int, rate: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Histogram of the first photon of each of `cycles` cycles, for `rate` (..., T, H, W) photons per cycle and bin.
+    """Draw the histogram of the first photons of `cycles` cycles, the multinomial of `first_photon_probabilities`.
 
-    The multinomial of `first_photon_probabilities`. Nothing is summed over earlier bins: of the photons first in one
-    of two neighbouring stretches of time, those in the earlier are a share (1 - exp(-a)) / (1 - exp(-a - b)) that
-    does not depend on what came before. Otherwise as `sample_multinomial`.
+    Of the photons that are first in one of two neighbouring stretches of time a share (1 - exp(-a)) / (1 - exp(-a - b))
+    is in the earlier one, whatever came before: no sums over earlier bins are needed.
+
+    Args:
+        cycles: number of cycles.
+        rate: photons per cycle and bin, (..., T, H, W).
+        generator: source of randomness.
+
+    Returns, Raises:
+        As `sample_multinomial`.
     """
     return _sample_tree(cycles, rate, _any_photon, generator, "sample_first_photons")
 
@@ -646,6 +702,7 @@ def sample_first_photons(cycles: int, rate: Tensor, generator: torch.Generator |
 def _sample_tree(
     trials: int, weights: Tensor, chance: Callable[[Tensor], Tensor], generator: torch.Generator | None, where: str
 ) -> Tensor:
+    """`_distribute` over the pixels of (..., T, H, W), in threads for large data."""
     if weights.ndim < 3:
         raise ShapeError(f"{where}: expected (..., T, H, W), got {tuple(weights.shape)}.")
     w = weights.detach()

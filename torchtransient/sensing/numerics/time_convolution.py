@@ -30,15 +30,26 @@ _WIDE = 64  # images at least this large are summed row by row: torch.cumsum str
 def convolve_time(
     x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero", method: Method = "auto"
 ) -> Tensor:
-    """y[t] = sum over j of kernel[j] x[t - first - j], along the time axis of (..., C, T, H, W).
+    """Convolve along time: y[t] = sum over j of kernel[j] x[t - first - j].
 
-    `kernel`: (K,), the share of a bin's light that arrives `first + j` bins later. Boundary "zero": what leaves the
-    window is lost, nothing comes in; "periodic": the window is one period of a repeating signal, sums are conserved.
-    "fft" works in float64, since the rounding of a float32 transform (1e-7 of the largest bin) would drown late bins,
-    and pads to T + K - 1 and more for "zero"; "direct" sums in the dtype given; "auto" chooses by the length of the
-    kernel. Half precision is computed in float32. Differentiable in both arguments; dtype and device of `x` are kept.
+    "direct" sums in the dtype of `x`. "fft" works in float64, since the rounding of a float32 transform (1e-7 of the
+    largest bin) would drown late bins, and pads to T + K - 1 and more for "zero". Half precision is computed in
+    float32. Differentiable in `x` and `kernel`.
 
-    Raises ShapeError for wrong layouts, an empty kernel or an unknown choice.
+    Args:
+        x: (..., C, T, H, W).
+        kernel: (K,), share of a bin's light that arrives `first + j` bins later.
+        first: lag of kernel[0] in bins, of either sign.
+        boundary: "zero": light that leaves the window is lost, none enters; "periodic": the window is one period, sums
+            are conserved.
+        method: "auto" chooses by the length of the kernel.
+
+    Returns:
+        Shape, dtype and device of `x`.
+
+    Raises:
+        ShapeError: for wrong layouts or an empty kernel.
+        ArgumentError: for an unknown boundary or method.
     """
     check_transient(x, "convolve_time")
     check_choice(boundary, Boundary, "boundary", "convolve_time")
@@ -63,15 +74,12 @@ def convolve_time(
 
 
 def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
-    """(kernel, first) as far as it matters in a window of `bins`: folded into one period, or cut to lags inside.
-
-    A kernel that misses the window altogether comes back empty.
-    """
+    """Fold (kernel, first) into one period, or crop it to lags inside a window of `bins`; empty if it misses it."""
     return _fold(kernel, first, bins) if boundary == "periodic" else _crop(kernel, first, bins)
 
 
 def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:
-    """The kernel modulo the period, when it is longer than one."""
+    """Kernel modulo the period, where it is longer than one."""
     if kernel.numel() <= period:
         return kernel, first % period
     lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % period
@@ -79,13 +87,14 @@ def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:
 
 
 def _crop(kernel: Tensor, first: int, bins: int) -> tuple[Tensor, int]:
-    """The part of the kernel whose lags lie in (-bins, bins); all others miss the window."""
+    """Part of the kernel whose lags lie in (-bins, bins)."""
     begin = min(max(0, 1 - bins - first), kernel.numel())
     end = max(min(kernel.numel(), bins - first), begin)
     return kernel[begin:end], first + begin
 
 
 def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    """Sum of shifted images, which keeps the layout."""
     bins, taps = x.shape[TIME], kernel.numel()
     work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
     if boundary == "periodic":
@@ -127,10 +136,20 @@ def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
 
 
 def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: int) -> Tensor:
-    """Rows (..., T), float64, times a transfer function, circular in `length`, moved by `first`: (..., keep).
+    """Multiply rows by a transfer function.
 
-    Results that rounding has put below zero are 0: a transform leaves 1e-17 of either sign where there is no light, and
-    a negative rate is none that a detector could draw from. The gradient is that of the transform alone.
+    Results that rounding puts below zero are set to 0 (a transform leaves 1e-17 of either sign in the dark, and no
+    detector draws from a negative rate); the gradient is that of the transform alone.
+
+    Args:
+        rows: (..., T) float64.
+        transfer: (length // 2 + 1,) complex128.
+        length: period of the transform, in bins.
+        first: shift to later bins.
+        keep: bins of the result.
+
+    Returns:
+        (..., keep) float64.
     """
     if rows.numel() == 0:
         return rows.new_zeros(*rows.shape[:-1], keep)
@@ -146,6 +165,7 @@ def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: i
 
 
 def _sum_before(x: Tensor, reverse: bool) -> Tensor:
+    """Sum of the earlier bins (of the later ones with `reverse`), without gradient."""
     if x.device.type != "cpu" or x.shape[-1] * x.shape[-2] < _WIDE:
         wide = x.to(torch.float64)
         if reverse:
@@ -189,5 +209,5 @@ def _apply(x: Tensor, reverse: bool) -> Tensor:
 
 
 def sum_before(x: Tensor) -> Tensor:
-    """Sum of all earlier bins along the time axis of (..., T, H, W), float64, differentiable any number of times."""
+    """Sum of the earlier bins of (..., T, H, W), float64, differentiable to any order."""
     return _apply(x, False)

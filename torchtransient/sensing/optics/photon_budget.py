@@ -336,9 +336,18 @@ def hot_pixel_rates(
     hot_factor: float = 100.0,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """A map (H, W) float64 of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
+    """Draw a map of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
 
-    `log_std`: standard deviation of the natural logarithm. For `PhotonBudget(dark_count_rate_hz=...)`.
+    Args:
+        height, width: of the map.
+        median_hz: median in Hz.
+        log_std: standard deviation of the natural logarithm.
+        hot_fraction: share of hot pixels.
+        hot_factor: rate of a hot pixel over that of others, at least 1.
+        generator: source of randomness.
+
+    Returns:
+        (H, W) float64 in Hz, for `PhotonBudget(dark_count_rate_hz=...)`.
     """
     median = check_number(median_hz, "median_hz", where := "hot_pixel_rates")
     spread = check_number(log_std, "log_std", where)

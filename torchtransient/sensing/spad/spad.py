@@ -49,11 +49,19 @@ from torchtransient.sensing.numerics.time_convolution import sum_before
 
 @in_single
 def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
-    """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
+    """Probabilities of the first photon of a cycle: (1 - exp(-rate[k])) exp(-sum of the rates before).
 
-    `rate`: expected detections per cycle and bin, >= 0. Sums over bins are made in float64, in the exponent, so that
-    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
-    UnitError for rates that are negative, infinite or NaN.
+    Sums over bins are made in float64, in the exponent, so that 1e4 bins lose no digits; in a saturated pixel the late
+    bins have probability and gradient 0.
+
+    Args:
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+
+    Returns:
+        Probability of each bin (..., C, T, H, W), and of no photon (..., C, H, W).
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN.
     """
     check_rates(check_bins(rate, "first_photon_probabilities"), "first_photon_probabilities")
     before = sum_before(rate)
@@ -63,7 +71,12 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CoatesEstimate(NamedTuple):
-    """`rate`: detections per cycle and bin; `valid`: bool, where cycles were still armed and not all of them fired."""
+    """Estimate of the light behind a histogram.
+
+    Attributes:
+        rate: detections per cycle and bin of a detector that is never dead, (..., C, T, H, W).
+        valid: mask of bins where cycles were still armed and not all of them fired.
+    """
 
     rate: Tensor
     valid: Tensor
@@ -75,6 +88,7 @@ def _rows(x: Tensor) -> Tensor:
 
 
 def _image(rows: Tensor, like: Tensor) -> Tensor:
+    """Rows (P, T) in the layout of `like`."""
     return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
 
 
@@ -84,17 +98,26 @@ def _columns(x: Tensor) -> Tensor:
 
 
 def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    """Columns (T, P) in the layout of `like`."""
     return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
 
 
 def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
-    """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
+    """Expected detections per cycle and bin of a detector armed at the start of each cycle, with dead time.
 
-    `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
-    `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
-    Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
-    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md). Raises UnitError
-    for rates that are negative, infinite or NaN.
+    Exact for dead times of fractions of a bin; bins of more than a photon are cut. Total variation from the exact mean:
+    below 1e-5 (docs/photon_counting.md). Differentiable to any order in both arguments.
+
+    Args:
+        rate: expected detections per cycle and bin of a detector that is never dead, (..., C, T, H, W), constant in a
+            bin.
+        dead_bins: non-paralyzable dead time in bins, at least 1/2; a number or scalar tensor.
+
+    Returns:
+        (..., C, T, H, W) float64.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
     check_transient(rate, "detections_with_dead_time")
     check_rates(rate, "detections_with_dead_time")
@@ -107,14 +130,24 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
 
 @in_single
 def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
-    """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
+    """Undo pile-up by the maximum likelihood estimate of Coates: rate[k] = -log(1 - counts[k] / cycles still armed at
+    k).
 
-    `counts`: (..., C, T, H, W) detections of `cycles` cycles; `dead_bins`: dead time in bins, at least 1, for several
-    detections per cycle, None for one. With it the cycles that come back inside a bin count for as long as they are
-    armed in it: the inverse of `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Where no cycle was
-    armed any more the rate is 0, where every armed one fired it is that of a share 1 - 1/(2 cycles); both are marked
-    not valid. Differentiable in `counts`, with a dead time once. dtype and device are kept. Raises UnitError for a
-    dead time below one bin.
+    With a dead time, cycles rearmed inside a bin count for as long as they are armed in it: the inverse of
+    `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Differentiable in `counts`, with a dead time
+    once.
+
+    Args:
+        counts: detections, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins, at least 1, for several detections per cycle; None for one.
+
+    Returns:
+        Rate in dtype and device of `counts`; 0 where no cycle was armed, that of a share 1 - 1/(2 cycles) where all
+        fired, both not valid.
+
+    Raises:
+        UnitError: for a dead time below one bin.
     """
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
@@ -136,11 +169,23 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
 def sample_detections(
     rate: Tensor, cycles: int, dead_bins: float | None = None, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """A histogram of `cycles` cycles, without gradient, in the shape and dtype of `rate` (..., C, T, H, W).
+    """Draw a histogram of `cycles` cycles, without gradient.
 
-    `dead_bins` None: one detection per cycle, multinomial by a tree of binomials. Else bin by bin (pieces of bins where
-    they hold more than a photon): of the armed cycles a binomial share fires, and those that fired are armed again
-    after the dead time. Means are those of `detections_with_dead_time`, correlations those of the cycles.
+    One detection per cycle is multinomial, by a tree of binomials. With a dead time, bin by bin (or piece by piece
+    where bins hold more than a photon), a binomial share of the armed cycles fires and is rearmed after the dead time.
+    Means are those of `detections_with_dead_time`, correlations those of the cycles.
+
+    Args:
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins, at least 1/2; None for one detection per cycle.
+        generator: source of randomness.
+
+    Returns:
+        Counts in shape and dtype of `rate`.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
     check_transient(rate, "sample_detections")
     number = check_count(cycles, "cycles", "sample_detections")
@@ -177,17 +222,27 @@ def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Gener
 
 
 class SynchronousSPAD(RandomSensor):
-    """Histogram (..., C, T, H, W), in counts, of `cycles` laser cycles from detections per cycle and bin.
+    """SPAD in step with the laser: histogram (..., C, T, H, W), in counts, of `cycles` cycles.
 
-    The input is the rate of an always-armed detector: signal, ambient light and dark counts, as `PhotonBudget` gives
-    it. `gate`: (T,) profile between 0 and 1 that multiplies the rate (bins before the gate opens do not pile up).
-    `dead_time_s` with `axis` or `bin_width_s`: several detections per cycle (`detections_with_dead_time`), the detector
-    being armed at the start of each; without it, the first photon of a cycle is the only one (dead until the next).
+    The input is the rate of an always-armed detector per cycle and bin: signal, ambient light and dark counts, as
+    `PhotonBudget` gives it. Without a dead time the first photon of a cycle is the only one; with one the detector is
+    armed at the start of each cycle and fires several times (`detections_with_dead_time`).
 
-    Policies: all four. The normal surrogate has the covariance of the cycles, between bins too; the score is that of
-    the draws, bin by bin. With a dead time `log_prob` is that of every bin given those before it, exact but for where
-    in a bin detections lay; `inverse` needs a dead time of at least one bin. Afterpulses and crosstalk are modules of
-    their own, behind.
+    All policies. "gaussian" has the covariance of the cycles, between bins too; "score" is that of the draws, bin by
+    bin. With a dead time `log_prob` is that of every bin given those before it, exact but for the place of detections
+    in a bin. Afterpulses and crosstalk are modules of their own, behind.
+
+    Args:
+        cycles: number of laser cycles.
+        gate: (T,) profile in [0, 1] that multiplies the rate; bins before the gate opens do not pile up.
+        dead_time_s: dead time in seconds, with `axis` or `bin_width_s`; None for one detection per cycle.
+        axis: time axis, or
+        bin_width_s: bin width in seconds.
+        grad: gradient policy.
+
+    Raises:
+        ShapeError: for a gate that is not (T,).
+        UnitError: for gate values outside [0, 1], and dead times below half a bin.
     """
 
     takes, gives = ("rate",), "counts"
@@ -284,7 +339,14 @@ class SynchronousSPAD(RandomSensor):
         return measurement
 
     def inverse(self, counts: Tensor) -> CoatesEstimate:
-        """The rate behind a histogram (`coates`), divided by the gate; bins where the gate is shut are not valid."""
+        """Rate behind a histogram (`coates`), divided by the gate; bins with a shut gate are not valid.
+
+        Args:
+            counts: (..., C, T, H, W).
+
+        Raises:
+            UnitError: for a dead time below one bin.
+        """
         estimate = coates(counts, self.cycles, self.dead_bins)
         if self.gate is None:
             return estimate
@@ -325,14 +387,27 @@ def first_photon_log_prob(
     constant: bool = True,
     where: str = "first_photon_log_prob",
 ) -> Tensor:
-    """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)). (..., C, T, H, W).
+    """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)).
 
-    Its sum over time is that of the histogram. `constant` False leaves the binomial coefficient out, which does not
-    depend on the rate. Concave in the rate. With `dead_bins`, cycles that come back inside a bin count for the part of
-    it in which they could fire: linear in the counts, greatest where the mean is right, to second order in the photons
-    of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are possible; a count
-    at rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than
-    `cycles` cycles.
+    Its sum over time is that of the histogram; concave in the rate. With a dead time, cycles rearmed inside a bin count
+    for the part of it in which they could fire: linear in the counts, greatest where the mean is right, to second order
+    in the photons of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are
+    possible; a count at rate 0 has log-probability -inf.
+
+    Args:
+        counts: detections, (..., C, T, H, W).
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins; None for one detection per cycle.
+        constant: include the binomial coefficient, which does not depend on the rate.
+        where: name of the caller, for errors.
+
+    Returns:
+        (..., C, T, H, W) in the dtype of `rate`.
+
+    Raises:
+        ShapeError: for fewer than 3 dimensions, or shapes that do not broadcast.
+        UnitError: for counts that need more than `cycles` cycles.
     """
     number = check_count(cycles, "cycles", where)
     (counts,), (rate,) = reals(where, torch.float64, counts=counts), reals(where, rate=rate)

@@ -1,4 +1,4 @@
-"""Counts triggered by counts: afterpulses of earlier detections and optical crosstalk of neighbouring pixels.
+"""Afterpulses on counts: detections triggered by carriers that an earlier one left behind, and laws of their delays.
 
 Delays of afterpulses count from the detection. A carrier that is released while the detector is dead makes no
 detection: laws of delays are cut off at the dead time. Time is in bins; a detection is spread evenly over its bin.
@@ -38,7 +38,7 @@ from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.remembered import remembered
 from torchtransient.sensing.base.sensor import PhysicalModule
 from torchtransient.sensing.counts.added_counts import AddedCounts
-from torchtransient.sensing.numerics.draws import LagTable, add_passing, by_pieces, sixteen_bits, thin
+from torchtransient.sensing.numerics.draws import LagTable, by_pieces, sixteen_bits, thin
 from torchtransient.sensing.numerics.time_convolution import filter_rows
 from torchtransient.sensing.response.response_shapes import above_floor
 
@@ -56,19 +56,13 @@ _VALUES = 1 << 16  # of a random number of 16 bits
 _LONGEST_TABLE = 1 << 14  # bins of a period, above which a table of 2^16 cells says little
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
 _MOST = 0.5  # afterpulses of a detection
-_EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
-_CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-_MOST_CROSSTALK = 0.25  # of each of four neighbours: one detection may trigger one other
 
 
 # ------------------------------------------------------------------------------------------------------- laws of delays
 
 
 def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: int) -> Tensor:
-    """Share of afterpulses in bins `first`, `first` + 1, ... after their detection, by component: (K, number) float64.
-
-    `tau_bins` (K,): mean delays beyond the dead time, differentiable.
-    """
+    """Share of afterpulses in bins `first`, ... after their detection, (K, number), for delays `tau_bins` (K,)."""
     tau = tau_bins.unsqueeze(1)
     k = torch.arange(first - 1, first + number, dtype=torch.float64, device=tau.device)
     # mean over the bin of the chance that the afterpulse is yet to come: 1 while the detector is dead
@@ -88,36 +82,80 @@ def exponential_kernel(tau_bins: Tensor, dead_bins: float, period_bins: int) -> 
 
 
 class AfterpulseDelays(PhysicalModule):
-    """A law of delays that ends. A subclass says how many afterpulses are yet to come, and draws.
+    """Law of delays of afterpulses that ends, for `Afterpulsing(probability, dead_time_s=..., delays=law)`.
 
-    For `Afterpulsing(probability, dead_time_s=..., delays=law)`.
+    Subclasses define `seen`, `mean_yet_to_come`, `draw` and `end_s`.
     """
 
     def seen(self, dead_time_s: float) -> Tensor | float:
-        """Share of all carriers that are set free after the dead time."""
+        """Share of all carriers that are released after the dead time.
+
+        Args:
+            dead_time_s: dead time in seconds.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define seen(dead_time_s).")
 
     def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
-        """Mean over the bins from `k` to `k` + 1 (bins after the detection) of the share that is yet to come."""
+        """Mean over the bin from `k` to `k` + 1 of the share of afterpulses that is yet to come.
+
+        Args:
+            k: (N,) float64, bins after the detection.
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+
+        Returns:
+            (N,) float64, 1 while the detector is dead.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define mean_yet_to_come(k, dead time, bin width).")
 
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
-        """(number,) float64 delays after the detection that are seen, in seconds."""
+        """Draw delays beyond the dead time.
+
+        Args:
+            number: of delays.
+            dead_time_s: dead time in seconds.
+            generator: source of randomness.
+
+        Returns:
+            (number,) float64, seconds after the detection.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define draw(number, dead time, generator).")
 
     def end_s(self) -> float:
-        """The longest delay, in seconds."""
+        """Longest delay in seconds."""
         raise NotImplementedError(f"{type(self).__name__} has to define end_s().")
 
     def shares(self, dead_time_s: float, bin_width_s: float, *, first: int, number: int) -> Tensor:
-        """Share of afterpulses in bins `first`, `first` + 1, ... after their detection: (number,) float64."""
+        """Share of afterpulses in bins `first`, `first` + 1, ... after their detection.
+
+        Args:
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+            first: first bin.
+            number: of bins.
+
+        Returns:
+            (number,) float64.
+        """
         device = next((t.device for t in [*self.parameters(), *self.buffers()]), None)
         k = torch.arange(first - 1, first + number, dtype=torch.float64, device=device)
         yet = self.mean_yet_to_come(k, dead_time_s, bin_width_s)
         return yet[:-1] - yet[1:]
 
     def kernel(self, dead_time_s: float, bin_width_s: float, period_bins: int) -> Tensor:
-        """The shares of all bins, folded into one period: (period_bins,) float64, sum 1."""
+        """Shares of all bins, folded into one period.
+
+        Args:
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+            period_bins: period in bins.
+
+        Returns:
+            (period_bins,) float64, sum 1.
+
+        Raises:
+            UnitError: for a law of more than 2^23 bins.
+        """
         number = math.ceil(self.end_s() / bin_width_s) + 2
         if number > _LONGEST_LAW:
             raise UnitError(
@@ -130,11 +168,18 @@ class AfterpulseDelays(PhysicalModule):
 
 
 class PowerLawDelays(AfterpulseDelays):
-    """Afterpulses whose rate falls as delay^-exponent, from the end of the dead time to `longest_s`; none later.
+    """Afterpulses whose rate falls as delay^-exponent, from the end of the dead time to `longest_s`.
 
-    Measured exponents are about 1 to 1.4 (Itzler et al. 2012, InGaAs/InP). The law has no beginning: it needs a dead
-    time above zero, and its `probability` counts what comes after it. `learnable`: `log_exponent` is a parameter.
-    Raises UnitError for exponents outside (0, 10].
+    Measured exponents are about 1 to 1.4 (Itzler et al. 2012, InGaAs/InP). The law diverges at delay 0: it needs a dead
+    time above zero, and its `probability` counts what comes after it.
+
+    Args:
+        exponent: in (0, 10].
+        longest_s: longest delay in seconds.
+        learnable: make `log_exponent` a parameter.
+
+    Raises:
+        UnitError: for exponents outside (0, 10].
     """
 
     log_exponent: Tensor
@@ -164,6 +209,7 @@ class PowerLawDelays(AfterpulseDelays):
         return self.log_exponent.double().exp()
 
     def _limits(self, dead_time_s: float) -> float:
+        """Logarithm of the longest delay over the dead time."""
         if not 0 < dead_time_s < self.longest_s:
             raise UnitError(
                 f"PowerLawDelays: expected a dead time above 0 and below longest_s = {self.longest_s:g} s, where the "
@@ -172,7 +218,7 @@ class PowerLawDelays(AfterpulseDelays):
         return math.log(self.longest_s / dead_time_s)
 
     def _growth(self, log_x: Tensor) -> Tensor:
-        """Integral of x^-exponent from 1 on, by the logarithm of x."""
+        """Integral of x^-exponent from 1 on, as a function of log x."""
         a = 1 - self.exponent
         flat = a.abs() < 1e-6
         safe = torch.where(flat, torch.ones_like(a), a)
@@ -200,11 +246,17 @@ class PowerLawDelays(AfterpulseDelays):
 
 
 class MeasuredDelays(AfterpulseDelays):
-    """Delays by a measured histogram `counts` (K,) in bins of `bin_width_s`, the first beginning `start_s` after it.
+    """Delays by a measured histogram, counts spread evenly over their bins.
 
-    Counts are spread evenly over their bins. `floor`: counts of a bin that are no afterpulses (dark counts, the level
-    far out), taken off; True the median of all bins, False nothing. Below it nothing is left. Raises ShapeError for
-    what is no histogram, UnitError for counts that are negative, not finite, or nothing above the floor.
+    Args:
+        counts: (K,) counts >= 0.
+        bin_width_s: width of its bins in seconds.
+        start_s: delay at which the first bin begins, in seconds.
+        floor: counts of a bin that are no afterpulses (dark counts), taken off; True: the median of all bins.
+
+    Raises:
+        ShapeError: for counts that are not (K,).
+        UnitError: for counts that are negative, not finite, or all below the floor.
     """
 
     share_of_bins: Tensor
@@ -279,10 +331,22 @@ class MeasuredDelays(AfterpulseDelays):
 
 
 def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: float, *, period_bins: int) -> Tensor:
-    """Share of afterpulses k bins after their detection, folded into one period: (period_bins,) float64, sum 1.
+    """Share of afterpulses k bins after their detection, folded into one period.
 
-    The delay is the dead time plus an exponential time of mean `tau_s` (differentiable); detections are spread evenly
-    over their bins. Bins are integrated exactly, and so are all later periods.
+    The delay is the dead time plus an exponential time; detections are spread evenly over their bins. Bins and later
+    periods are integrated exactly.
+
+    Args:
+        tau_s: mean delay beyond the dead time in seconds, differentiable.
+        dead_time_s: dead time in seconds.
+        bin_width_s: bin width in seconds.
+        period_bins: period in bins.
+
+    Returns:
+        (period_bins,) float64, sum 1.
+
+    Raises:
+        UnitError: for values outside of their ranges.
     """
     if as_number(tau_s) is None:
         raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
@@ -303,10 +367,21 @@ def add_afterpulses(
 ) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
-    `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel` (or `Afterpulsing.kernel`, which
-    has the probability in it); the window is the first T bins of a period of P. Afterpulses outside the window are
-    lost. With P = T sums grow by 1/(1 - probability) exactly.
-    Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
+    The window is the first T bins of a period of P; afterpulses outside of it are lost. With P = T sums grow by 1/(1 -
+    probability) exactly. Computed in float64 by FFT round the period; differentiable in all three tensors.
+
+    Args:
+        counts: (..., C, T, H, W).
+        probability: afterpulses of a detection.
+        kernel: (P,), P >= T, of `afterpulse_kernel` (or `Afterpulsing.kernel`, which includes the probability).
+        only_added: return the afterpulses alone.
+
+    Returns:
+        Shape, dtype and device of `counts`.
+
+    Raises:
+        ShapeError: for a kernel that is not (P,).
+        UnitError: for P < T.
     """
     check_transient(counts, "add_afterpulses")
     (kernel,) = reals("add_afterpulses", kernel=kernel)
@@ -320,7 +395,7 @@ def add_afterpulses(
 
 
 def _gain(probability: Tensor | float, kernel: Tensor, bins: int) -> tuple[Tensor, int]:
-    """Transfer function from detections to all afterpulses, and its length."""
+    """Transfer function from detections to all generations of afterpulses, and its length."""
     period = kernel.shape[0]
     transfer = probability * torch.fft.rfft(kernel)
     # only what is added is transformed: the detections themselves keep all their digits
@@ -345,32 +420,38 @@ def _check_period(period: int, bins: int) -> None:
 
 
 def _from_outside(kernel: Tensor, bins: int) -> Tensor:
+    """Afterpulses (bins,) in the window of one count in every bin outside of it."""
     window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
     total = kernel.sum() / (1 - kernel.sum())
     return (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).flatten()
 
 
 class Afterpulsing(AddedCounts):
-    """Every detection triggers others later: with `probability`, one dead time plus a random time after it.
+    """Afterpulses on counts, behind the SPAD: every detection triggers others one dead time plus a random time later.
 
-    `probability` and `tau_s`: numbers, or one each of several exponentials (carriers of several traps; probabilities
-    add up); mean delays `tau_s` are counted from the end of the dead time on, since exponentials have no memory.
-    `delays`: another law instead, `PowerLawDelays` or `MeasuredDelays`, cut off at the dead time. Probabilities are
-    those of afterpulses after the dead time, as data sheets give them; with `counted_from` "avalanche" those of all
-    carriers, of which those that are set free during the dead time are not seen.
+    The histogram is taken round the laser period: afterpulses of one cycle fall into later ones, constant light stays
+    constant. Dead time is not applied to the afterpulses themselves, nor do they keep photons from being seen: right in
+    dim light (`AfterpulsingSPAD` for the rest). A period longer than the window has counts outside of it, whose
+    afterpulses fall into the window: `background` stands for them.
 
-    Works on counts, behind the SPAD. The histogram is taken round the laser period (`period_s`, by default the window):
-    afterpulses of one cycle fall into later ones, constant light stays constant. Dead time is not applied to the
-    afterpulses themselves, nor do they keep photons from being seen: right in dim light (`AfterpulsingSPAD` for the
-    rest).
+    Args:
+        probability: afterpulses of a detection, one number, or one for each of several exponentials (traps).
+        tau_s: mean delays beyond the dead time in seconds, as many; exponentials have no memory.
+        dead_time_s: dead time in seconds, 0 for none.
+        delays: law of delays instead of `tau_s`, cut off at the dead time.
+        counted_from: "dead_time": probabilities of afterpulses after the dead time, as in data sheets; "avalanche": of
+            all carriers, of which those released during the dead time are not seen.
+        axis: time axis, which gives the bin width.
+        bin_width_s: bin width in seconds, without an axis.
+        period_s: laser period in seconds; None: the window.
+        background: constant counts of a bin of the whole exposure outside of the window, a number or (H, W)
+            (`PhotonBudget.background_counts`); 0: the detector is dark or off there.
+        learnable: make `logit_probability` and `log_tau_s` parameters.
+        grad: gradient policy.
 
-    A period that is longer than the window has counts that nobody sees, whose afterpulses do come into the window:
-    `background`, constant counts of a bin of the exposure (a number or a map; `PhotonBudget.background_counts`), is
-    taken to go on outside of it, and constant light then stays constant. 0: the detector is dark or off there.
-
-    `learnable`: `logit_probability`, `log_tau_s`, as long as there are exponentials.
-
-    Raises UnitError for probabilities whose sum is not in (0, 0.5], ShapeError where they and `tau_s` differ in number.
+    Raises:
+        UnitError: for probabilities whose sum is not in (0, 0.5].
+        ShapeError: for probabilities and `tau_s` of different numbers.
     """
 
     logit_probability: Tensor
@@ -417,6 +498,7 @@ class Afterpulsing(AddedCounts):
             self.seen()
 
     def _keep(self, probability: float | Numbers, tau_s: float | Numbers, learnable: bool) -> None:
+        """Check and register probabilities and delays."""
         where = "Afterpulsing"
         chance, tau = numbers_of(probability, "probability", where), numbers_of(tau_s, "tau_s", where)
         several = isinstance(chance, Sequence) and not isinstance(chance, str)
@@ -447,13 +529,21 @@ class Afterpulsing(AddedCounts):
 
     @property
     def tau_s(self) -> Tensor:
-        """Mean delays beyond the dead time, in seconds, float64. UnitError where another law stands for them."""
+        """Mean delays beyond the dead time, in seconds, float64.
+
+        Raises:
+            UnitError: with another law of delays.
+        """
         if self.delays is not None:
             raise UnitError(f"Afterpulsing.tau_s: expected exponentials, but the delays are {self.delays!r}.")
         return self.log_tau_s.double().exp()
 
     def seen(self) -> Tensor:
-        """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
+        """Afterpulses of a detection after its dead time, by exponential: (K,) float64.
+
+        Raises:
+            UnitError: for learnt probabilities whose sum is above 0.5.
+        """
         p = self.probability.reshape(-1)
         if not float(p.detach().sum()) <= _MOST * (1 + 1e-9):
             raise UnitError(
@@ -477,7 +567,7 @@ class Afterpulsing(AddedCounts):
         return self.seen() @ exponential_kernel(tau, dead, period_bins)
 
     def first_kernel(self, bins: int) -> Tensor:
-        """Those among them that come less than `bins` bins later, without later rounds: (bins,) float64."""
+        """Afterpulses that come less than `bins` bins later, without later rounds: (bins,) float64."""
         if self.delays is not None:
             return self.seen() * self.delays.shares(self.dead_time_s, self.bin_width_s, first=0, number=bins)
         tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
@@ -494,7 +584,7 @@ class Afterpulsing(AddedCounts):
         return added if beyond is None else added + beyond
 
     def _beyond(self, x: Tensor) -> Tensor | None:
-        """Mean afterpulses in the window of constant counts outside of it; None where there are none."""
+        """Mean afterpulses in the window of constant counts outside of it; None without such counts."""
         bins, period = x.shape[TIME], self._period_bins(x)
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
@@ -504,11 +594,11 @@ class Afterpulsing(AddedCounts):
         return (missing * level).to(x.dtype).expand_as(x)
 
     def _missing(self, period: int, bins: int) -> Tensor:
-        """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""
+        """Afterpulses (bins,) in the window of one count in every bin outside of it, remembered."""
         return remembered(self, ("missing", period, bins), lambda: _from_outside(self._kernel(period), bins))
 
     def _kernel(self, period: int) -> Tensor:
-        """`kernel`, remembered while nothing is learnt: not to be changed in place."""
+        """`kernel`, remembered while nothing is learnt: do not change in place."""
         return remembered(self, ("kernel", period), lambda: self.kernel(period))
 
     def share(self) -> float:
@@ -516,7 +606,7 @@ class Afterpulsing(AddedCounts):
         return p / (1 - p)
 
     def _draw_delays(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
-        """In bins after the detection, in the shape, dtype and device of `like` (N,)."""
+        """Delays in bins, in shape, dtype and device of `like` (N,)."""
         if self.delays is not None:
             delays = self.delays.draw(like.numel(), self.dead_time_s, generator) / self.bin_width_s
             return delays.to(like)
@@ -538,7 +628,7 @@ class Afterpulsing(AddedCounts):
         draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
-            """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
+            """Places of all afterpulses of the detections of a piece, of all generations."""
             first = thin(piece, p, own)
             found = [first.place[:0]]
             for block in range(0, first.place.numel(), _ENTRIES):
@@ -563,7 +653,7 @@ class Afterpulsing(AddedCounts):
         return total if beyond is None else total + self._poisson(beyond, generator)
 
     def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
-        """Draws of the bins from a detection to its afterpulse, folded into one period: int64 as large as a tensor."""
+        """Function that draws bins from a detection to its afterpulse, folded into one period, int64."""
         if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _LONGEST_TABLE:
             kernel = self._kernel(period).cpu()
             return LagTable(kernel / kernel.sum()).draw
@@ -583,7 +673,7 @@ class Afterpulsing(AddedCounts):
 
 
 def _one_each(place: Tensor, number: Tensor) -> Tensor:
-    """Every place as often as its number says."""
+    """Every place, repeated `number` times."""
     if place.numel() < _FEW:
         return place.repeat_interleave(number.long())
     all_places, k = [place if bool((number >= 1).all()) else place[number >= 1]], 2
@@ -603,108 +693,3 @@ def _passes(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor
     # the last step passes in part
     finer = torch.rand(passing.shape, dtype=torch.float64, device=like.device, generator=generator)
     return passing[(bits[passing] < steps - _VALUES // 2).logical_or_(finer < p * _VALUES - steps)]
-
-
-# ------------------------------------------------------------------------------------------------------------ crosstalk
-
-
-@in_single
-def add_crosstalk(
-    counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
-) -> Tensor:
-    """Mean histogram with optical crosstalk: each detection triggers each of the 4 neighbours with `probability`.
-
-    `diagonal`: the same for the 4 neighbours across a corner. No delay: crosstalk takes less than a bin. What leaves
-    the rim of the sensor is lost. First order: crosstalk of crosstalk is left out. (..., C, T, H, W), dtype kept.
-    """
-    check_transient(counts, "add_crosstalk")
-    probability = one_number(probability, "probability", "add_crosstalk")
-    diagonal = one_number(diagonal, "diagonal", "add_crosstalk")
-    near = torch.as_tensor(probability, device=counts.device).to(counts.dtype)
-    far = torch.as_tensor(diagonal, device=counts.device).to(counts.dtype)
-    padded = torch.nn.functional.pad(counts, (1, 1, 1, 1))
-    height, width = counts.shape[-2:]
-
-    def seen(dy: int, dx: int) -> Tensor:
-        return padded[..., 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-
-    added = near * (seen(-1, 0) + seen(1, 0) + seen(0, -1) + seen(0, 1))
-    if far.requires_grad or bool(far != 0):
-        added = added + far * (seen(-1, -1) + seen(-1, 1) + seen(1, -1) + seen(1, 1))
-    return added if only_added else counts + added
-
-
-class Crosstalk(AddedCounts):
-    """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`. `learnable`: `logit_probability`.
-
-    `diagonal_ratio`: probability across a corner over that across an edge.
-    """
-
-    logit_probability: Tensor
-
-    def __init__(
-        self,
-        probability: float,
-        *,
-        diagonal_ratio: float = 0.0,
-        learnable: bool = False,
-        grad: GradPolicy = "expected",
-    ) -> None:
-        super().__init__(grad)
-        p = check_number(probability, "probability", "Crosstalk", high=_MOST_CROSSTALK, open_low=True)
-        self.diagonal_ratio = check_number(diagonal_ratio, "diagonal_ratio", "Crosstalk", high=1.0)
-        tensor = torch.tensor(math.log(p / (1 - p)), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("logit_probability", nn.Parameter(tensor))
-        else:
-            self.register_buffer("logit_probability", tensor)
-
-    @property
-    def probability(self) -> Tensor:
-        """Of one neighbour per detection, float64."""
-        return self.logit_probability.double().sigmoid()
-
-    def _probabilities(self) -> tuple[Tensor, Tensor | float]:
-        """Of an edge and of a corner."""
-        p = self.probability
-        if not bool(p <= _MOST_CROSSTALK * (1 + 1e-9)):
-            raise UnitError(
-                f"Crosstalk: expected probability in (0, {_MOST_CROSSTALK:g}], got {float(p.detach()):g}. If it is "
-                "learnt, lower the learning rate."
-            )
-        return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
-
-    @in_single
-    def extra(self, x: Tensor) -> Tensor:
-        return add_crosstalk(x, *self._probabilities(), only_added=True)
-
-    def variance(self, x: Tensor) -> Tensor:
-        near, far = self._probabilities()
-        return add_crosstalk(x, near * (1 - near), far * (1 - far), only_added=True)
-
-    def share(self) -> float:
-        return 4 * float(self.probability.detach()) * (1 + self.diagonal_ratio)
-
-    def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
-        check_transient(counts, "Crosstalk")
-        *_, height, width = counts.shape
-        frames = counts.reshape(-1, height, width)
-        result = frames.clone(memory_format=torch.contiguous_format)
-        near, far = self._probabilities()
-        rings = [(_EDGES, float(near.detach())), (_CORNERS, float(far.detach()) if isinstance(far, Tensor) else far)]
-        together = max(_ENTRIES // max(height * width, 1), 1)
-
-        def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> None:
-            """Every detection of a neighbour triggers with the same probability: one draw for all neighbours."""
-            for first in range(0, piece.shape[0], together):
-                rimmed = torch.nn.functional.pad(piece[first : first + together], (1, 1, 1, 1))
-                into = result[begin + first : begin + first + rimmed.shape[0]]
-                for ring, p in rings:
-                    if p > 0:
-                        near = torch.zeros_like(into)
-                        for y, x in ring:
-                            near += rimmed[:, 1 + y : 1 + y + height, 1 + x : 1 + x + width]
-                        add_passing(near, p, into, own)
-
-        by_pieces(follow, frames, generator)
-        return result.view(counts.shape)
