@@ -278,16 +278,12 @@ class MeasuredDelays(AfterpulseDelays):
     def end_s(self) -> float:
         return self.start_s + self.share_of_bins.numel() * self.own_width_s
 
-    def _until(self, time_s: float) -> float:
-        """Share of the histogram before a delay."""
-        place = (time_s - self.start_s) / self.own_width_s
+    def seen(self, dead_time_s: float) -> float:
+        place = (dead_time_s - self.start_s) / self.own_width_s
         whole = min(max(math.floor(place), 0), self.share_of_bins.numel() - 1)
         part = min(max(place - whole, 0.0), 1.0)
         shares = self.share_of_bins.double()
-        return float(shares[:whole].sum() + part * shares[whole])
-
-    def seen(self, dead_time_s: float) -> float:
-        left = 1 - self._until(dead_time_s)
+        left = 1 - float(shares[:whole].sum() + part * shares[whole])
         if left <= 0:
             raise UnitError(
                 f"MeasuredDelays: expected delays beyond the dead time of {dead_time_s:g} s, but the histogram ends at "
@@ -417,13 +413,6 @@ def _filtered(counts: Tensor, gain: Tensor, length: int) -> Tensor:
 def _check_period(period: int, bins: int) -> None:
     if period < bins:
         raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
-
-
-def _from_outside(kernel: Tensor, bins: int) -> Tensor:
-    """Afterpulses (bins,) in the window of one count in every bin outside of it."""
-    window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
-    total = kernel.sum() / (1 - kernel.sum())
-    return (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).flatten()
 
 
 class Afterpulsing(AddedCounts):
@@ -589,13 +578,17 @@ class Afterpulsing(AddedCounts):
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
             return None
-        missing = self._missing(period, bins).to(x.device).view(-1, 1, 1)
-        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
-        return (missing * level).to(x.dtype).expand_as(x)
 
-    def _missing(self, period: int, bins: int) -> Tensor:
-        """Afterpulses (bins,) in the window of one count in every bin outside of it, remembered."""
-        return remembered(self, ("missing", period, bins), lambda: _from_outside(self._kernel(period), bins))
+        def missing() -> Tensor:
+            """Afterpulses (bins,) in the window of one count in every bin outside of it."""
+            kernel = self._kernel(period)
+            window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
+            inside = add_afterpulses(window, 1.0, kernel, only_added=True)
+            return (kernel.sum() / (1 - kernel.sum()) - inside).clamp_min(0).flatten()
+
+        share = remembered(self, ("missing", period, bins), missing).to(x.device).view(-1, 1, 1)
+        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
+        return (share * level).to(x.dtype).expand_as(x)
 
     def _kernel(self, period: int) -> Tensor:
         """`kernel`, remembered while nothing is learnt: do not change in place."""

@@ -471,14 +471,6 @@ def _rearmed(back: Tensor, part: Tensor) -> Tensor:
     return first * c + part * old_c - ROOT3 * first * part * (s - old_s)
 
 
-def _check_whole_bins(dead_bins: float, where: str) -> None:
-    """UnitError for a dead time below one bin: the histogram does not tell what happened inside a bin."""
-    if check_dead_bins(dead_bins) < 1 - 1e-9:
-        raise UnitError(
-            f"{where}: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower bins to undo it."
-        )
-
-
 def _invert_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[ArmedCycles, Tensor, Tensor]:
     """Armed cycles, share of them that fired, and the rate that explains it, for counts (P, T)."""
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
@@ -546,7 +538,11 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
     Raises:
         UnitError: for a dead time below one bin.
     """
-    _check_whole_bins(dead_bins, "coates")
+    if check_dead_bins(dead_bins) < 1 - 1e-9:
+        raise UnitError(
+            f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower "
+            "bins to undo it."
+        )
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
     last = torch.zeros_like(rate)

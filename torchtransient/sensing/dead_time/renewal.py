@@ -330,12 +330,8 @@ class ConstantLight:
 Operator = Callable[[Tensor], Tensor]
 
 
-def _identity(x: Tensor) -> Tensor:
-    return x
-
-
 def gmres(
-    operator: Operator, right: Tensor, start: Tensor, tolerance: float, precondition: Operator = _identity
+    operator: Operator, right: Tensor, start: Tensor, tolerance: float, precondition: Operator = lambda v: v
 ) -> tuple[Tensor, Tensor]:
     """Solve operator(x) = right by restarted GMRES, every row its own system.
 
@@ -574,40 +570,32 @@ def _solve_stationary(chain: RenewalChain) -> Tensor:
     return pi
 
 
-def _solve_adjoint(chain: RenewalChain, pi: Tensor, gradient: Tensor) -> Tensor:
-    """Solution of (1 - F^T) x = gradient less its product with pi, with pi x = 0."""
-    ones = torch.cat([torch.ones_like(chain.rate), torch.zeros_like(chain.rate)], -1)
+def _solve_singular(chain: RenewalChain, pi: Tensor, right: Tensor, *, transposed: bool) -> Tensor:
+    """Solution of (1 - F) x = right with P x = 0, P = pi 1^T the projector on counts, or of the transposes.
+
+    `right` has P right = 0: its part along the null space meets nothing.
+    """
+    step = chain.transposed if transposed else chain.step
+    constant = _constant_light(chain, pi)
+    inverse = constant.solve_transposed if transposed else constant.solve
+
+    def projected(v: Tensor, p: Tensor) -> Tensor:
+        if transposed:
+            ones = torch.cat([torch.ones_like(v[:, : chain.bins]), torch.zeros_like(v[:, chain.bins :])], -1)
+            return ones * (p * v).sum(-1, keepdim=True)
+        return p * _total(chain, v)
 
     def operator(v: Tensor) -> Tensor:
-        return v - chain.transposed(v) + ones * (pi * v).sum(-1, keepdim=True)
+        return v - step(v) + projected(v, pi)
 
-    # the constant part of the gradient meets sum d pi = 0 and drops out
-    right = gradient - ones * (pi * gradient).sum(-1, keepdim=True)
-    inverse = _constant_light(chain, pi).solve_transposed
     found, residual = gmres(operator, right, torch.zeros_like(right), _TOLERANCE, inverse)
     rows = (~(residual <= _CONVERGED)).nonzero().flatten()
     if rows.numel():
-        hard, p, g = RenewalChain(chain.rate[rows], chain.whole, chain.part), pi[rows], right[rows]
-        direct = solve_banded(hard, g, p[:, : chain.bins].argmax(-1), transposed=True)
-        direct = direct - ones[rows] * (p * direct).sum(-1, keepdim=True)
-        _check_residual((direct - hard.transposed(direct) - g).norm(dim=-1) / direct.norm(dim=-1))
-        found = found.index_copy(0, rows, direct)
-    return found
-
-
-def _solve_tangent(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
-    """Solution of (1 - F) x = right with counts that sum to 0, for `right` whose counts do."""
-
-    def operator(v: Tensor) -> Tensor:
-        return v - chain.step(v) + pi * _total(chain, v)
-
-    found, residual = gmres(operator, right, torch.zeros_like(right), _TOLERANCE, _constant_light(chain, pi).solve)
-    rows = (~(residual <= _CONVERGED)).nonzero().flatten()
-    if rows.numel():
         hard, p, r = RenewalChain(chain.rate[rows], chain.whole, chain.part), pi[rows], right[rows]
-        direct = solve_banded(hard, r, p[:, : chain.bins].argmax(-1), transposed=False)
-        direct = direct - p * _total(hard, direct)
-        _check_residual((direct - hard.step(direct) - r).norm(dim=-1) / direct.norm(dim=-1))
+        direct = solve_banded(hard, r, p[:, : chain.bins].argmax(-1), transposed=transposed)
+        direct = direct - projected(direct, p)
+        stepped = hard.transposed(direct) if transposed else hard.step(direct)
+        _check_residual((direct - stepped - r).norm(dim=-1) / direct.norm(dim=-1))
         found = found.index_copy(0, rows, direct)
     return found
 
@@ -627,7 +615,7 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (chain.rate, pi, right)), strict=True):
         # rounding is no excess
         d = d - p * _total(chain, d)
-        found.append(_solve_tangent(RenewalChain(r, chain.whole, chain.part), p, d))
+        found.append(_solve_singular(RenewalChain(r, chain.whole, chain.part), p, d, transposed=False))
     return torch.cat(found)
 
 
@@ -664,7 +652,7 @@ class _StationaryPhases(torch.autograd.Function):
         found = []
         for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (rate, pi, by_rate)), strict=True):
             right = _step_along(r, ctx.whole, part, p, d, by_part)
-            found.append(_solve_tangent(RenewalChain(r, ctx.whole, part), p, right))
+            found.append(_solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=False))
         return torch.cat(found)
 
     @staticmethod
@@ -673,7 +661,10 @@ class _StationaryPhases(torch.autograd.Function):
         rate, part, pi = ctx.saved_tensors
         by_rate, by_part = [], torch.zeros_like(part)
         for r, p, g in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (rate, pi, gradient)), strict=True):
-            adjoint = _solve_adjoint(RenewalChain(r, ctx.whole, part), p, g)
+            # the constant part of the gradient meets sum d pi = 0 and drops out
+            ones = torch.cat([torch.ones_like(r), torch.zeros_like(r)], -1)
+            right = g - ones * (p * g).sum(-1, keepdim=True)
+            adjoint = _solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=True)
             with torch.enable_grad():
                 leaves = r.detach().requires_grad_(), part.detach().requires_grad_()
                 value = RenewalChain(leaves[0], ctx.whole, leaves[1]).step(p)

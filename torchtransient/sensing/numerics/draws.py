@@ -79,13 +79,6 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
 # -------------------------------------------------------------------------------------------------------------- threads
 
 
-def _alone() -> None:
-    """Let the operations of torch in this thread take no threads of their own."""
-    torch.get_num_threads()  # a first look takes over the number of the process, which would undo the next line
-    torch.set_num_threads(1)
-    _OWN.works_alone = True
-
-
 def _forget() -> None:
     """Drop the pools of a forked process: threads do not survive the fork, and the lock may be held."""
     global _LOCK
@@ -103,7 +96,10 @@ def _pool(threads: int) -> ThreadPoolExecutor:
             pool, all_there = ThreadPoolExecutor(threads), threading.Barrier(threads)
 
             def begin(_: int) -> None:
-                _alone()
+                # a first look takes over the number of the process, which would undo the next line
+                torch.get_num_threads()
+                torch.set_num_threads(1)  # operations of torch take no threads of their own
+                _OWN.works_alone = True
                 all_there.wait()
 
             before = torch.get_num_threads()
@@ -335,13 +331,11 @@ def binomial_table(probability: float, *, small: bool = False) -> BinomialTables
 
 
 @functools.cache
-def _coarse() -> BinomialTables:
-    return BinomialTables(torch.arange(17, dtype=torch.float64, device="cpu") / 32, _FEW_TRIALS, 4096)
-
-
-@functools.cache
-def _fine() -> BinomialTables:
-    return BinomialTables(torch.arange(64, dtype=torch.float64, device="cpu") / 1024, _FEW_TRIALS, 512)
+def _share_tables() -> tuple[tuple[BinomialTables, int], ...]:
+    """Tables of shares in steps of 1/32 up to 1/2, and in steps of 1/1024 up to 1/16, with their steps."""
+    coarse = torch.arange(17, dtype=torch.float64, device="cpu") / 32
+    fine = torch.arange(64, dtype=torch.float64, device="cpu") / 1024
+    return (BinomialTables(coarse, _FEW_TRIALS, 4096), 32), (BinomialTables(fine, _FEW_TRIALS, 512), 1024)
 
 
 def draw_lower_share(
@@ -359,7 +353,7 @@ def draw_lower_share(
     """
     # a share in steps of 1/32, then what is left of it in steps of 1/1024: trials pass the first time or the second
     number, rest, left = torch.zeros_like(trials), share, trials
-    for table, steps in ((_coarse(), 32), (_fine(), 1024)):
+    for table, steps in _share_tables():
         which = (rest * steps).to(torch.int32)
         lower = which * (1 / steps)
         rest = (rest - lower).div_(1 - lower)
@@ -626,7 +620,10 @@ def _distribute(
         for begin in range(0, even, together):
             parent = counts[begin : min(begin + together, even)]
             pair = slice(2 * begin, 2 * begin + 2 * parent.shape[0])
-            first = halve(parent, _first_of_two(finer[pair], chance), generator)
+            sums = chance(finer[pair][0::2] + finer[pair][1::2]).clamp_min_(torch.finfo(finer.dtype).tiny)
+            # 0/0 means no light and no counts
+            share = chance(finer[pair][0::2]).div_(sums).clamp_max_(1)
+            first = halve(parent, share, generator)
             split[pair][0::2] = first
             torch.sub(parent, first, out=split[pair][1::2])
         split[2 * even :] = counts[even:]
@@ -647,23 +644,6 @@ def _one_by_one(number: Tensor, chances: Tensor, generator: torch.Generator | No
     return torch.bincount(found, minlength=bins * pixels).view(pixels, bins).T.double()
 
 
-def _first_of_two(weights: Tensor, chance: Callable[[Tensor], Tensor]) -> Tensor:
-    """Share of the counts of rows 0 and 1, 2 and 3, ... that is in the first of the two."""
-    first = weights[0::2]
-    whole = chance(first + weights[1::2]).clamp_min_(torch.finfo(weights.dtype).tiny)
-    # 0/0 means no light and no counts
-    return chance(first).div_(whole).clamp_max_(1)
-
-
-def _any_photon(rate: Tensor) -> Tensor:
-    """1 - exp(-rate), in a new tensor."""
-    return rate.neg().expm1_().neg_()
-
-
-def _as_it_is(probability: Tensor) -> Tensor:
-    return probability.clone()
-
-
 def sample_multinomial(trials: int, probabilities: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Draw multinomial counts along time by conditional binomials over a tree of bins: T binomials a pixel.
 
@@ -679,7 +659,7 @@ def sample_multinomial(trials: int, probabilities: Tensor, generator: torch.Gene
         ShapeError: for fewer than 3 dimensions.
         UnitError: for negative or non-finite probabilities.
     """
-    return _sample_tree(trials, probabilities, _as_it_is, generator, "sample_multinomial")
+    return _sample_tree(trials, probabilities, lambda p: p.clone(), generator, "sample_multinomial")
 
 
 def sample_first_photons(cycles: int, rate: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -696,7 +676,7 @@ def sample_first_photons(cycles: int, rate: Tensor, generator: torch.Generator |
     Returns, Raises:
         As `sample_multinomial`.
     """
-    return _sample_tree(cycles, rate, _any_photon, generator, "sample_first_photons")
+    return _sample_tree(cycles, rate, lambda r: r.neg().expm1_().neg_(), generator, "sample_first_photons")
 
 
 def _sample_tree(

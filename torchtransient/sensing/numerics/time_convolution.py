@@ -75,19 +75,11 @@ def convolve_time(
 
 def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
     """Fold (kernel, first) into one period, or crop it to lags inside a window of `bins`; empty if it misses it."""
-    return _fold(kernel, first, bins) if boundary == "periodic" else _crop(kernel, first, bins)
-
-
-def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:
-    """Kernel modulo the period, where it is longer than one."""
-    if kernel.numel() <= period:
-        return kernel, first % period
-    lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % period
-    return kernel.new_zeros(period).index_add(0, lags, kernel), 0
-
-
-def _crop(kernel: Tensor, first: int, bins: int) -> tuple[Tensor, int]:
-    """Part of the kernel whose lags lie in (-bins, bins)."""
+    if boundary == "periodic":
+        if kernel.numel() <= bins:
+            return kernel, first % bins
+        lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % bins
+        return kernel.new_zeros(bins).index_add(0, lags, kernel), 0
     begin = min(max(0, 1 - bins - first), kernel.numel())
     end = max(min(kernel.numel(), bins - first), begin)
     return kernel[begin:end], first + begin

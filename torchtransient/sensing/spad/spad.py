@@ -33,7 +33,6 @@ from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, rec
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.dead_time.clocked import mean_detections, second_detections
 from torchtransient.sensing.dead_time.clocked_counts import (
-    DrawnCycles,
     armed_time,
     check_cycles,
     coates_of_rows,
@@ -119,11 +118,9 @@ def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor
     Raises:
         UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
-    check_transient(rate, "detections_with_dead_time")
+    check_bins(rate, "detections_with_dead_time")
     check_rates(rate, "detections_with_dead_time")
     check_dead_bins(dead_bins)
-    if rate.numel() == 0:
-        return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     return _of_columns(mean_detections(_columns(rate), dead), rate)
 
@@ -187,30 +184,16 @@ def sample_detections(
     Raises:
         UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
-    check_transient(rate, "sample_detections")
+    check_bins(rate, "sample_detections")
     number = check_count(cycles, "cycles", "sample_detections")
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, rate, generator)
     check_dead_bins(dead_bins)
     check_rates(rate, "sample_detections")
-    if rate.numel() == 0:
-        return rate.clone()
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     counts = sample_cycles(_columns(rate), dead, number, generator)
     return _of_columns(counts, rate).to(rate.dtype)
-
-
-def _drawn(
-    rate: Tensor, cycles: int, dead_bins: float, generator: torch.Generator | None
-) -> tuple[Tensor, list[DrawnCycles]]:
-    check_dead_bins(dead_bins)
-    check_rates(rate, "sample_detections")
-    if rate.numel() == 0:
-        return rate.clone(), []
-    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    counts, drawn = draw_cycle_steps(_rows(rate), dead, cycles, generator)
-    return _image(counts, rate).to(rate.dtype), drawn
 
 
 def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Generator | None = None) -> Tensor:
@@ -281,7 +264,7 @@ class SynchronousSPAD(RandomSensor):
         self.register_buffer("gate", gate)
 
     def _gated(self, x: Tensor) -> Tensor:
-        check_transient(x, "SynchronousSPAD")
+        check_bins(x, "SynchronousSPAD")
         if self.gate is None:
             return x
         if self.gate.shape[0] != x.shape[TIME]:
@@ -301,7 +284,7 @@ class SynchronousSPAD(RandomSensor):
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
         variance = p * (1 - p)
-        if self.dead_bins is not None and self.dead_bins < 1 and x.numel():
+        if self.dead_bins is not None and self.dead_bins < 1:
             # a cycle may fire twice in a bin
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
             variance = variance + 2 * _image(second_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
@@ -310,8 +293,6 @@ class SynchronousSPAD(RandomSensor):
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.dead_bins is not None:
             rate = check_rates(self._gated(x), "SynchronousSPAD")
-            if rate.numel() == 0:
-                return rate * self.cycles
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
             return _image(normal_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
         p = self.probabilities(x)
@@ -329,14 +310,15 @@ class SynchronousSPAD(RandomSensor):
             return super().forward(x, generator)
         check_generator(generator, "SynchronousSPAD")
         with torch.no_grad():
-            measurement, drawn = _drawn(self._gated(x), self.cycles, self.dead_bins, generator)
+            rate = check_rates(self._gated(x), "SynchronousSPAD")
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            counts, drawn = draw_cycle_steps(_rows(rate), dead, self.cycles, generator)
 
         def log_prob() -> Tensor:
-            rate, dead = _rows(self._gated(x)), torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            return cycles_log_prob(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
+            return cycles_log_prob(drawn, _rows(self._gated(x)), dead, self.cycles).view(x.select(TIME, 0).shape)
 
         record_score(log_prob, type(self).__name__)
-        return measurement
+        return _image(counts, x).to(x.dtype)
 
     def inverse(self, counts: Tensor) -> CoatesEstimate:
         """Rate behind a histogram (`coates`), divided by the gate; bins with a shut gate are not valid.
