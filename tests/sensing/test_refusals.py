@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,7 +18,6 @@ from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelay
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
 from torchtransient.sensing.counts.added_counts import AddedCounts
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
-from torchtransient.sensing.dead_time.free_running import _balance
 from torchtransient.sensing.dead_time.renewal import _check_residual
 from torchtransient.sensing.devices.devices import Device
 from torchtransient.sensing.numerics.draws import sample_multinomial
@@ -191,20 +189,10 @@ REFUSED = {
     "block of one angle": (lambda: mosaic_rows(30.0), ShapeError, "mosaic_rows: expected rows of angles, got 30"),
     "block of one row": (lambda: mosaic_rows([30.0, 60.0]), ShapeError, "mosaic_rows: expected rows of angles"),
     "raw light as a list": (lambda: demosaic([1.0]), ShapeError, r"demosaic: expected raw as a tensor, got .*1\.0"),
-    "time constant as a text": (lambda: sensing.afterpulse_kernel("3", 1e-9, 1e-9, period_bins=4), UnitError,
-                                "afterpulse_kernel: expected tau_s as one number of seconds, got '3'"),
-    "two time constants": (lambda: sensing.afterpulse_kernel(torch.ones(2), 1e-9, 1e-9, period_bins=4), UnitError,
-                           "tau_s as one number of seconds"),
     "transpose of no sensor": (lambda: sensing.adjoint(torch.nn.Identity(), LIGHT, LIGHT.shape), ArgumentError,
                                r"adjoint: expected a sensor of tt\.sensing, got .*Identity"),
     "samples of two lengths": (lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]), ShapeError,
                                "measured_code: expected samples as rows of numbers of one length"),
-    "ends of a train that has no state": (
-        lambda: _balance(None, None, SimpleNamespace(begin=None), SimpleNamespace(begin=LIGHT), 3, None),
-        AssertionError, "begins in its stationary state"),
-    "trains that have no state": (
-        lambda: _balance(None, None, SimpleNamespace(begin=LIGHT), SimpleNamespace(begin=None), 3, None),
-        AssertionError, "begins in its stationary state"),
     "no solid angle": (lambda: sensing.Optics(solid_angle_sr=0.0), UnitError, "solid_angle_sr in"),
 }  # fmt: skip
 

@@ -22,7 +22,6 @@ from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing as
 from torchtransient.sensing.correlated_noise.afterpulsing import MeasuredDelays as MeasuredDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import PowerLawDelays as PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import add_afterpulses as add_afterpulses
-from torchtransient.sensing.correlated_noise.afterpulsing import afterpulse_kernel as afterpulse_kernel
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD as AfterpulsingSPAD
 from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk as Crosstalk
 from torchtransient.sensing.correlated_noise.crosstalk import add_crosstalk as add_crosstalk

@@ -148,20 +148,6 @@ def number(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_hazards_of_parts_of_bins():
-    """Sums while armed over armed time: parts that are armed longer count for more; nothing where none is."""
-    hazard, waited = number([[1.0, 3.0, 2.0, 5.0, 7.0, 9.0]]), number([[0.5, 1.0, 0.0, 0.25, 0.0, 0.0]])
-    found = carriers._merge_pieces(hazard, waited, 2)
-    assert found.tolist() == [[pytest.approx(2 * 3.5 / 1.5), 10.0, 0.0]]
-    assert carriers._subdivide(number([[6.0, 9.0]]), 3).tolist() == [[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]
-    part, whole = number([3.0, -1.0, 2.0]), number([2.0, 2.0, 0.0]).requires_grad_()
-    with torch.autograd.set_detect_anomaly(True):
-        ratio = carriers._safe_ratio(part, whole)
-        (slope,) = torch.autograd.grad(ratio.sum(), whole)
-    assert ratio.tolist() == [1.5, 0.0, 0.0] and slope.tolist() == [-0.75, 0.0, 0.0]
-    assert carriers._safe_ratio(number([1.0, 4.0]), number([1e-201, 1e-199])).tolist() == pytest.approx([0.0, 4e199])
-
-
 class Watched(carriers.FreeRunningTrain):
     """Remembers the lowest rate that it was asked for."""
 
@@ -179,13 +165,6 @@ def test_no_rate_of_other_carriers_is_below_zero():
     train = Watched(1, number(0.3))
     hazard, _ = carriers.carrier_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
     assert 0 < Watched.least <= 1e-6 * (1 + 1e-9) and bool((hazard > 0).all())
-
-
-def test_generations_of_carriers():
-    """Until 1e-5 of them are left, two at least; one where there are hardly any."""
-    for seen, rounds in (([1e-6], 1), ([0.9e-5], 1), ([1.1e-5], 2), ([0.003], 2), ([0.004], 3), ([0.1, 0.1], 8),
-                         ([0.5], 17)):  # fmt: skip
-        assert carriers._generations(number(seen)) == rounds
 
 
 @pytest.mark.parametrize("largest", [0.3, 1.9, 2.1, 40.0])

@@ -13,7 +13,7 @@ from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import trapped_carrier_lines
 from torchtransient.sensing.dead_time import free_running, renewal
 from torchtransient.sensing.dead_time.clocked import CycleMeans, cycle_means, response_series, series_degree
-from torchtransient.sensing.dead_time.clocked_counts import _cycle_steps, _merge_states, _merged_pieces, _sum_pieces
+from torchtransient.sensing.dead_time.clocked_counts import _cycle_steps, _merge_states, _sum_pieces
 from torchtransient.sensing.dead_time.free_running import late_lines
 from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, solve_banded
 
@@ -260,12 +260,6 @@ def test_pieces_that_are_drawn_as_one(whole, wider):
     assert found[:, 0].tolist() == pytest.approx(wanted_count.tolist())
     assert late_rows[:, 0].tolist() == pytest.approx([0.0, *wanted_late])
     assert armed[:, 0].tolist() == [float(j) for j in range(0, 6, wider)]
-
-
-def test_how_many_pieces_are_drawn_as_one():
-    """Four at most, as many as divide a bin, no longer than a dead time."""
-    given = (1, 9), (2, 9), (4, 9), (8, 9), (8, 4), (8, 3), (8, 2), (8, 1)
-    assert [_merged_pieces(*pair) for pair in given] == [1, 2, 4, 4, 4, 2, 2, 1]
 
 
 @pytest.mark.parametrize("dead, pieces", [(1.3, 1), (1.3, 4), (2.6, 2), (3.4, 4)])

@@ -9,10 +9,16 @@ from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing import ScoreFunction, SynchronousSPAD, coates, first_photon_log_prob, sample_detections
+from torchtransient.sensing import (
+    ScoreFunction,
+    SynchronousSPAD,
+    coates,
+    detections_with_dead_time,
+    first_photon_log_prob,
+    sample_detections,
+)
 from torchtransient.sensing.dead_time import clocked_counts
 from torchtransient.sensing.dead_time.clocked import mean_detections, mean_detections_in_steps
-from torchtransient.sensing.spad.spad import detections_with_dead_time
 
 BINS = 24
 WIDTH_S = 1e-10

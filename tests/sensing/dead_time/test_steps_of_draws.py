@@ -46,7 +46,7 @@ def number(x):
     return torch.tensor(x, dtype=torch.float64)
 
 
-def free_running_hazard(rate, dead):
+def free_running_steps(rate, dead):
     """Chances (T, P, 1) of a detector that runs free."""
     state = stationary_state(rate, number(dead))
     columns = [v.T.unsqueeze(-1) for v in (rate, state.detected, state.armed, state.late)]
@@ -77,7 +77,7 @@ def steps_by_distributions(path, chances, periods):
 def test_scores_of_detectors_that_run_free(dead):
     """Derivatives of the log-probability of the steps, beginning included; nobody is lost on the way."""
     rate = rates().requires_grad_()
-    chances = free_running_hazard(rate, dead)
+    chances = free_running_steps(rate, dead)
     with torch.no_grad():
         path = draws.draw_steps(chances, PERIODS, generator())
     weights = number([1.0, 2.0, -0.5]).unsqueeze(-1)
@@ -126,29 +126,9 @@ def test_the_mean_of_all_steps_is_the_mean(dead):
         torch.testing.assert_close(path.back, steps.back)
         torch.testing.assert_close(path.armed, steps.armed, rtol=1e-5, atol=1e-7)
         torch.testing.assert_close(path.end + path.wrapped.sum(-3), torch.ones(3, 1).double())
-    chances = free_running_hazard(rates(), max(dead, 1.0))
+    chances = free_running_steps(rates(), max(dead, 1.0))
     begin = draws.StepProbabilities(None, chances.fire, chances.soon, chances.late, chances.whole)
     assert torch.equal(draws.draw_steps(begin, 7, None, draw=mean_of).armed[0], torch.full((3, 1), 7.0).double())
-
-
-def test_shares_by_hand():
-    found = draws.bounded_ratio(number([1.0, 3.0, 0.0, -1.0, 5.0, 1e-14]), number([4.0, 4.0, 0.0, 2.0, 4.0, 1e-14]))
-    assert found.tolist() == [0.25, 0.75, 0.0, 0.0, 1.0, 0.0]
-    # armed 0.5 of which 0.4 fire, 0.3 come back: of 0.26 detections 0.06 are theirs; of 0.1 or 0.6 one chance for both
-    fire, detected = number([0.4, 0.4, 0.4]), number([0.26, 0.1, 0.6])
-    shares = draws.firing_probabilities(fire, detected, number([0.5] * 3), number([0.3] * 3))
-    assert shares[0].tolist() == pytest.approx([0.4, 0.1 / 0.8, 0.6 / 0.8])
-    assert shares[1].tolist() == pytest.approx([0.2, 0.1 / 0.8, 0.6 / 0.8])
-    ends = draws.firing_probabilities(fire[:2], number([0.2, 0.5]), number([0.5] * 2), number([0.3] * 2))
-    assert ends[0].tolist() == pytest.approx([0.4, 0.4]) and ends[1].tolist() == pytest.approx([0.0, 1.0])
-
-
-def test_normal_steps():
-    """n p and the root of n p (1 - p), of numbers below zero the mean alone."""
-    many, chance = number([100.0, 40.0, -3.0]), number([0.2, 0.5, 0.5])
-    z = torch.randn(3, dtype=torch.float64, generator=generator())
-    found = draws.draw_normal(many, chance, generator())
-    assert found.tolist() == pytest.approx([20 + 4 * float(z[0]), 20 + math.sqrt(10) * float(z[1]), -1.5])
 
 
 @pytest.mark.parametrize("dead", [1.3, 2.0, 6.4])

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import MOST_MADE, Numbers, as_number, shown
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single, number_tensor
 from torchtransient.sensing.base.given import numbers_of
@@ -26,7 +26,6 @@ from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
     check_choice,
-    check_count,
     check_number,
     check_seconds,
     check_transient,
@@ -326,33 +325,6 @@ class MeasuredDelays(AfterpulseDelays):
 # ---------------------------------------------------------------------------------------------------------- afterpulses
 
 
-def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: float, *, period_bins: int) -> Tensor:
-    """Share of afterpulses k bins after their detection, folded into one period.
-
-    The delay is the dead time plus an exponential time; detections are spread evenly over their bins. Bins and later
-    periods are integrated exactly.
-
-    Args:
-        tau_s: mean delay beyond the dead time in seconds, differentiable.
-        dead_time_s: dead time in seconds.
-        bin_width_s: bin width in seconds.
-        period_bins: period in bins.
-
-    Returns:
-        (period_bins,) float64, sum 1.
-
-    Raises:
-        UnitError: for values outside of their ranges.
-    """
-    if as_number(tau_s) is None:
-        raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
-    dead_time_s = check_seconds(dead_time_s, "dead_time_s", "afterpulse_kernel", high=1.0)
-    bin_width_s = check_seconds(bin_width_s, "bin_width_s", "afterpulse_kernel", open_low=True, high=1.0)
-    period_bins = check_count(period_bins, "period_bins", "afterpulse_kernel", most=MOST_MADE)
-    tau = torch.as_tensor(one_number(tau_s, "tau_s", "afterpulse_kernel"), dtype=torch.float64) / bin_width_s
-    return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
-
-
 @in_single
 def add_afterpulses(
     counts: Tensor,
@@ -369,7 +341,8 @@ def add_afterpulses(
     Args:
         counts: (..., C, T, H, W).
         probability: afterpulses of a detection.
-        kernel: (P,), P >= T, of `afterpulse_kernel` (or `Afterpulsing.kernel`, which includes the probability).
+        kernel: (P,), P >= T, afterpulses k bins after their detection, up to the factor `probability`. That of
+            `Afterpulsing.kernel` includes the probability.
         only_added: return the afterpulses alone.
 
     Returns:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -455,11 +456,10 @@ def _balance(
     generator: torch.Generator | None,
 ) -> Tensor:
     """Correction (P, N), real numbers, to counts of independent periods: excess of ends over beginnings, detected."""
-    if path.begin is None or chances.begin is None:
-        raise AssertionError("a free-running detector begins in its stationary state")
-    begin = _rows(path.begin)
+    # a free-running detector begins in its stationary state: neither is None
+    begin, begin_chances = _rows(cast(Tensor, path.begin)), cast(Tensor, chances.begin)
     # the train itself begins and ends somewhere
-    first, last = (_rows(sample_multinomial(1, chances.begin, generator)) for _ in range(2))
+    first, last = (_rows(sample_multinomial(1, begin_chances, generator)) for _ in range(2))
     ends = first - last
     armed = path.end - begin[:, :1] + ends[:, :1]
     back = _rows(path.wrapped) - begin[:, 1:] + ends[:, 1:]
