@@ -196,7 +196,7 @@ def test_which_trains_are_drawn_with_their_memory(monkeypatch):
         def __init__(self):
             self.per_bin = per_bin
 
-        def of(self, rows):
+        def select(self, rows):
             asked.append(rows.tolist())
             return rows
 

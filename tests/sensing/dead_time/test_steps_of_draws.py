@@ -260,16 +260,16 @@ def test_short_stays_saturate_less():
     time = armed_time(number([8.0, 0.0, 0.0]).reshape(1, 3, 1, 1), 8, 1.0)
     for r in (0.01, 0.1, 0.4):
         rate = torch.full((1, 3, 1, 1), r, dtype=torch.float64).requires_grad_()
-        (slope,) = torch.autograd.grad(time.sooner(rate).sum(), rate)
+        (slope,) = torch.autograd.grad(time.short_exposures(rate).sum(), rate)
         fired = 1 - (1 - math.exp(-r)) / r
         rise = 8 * (fired / (1 - math.exp(-r)) - 0.5)
         assert float(slope[0, 1]) == pytest.approx(rise, rel=r / 6 + 1e-4)
         assert float(slope[0, 2]) == pytest.approx(0.0, abs=1e-12)
     flood = torch.full((1, 3, 1, 1), 1e7, dtype=torch.float64).requires_grad_()
-    (slope,) = torch.autograd.grad(time.sooner(flood).sum(), flood)
+    (slope,) = torch.autograd.grad(time.short_exposures(flood).sum(), flood)
     assert float(slope[0, 1]) == pytest.approx(8 * 0.5, rel=1e-5)
     dark = torch.zeros(1, 3, 1, 1, dtype=torch.float64)
-    assert not bool(time.sooner(dark).any())
+    assert not bool(time.short_exposures(dark).any())
 
 
 def test_cycles_that_are_left():

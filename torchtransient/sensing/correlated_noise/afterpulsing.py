@@ -542,10 +542,10 @@ class Afterpulsing(AddedCounts):
         _check_period(period, bins)
         gain, length = remembered(self, ("gain", period, bins), lambda: _gain(1.0, self._kernel(period), bins))
         added = _filtered(x, gain.to(x.device), length)
-        beyond = self._beyond(x)
+        beyond = self._from_background(x)
         return added if beyond is None else added + beyond
 
-    def _beyond(self, x: Tensor) -> Tensor | None:
+    def _from_background(self, x: Tensor) -> Tensor | None:
         """Mean afterpulses in the window of constant counts outside of it; None without such counts."""
         bins, period = x.shape[TIME], self._period_bins(x)
         dark = not isinstance(self.background, Tensor) and self.background == 0
@@ -599,7 +599,7 @@ class Afterpulsing(AddedCounts):
             found = [first.place[:0]]
             for block in range(0, first.place.numel(), _ENTRIES):
                 at = slice(block, block + _ENTRIES)
-                place = _one_each(first.place[at] + begin, first.number[at])
+                place = _repeat(first.place[at] + begin, first.number[at])
                 time = place.div(pixels, rounding_mode="floor") % bins
                 while time.numel():
                     lag = draw(time, own)
@@ -607,7 +607,7 @@ class Afterpulsing(AddedCounts):
                     # a round later is as far in front of the window as it is behind the end of the period
                     time, place = time.add_(lag), place.add_(lag, alpha=pixels)
                     found.append(place[time < bins])
-                    again = _passes(time, p, own)
+                    again = _passing(time, p, own)
                     time, place = time[again], place[again]
             return torch.cat(found)
 
@@ -615,7 +615,7 @@ class Afterpulsing(AddedCounts):
         total = counts.clone(memory_format=torch.contiguous_format)
         for places in by_pieces(follow, counts.reshape(-1), generator):
             total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        beyond = self._beyond(counts)
+        beyond = self._from_background(counts)
         return total if beyond is None else total + self._poisson(beyond, generator)
 
     def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
@@ -638,7 +638,7 @@ class Afterpulsing(AddedCounts):
         return draw
 
 
-def _one_each(place: Tensor, number: Tensor) -> Tensor:
+def _repeat(place: Tensor, number: Tensor) -> Tensor:
     """Every place, repeated `number` times."""
     if place.numel() < _FEW:
         return place.repeat_interleave(number.long())
@@ -651,7 +651,7 @@ def _one_each(place: Tensor, number: Tensor) -> Tensor:
         all_places.append(place)
 
 
-def _passes(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor:
+def _passing(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor:
     """Indices of the entries that pass, each with probability `p`."""
     steps = math.floor(p * _VALUES)
     bits = sixteen_bits(like, generator)

@@ -224,19 +224,19 @@ class ClockedTrain:
     largest: float  # rates, but for those lost
 
     def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
-        return self._walk(rate, rate, None, None, self.largest)
+        return self._solve(rate, rate, None, None, self.largest)
 
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        return self._walk(rate, rate + lost, back.unsqueeze(-1), source, self.largest + float(lost.detach().amax()))
+        return self._solve(rate, rate + lost, back.unsqueeze(-1), source, self.largest + float(lost.detach().amax()))
 
-    def _walk(
+    def _solve(
         self, rate: Tensor, loss: Tensor, back: Tensor | None, source: Tensor | None, largest: float
     ) -> tuple[Tensor, Tensor]:
         pieces = rate.shape[-1]
         bins = _response(loss, self.part, largest)
         kept = None if source is None else rate / loss
         start = torch.ones_like(rate[:, :1]) if source is None else torch.zeros_like(rate[:, :1])
-        walk, put = DeadTimeBlocks(pieces, self.whole, 1), None
+        blocks, put = DeadTimeBlocks(pieces, self.whole, 1), None
         if source is not None:
             put = torch.cat([torch.nn.functional.pad(source, (self.whole + k, 0))[..., :pieces] for k in (0, 1)], 1)
         stretch = max(1, math.floor(_EXPONENT / max(largest, 1e-3)))
@@ -249,7 +249,7 @@ class ClockedTrain:
         shares = none if kept is None else torch.split(kept, self.whole, -1)
         for own, put_here, share in zip(zip(*columns, strict=True), sources, shares, strict=True):
             kept_, waited_, slope_, wait, fire_slope, light, lost = own
-            inflow = walk.inflow(light.shape[-1])
+            inflow = blocks.inflow(light.shape[-1])
             if put_here is not None and back is not None and inflow is not None:
                 inflow = inflow * back + put_here
             joined = None if inflow is None else (kept_ * inflow).sum(1)
@@ -260,7 +260,7 @@ class ClockedTrain:
                 slope = slope + (slope_ * inflow).sum(1)
             count = light * waited
             slope = slope if share is None else slope * share
-            walk.keep(count, slope)
+            blocks.append(count, slope)
             found.append((waited, count, slope))
         waited, count, slope = (torch.cat(c, -1) for c in zip(*found, strict=True))
         return waited, torch.stack([count, slope], 1)

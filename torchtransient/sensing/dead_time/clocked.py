@@ -136,7 +136,7 @@ class DeadTimeBlocks:
         for begin in range(0, self.size, self.whole):
             yield begin, min(begin + self.whole, self.size)
 
-    def taken(self, value: Tensor, begin: int, end: int) -> Tensor:
+    def of_pieces(self, value: Tensor, begin: int, end: int) -> Tensor:
         """Columns of pieces out of values of bins."""
         if self.pieces == 1:
             return value[..., begin:end]
@@ -152,7 +152,7 @@ class DeadTimeBlocks:
         old = torch.cat([last, young[..., :-1]], -1)
         return torch.cat([young, old], 1)[..., :length]
 
-    def keep(self, count: Tensor, slope: Tensor) -> None:
+    def append(self, count: Tensor, slope: Tensor) -> None:
         """Append the lines of a stretch."""
         if self._before is not None:
             self._last = (self._before[0][..., -1:], self._before[1][..., -1:])
@@ -185,19 +185,19 @@ def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | N
         largest: known bound of the photons in a piece, or None.
     """
     whole, part = split_dead_time(dead_bins.to(rate.device, torch.float64) * pieces)
-    walk = DeadTimeBlocks(rate.shape[-1], whole, pieces)
+    blocks = DeadTimeBlocks(rate.shape[-1], whole, pieces)
     response = bin_response(rate / pieces, part, largest)
     start = torch.ones_like(rate[:, :1])
     columns: list[tuple[Tensor, Tensor, Tensor]] = []
-    for begin, end in walk.stretches():
-        bins = BinResponse(**{name: walk.taken(value, begin, end) for name, value in vars(response).items()})
-        back = walk.inflow(end - begin)
-        flux = walk.taken(rate, begin, end) / pieces
+    for begin, end in blocks.stretches():
+        bins = BinResponse(**{name: blocks.of_pieces(value, begin, end) for name, value in vars(response).items()})
+        back = blocks.inflow(end - begin)
+        flux = blocks.of_pieces(rate, begin, end) / pieces
         armed, start = armed_probabilities(start, flux, None if back is None else (bins.kept * back).sum(1))
         count, slope = armed * bins.fire, armed * bins.slope
         if back is not None:
             count, slope = count + (bins.hit * back).sum(1), slope + (bins.hit_slope * back).sum(1)
-        walk.keep(count, slope)
+        blocks.append(count, slope)
         columns.append((armed, count, slope))
     armed, count, slope = (torch.cat(c, -1) for c in zip(*columns, strict=True))
     return CycleMeans(armed, count, slope, whole, part, pieces)
@@ -522,10 +522,10 @@ class _Detected(torch.autograd.Function):
     def forward(rate: Tensor, dead_bins: Tensor, keep: bool) -> tuple[Tensor, Tensor]:
         detected = torch.empty_like(rate)
         kept = rate.new_empty(0)
-        for columns, walk in detection_scans(rate, dead_bins):
-            states = walk.forward()
-            detected[:, columns] = states[1:, 1].view(rate.shape[0], walk.pieces, -1).sum(1)
-            if keep and walk.columns == rate.shape[1] and walk.pieces == 1:
+        for columns, scan in detection_scans(rate, dead_bins):
+            states = scan.forward()
+            detected[:, columns] = states[1:, 1].view(rate.shape[0], scan.pieces, -1).sum(1)
+            if keep and scan.columns == rate.shape[1] and scan.pieces == 1:
                 kept = states
         return detected, kept
 
@@ -566,12 +566,12 @@ class _Adjoint(torch.autograd.Function):
     @staticmethod
     def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
         gradient = torch.empty_like(rate)
-        for columns, walk in detection_scans(rate, dead_bins):
-            states = kept if kept.ndim > 1 else walk.forward()
+        for columns, scan in detection_scans(rate, dead_bins):
+            states = kept if kept.ndim > 1 else scan.forward()
             given = torch.zeros_like(states)
             own = weights[:, columns]
-            given[1:, 1] = own.repeat_interleave(walk.pieces, 0) if walk.pieces > 1 else own
-            gradient[:, columns] = walk.adjoint(states, given)
+            given[1:, 1] = own.repeat_interleave(scan.pieces, 0) if scan.pieces > 1 else own
+            gradient[:, columns] = scan.adjoint(states, given)
         return gradient
 
     @staticmethod

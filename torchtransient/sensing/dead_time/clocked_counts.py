@@ -282,23 +282,23 @@ def sample_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch
     """
     counts = torch.empty_like(rate)
     with torch.no_grad():
-        for columns, walk in detection_scans(rate, dead_bins):
-            drawn = _sample_scan(walk, cycles, generator)
-            counts[:, columns] = drawn.view(walk.bins, -1, walk.columns).sum(1) if len(drawn) > walk.bins else drawn
+        for columns, scan in detection_scans(rate, dead_bins):
+            drawn = _sample_scan(scan, cycles, generator)
+            counts[:, columns] = drawn.view(scan.bins, -1, scan.columns).sum(1) if len(drawn) > scan.bins else drawn
     return counts
 
 
-def _sample_scan(walk: DetectionScan, cycles: int, generator: torch.Generator | None) -> Tensor:
+def _sample_scan(scan: DetectionScan, cycles: int, generator: torch.Generator | None) -> Tensor:
     """Counts (N, P) of merged pieces."""
-    wider = _merged_pieces(walk.pieces, walk.whole)
-    count, armed, late = _merge_states(walk.forward(), walk.part, walk.whole, wider)
-    size, whole, pieces = count.shape[0], walk.whole // wider, walk.pieces // wider
+    wider = _merged_pieces(scan.pieces, scan.whole)
+    count, armed, late = _merge_states(scan.forward(), scan.part, scan.whole, wider)
+    size, whole, pieces = count.shape[0], scan.whole // wider, scan.pieces // wider
     counts = torch.empty_like(count)
     able = torch.full_like(count[0], float(cycles))
-    some_later = walk.part > 0 or walk.whole % wider > 0
+    some_later = scan.part > 0 or scan.whole % wider > 0
     waits = count.new_zeros(size + 1 if some_later else 1, count.shape[1])  # of the detections of the piece before
-    for begin, end in walk.blocks(wider):
-        flux = walk.rate[begin // pieces : end // pieces] / pieces
+    for begin, end in scan.blocks(wider):
+        flux = scan.rate[begin // pieces : end // pieces] / pieces
         fire = -torch.expm1(-(flux.repeat_interleave(pieces, 0) if pieces > 1 else flux))
         after = max(begin, whole)
         soon = fire[:0]
@@ -475,11 +475,11 @@ def _invert_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Armed
     """Armed cycles, share of them that fired, and the rate that explains it, for counts (P, T)."""
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
     whole, part = split_dead_time(dead)
-    walk = DeadTimeBlocks(counts.shape[-1], whole, 1)
+    blocks = DeadTimeBlocks(counts.shape[-1], whole, 1)
     left = torch.full_like(counts[:, :1], float(cycles))
     columns: list[tuple[Tensor, ...]] = []
-    for begin, end in walk.stretches():
-        n, back = counts[:, begin:end], walk.inflow(end - begin)
+    for begin, end in blocks.stretches():
+        n, back = counts[:, begin:end], blocks.inflow(end - begin)
         change = -n if back is None else _rearmed(back, part) - n
         after = left + change.cumsum(-1)
         # a fraction of a cycle that rounding or noise puts below none
@@ -491,7 +491,7 @@ def _invert_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Armed
         slope = here.armed * bins.slope
         if back is not None:
             slope = slope + (bins.hit_slope * back).sum(1)
-        walk.keep(n, slope)
+        blocks.append(n, slope)
         all_back = back if back is not None else n.new_zeros(n.shape[0], 4, n.shape[1])
         columns.append((here.armed, all_back, share, r))
     armed, backs, shares, rates = (torch.cat(c, -1) for c in zip(*columns, strict=True))
@@ -577,7 +577,7 @@ class ExposedCycles:
         young, old = (number * mean for number, mean in zip(self.joined, self.remaining, strict=True))
         return self.armed + young + old
 
-    def sooner(self, rate: Tensor) -> Tensor:
+    def short_exposures(self, rate: Tensor) -> Tensor:
         """Correction to `exposed` times the rate for short exposures, which saturate less.
 
         Of rearmed cycles a share h(r) fires at the rate r, and h(r) / (1 - exp(-r)) rises from the mean `remaining` to

@@ -319,7 +319,7 @@ class _StationaryTrain:
         """Detections (P, T) per period."""
         return _whole_bins(self.state.detected, self.pieces)
 
-    def of(self, rows: Tensor) -> _StationaryTrain:
+    def select(self, rows: Tensor) -> _StationaryTrain:
         """Detectors of these rows."""
         if torch.equal(rows, torch.arange(self.chain.rate.shape[0], device=rows.device)):
             return self
@@ -393,15 +393,15 @@ def _sample_counts(
     one_by_one = number <= ONE_BY_ONE
     many = (~one_by_one).nonzero().flatten()
     if many.numel():
-        wide = _remembers_phase(state.of(many), rate[many], dead_bins, periods)
+        wide = _remembers_phase(state.select(many), rate[many], dead_bins, periods)
         one_by_one = one_by_one.index_fill(0, many[wide], True)
         many = many[~wide]
     if many.numel():
-        found, more = _independent_periods(state.of(many), periods, generator, normal=False)
+        found, more = _independent_periods(state.select(many), periods, generator, normal=False)
         counts = counts.index_copy(0, many, found if more is None else _add_rounded(found, more, generator))
     rows = one_by_one.nonzero().flatten()
     if rows.numel():
-        chosen = state.of(rows)
+        chosen = state.select(rows)
         if float(number[rows].max()) > MOST_ONE_BY_ONE:
             raise TorchTransientError(
                 f"FreeRunningSPAD: expected at most {MOST_ONE_BY_ONE:g} detections where dead time and wait make up a "
@@ -440,7 +440,7 @@ def _remembers_phase(state: _StationaryTrain, rate: Tensor, dead_bins: Tensor, p
     if periods == 1 or not asked.numel():
         return wide
     pilot = torch.Generator(rate.device).manual_seed(0)
-    _, more = _independent_periods(state.of(asked.repeat(_PILOTS)), periods, pilot, normal=True)
+    _, more = _independent_periods(state.select(asked.repeat(_PILOTS)), periods, pilot, normal=True)
     if more is not None:
         size = _DEVIATIONS * more.view(_PILOTS, -1, bins).abs().amax(0)
         wide[asked] = (size - mean[asked]).clamp_min(0).sum(-1) > _CLIPPED * mean[asked].sum(-1)

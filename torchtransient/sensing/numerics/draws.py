@@ -244,10 +244,10 @@ class BinomialTables:
 
     def _of_few(self, which: Tensor | int, trials: Tensor, generator: torch.Generator | None) -> Tensor:
         """Numbers (K,) int8 of at most `most` trials."""
-        cell, number = self._look(self._row(which, trials), generator)
+        cell, number = self._look_up(self._row(which, trials), generator)
         unsure = (number < 0).nonzero().squeeze(-1)
         if unsure.numel():
-            number[unsure] = self._exactly(self._row(which, trials)[unsure], cell[unsure], generator)
+            number[unsure] = self._draw_exactly(self._row(which, trials)[unsure], cell[unsure], generator)
         return number
 
     def draw_some(self, trials: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -256,24 +256,24 @@ class BinomialTables:
             number = self.draw(0, trials, generator)
             place = number.nonzero().squeeze(-1)
             return place, number.index_select(0, place)
-        cell, number = self._look(trials, generator)
+        cell, number = self._look_up(trials, generator)
         place = number.nonzero().squeeze(-1)
         some = number.index_select(0, place)
         unsure = (some < 0).nonzero().squeeze(-1)
         if unsure.numel():
             among = place[unsure]
-            some[unsure] = self._exactly(trials[among], cell[among], generator)
+            some[unsure] = self._draw_exactly(trials[among], cell[among], generator)
         return place, some.to(torch.int32)
 
     def _row(self, which: Tensor | int, trials: Tensor) -> Tensor:
         return trials if isinstance(which, int) and which == 0 else trials + which * (self._most + 1)
 
-    def _look(self, row: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    def _look_up(self, row: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Cells (K,) and their results (K,), -1 where a border lies inside the cell."""
         cell = sixteen_bits(row, generator).to(torch.int32).bitwise_and_(self._cells - 1)
         return cell, self._number.index_select(0, cell.add(row, alpha=self._cells))
 
-    def _exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
+    def _draw_exactly(self, row: Tensor, cell: Tensor, generator: torch.Generator | None) -> Tensor:
         """Results by the distribution function, with the uniform number completed inside its cell."""
         u = torch.rand(row.shape, dtype=torch.float64, device="cpu", generator=generator)
         u = u.add_(cell).mul_(1 / self._cells).add_(row)
@@ -403,9 +403,9 @@ def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator
     found = []
     for begin in range(0, max(flat.numel(), 1), _ENTRIES):
         at = slice(begin, begin + _ENTRIES)
-        candidates = _sift(flat[at], p if p.numel() == 1 else p[at], generator)
+        candidates = _find_candidates(flat[at], p if p.numel() == 1 else p[at], generator)
         found.append(candidates._replace(place=candidates.place + begin))
-    return _decide(_joined(found), flat.dtype, generator)
+    return _decide_numbers(_concatenate(found), flat.dtype, generator)
 
 
 def add_passing(counts: Tensor, probability: float, into: Tensor, generator: torch.Generator | None = None) -> None:
@@ -418,7 +418,7 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
         generator: source of randomness.
     """
     if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
-        trials, large, others = _apart(counts.reshape(-1), probability, generator)
+        trials, large, others = _split_large(counts.reshape(-1), probability, generator)
         table = binomial_table(probability, small=counts.numel() < _ENTRIES // 4)
         into.view(-1).add_(table.draw(0, trials, generator)).index_add_(0, large, others)
         return
@@ -431,7 +431,7 @@ def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator 
     places, numbers = [], []
     table = binomial_table(probability, small=flat.numel() < _ENTRIES // 4)
     for begin in range(0, flat.numel(), _ENTRIES):
-        trials, large, others = _apart(flat[begin : begin + _ENTRIES], probability, generator)
+        trials, large, others = _split_large(flat[begin : begin + _ENTRIES], probability, generator)
         place, number = table.draw_some(trials, generator)
         places.append(place.add_(begin))
         numbers.append(number.to(flat.dtype))
@@ -445,7 +445,7 @@ def _thin_by_table(flat: Tensor, probability: float, generator: torch.Generator 
     return Events(place, number)
 
 
-def _apart(
+def _split_large(
     counts: Tensor, probability: float, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Trials (K,) int32 with 0 in place of large counts; places and numbers of those, by torch.binomial."""
@@ -461,7 +461,7 @@ def _apart(
     return trials, large, torch.binomial(many, torch.full_like(many, probability), generator=generator)
 
 
-def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
+def _find_candidates(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidates:
     """Entries that may have events, by 16 random bits each: P(any) <= n p. `p`: one for each of `n`, or one."""
     # one step more than the bound covers what rounding takes
     steps = (n * p.to(n.dtype)).mul_(_GRID).sub_(_GRID / 2 - 2).clamp_(max=_GRID / 2 - 1).to(torch.int16)
@@ -470,13 +470,13 @@ def _sift(n: Tensor, p: Tensor, generator: torch.Generator | None) -> _Candidate
     return _Candidates(place, n[place], p if p.numel() == 1 else p[place], bits[place])
 
 
-def _joined(parts: list[_Candidates]) -> _Candidates:
+def _concatenate(parts: list[_Candidates]) -> _Candidates:
     place, many, share, bits = zip(*parts, strict=True)
     one_share = all(s.numel() == 1 for s in share) and len(parts) > 1
     return _Candidates(torch.cat(place), torch.cat(many), share[0] if one_share else torch.cat(share), torch.cat(bits))
 
 
-def _decide(chosen: _Candidates, dtype: torch.dtype, generator: torch.Generator | None) -> Events:
+def _decide_numbers(chosen: _Candidates, dtype: torch.dtype, generator: torch.Generator | None) -> Events:
     """Binomial numbers of candidates.
 
     The number is at least k where u < P(K >= k). With the binomial moments x = n p, y = n (n - 1) p^2 / 2 and z = n (n
@@ -570,14 +570,14 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
             trials[unfit], less[unfit] = 0, 0.0
         number, left, missing = draw_lower_share(trials, less, generator)
         likely = p > 0.5
-        candidates = _sift(left.to(flat.dtype), missing, generator)
+        candidates = _find_candidates(left.to(flat.dtype), missing, generator)
         # not `where`, which guesses at every entry
         out[at] = trials.sub_(number, alpha=2).mul_(likely).add_(number)
         if unfit.numel():
             out[at][unfit] = torch.binomial(many[unfit], p[unfit], generator=generator)
         found.append(candidates._replace(place=(candidates.place + begin) * 2 + likely[candidates.place]))
     if found:
-        added = _decide(_joined(found), flat.dtype, generator)
+        added = _decide_numbers(_concatenate(found), flat.dtype, generator)
         place = added.place >> 1
         out[place] += added.number * (1 - (added.place & 1) * 2)
     return out.view(n.shape)

@@ -400,10 +400,10 @@ def first_photon_log_prob(
     dead_bins = None if dead_bins is None else one_number(dead_bins, "dead_bins", where)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
     if dead_bins is None:
-        sooner, exposed = torch.zeros_like(r), number - sum_before(n.detach())
+        short, exposed = torch.zeros_like(r), number - sum_before(n.detach())
     else:
         time = armed_time(n.detach(), number, float(dead_bins))
-        sooner, exposed = time.sooner(r), time.exposed
+        short, exposed = time.short_exposures(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
     refuse_cut_off(dead_bins, "dead_bins", where)
@@ -412,7 +412,7 @@ def first_photon_log_prob(
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
     fire = log_of_firing(torch.where(hit, r, 0.5))
-    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - short
     if constant:
         value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)
