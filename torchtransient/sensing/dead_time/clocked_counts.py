@@ -105,7 +105,6 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
     Where the straight lines leave too much or too little for the rearmed ones, one probability for both keeps the mean.
     """
     rest = detected - armed * fire
-    # straight lines can put a little too much or too little here; one chance for both keeps the mean
     whole_chance = bounded_ratio(detected, armed + back)
     fits = (rest >= 0) & (rest <= back)
     return torch.where(fits, fire, whole_chance), torch.where(fits, bounded_ratio(rest, back), whole_chance)
