@@ -391,7 +391,6 @@ BARE = {
     "losses/results.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "sensing/dead_time/free_running_ring.py": {"AssertionError"},  # what its own calls rule out
     "vis/video.py": {"IndexError"},  # the protocol of sequences
 }
 

@@ -200,7 +200,7 @@ def pulse_of_a_nanosecond(x):
 
 
 def afterpulses_of_a_window(x):
-    return sensing.add_afterpulses(x, 0.1, sensing.afterpulse_kernel(3e-10, 1e-9, 1e-11, period_bins=600))
+    return sensing.add_afterpulses(x, 1.0, sensing.Afterpulsing(0.1, 3e-10, 1e-9, bin_width_s=1e-11).kernel(600))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -16,11 +16,10 @@ from torchtransient.sensing.base.pixel_maps import check_map, kept_map
 from torchtransient.sensing.base.policies import straight_through
 from torchtransient.sensing.chain.first_photon_moves import multinomial_log_prob
 from torchtransient.sensing.counts.moved_counts import Moves, move_counts
-from torchtransient.sensing.dead_time.dead_time_cycle import row_levels, whole_and_part
-from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
+from torchtransient.sensing.dead_time.clocked import subdivision_levels
+from torchtransient.sensing.dead_time.renewal import split_dead_time, stationary_phases
 from torchtransient.sensing.estimation.depth import background_per_bin
-from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons, sample_multinomial
-from torchtransient.sensing.numerics.thinning import halve, thin
+from torchtransient.sensing.numerics.draws import check_rates, halve, sample_first_photons, sample_multinomial, thin
 from torchtransient.sensing.numerics.time_convolution import convolve_time
 from torchtransient.sensing.pixels.coincidence import _mean_survival
 from torchtransient.sensing.spad.spad import sample_detections
@@ -136,7 +135,7 @@ def test_values_that_are_refused_are_told_with_a_gradient_too():
         with pytest.raises(UnitError, match="got -1 to -1"):
             check_rates(negative, "here")
         with pytest.raises(TorchTransientError, match="photons in a bin, got 1e"):
-            row_levels(torch.full((2, 3), 1e12, requires_grad=True), 1)
+            subdivision_levels(torch.full((2, 3), 1e12, requires_grad=True), 1)
 
 
 # ----------------------------------------------------------------------------------------------------------- draws
@@ -244,7 +243,7 @@ def test_moves_under_a_score_have_no_gradient_of_their_mean():
 
 def test_a_dead_time_just_below_a_whole_number_keeps_its_derivative():
     dead = torch.tensor(3 - 1e-10, dtype=torch.float64, requires_grad=True)
-    whole, part = whole_and_part(dead)
+    whole, part = split_dead_time(dead)
     assert whole == 3 and float(part.detach()) == 0.0
     assert float(torch.autograd.grad(part, dead)[0]) == 1.0
 

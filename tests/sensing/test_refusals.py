@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,12 +14,11 @@ from torchtransient.sensing.base.pixel_maps import check_map
 from torchtransient.sensing.base.policies import ScoreFunction
 from torchtransient.sensing.base.sensor import RandomSensor, Sensor
 from torchtransient.sensing.base.wrapped_detector import WrappedDetector
-from torchtransient.sensing.correlated_noise.afterpulse_delays import AfterpulseDelays
-from torchtransient.sensing.correlated_noise.trapped_ring import _Chain
+from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelays
+from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
 from torchtransient.sensing.counts.added_counts import AddedCounts
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
-from torchtransient.sensing.dead_time.free_running_ring import _closing
-from torchtransient.sensing.dead_time.stationary_phases import _check
+from torchtransient.sensing.dead_time.renewal import _check_residual
 from torchtransient.sensing.devices.devices import Device
 from torchtransient.sensing.numerics.draws import sample_multinomial
 from torchtransient.sensing.optics.polarization import demosaic, mosaic_rows
@@ -121,11 +119,11 @@ REFUSED = {
         lambda: Moves(0, torch.ones(2, 6) / 2, "zero").log_prob(torch.ones(2, 1)), GradientError,
         r"MovedCounts: expected shares \(L,\) under grad='score'"),
     "carriers that do not converge": (
-        lambda: _Chain._checked(torch.ones(2), torch.tensor([0.0, 2e-7])), TorchTransientError,
-        "relative residual of 1e-07 of the carriers .*got 2e-07"),
-    "phases that do not converge": (lambda: _check(torch.tensor([1e-10, 2e-9])), TorchTransientError,
+        lambda: _LossyChain._checked(torch.ones(2), torch.tensor([0.0, 2e-7])), TorchTransientError,
+        "relative residual of 1e-07 of trapped carriers, got 2e-07"),
+    "phases that do not converge": (lambda: _check_residual(torch.tensor([1e-10, 2e-9])), TorchTransientError,
                                     "relative residual of 1e-09, got 2e-09"),
-    "phases that are no number": (lambda: _check(torch.tensor([math.nan])), TorchTransientError, "got nan"),
+    "phases that are no number": (lambda: _check_residual(torch.tensor([math.nan])), TorchTransientError, "got nan"),
     "name of a device": (lambda: described(name=3), StorageError, "expected name as a text, got 3"),
     "description of a device": (lambda: described(description=None), StorageError, "expected description as a text"),
     "source of a device": (lambda: described(sources="page 3"), StorageError, "expected sources as a list"),
@@ -191,20 +189,10 @@ REFUSED = {
     "block of one angle": (lambda: mosaic_rows(30.0), ShapeError, "mosaic_rows: expected rows of angles, got 30"),
     "block of one row": (lambda: mosaic_rows([30.0, 60.0]), ShapeError, "mosaic_rows: expected rows of angles"),
     "raw light as a list": (lambda: demosaic([1.0]), ShapeError, r"demosaic: expected raw as a tensor, got .*1\.0"),
-    "time constant as a text": (lambda: sensing.afterpulse_kernel("3", 1e-9, 1e-9, period_bins=4), UnitError,
-                                "afterpulse_kernel: expected tau_s as one number of seconds, got '3'"),
-    "two time constants": (lambda: sensing.afterpulse_kernel(torch.ones(2), 1e-9, 1e-9, period_bins=4), UnitError,
-                           "tau_s as one number of seconds"),
     "transpose of no sensor": (lambda: sensing.adjoint(torch.nn.Identity(), LIGHT, LIGHT.shape), ArgumentError,
                                r"adjoint: expected a sensor of tt\.sensing, got .*Identity"),
     "samples of two lengths": (lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]), ShapeError,
                                "measured_code: expected samples as rows of numbers of one length"),
-    "ends of a train that has no state": (
-        lambda: _closing(None, None, SimpleNamespace(begin=None), SimpleNamespace(begin=LIGHT), 3, None),
-        AssertionError, "begins in its stationary state"),
-    "trains that have no state": (
-        lambda: _closing(None, None, SimpleNamespace(begin=LIGHT), SimpleNamespace(begin=None), 3, None),
-        AssertionError, "begins in its stationary state"),
     "no solid angle": (lambda: sensing.Optics(solid_angle_sr=0.0), UnitError, "solid_angle_sr in"),
 }  # fmt: skip
 
@@ -261,5 +249,5 @@ def test_limits_that_are_reached_are_taken():
     assert torch.equal(sensing.paralyzable_histogram(LIGHT, 0.0), LIGHT)
     assert sensing.defocus_psf(0.5).tolist() == [[1.0]]
     for half in (torch.tensor([0.2]), torch.tensor([1e-7])):
-        _Chain._checked(half, half * 0 + 1e-7)
-    _check(torch.tensor([1e-9], dtype=torch.float64))
+        _LossyChain._checked(half, half * 0 + 1e-7)
+    _check_residual(torch.tensor([1e-9], dtype=torch.float64))

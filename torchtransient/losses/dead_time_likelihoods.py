@@ -36,7 +36,7 @@ from torchtransient.losses.likelihoods import (
     floored,
 )
 from torchtransient.losses.results import TRANSIENT, Transient, reads
-from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins
+from torchtransient.sensing.dead_time.renewal import check_dead_bins
 from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
 
 _TIME = -3

@@ -22,13 +22,11 @@ from torchtransient.sensing.coherent.beats import CoherentReceiver as CoherentRe
 from torchtransient.sensing.coherent.beats import Speckle as Speckle
 from torchtransient.sensing.coherent.range_and_speed import fold_beats as fold_beats
 from torchtransient.sensing.coherent.range_and_speed import range_and_speed as range_and_speed
-from torchtransient.sensing.correlated_noise.afterpulse_delays import AfterpulseDelays as AfterpulseDelays
-from torchtransient.sensing.correlated_noise.afterpulse_delays import MeasuredDelays as MeasuredDelays
-from torchtransient.sensing.correlated_noise.afterpulse_delays import PowerLawDelays as PowerLawDelays
+from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelays as AfterpulseDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing as Afterpulsing
+from torchtransient.sensing.correlated_noise.afterpulsing import MeasuredDelays as MeasuredDelays
+from torchtransient.sensing.correlated_noise.afterpulsing import PowerLawDelays as PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import add_afterpulses as add_afterpulses
-from torchtransient.sensing.correlated_noise.afterpulsing import afterpulse_kernel as afterpulse_kernel
-from torchtransient.sensing.correlated_noise.afterpulsing import hot_pixel_rates as hot_pixel_rates
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD as AfterpulsingSPAD
 from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk as Crosstalk
 from torchtransient.sensing.correlated_noise.crosstalk import add_crosstalk as add_crosstalk
@@ -96,6 +94,7 @@ from torchtransient.sensing.optics.photon_budget import BudgetReport as BudgetRe
 from torchtransient.sensing.optics.photon_budget import Optics as Optics
 from torchtransient.sensing.optics.photon_budget import PhotonBudget as PhotonBudget
 from torchtransient.sensing.optics.photon_budget import ambient_photon_rate as ambient_photon_rate
+from torchtransient.sensing.optics.photon_budget import hot_pixel_rates as hot_pixel_rates
 from torchtransient.sensing.optics.photon_budget import photon_energy_j as photon_energy_j
 from torchtransient.sensing.optics.polarization import Analyzers as Analyzers
 from torchtransient.sensing.optics.polarization import PolarizationMosaic as PolarizationMosaic

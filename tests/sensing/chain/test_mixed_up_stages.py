@@ -294,7 +294,7 @@ SECONDS = {
 }  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
 OTHERS = {
-    "BudgetReport", "CramerRaoBound", "Device", "Response", "afterpulse_kernel", "emg_cdf", "emg_density",
+    "BudgetReport", "CramerRaoBound", "Device", "Response", "emg_cdf", "emg_density",
     "emg_survival", "gate_profiles", "resample_counts",
 }  # fmt: skip
 
@@ -406,7 +406,7 @@ def test_functions_that_count(dtype):
     """Each of half-precision numbers is that of the same numbers in float32."""
     x = torch.linspace(0.1, 1.0, 8).view(1, 8, 1, 1).to(dtype)
     many, far = (x * 1e4).round(), 700 + x
-    kernel = sensing.afterpulse_kernel(2 * NS, 1 * NS, 1 * NS, period_bins=8)
+    kernel = sensing.Afterpulsing(0.3, 2 * NS, 1 * NS, bin_width_s=1 * NS).kernel(8)
     for call in (
         lambda v: sensing.sample_detections(v, 10**6, generator=generator()),
         lambda v: sensing.poisson(many.to(v.dtype), generator()),
@@ -414,7 +414,7 @@ def test_functions_that_count(dtype):
         lambda v: sensing.nonparalyzable_histogram(v, 2.5),
         lambda v: sensing.paralyzable_histogram(v, 2.5),
         lambda v: sensing.coates(many.to(v.dtype), 10**5).rate,
-        lambda v: sensing.add_afterpulses(many.to(v.dtype), 0.3, kernel),
+        lambda v: sensing.add_afterpulses(many.to(v.dtype), 1.0, kernel),
         lambda v: sensing.add_crosstalk(many.to(v.dtype), 0.2),
         lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
         lambda v: sensing.equi_depth_edges(v, 4),

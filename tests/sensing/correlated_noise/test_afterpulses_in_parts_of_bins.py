@@ -7,11 +7,10 @@ import torch
 
 from support.marks import long
 from torchtransient import TimeAxis, sensing
-from torchtransient.sensing.correlated_noise import trapped_carriers as carriers
-from torchtransient.sensing.correlated_noise.trapped_ring import _Chain
-from torchtransient.sensing.dead_time import stationary_phases as phases
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain, bin_response
-from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
+from torchtransient.sensing.correlated_noise import afterpulsing_spad as carriers
+from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
+from torchtransient.sensing.dead_time import renewal
+from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, stationary_phases
 from torchtransient.sensing.spad.spad import exposed_cycles
 
 BINS, WIDTH = 5, 100e-12
@@ -149,21 +148,7 @@ def number(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_hazards_of_parts_of_bins():
-    """Sums while armed over armed time: parts that are armed longer count for more; nothing where none is."""
-    hazard, waited = number([[1.0, 3.0, 2.0, 5.0, 7.0, 9.0]]), number([[0.5, 1.0, 0.0, 0.25, 0.0, 0.0]])
-    found = carriers._coarser(hazard, waited, 2)
-    assert found.tolist() == [[pytest.approx(2 * 3.5 / 1.5), 10.0, 0.0]]
-    assert carriers._finer(number([[6.0, 9.0]]), 3).tolist() == [[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]
-    part, whole = number([3.0, -1.0, 2.0]), number([2.0, 2.0, 0.0]).requires_grad_()
-    with torch.autograd.set_detect_anomaly(True):
-        ratio = carriers._ratio(part, whole)
-        (slope,) = torch.autograd.grad(ratio.sum(), whole)
-    assert ratio.tolist() == [1.5, 0.0, 0.0] and slope.tolist() == [-0.75, 0.0, 0.0]
-    assert carriers._ratio(number([1.0, 4.0]), number([1e-201, 1e-199])).tolist() == pytest.approx([0.0, 4e199])
-
-
-class Watched(carriers.RingTrain):
+class Watched(carriers.FreeRunningTrain):
     """Remembers the lowest rate that it was asked for."""
 
     least = 1.0
@@ -178,15 +163,8 @@ def test_no_rate_of_other_carriers_is_below_zero():
     """Of pairs in the dark before a flash, where each of them makes others less likely."""
     first = number([[1e-6, 1e-6, 1.0, 1e-6, 1e-6, 1e-6]])
     train = Watched(1, number(0.3))
-    hazard, _ = carriers.armed_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
+    hazard, _ = carriers.carrier_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
     assert 0 < Watched.least <= 1e-6 * (1 + 1e-9) and bool((hazard > 0).all())
-
-
-def test_generations_of_carriers():
-    """Until 1e-5 of them are left, two at least; one where there are hardly any."""
-    for seen, rounds in (([1e-6], 1), ([0.9e-5], 1), ([1.1e-5], 2), ([0.003], 2), ([0.004], 3), ([0.1, 0.1], 8),
-                         ([0.5], 17)):  # fmt: skip
-        assert carriers._rounds(number(seen)) == rounds
 
 
 @pytest.mark.parametrize("largest", [0.3, 1.9, 2.1, 40.0])
@@ -204,13 +182,13 @@ def test_a_bin_by_powers_and_by_moments(part, largest):
 def test_carriers_on_a_ring_start_from_constant_light(whole):
     """Rows that are constant are undone at once, by the losses and shares of their own."""
     loss, kept = number([[0.03], [0.9], [7.0]]).expand(3, 5), number([[0.999], [0.3], [0.8]]).expand(3, 5)
-    chain = _Chain(loss.contiguous(), kept.contiguous(), number(0.4), whole)
+    chain = _LossyChain(loss.contiguous(), kept.contiguous(), number(0.4), whole)
     x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(chain.constant.solve(x - chain.step(x)), x, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(chain.solve(x - chain.step(x)), x, rtol=1e-8, atol=1e-8)
     # all of a share and none of one, too: a number that is near enough
     for share in (0.0, 1.0):
-        edge = _Chain(loss[:1].contiguous(), share + 0 * kept[:1], number(0.4), whole)
+        edge = _LossyChain(loss[:1].contiguous(), share + 0 * kept[:1], number(0.4), whole)
         found = edge.constant.solve(x[:1] - edge.step(x[:1]))
         if share == 0:
             torch.testing.assert_close(found, x[:1], rtol=1e-5, atol=1e-5)
@@ -227,4 +205,4 @@ def test_detections_on_a_ring_start_from_constant_light(whole):
     x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     ones = torch.cat([torch.ones(5), torch.zeros(5)]).double()
     right = x - chain.step(x) + x[:, :5].mean(-1, keepdim=True) * ones
-    torch.testing.assert_close(phases._constant(chain, 4 * pi).solve(right), x, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(renewal._constant_light(chain, 4 * pi).solve(right), x, rtol=1e-8, atol=1e-8)

@@ -16,7 +16,6 @@ from torchtransient.sensing import (
     ScoreFunction,
     add_afterpulses,
     add_crosstalk,
-    afterpulse_kernel,
     hot_pixel_rates,
 )
 from torchtransient.sensing.correlated_noise import crosstalk
@@ -24,9 +23,14 @@ from torchtransient.sensing.correlated_noise import crosstalk
 BINS = 40
 
 
+def kernel_of(tau, dead, period=BINS):
+    """Delays of one afterpulse, in bins."""
+    return Afterpulsing(0.5, tau * 1e-10, dead * 1e-10, bin_width_s=1e-10).kernel(period) / 0.5
+
+
 @pytest.mark.parametrize("tau, dead", [(7.0, 3.2), (300.0, 55.0), (0.01, 2.0), (25.0, 0.0)])
 def test_kernel_against_random_delays(tau, dead):
-    kernel = afterpulse_kernel(tau * 1e-10, dead * 1e-10, 1e-10, period_bins=BINS)
+    kernel = kernel_of(tau, dead)
     assert float(kernel.sum()) == pytest.approx(1, abs=1e-12)
     rng = np.random.default_rng(0)
     delays = rng.random(400_000) + dead + rng.exponential(tau, 400_000)
@@ -49,7 +53,7 @@ def test_geometric_sum_against_a_branching_process():
         times = np.floor(times[rng.random(times.size) < p])
         times = times + rng.random(times.size) + dead + rng.exponential(tau, times.size)
         total += np.bincount(np.floor(times).astype(int) % BINS, minlength=BINS)
-    kernel = afterpulse_kernel(tau * 1e-10, dead * 1e-10, 1e-10, period_bins=BINS)
+    kernel = kernel_of(tau, dead)
     found = add_afterpulses(torch.as_tensor(h).view(1, -1, 1, 1), p, kernel).flatten().numpy()
     assert found.sum() == pytest.approx(counts / (1 - p), rel=1e-12)
     z = (total - found)[found < counts] / np.sqrt(found[found < counts])
@@ -72,7 +76,7 @@ def test_long_periods_are_wrapped_round_the_window():
     """A period longer than two windows is not transformed whole; the means are those of the whole period."""
     x = torch.rand(1, 16, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for period in (16, 32, 33, 40, 100):
-        kernel = afterpulse_kernel(70e-10, 20e-10, 1e-10, period_bins=period)
+        kernel = kernel_of(70, 20, period)
         whole = add_afterpulses(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, period - 16)), 0.3, kernel)
         torch.testing.assert_close(add_afterpulses(x, 0.3, kernel), whole[:, :16])
 

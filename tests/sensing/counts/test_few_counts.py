@@ -51,7 +51,7 @@ def test_first_photons_of_few_and_of_many_counts(monkeypatch, few, kind):
 def test_counts_are_parted_block_by_block(monkeypatch, block, bins):
     """As many pairs of bins at a time as fit into a block, one at least, and the last few; odd ones stay."""
     monkeypatch.setattr(draws, "_FEW_COUNTS", 0)
-    monkeypatch.setattr(draws, "_BLOCK", block)
+    monkeypatch.setattr(draws, "_PAIRS", block)
     shares = 1 + torch.rand(bins, 1, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     shares[5, :, 1], shares[-1, :, 2] = 0.0, 0.0
     shares = shares / shares.sum(0)

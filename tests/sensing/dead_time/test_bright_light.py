@@ -10,14 +10,17 @@ from support.marks import long_pairs
 from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, nonparalyzable_histogram
-from torchtransient.sensing.dead_time import free_running_ring, free_running_state
-from torchtransient.sensing.dead_time.banded_solve import solve_banded
-from torchtransient.sensing.dead_time.constant_light import ConstantLight
-from torchtransient.sensing.dead_time.free_running_draws import BinChances, bin_chances, draw_path
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
-from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
-from torchtransient.sensing.numerics.exponential_moments import moments
-from torchtransient.sensing.numerics.krylov import gmres
+from torchtransient.sensing.dead_time import free_running
+from torchtransient.sensing.dead_time.clocked_counts import StepProbabilities, draw_steps
+from torchtransient.sensing.dead_time.free_running import stationary_steps
+from torchtransient.sensing.dead_time.renewal import (
+    ConstantLight,
+    RenewalChain,
+    gmres,
+    moments,
+    solve_banded,
+    stationary_phases,
+)
 from torchtransient.sensing.spad.free_running import state_image
 
 BINS = 32
@@ -197,7 +200,7 @@ def test_a_phase_locked_at_the_edge_of_a_bin(monkeypatch):
     assert float(found.min()) >= 0
     assert total_variation(found.numpy(), limit.numpy()) < 1e-2
     assert float(limit.max() / limit.sum()) > 0.9
-    monkeypatch.setattr(free_running_state, "_FINEST", 2)
+    monkeypatch.setattr(free_running, "_FINEST", 2)
     with pytest.raises(TorchTransientError, match="narrower bins"):
         nonparalyzable_histogram(image(light), 31.9)
 
@@ -277,7 +280,7 @@ def test_a_phase_that_is_remembered():
 
 @pytest.mark.slow
 def test_more_detections_than_can_be_drawn(monkeypatch):
-    monkeypatch.setattr(free_running_ring, "MOST_ONE_BY_ONE", 1100)
+    monkeypatch.setattr(free_running, "MOST_ONE_BY_ONE", 1100)
     spad = FreeRunningSPAD(1200, 15.984e-10, bin_width_s=1e-10)
     with pytest.raises(TorchTransientError, match="fewer cycles, or grad='gaussian'"):
         spad.sample(torch.full((1, 16, 1, 1), 1000 / 16.0))
@@ -330,9 +333,9 @@ def test_score_is_unbiased(kind, dead):
         if kind == "paralyzable":
             h = spad.sample(x.expand(many, 1, 6, 1, 1), g).view(many, 6)
         else:  # one solution for all draws
-            one = bin_chances(x, state_image(x, double(dead)))
+            one = stationary_steps(x, state_image(x, double(dead)))
             wide = [v.expand(*v.shape[:-1], many) for v in (one.begin, one.fire, one.soon, one.late)]
-            h = draw_path(BinChances(*wide, one.whole), 3, g).counts.view(6, many).T
+            h = draw_steps(StepProbabilities(*wide, one.whole), 3, g).counts.view(6, many).T
         return losses(h).mean(0)
 
     step = 0.1
@@ -353,14 +356,14 @@ def test_score_is_unbiased(kind, dead):
 @pytest.mark.parametrize("dead, peak", [(3.3, 30.0)])
 def test_bins_are_cut_where_light_changes(dead, peak):
     """Pulses in which detectors are armed again, beside bins cut in 64."""
-    from torchtransient.sensing.dead_time.free_running_state import _solved, stationary_state
+    from torchtransient.sensing.dead_time.free_running import _solve_cut, stationary_state
 
     rate = 1e-3 + peak * torch.exp(-0.5 * ((torch.arange(64, dtype=torch.float64) - 20) / 6) ** 2)[None]
     d = torch.tensor(dead, dtype=torch.float64)
-    fine = _solved(rate, d, 64).detected
+    fine = _solve_cut(rate, d, 64).detected
 
     def total_variation(found):
         return float((found - fine).abs().sum() / fine.sum() / 2)
 
     assert total_variation(stationary_state(rate, d).detected) < 1e-3
-    assert total_variation(_solved(rate, d, 1).detected) > 4 * total_variation(stationary_state(rate, d).detected)
+    assert total_variation(_solve_cut(rate, d, 1).detected) > 4 * total_variation(stationary_state(rate, d).detected)

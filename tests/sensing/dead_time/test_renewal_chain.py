@@ -10,15 +10,12 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.correlated_noise.trapped_ring import trapped_lines
-from torchtransient.sensing.dead_time import free_running_ring
-from torchtransient.sensing.dead_time import stationary_phases as phases
-from torchtransient.sensing.dead_time.banded_solve import solve_banded
-from torchtransient.sensing.dead_time.dead_time_cycle import Cycle, cycle_of_rows
-from torchtransient.sensing.dead_time.dead_time_draws import _bins, _steps, _wider_pieces, _width
-from torchtransient.sensing.dead_time.dead_time_walk import degree_of, response_series
-from torchtransient.sensing.dead_time.free_running_state import late_lines
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain, bin_response
+from torchtransient.sensing.correlated_noise.afterpulsing_spad import trapped_carrier_lines
+from torchtransient.sensing.dead_time import free_running, renewal
+from torchtransient.sensing.dead_time.clocked import CycleMeans, cycle_means, response_series, series_degree
+from torchtransient.sensing.dead_time.clocked_counts import _cycle_steps, _merge_states, _sum_pieces
+from torchtransient.sensing.dead_time.free_running import late_lines
+from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, solve_banded
 
 ROOT = math.sqrt(3.0)
 
@@ -92,20 +89,20 @@ def test_the_transpose_is_one(bins, whole, part, high):
 def solved(rate, part, whole):
     """Stationary lines, their derivatives in both modes by light and dead time, and what becomes of a change."""
     leaves = rate.clone().requires_grad_(), part.clone().requires_grad_()
-    pi = phases.stationary_phases(*leaves, whole)
+    pi = renewal.stationary_phases(*leaves, whole)
     weights = torch.rand(pi.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     slopes = torch.autograd.grad((pi * weights).sum(), leaves)
     along = torch.ones_like(rate) / 7 + rate.square(), torch.full_like(part, 0.3)
     with forward_ad.dual_level():
         duals = [forward_ad.make_dual(*pair) for pair in zip((rate, part), along, strict=True)]
-        dual = phases.stationary_phases(*duals, whole)
+        dual = renewal.stationary_phases(*duals, whole)
         forwards = forward_ad.unpack_dual(dual).tangent.clone()
     total = sum((s * a).sum() for s, a in zip(slopes, along, strict=True))
     torch.testing.assert_close((forwards * weights).sum(), total, rtol=1e-7, atol=1e-9)
     change = weights.clone()
     change[:, 0] -= change[:, : rate.shape[1]].sum(-1)
     change[0] = 0.0  # one that does not change
-    after = phases.tangent_phases(RenewalChain(rate, whole, part), pi.detach(), change)
+    after = renewal.sum_of_detections(RenewalChain(rate, whole, part), pi.detach(), change)
     return [pi.detach(), *slopes, forwards, after]
 
 
@@ -128,7 +125,7 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
     """Those alone: lines, derivatives and changes are the same, to what iterations leave."""
     rate, part = rates(6, 3), torch.tensor(0.4, dtype=torch.float64)
     wanted = solved(rate, part, 3)
-    converging = phases.gmres
+    converging = renewal.gmres
 
     def stuck(operator, right, start, *others):
         found, residual = converging(operator, right, start, *others)
@@ -141,20 +138,20 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
         return solve_banded(chain, right, pinned, transposed=transposed)
 
     pins = []
-    monkeypatch.setattr(phases, "gmres", stuck)
-    monkeypatch.setattr(phases, "solve_banded", spied)
+    monkeypatch.setattr(renewal, "gmres", stuck)
+    monkeypatch.setattr(renewal, "solve_banded", spied)
     for found, exact in zip(solved(rate, part, 3), wanted, strict=True):
         torch.testing.assert_close(found, exact, rtol=1e-7, atol=1e-9)
     # each row is held where its own detections are: lines twice, both derivatives, and the change
     largest = wanted[0][1:, :6].argmax(-1).tolist()
     assert largest[0] != largest[1] and pins == [largest] * 5
-    monkeypatch.setattr(phases, "solve_banded", lambda chain, right, *_, **__: right + 0.1)
+    monkeypatch.setattr(renewal, "solve_banded", lambda chain, right, *_, **__: right + 0.1)
     with pytest.raises(TorchTransientError, match="stationary_phases: expected a relative residual"):
-        phases.stationary_phases(rate, part, 3)
-    monkeypatch.setattr(phases, "gmres", converging)
+        renewal.stationary_phases(rate, part, 3)
+    monkeypatch.setattr(renewal, "gmres", converging)
     leaf = rate.clone().requires_grad_()
-    pi = phases.stationary_phases(leaf, part, 3)
-    monkeypatch.setattr(phases, "gmres", stuck)
+    pi = renewal.stationary_phases(leaf, part, 3)
+    monkeypatch.setattr(renewal, "gmres", stuck)
     with pytest.raises(TorchTransientError, match="relative residual"):
         torch.autograd.grad(pi[:, 0].sum(), leaf)
 
@@ -170,19 +167,19 @@ def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
     step = matrices(loss, whole, part)
     matrix = torch.eye(2 * bins, dtype=torch.float64) - step * torch.cat([kept, kept], -1).unsqueeze(1)
     wanted = torch.linalg.solve(matrix, (step @ source.unsqueeze(-1)).squeeze(-1))
-    torch.testing.assert_close(trapped_lines(loss, kept, source, dead, whole), wanted, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(trapped_carrier_lines(loss, kept, source, dead, whole), wanted, rtol=1e-8, atol=1e-9)
     leaves = [v.clone().requires_grad_() for v in (loss, kept, source, dead)]
     if whole == 5:
         assert torch.autograd.gradcheck(
-            lambda *v: trapped_lines(*v, whole), leaves, atol=1e-6, fast_mode=True, check_forward_ad=True
+            lambda *v: trapped_carrier_lines(*v, whole), leaves, atol=1e-6, fast_mode=True, check_forward_ad=True
         )
     one = [v.detach() for v in leaves]
     with forward_ad.dual_level():  # what is given beside it is left as it is
-        trapped_lines(forward_ad.make_dual(one[0], one[0]), *one[1:], whole)
-        phases.stationary_phases(one[0], forward_ad.make_dual(dead, one[3]), whole)
-        phases.stationary_phases(forward_ad.make_dual(one[0], one[0]), dead, whole)
+        trapped_carrier_lines(forward_ad.make_dual(one[0], one[0]), *one[1:], whole)
+        renewal.stationary_phases(one[0], forward_ad.make_dual(dead, one[3]), whole)
+        renewal.stationary_phases(forward_ad.make_dual(one[0], one[0]), dead, whole)
     assert not any(v.requires_grad for v in (*one, dead))
-    found = torch.autograd.grad(trapped_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
+    found = torch.autograd.grad(trapped_carrier_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
     assert bool(found.isfinite().all()) and not any(v.requires_grad for v in one)
 
 
@@ -199,7 +196,7 @@ def test_which_trains_are_drawn_with_their_memory(monkeypatch):
         def __init__(self):
             self.per_bin = per_bin
 
-        def of(self, rows):
+        def select(self, rows):
             asked.append(rows.tolist())
             return rows
 
@@ -210,11 +207,11 @@ def test_which_trains_are_drawn_with_their_memory(monkeypatch):
         more[half:, 0] = -(mean[:, 0] + short * mean.sum(-1))[rows[half:]] / 3
         return None, more
 
-    monkeypatch.setattr(free_running_ring, "_periods", periods)
+    monkeypatch.setattr(free_running, "_independent_periods", periods)
     dead = torch.tensor(1.5, dtype=torch.float64)
-    wide = free_running_ring._remembered(State(), per_bin, dead, 10)
+    wide = free_running._remembers_phase(State(), per_bin, dead, 10)
     assert wide.tolist() == [True, False, False, True, False] and asked == [[0, 1, 3, 0, 1, 3]]
-    assert not bool(free_running_ring._remembered(State(), per_bin, dead, 1).any()) and len(asked) == 1
+    assert not bool(free_running._remembers_phase(State(), per_bin, dead, 1).any()) and len(asked) == 1
 
 
 # ------------------------------------------------------------------------- who is armed again one piece later
@@ -236,13 +233,13 @@ def test_late_detections_of_lines(part):
     """Of a line, and none below zero or beyond all: in the cycle and in the stationary state."""
     count, slope = LINES
     wanted = [late_of(float(c), float(s), part) for c, s in zip(count[0], slope[0], strict=True)]
-    of_cycle = Cycle(count, count, slope, 2, torch.tensor(part, dtype=torch.float64), 1).late
+    of_cycle = CycleMeans(count, count, slope, 2, torch.tensor(part, dtype=torch.float64), 1).late
     on_ring = late_lines(torch.cat(LINES, -1), torch.tensor(part, dtype=torch.float64))
     for found in (of_cycle, on_ring):
         assert found[0].tolist() == pytest.approx(wanted, abs=1e-5)
-    steep = Cycle(count, count, 90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    steep = CycleMeans(count, count, 90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
     assert bool((steep <= count).all()) and float(steep[0, 0]) == 0.5
-    falling = Cycle(count, count, -90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
+    falling = CycleMeans(count, count, -90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
     assert bool((falling >= 0).all()) and float(falling[0, 0]) == 0.0
 
 
@@ -251,7 +248,7 @@ def test_pieces_that_are_drawn_as_one(whole, wider):
     """Fine piece j is armed again in j + whole, its late ones in the next: wide ones are told by what they hold."""
     count, slope = LINES
     part = 0.3
-    late = Cycle(count, count, slope, whole, torch.tensor(part, dtype=torch.float64), 1).late[0]
+    late = CycleMeans(count, count, slope, whole, torch.tensor(part, dtype=torch.float64), 1).late[0]
     wanted_late, wanted_count = np.zeros(6 // wider), np.zeros(6 // wider)
     for j in range(6):
         wanted_count[j // wider] += float(count[0, j])
@@ -259,16 +256,10 @@ def test_pieces_that_are_drawn_as_one(whole, wider):
             wanted_late[j // wider] += number * (again // wider - j // wider - whole // wider)
     states = torch.zeros(7, 3, 1, dtype=torch.float64)
     states[1:, 1, 0], states[1:, 2, 0], states[:-1, 0, 0] = count[0], slope[0], torch.arange(6.0).double()
-    found, armed, late_rows = _wider_pieces(states, part, whole, wider)
+    found, armed, late_rows = _merge_states(states, part, whole, wider)
     assert found[:, 0].tolist() == pytest.approx(wanted_count.tolist())
     assert late_rows[:, 0].tolist() == pytest.approx([0.0, *wanted_late])
     assert armed[:, 0].tolist() == [float(j) for j in range(0, 6, wider)]
-
-
-def test_how_many_pieces_are_drawn_as_one():
-    """Four at most, as many as divide a bin, no longer than a dead time."""
-    given = (1, 9), (2, 9), (4, 9), (8, 9), (8, 4), (8, 3), (8, 2), (8, 1)
-    assert [_width(*pair) for pair in given] == [1, 2, 4, 4, 4, 2, 2, 1]
 
 
 @pytest.mark.parametrize("dead, pieces", [(1.3, 1), (1.3, 4), (2.6, 2), (3.4, 4)])
@@ -276,9 +267,9 @@ def test_steps_of_a_cycle_hold_what_the_cycle_does(dead, pieces):
     """Counts of bins, who is armed, and everybody comes back a dead time later, in the piece that it ends in."""
     rate = rates(5, 2)
     bins = torch.tensor(dead, dtype=torch.float64)
-    steps, cycle = _steps(rate, bins, pieces), cycle_of_rows(rate, bins, pieces)
+    steps, cycle = _cycle_steps(rate, bins, pieces), cycle_means(rate, bins, pieces)
     wider = pieces // steps.pieces
-    torch.testing.assert_close(_bins(steps.count, steps.pieces), cycle.count.view(2, 5, pieces).sum(-1))
+    torch.testing.assert_close(_sum_pieces(steps.count, steps.pieces), cycle.count.view(2, 5, pieces).sum(-1))
     torch.testing.assert_close(steps.armed.squeeze(-1).T, cycle.armed[:, ::wider])
     back = torch.zeros(2, 5 * pieces // wider, dtype=torch.float64)
     for j in range(5 * pieces):
@@ -305,4 +296,4 @@ def test_power_series_of_a_bin(part):
                                  (slope, exact.hit_slope, exact.slope)):  # fmt: skip
         torch.testing.assert_close(found[order], wanted[0], rtol=1e-10, atol=1e-12)
         torch.testing.assert_close(found[4], armed[0], rtol=1e-10, atol=1e-12)
-    assert degree_of(0.25) == next(d for d in range(3, 40) if 0.25**d / math.factorial(d) <= 1e-15)
+    assert series_degree(0.25) == next(d for d in range(3, 40) if 0.25**d / math.factorial(d) <= 1e-15)

@@ -9,11 +9,16 @@ from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing import ScoreFunction, SynchronousSPAD, coates, first_photon_log_prob, sample_detections
-from torchtransient.sensing.dead_time import dead_time_inverse
-from torchtransient.sensing.dead_time.dead_time_cycle import detected_rows
-from torchtransient.sensing.dead_time.dead_time_means import detected_columns
-from torchtransient.sensing.spad.spad import detections_with_dead_time
+from torchtransient.sensing import (
+    ScoreFunction,
+    SynchronousSPAD,
+    coates,
+    detections_with_dead_time,
+    first_photon_log_prob,
+    sample_detections,
+)
+from torchtransient.sensing.dead_time import clocked_counts
+from torchtransient.sensing.dead_time.clocked import mean_detections, mean_detections_in_steps
 
 BINS = 24
 WIDTH_S = 1e-10
@@ -157,7 +162,7 @@ def test_the_walk_is_the_recursion_in_steps(dead):
     weights = torch.randn(23, 9, generator=torch.Generator().manual_seed(2)).double()
     d = torch.tensor(dead, dtype=torch.float64)
     found = []
-    for solve in (lambda v: detected_columns(v, d), lambda v: detected_rows(v.T, d).T):
+    for solve in (lambda v: mean_detections(v, d), lambda v: mean_detections_in_steps(v.T, d).T):
         leaf = x.double().requires_grad_()
         y = solve(leaf)
         found.append((y.detach(), *torch.autograd.grad((y * weights).sum(), leaf)))
@@ -249,7 +254,7 @@ def test_more_detections_than_cycles_leave_none_armed():
     """As noise has them: in the next bin those can fire that come back."""
     counts = torch.tensor([[13.0, 5.0, 1.0]], dtype=torch.float64)
     for dead, back in ((1.0, 13.0), (1.0 - 1e-10, 13.0), (2.0, 0.0)):
-        here = dead_time_inverse._walked(counts, 10, dead)[0]
+        here = clocked_counts._invert_rows(counts, 10, dead)[0]
         assert float(here.armed[0, 1]) == 0.0
         assert float(here.cycles[0, 1]) == pytest.approx(back, abs=1e-8)
         assert 0 <= float(here.part) < 1e-12
@@ -284,9 +289,9 @@ def test_slopes_of_estimates_where_nothing_was_detected(dead):
 def test_in_a_flood_coates_looks_no_closer(monkeypatch):
     """What uncut bins miss is asked for rates of 30 a bin at most, and is a tenth of the counts at most."""
     asked, given = [], []
-    means, walked = dead_time_inverse.detected_columns, dead_time_inverse._walked
-    monkeypatch.setattr(dead_time_inverse, "detected_columns", lambda r, d: asked.append(r) or means(r, d))
-    monkeypatch.setattr(dead_time_inverse, "_walked", lambda c, *rest: given.append(c) or walked(c, *rest))
+    means, walked = clocked_counts.mean_detections, clocked_counts._invert_rows
+    monkeypatch.setattr(clocked_counts, "mean_detections", lambda r, d: asked.append(r) or means(r, d))
+    monkeypatch.setattr(clocked_counts, "_invert_rows", lambda c, *rest: given.append(c) or walked(c, *rest))
     counts = spad(1.3, 1000)(image([0.5, 70.0, 90.0, 40.0, 3.0]))
     rate = coates(counts, 1000, 1.3).rate.flatten()
     assert float(rate.max()) > 30 and max(float(r.max()) for r in asked) == 30.0

@@ -10,21 +10,26 @@ import torch
 from torch import distributions
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.dead_time import free_running_draws as draws
-from torchtransient.sensing.dead_time.dead_time_draws import _steps, draw_cycles, score_of_cycles
-from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles
-from torchtransient.sensing.dead_time.free_running_events import begin_places
-from torchtransient.sensing.dead_time.free_running_state import (
+from torchtransient.sensing.dead_time import clocked_counts as draws
+from torchtransient.sensing.dead_time.clocked_counts import (
+    _cycle_steps,
+    armed_time,
+    check_cycles,
+    cycles_log_prob,
+    draw_cycle_steps,
+)
+from torchtransient.sensing.dead_time.free_running import (
     FreeRunningState,
     _armed_in_the_light,
-    _settled,
-    _solved,
-    per_period,
+    _solve_cut,
+    _solve_settled,
+    clamped_state,
+    detections_per_period,
+    first_armed,
     stationary_state,
-    within_limits,
+    stationary_steps,
 )
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
-from torchtransient.sensing.dead_time.stationary_phases import stationary_phases
+from torchtransient.sensing.dead_time.renewal import RenewalChain, stationary_phases
 
 BINS, PERIODS = 5, 40
 
@@ -41,12 +46,12 @@ def number(x):
     return torch.tensor(x, dtype=torch.float64)
 
 
-def of_free_running(rate, dead):
+def free_running_steps(rate, dead):
     """Chances (T, P, 1) of a detector that runs free."""
     state = stationary_state(rate, number(dead))
     columns = [v.T.unsqueeze(-1) for v in (rate, state.detected, state.armed, state.late)]
     placed = type(state)(columns[1], columns[2], columns[3], state.whole)
-    return draws.bin_chances(columns[0], placed)
+    return stationary_steps(columns[0], placed)
 
 
 def mean_of(many, chance, generator):
@@ -72,11 +77,11 @@ def steps_by_distributions(path, chances, periods):
 def test_scores_of_detectors_that_run_free(dead):
     """Derivatives of the log-probability of the steps, beginning included; nobody is lost on the way."""
     rate = rates().requires_grad_()
-    chances = of_free_running(rate, dead)
+    chances = free_running_steps(rate, dead)
     with torch.no_grad():
-        path = draws.draw_path(chances, PERIODS, generator())
+        path = draws.draw_steps(chances, PERIODS, generator())
     weights = number([1.0, 2.0, -0.5]).unsqueeze(-1)
-    found = (draws.path_log_prob(path, chances, PERIODS) * weights).sum()
+    found = (draws.steps_log_prob(path, chances, PERIODS) * weights).sum()
     wanted = (steps_by_distributions(path, chances, PERIODS) * weights).sum()
     slopes = [torch.autograd.grad(v, rate, retain_graph=True)[0] for v in (found, wanted)]
     torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-7, atol=1e-7)
@@ -96,13 +101,13 @@ def test_scores_of_detectors_that_run_free(dead):
 @pytest.mark.parametrize("dead", [0.6, 1.3, 3.0])
 def test_scores_of_cycles(dead):
     rate = rates(3, 2.0).requires_grad_()
-    counts, drawn = draw_cycles(rate, number(dead), PERIODS, generator())
+    counts, drawn = draw_cycle_steps(rate, number(dead), PERIODS, generator())
     assert sum(len(one.rows) if one.rows is not None else 3 for one in drawn) == 3
-    found = score_of_cycles(drawn, rate, number(dead), PERIODS)
+    found = cycles_log_prob(drawn, rate, number(dead), PERIODS)
     wanted = torch.zeros(3, dtype=torch.float64)
     for one in drawn:
         rows = torch.arange(3) if one.rows is None else one.rows
-        chances = _steps(rate[rows], number(dead), one.pieces).chances
+        chances = _cycle_steps(rate[rows], number(dead), one.pieces).chances
         wanted = wanted.index_copy(0, rows, steps_by_distributions(one.path, chances, PERIODS).flatten())
     weights = number([1.0, 2.0, -0.5])
     slopes = [torch.autograd.grad((v * weights).sum(), rate, retain_graph=True)[0] for v in (found, wanted)]
@@ -115,42 +120,22 @@ def test_the_mean_of_all_steps_is_the_mean(dead):
     """Each step taken by its share: detections, those that come back, those that are armed."""
     rate = rates(3, 2.0)
     for pieces in (2, 4):
-        steps = _steps(rate, number(dead), pieces)
-        path = draws.draw_path(steps.chances, 1, None, draw=mean_of)
+        steps = _cycle_steps(rate, number(dead), pieces)
+        path = draws.draw_steps(steps.chances, 1, None, draw=mean_of)
         torch.testing.assert_close(path.counts, steps.count)
         torch.testing.assert_close(path.back, steps.back)
         torch.testing.assert_close(path.armed, steps.armed, rtol=1e-5, atol=1e-7)
         torch.testing.assert_close(path.end + path.wrapped.sum(-3), torch.ones(3, 1).double())
-    chances = of_free_running(rates(), max(dead, 1.0))
-    begin = draws.BinChances(None, chances.fire, chances.soon, chances.late, chances.whole)
-    assert torch.equal(draws.draw_path(begin, 7, None, draw=mean_of).armed[0], torch.full((3, 1), 7.0).double())
-
-
-def test_shares_by_hand():
-    found = draws.share(number([1.0, 3.0, 0.0, -1.0, 5.0, 1e-14]), number([4.0, 4.0, 0.0, 2.0, 4.0, 1e-14]))
-    assert found.tolist() == [0.25, 0.75, 0.0, 0.0, 1.0, 0.0]
-    # armed 0.5 of which 0.4 fire, 0.3 come back: of 0.26 detections 0.06 are theirs; of 0.1 or 0.6 one chance for both
-    fire, detected = number([0.4, 0.4, 0.4]), number([0.26, 0.1, 0.6])
-    shares = draws.step_shares(fire, detected, number([0.5] * 3), number([0.3] * 3))
-    assert shares[0].tolist() == pytest.approx([0.4, 0.1 / 0.8, 0.6 / 0.8])
-    assert shares[1].tolist() == pytest.approx([0.2, 0.1 / 0.8, 0.6 / 0.8])
-    ends = draws.step_shares(fire[:2], number([0.2, 0.5]), number([0.5] * 2), number([0.3] * 2))
-    assert ends[0].tolist() == pytest.approx([0.4, 0.4]) and ends[1].tolist() == pytest.approx([0.0, 1.0])
-
-
-def test_normal_steps():
-    """n p and the root of n p (1 - p), of numbers below zero the mean alone."""
-    many, chance = number([100.0, 40.0, -3.0]), number([0.2, 0.5, 0.5])
-    z = torch.randn(3, dtype=torch.float64, generator=generator())
-    found = draws.normal_share(many, chance, generator())
-    assert found.tolist() == pytest.approx([20 + 4 * float(z[0]), 20 + math.sqrt(10) * float(z[1]), -1.5])
+    chances = free_running_steps(rates(), max(dead, 1.0))
+    begin = draws.StepProbabilities(None, chances.fire, chances.soon, chances.late, chances.whole)
+    assert torch.equal(draws.draw_steps(begin, 7, None, draw=mean_of).armed[0], torch.full((3, 1), 7.0).double())
 
 
 @pytest.mark.parametrize("dead", [1.3, 2.0, 6.4])
 def test_a_state_from_finer_pieces_is_the_same(dead):
     """Bins of dim light, whole or cut: detected, armed and late ones agree to the third order of their photons."""
     rate = rates(2, 0.2)
-    coarse, *others = (_solved(rate, number(dead), pieces) for pieces in (1, 2, 3, 4))
+    coarse, *others = (_solve_cut(rate, number(dead), pieces) for pieces in (1, 2, 3, 4))
     for finer in others:
         assert finer.whole == coarse.whole == math.floor(dead)
         for name in ("detected", "armed", "late"):
@@ -162,10 +147,10 @@ def test_places_where_detectors_begin(whole, part):
     """Armed with the chance that the state has; else after what is left of a dead time that began in its light."""
     many, rate = 40_000, rates(1, 1.2, 4)
     chain = RenewalChain(rate, whole, number(part))
-    lines = per_period(chain, stationary_phases(rate, number(part), whole))
+    lines = detections_per_period(chain, stationary_phases(rate, number(part), whole))
     several = RenewalChain(rate.expand(many, -1), whole, number(part))
-    state = within_limits(several, lines.expand(many, -1))
-    start = begin_places(state, number(part), generator()).flatten().numpy()
+    state = clamped_state(several, lines.expand(many, -1))
+    start = first_armed(state, number(part), generator()).flatten().numpy()
     armed = float(chain.at_start(chain.inflow(lines))[0, 0])
     assert np.mean(start == 0) == pytest.approx(armed, abs=5 * math.sqrt(armed * (1 - armed) / many))
     # a detection at time t < 0 arms again at t + dead: light of the last dead time, seen backwards
@@ -191,7 +176,7 @@ def test_lines_that_dip_below_zero_are_drawn_from_within_limits():
     late = 0.6 * count + math.sqrt(3) * 0.4 * 0.6 * slope
     armed = chain.at_start(chain.inflow(lines))
     assert float(armed.min()) < 0 and float(armed.max()) > 1 and float(late[0, 0]) > 0.5 and float(late[0, 2]) < 0
-    state = within_limits(chain, lines)
+    state = clamped_state(chain, lines)
     assert state.detected.tolist() == [[0.5, 0.0, 0.3, 0.4], [9.0, 8.0, 0.0, 7.0]] and state.whole == 1
     assert state.late.flatten().tolist() == pytest.approx([0.5, 0.0, 0.0, 0.24, 5.4, 4.8, 0.0, 4.2])
     assert torch.equal(state.armed, armed.clamp(0, 1))
@@ -202,7 +187,7 @@ def test_lines_that_dip_below_zero_are_drawn_from_within_limits():
 def test_stationary_states_in_bright_light_are_within_limits(dead):
     """Straight lines miss the edges of bins by up to a third of what is in them; no number of a state does."""
     rate = 10 ** (4 * torch.rand(40, 6, generator=generator(), dtype=torch.float64) - 2)
-    bare, state = _settled(rate, number(dead), 1), stationary_state(rate, number(dead))
+    bare, state = _solve_settled(rate, number(dead), 1), stationary_state(rate, number(dead))
     assert float(bare.armed.min()) < 0
     assert bool((state.detected >= 0).all() & (state.late >= 0).all() & (state.late <= state.detected).all())
     assert bool((state.armed >= 0).all() & (state.armed <= 1).all())
@@ -242,7 +227,7 @@ def test_detectors_that_nothing_of_the_period_before_keeps_dead_begin_armed():
     count = number([[0.6, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.9]])
     state = FreeRunningState(count, number([[0.0, 1, 1, 1], [0.0, 0.5, 1, 1]]), 0 * count, 1)
     for seed in range(5):
-        start = begin_places(state, number(0.4), generator(seed)).flatten()
+        start = first_armed(state, number(0.4), generator(seed)).flatten()
         # the detection of the last piece lay in its first 0.6, and is felt for 1.4 pieces
         assert float(start[0]) == 0.0 and 0 < float(start[1]) <= 1.0
 
@@ -275,16 +260,16 @@ def test_short_stays_saturate_less():
     time = armed_time(number([8.0, 0.0, 0.0]).reshape(1, 3, 1, 1), 8, 1.0)
     for r in (0.01, 0.1, 0.4):
         rate = torch.full((1, 3, 1, 1), r, dtype=torch.float64).requires_grad_()
-        (slope,) = torch.autograd.grad(time.sooner(rate).sum(), rate)
+        (slope,) = torch.autograd.grad(time.short_exposures(rate).sum(), rate)
         fired = 1 - (1 - math.exp(-r)) / r
         rise = 8 * (fired / (1 - math.exp(-r)) - 0.5)
         assert float(slope[0, 1]) == pytest.approx(rise, rel=r / 6 + 1e-4)
         assert float(slope[0, 2]) == pytest.approx(0.0, abs=1e-12)
     flood = torch.full((1, 3, 1, 1), 1e7, dtype=torch.float64).requires_grad_()
-    (slope,) = torch.autograd.grad(time.sooner(flood).sum(), flood)
+    (slope,) = torch.autograd.grad(time.short_exposures(flood).sum(), flood)
     assert float(slope[0, 1]) == pytest.approx(8 * 0.5, rel=1e-5)
     dark = torch.zeros(1, 3, 1, 1, dtype=torch.float64)
-    assert not bool(time.sooner(dark).any())
+    assert not bool(time.short_exposures(dark).any())
 
 
 def test_cycles_that_are_left():

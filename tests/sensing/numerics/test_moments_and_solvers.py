@@ -8,11 +8,14 @@ import mpmath
 import pytest
 import torch
 
-from torchtransient.sensing.dead_time.constant_light import ConstantLight
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
-from torchtransient.sensing.numerics.exponential_moments import _weights, moments, second_moment
-from torchtransient.sensing.numerics.krylov import gmres
-from torchtransient.sensing.numerics.running_sums import sum_before
+from torchtransient.sensing.dead_time.renewal import (
+    ConstantLight,
+    RenewalChain,
+    gmres,
+    moments,
+    second_moment,
+)
+from torchtransient.sensing.numerics.time_convolution import sum_before
 
 BELOW = math.nextafter(1.0, 0.0)
 SMALL = [0.0, 1e-12, 1e-3, 0.4, BELOW, 1.0]
@@ -64,13 +67,6 @@ def test_moments_and_their_slopes(values, largest):
     close(second_moment(x).detach(), [decayed(2, v) for v in values], 1e-14)
     (slope,) = torch.autograd.grad(second_moment(x).sum(), x)
     close(slope, [-decayed(3, v) for v in values], 2e-12)
-
-
-def test_series_are_as_long_as_their_rates_need():
-    """In the dark three derivatives; terms below 1e-19 are left out; nothing at all has no moments."""
-    assert _weights(0.0) == pytest.approx([1 / 3, 1 / 8, 1 / 30, 1 / 144], rel=1e-15)
-    assert [len(_weights(x)) for x in (1e-3, 0.1, 1.0)] == [8, 13, 20]
-    assert all(v.shape == (0,) for v in moments(torch.zeros(0, dtype=torch.float64)).hit)
 
 
 # ------------------------------------------------------------------------------------------------------------ solvers

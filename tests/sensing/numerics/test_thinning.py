@@ -9,8 +9,7 @@ from scipy import stats
 
 from support.sweeps import together
 from torchtransient.errors import UnitError
-from torchtransient.sensing.numerics.binomial_tables import LagTable
-from torchtransient.sensing.numerics.thinning import add_passing, halve, thin
+from torchtransient.sensing.numerics.draws import LagTable, add_passing, halve, thin
 
 DRAWS = 25_000
 

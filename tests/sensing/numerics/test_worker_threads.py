@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from torchtransient import sensing
-from torchtransient.sensing.numerics import worker_threads
-from torchtransient.sensing.numerics.worker_threads import side_by_side
+from torchtransient.sensing.numerics import draws
+from torchtransient.sensing.numerics.draws import parallel_map
 
 
 @pytest.fixture(params=[1, 2, 3])
@@ -29,17 +29,17 @@ def of_thread(_):
 
 
 def nested(_):
-    return sum(side_by_side(of_thread, range(3)))
+    return sum(parallel_map(of_thread, range(3)))
 
 
 def test_threads_beside_others_work_alone(threads):
-    assert side_by_side(of_thread, range(4)) == [1] * 4
+    assert parallel_map(of_thread, range(4)) == [1] * 4
     assert torch.get_num_threads() == threads
-    assert side_by_side(lambda a, b: a - b, [5, 7], [1, 2]) == [4, 5]
+    assert parallel_map(lambda a, b: a - b, [5, 7], [1, 2]) == [4, 5]
 
 
 def test_threads_may_ask_for_threads(threads):
-    assert side_by_side(nested, range(8)) == [3] * 8
+    assert parallel_map(nested, range(8)) == [3] * 8
 
 
 def test_what_fails_in_a_thread_fails_outside(threads):
@@ -47,17 +47,17 @@ def test_what_fails_in_a_thread_fails_outside(threads):
         raise KeyError(k)
 
     with pytest.raises(KeyError):
-        side_by_side(fail, range(4))
-    assert side_by_side(of_thread, range(2)) == [1] * 2
+        parallel_map(fail, range(4))
+    assert parallel_map(of_thread, range(2)) == [1] * 2
 
 
 def _in_child(queue):
-    queue.put(side_by_side(of_thread, range(2)))
+    queue.put(parallel_map(of_thread, range(2)))
 
 
 @pytest.mark.slow
 def test_forks_begin_anew(threads):
-    side_by_side(of_thread, range(4))
+    parallel_map(of_thread, range(4))
     context = multiprocessing.get_context("fork")
     queue = context.SimpleQueue()
     child = context.Process(target=_in_child, args=(queue,))
@@ -75,12 +75,12 @@ def modes(_):
 
 
 def test_threads_are_in_the_mode_of_the_caller(threads):
-    assert side_by_side(modes, range(4)) == [(False, True)] * 4
+    assert parallel_map(modes, range(4)) == [(False, True)] * 4
     with torch.no_grad():
-        assert side_by_side(modes, range(4)) == [(False, False)] * 4
+        assert parallel_map(modes, range(4)) == [(False, False)] * 4
     with torch.inference_mode():
-        assert side_by_side(modes, range(4)) == [(True, False)] * 4
-    assert side_by_side(modes, range(4)) == [(False, True)] * 4
+        assert parallel_map(modes, range(4)) == [(True, False)] * 4
+    assert parallel_map(modes, range(4)) == [(False, True)] * 4
 
 
 @pytest.mark.slow
@@ -102,7 +102,7 @@ def test_large_images_are_drawn_in_inference_mode(threads, sensor):
 def test_where_no_thread_can_be_had_the_caller_does_it_all(monkeypatch):
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    monkeypatch.setattr(worker_threads, "_POOLS", {})
+    monkeypatch.setattr(draws, "_POOLS", {})
     start, started = threading.Thread.start, []
 
     def only_one(thread):
@@ -113,31 +113,31 @@ def test_where_no_thread_can_be_had_the_caller_does_it_all(monkeypatch):
 
     monkeypatch.setattr(threading.Thread, "start", only_one)
     try:
-        assert side_by_side(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
+        assert parallel_map(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
-    assert not worker_threads._POOLS
+    assert not draws._POOLS
 
 
 _AT_THE_END = """
 import atexit, sys, threading
 import torch
 torch.set_num_threads(2)
-from torchtransient.sensing.numerics.worker_threads import side_by_side
-assert side_by_side(int, "12") == [1, 2]
+from torchtransient.sensing.numerics.draws import parallel_map
+assert parallel_map(int, "12") == [1, 2]
 def late():
     threading.main_thread().join()
-    print(side_by_side(int, "34"), flush=True)
+    print(parallel_map(int, "34"), flush=True)
 threading.Thread(target=late).start()
-atexit.register(lambda: print(side_by_side(int, "56"), flush=True))
+atexit.register(lambda: print(parallel_map(int, "56"), flush=True))
 """
 
 
 def test_no_thread_takes_a_job_at_the_end(threads, monkeypatch):
-    side_by_side(of_thread, range(4))
+    parallel_map(of_thread, range(4))
     monkeypatch.setattr(concurrent.futures.thread, "_shutdown", True)
-    assert side_by_side(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
+    assert parallel_map(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
 
 
 @pytest.mark.slow

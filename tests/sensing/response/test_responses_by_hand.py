@@ -11,7 +11,7 @@ from scipy import stats
 
 from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.correlated_noise.afterpulse_delays import exponential_kernel, exponential_shares
+from torchtransient.sensing.correlated_noise.afterpulsing import exponential_kernel, exponential_shares
 from torchtransient.sensing.counts.moved_counts import Moves, move_counts, shifted
 from torchtransient.sensing.estimation.cramer_rao import shares_between
 from torchtransient.sensing.response import response_shapes as shapes

@@ -17,8 +17,7 @@ from torchtransient.sensing import (
     nonparalyzable_histogram,
     paralyzable_histogram,
 )
-from torchtransient.sensing.dead_time.renewal_chain import RenewalChain
-from torchtransient.sensing.numerics.krylov import gmres
+from torchtransient.sensing.dead_time.renewal import RenewalChain, gmres
 
 BINS = 64
 

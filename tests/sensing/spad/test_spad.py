@@ -21,9 +21,9 @@ from torchtransient.sensing import (
     first_photon_probabilities,
     sample_detections,
 )
-from torchtransient.sensing.dead_time.dead_time_inverse import armed_time
+from torchtransient.sensing.dead_time.clocked_counts import armed_time
 from torchtransient.sensing.numerics.draws import fast_poisson, sample_first_photons, sample_multinomial
-from torchtransient.sensing.numerics.running_sums import sum_before
+from torchtransient.sensing.numerics.time_convolution import sum_before
 
 BINS = 48
 
@@ -353,6 +353,6 @@ def test_probability_of_more_counts_than_were_armed_on_average():
     counts, rate = (as_image(torch.tensor(v, dtype=torch.float64)) for v in ([60.0, 50.0, 3.0], [0.9, 0.8, 0.1]))
     both = [first_photon_log_prob(counts, rate, 100, dead_bins=1.5, constant=c).flatten() for c in (True, False)]
     # 40 are armed, and of the 60 a quarter comes back for a quarter of the bin
-    sooner = float(armed_time(counts, 100, 1.5).sooner(rate).flatten()[1])
+    sooner = float(armed_time(counts, 100, 1.5).short_exposures(rate).flatten()[1])
     assert float(both[0][1]) == pytest.approx(50 * math.log(-math.expm1(-0.8)) - sooner)
     assert float(both[0][1]) == float(both[1][1]) and float(both[0][0]) != float(both[1][0])

@@ -106,8 +106,6 @@ CALLS = {
     # ------------------------------------------------------------------------------------------------- functions
     "add_afterpulses": ({"counts": COUNTS, "probability": number(0.1), "kernel": 0.1 * rand(12)}, {}),
     "add_crosstalk": ({"counts": COUNTS, "probability": number(0.1), "diagonal": number(0.02)}, {}),
-    "afterpulse_kernel": (
-        {"tau_s": number(1e-9), "dead_time_s": number(1e-10), "bin_width_s": number(1e-10)}, {"period_bins": 12}),
     "ambient_photon_rate": (
         {"albedo": rand(2, 3), "spectral_irradiance_w_m2_nm": number(1.3), "filter_bandwidth_m": number(1e-8),
          "wavelength_m": number(7e-7), "illumination": rand(2, 3)}, {"optics": OPTICS}),

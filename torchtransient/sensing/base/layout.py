@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from torchtransient.axes import WIDEST_BIN_S, TimeAxis
-from torchtransient.checks import MOST, as_number, as_whole, shown, unit_of
+from torchtransient.checks import MOST, as_number, as_whole, is_one_of, shown, unit_of
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import product as product
 from torchtransient.floating import without_autocast as without_autocast
@@ -165,6 +165,13 @@ def check_count(value: float, name: str, where: str, *, low: int = 1, most: int 
         limit = "2^63 - 1" if most == MOST else most
         raise UnitError(f"{where}: expected {name} to be a whole number of at most {limit}, got {shown(value)}.")
     return whole
+
+
+def check_choice(value: str, choices: object, name: str, where: str) -> None:
+    """ArgumentError unless `value` is one of the strings of a Literal type."""
+    allowed = get_args(choices)
+    if not is_one_of(value, allowed):
+        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {shown(value)}.")
 
 
 def check_one_of(where: str, given: Mapping[str, Any]) -> None:

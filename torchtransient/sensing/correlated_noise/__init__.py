@@ -1,1 +1,1 @@
-"""Detections that others caused: afterpulses and crosstalk."""
+"""Correlated noise: afterpulsing on counts and in the detector, optical crosstalk."""

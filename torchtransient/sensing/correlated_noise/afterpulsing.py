@@ -1,4 +1,12 @@
-"""Afterpulses: detections triggered by carriers that an earlier one left behind. And maps of hot pixels."""
+"""Afterpulses on counts: detections triggered by carriers that an earlier one left behind, and laws of their delays.
+
+Delays of afterpulses count from the detection. A carrier that is released while the detector is dead makes no
+detection: laws of delays are cut off at the dead time. Time is in bins; a detection is spread evenly over its bin.
+
+Sources: several exponentials: Cova, Lacaita, Ripamonti, Trapping phenomena in avalanche photodiodes on nanosecond scale
+(IEEE EDL 1991). Power law: Itzler, Jiang, Entwistle, Power law temporal dependence of InGaAs/InP SPAD afterpulsing
+(Journal of Modern Optics 2012).
+"""
 
 from __future__ import annotations
 
@@ -10,14 +18,14 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import MOST_MADE, Numbers, as_number, shown
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.floating import in_single
+from torchtransient.floating import in_single, number_tensor
 from torchtransient.sensing.base.given import numbers_of
 from torchtransient.sensing.base.layout import (
     TIME,
     bin_width_of,
-    check_count,
+    check_choice,
     check_number,
     check_seconds,
     check_transient,
@@ -27,41 +35,294 @@ from torchtransient.sensing.base.layout import (
 from torchtransient.sensing.base.pixel_maps import check_map, keep_map, kept_map, over_time
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.remembered import remembered
-from torchtransient.sensing.correlated_noise.afterpulse_delays import (
-    AfterpulseDelays,
-    exponential_kernel,
-    exponential_shares,
-)
+from torchtransient.sensing.base.sensor import PhysicalModule
 from torchtransient.sensing.counts.added_counts import AddedCounts
-from torchtransient.sensing.numerics.binomial_tables import LagTable, sixteen_bits
-from torchtransient.sensing.numerics.draws import by_pieces
-from torchtransient.sensing.numerics.thinning import thin
-from torchtransient.sensing.numerics.time_convolution import check_choice, filter_rows
+from torchtransient.sensing.numerics.draws import LagTable, by_pieces, sixteen_bits, thin
+from torchtransient.sensing.numerics.time_convolution import filter_rows
+from torchtransient.sensing.response.response_shapes import above_floor
 
 CountedFrom = Literal["dead_time", "avalanche"]
 
-_BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
+_LONGEST_LAW = 1 << 23  # bins of a law of delays that ends
+_NODES, _WEIGHTS = (
+    (-0.9602898564975363, -0.7966664774136267, -0.5255324099163290, -0.1834346424956498),
+    (0.1012285362903763, 0.2223810344533745, 0.3137066458778873, 0.3626837833783620),
+)  # Gauss-Legendre, 8 points, the lower half
+_ENTRIES = 1 << 17  # at a time, so that temporaries stay in the cache
 _WORTH_TABLE = 1 << 16  # entries, above which the lags of afterpulses are looked up
 _FEW = 1 << 12  # places, below which one slow operation takes less time than several fast ones
 _VALUES = 1 << 16  # of a random number of 16 bits
-_MOST_LAGS = 1 << 14  # bins of a period, above which a table of 2^16 cells says little
+_LONGEST_TABLE = 1 << 14  # bins of a period, above which a table of 2^16 cells says little
 _FINE = 2.0**14  # bins of a period, or of a delay, up to which single precision places afterpulses
 _MOST = 0.5  # afterpulses of a detection
 
 
-def afterpulse_kernel(tau_s: Tensor | float, dead_time_s: float, bin_width_s: float, *, period_bins: int) -> Tensor:
-    """Share of afterpulses k bins after their detection, folded into one period: (period_bins,) float64, sum 1.
+# ------------------------------------------------------------------------------------------------------- laws of delays
 
-    The delay is the dead time plus an exponential time of mean `tau_s` (differentiable); detections are spread evenly
-    over their bins. Bins are integrated exactly, and so are all later periods.
+
+def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: int) -> Tensor:
+    """Share of afterpulses in bins `first`, ... after their detection, (K, number), for delays `tau_bins` (K,)."""
+    tau = tau_bins.unsqueeze(1)
+    k = torch.arange(first - 1, first + number, dtype=torch.float64, device=tau.device)
+    # mean over the bin of the chance that the afterpulse is yet to come: 1 while the detector is dead
+    begin = torch.minimum(k.clamp_min(dead_bins), k + 1)
+    late = tau * torch.exp(-(begin - dead_bins).clamp_min(0) / tau) * -torch.expm1(-(k + 1 - begin) / tau)
+    yet = begin - k + late
+    return yet[:, :-1] - yet[:, 1:]
+
+
+def exponential_kernel(tau_bins: Tensor, dead_bins: float, period_bins: int) -> Tensor:
+    """`exponential_shares` of all bins, folded into one period: (K, period_bins), every sum 1."""
+    start = math.floor(dead_bins)
+    shares = exponential_shares(tau_bins, dead_bins, start, 3 * period_bins).view(-1, 3, period_bins)
+    # two bins are cut by the dead time; those of the third round and all later ones are a geometric series
+    rest = shares[:, 2] / -torch.expm1(-period_bins / tau_bins).unsqueeze(1)
+    return (shares[:, 0] + shares[:, 1] + rest).roll(start % period_bins, -1)
+
+
+class AfterpulseDelays(PhysicalModule):
+    """Law of delays of afterpulses that ends, for `Afterpulsing(probability, dead_time_s=..., delays=law)`.
+
+    Subclasses define `seen`, `mean_yet_to_come`, `draw` and `end_s`.
     """
-    if as_number(tau_s) is None:
-        raise UnitError(f"afterpulse_kernel: expected tau_s as one number of seconds, got {shown(tau_s)}.")
-    dead_time_s = check_seconds(dead_time_s, "dead_time_s", "afterpulse_kernel", high=1.0)
-    bin_width_s = check_seconds(bin_width_s, "bin_width_s", "afterpulse_kernel", open_low=True, high=1.0)
-    period_bins = check_count(period_bins, "period_bins", "afterpulse_kernel", most=MOST_MADE)
-    tau = torch.as_tensor(one_number(tau_s, "tau_s", "afterpulse_kernel"), dtype=torch.float64) / bin_width_s
-    return exponential_kernel(tau.reshape(1), dead_time_s / bin_width_s, period_bins)[0]
+
+    def seen(self, dead_time_s: float) -> Tensor | float:
+        """Share of all carriers that are released after the dead time.
+
+        Args:
+            dead_time_s: dead time in seconds.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has to define seen(dead_time_s).")
+
+    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        """Mean over the bin from `k` to `k` + 1 of the share of afterpulses that is yet to come.
+
+        Args:
+            k: (N,) float64, bins after the detection.
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+
+        Returns:
+            (N,) float64, 1 while the detector is dead.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has to define mean_yet_to_come(k, dead time, bin width).")
+
+    def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
+        """Draw delays beyond the dead time.
+
+        Args:
+            number: of delays.
+            dead_time_s: dead time in seconds.
+            generator: source of randomness.
+
+        Returns:
+            (number,) float64, seconds after the detection.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has to define draw(number, dead time, generator).")
+
+    def end_s(self) -> float:
+        """Longest delay in seconds."""
+        raise NotImplementedError(f"{type(self).__name__} has to define end_s().")
+
+    def shares(self, dead_time_s: float, bin_width_s: float, *, first: int, number: int) -> Tensor:
+        """Share of afterpulses in bins `first`, `first` + 1, ... after their detection.
+
+        Args:
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+            first: first bin.
+            number: of bins.
+
+        Returns:
+            (number,) float64.
+        """
+        device = next((t.device for t in [*self.parameters(), *self.buffers()]), None)
+        k = torch.arange(first - 1, first + number, dtype=torch.float64, device=device)
+        yet = self.mean_yet_to_come(k, dead_time_s, bin_width_s)
+        return yet[:-1] - yet[1:]
+
+    def kernel(self, dead_time_s: float, bin_width_s: float, period_bins: int) -> Tensor:
+        """Shares of all bins, folded into one period.
+
+        Args:
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds.
+            period_bins: period in bins.
+
+        Returns:
+            (period_bins,) float64, sum 1.
+
+        Raises:
+            UnitError: for a law of more than 2^23 bins.
+        """
+        number = math.ceil(self.end_s() / bin_width_s) + 2
+        if number > _LONGEST_LAW:
+            raise UnitError(
+                f"{type(self).__name__}: expected delays of at most {_LONGEST_LAW} bins, got {number} bins of "
+                f"{bin_width_s:g} s. Let the law end earlier, or use wider bins."
+            )
+        shares = self.shares(dead_time_s, bin_width_s, first=0, number=number)
+        rounds = -(-number // period_bins)
+        return torch.nn.functional.pad(shares, (0, rounds * period_bins - number)).view(rounds, period_bins).sum(0)
+
+
+class PowerLawDelays(AfterpulseDelays):
+    """Afterpulses whose rate falls as delay^-exponent, from the end of the dead time to `longest_s`.
+
+    Measured exponents are about 1 to 1.4 (Itzler et al. 2012, InGaAs/InP). The law diverges at delay 0: it needs a dead
+    time above zero, and its `probability` counts what comes after it.
+
+    Args:
+        exponent: in (0, 10].
+        longest_s: longest delay in seconds.
+        learnable: make `log_exponent` a parameter.
+
+    Raises:
+        UnitError: for exponents outside (0, 10].
+    """
+
+    log_exponent: Tensor
+
+    def __init__(self, exponent: float, longest_s: float, *, learnable: bool = False) -> None:
+        super().__init__()
+        value = check_number(exponent, "exponent", "PowerLawDelays", high=10.0, open_low=True)
+        self.longest_s = check_seconds(longest_s, "longest_s", "PowerLawDelays", open_low=True)
+        tensor = torch.tensor(math.log(value), dtype=torch.float64)
+        if learnable:
+            self.register_parameter("log_exponent", nn.Parameter(tensor))
+        else:
+            self.register_buffer("log_exponent", tensor)
+
+    def end_s(self) -> float:
+        return self.longest_s
+
+    def seen(self, dead_time_s: float) -> float:
+        raise UnitError(
+            "PowerLawDelays: expected counted_from='dead_time', got 'avalanche'. The law is infinite at delay 0; give "
+            "the probability of what comes after the dead time."
+        )
+
+    @property
+    def exponent(self) -> Tensor:
+        """Exponent of the law, float64."""
+        return self.log_exponent.double().exp()
+
+    def _limits(self, dead_time_s: float) -> float:
+        """Logarithm of the longest delay over the dead time."""
+        if not 0 < dead_time_s < self.longest_s:
+            raise UnitError(
+                f"PowerLawDelays: expected a dead time above 0 and below longest_s = {self.longest_s:g} s, where the "
+                f"law begins, got {dead_time_s:g} s."
+            )
+        return math.log(self.longest_s / dead_time_s)
+
+    def _growth(self, log_x: Tensor) -> Tensor:
+        """Integral of x^-exponent from 1 on, as a function of log x."""
+        a = 1 - self.exponent
+        flat = a.abs() < 1e-6
+        safe = torch.where(flat, torch.ones_like(a), a)
+        return torch.where(flat, log_x * (1 + a * log_x / 2), torch.expm1(safe * log_x) / safe)
+
+    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        end = self._limits(dead_time_s)
+        total = self._growth(torch.tensor(end, dtype=torch.float64, device=k.device))
+        dead = dead_time_s / bin_width_s
+        begin = torch.minimum(k.clamp_min(dead), k + 1)
+        half, mean = (k + 1 - begin) / 2, torch.zeros_like(k)
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            for side in (-1, 1):
+                log_x = torch.log((begin + half * (1 + side * node)).clamp_min(dead) / dead).clamp_max(end)
+                mean = mean + 0.5 * weight * (1 - self._growth(log_x) / total)
+        return begin - k + 2 * half * mean
+
+    def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
+        end, device = self._limits(dead_time_s), self.log_exponent.device
+        u = torch.rand(number, dtype=torch.float64, device=device, generator=generator)
+        a = 1 - float(self.exponent.detach())
+        if abs(a) < 1e-6:
+            return dead_time_s * torch.exp(u * end)
+        return dead_time_s * torch.exp(torch.log1p(u * math.expm1(a * end)) / a)
+
+
+class MeasuredDelays(AfterpulseDelays):
+    """Delays by a measured histogram, counts spread evenly over their bins.
+
+    Args:
+        counts: (K,) counts >= 0.
+        bin_width_s: width of its bins in seconds.
+        start_s: delay at which the first bin begins, in seconds.
+        floor: counts of a bin that are no afterpulses (dark counts), taken off; True: the median of all bins.
+
+    Raises:
+        ShapeError: for counts that are not (K,).
+        UnitError: for counts that are negative, not finite, or all below the floor.
+    """
+
+    share_of_bins: Tensor
+
+    def __init__(self, counts: Tensor, bin_width_s: float, *, start_s: float = 0.0, floor: float | bool = 0.0) -> None:
+        super().__init__()
+        where = "MeasuredDelays"
+        counts = number_tensor(counts, f"{where}: expected counts (K,) of a histogram of delays")
+        if counts.ndim != 1 or counts.numel() == 0:
+            raise ShapeError(f"{where}: expected counts (K,) of a histogram of delays, got {tuple(counts.shape)}.")
+        numbers = counts.detach().double()
+        if not bool((numbers >= 0).all()) or not bool(torch.isfinite(numbers).all()):
+            raise UnitError(f"{where}: expected finite counts >= 0. Look at the measurement.")
+        shares = above_floor(numbers, floor, where)
+        self.own_width_s = check_seconds(bin_width_s, "bin_width_s", where, open_low=True)
+        self.start_s = check_seconds(start_s, "start_s", where)
+        self.register_buffer("share_of_bins", shares)
+
+    def end_s(self) -> float:
+        return self.start_s + self.share_of_bins.numel() * self.own_width_s
+
+    def seen(self, dead_time_s: float) -> float:
+        place = (dead_time_s - self.start_s) / self.own_width_s
+        whole = min(max(math.floor(place), 0), self.share_of_bins.numel() - 1)
+        part = min(max(place - whole, 0.0), 1.0)
+        shares = self.share_of_bins.double()
+        left = 1 - float(shares[:whole].sum() + part * shares[whole])
+        if left <= 0:
+            raise UnitError(
+                f"MeasuredDelays: expected delays beyond the dead time of {dead_time_s:g} s, but the histogram ends at "
+                f"{self.end_s():g} s with nothing left. Measure for longer."
+            )
+        return left
+
+    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        shares, left = self.share_of_bins.double(), self.seen(dead_time_s)
+        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        # integral over delays of what is yet to come, in own bins, a parabola in each
+        sums = torch.cat([yet.new_zeros(1), (0.5 * (yet[:-1] + yet[1:])).cumsum(0)])
+        dead = dead_time_s / bin_width_s
+
+        def integral(place: Tensor) -> Tensor:
+            own = (place * bin_width_s - self.start_s) / self.own_width_s
+            inside = own.clamp(0, shares.numel())
+            whole = inside.floor().clamp_max(shares.numel() - 1).long()
+            part = inside - whole
+            curve = sums[whole] + part * yet[whole] - 0.5 * part**2 * shares[whole]
+            return (curve + own.clamp_max(0)) * (self.own_width_s / bin_width_s)
+
+        begin = torch.minimum(k.clamp_min(dead), k + 1)
+        return begin - k + (integral(k + 1) - integral(begin)) / left
+
+    def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
+        # from the end on: what is yet to come is above 0 and at most all, which ends in a bin that holds something
+        shares = self.share_of_bins.double().flip(0)
+        sums = shares.cumsum(0)
+        u = torch.rand(number, dtype=torch.float64, device=shares.device, generator=generator)
+        yet = self.seen(dead_time_s) * (1 - u) * sums[-1]
+        later = torch.searchsorted(sums, yet)
+        place = shares.numel() - 1 - later + (sums[later] - yet) / shares[later]
+        return (self.start_s + place * self.own_width_s).clamp_min(dead_time_s)
+
+    def extra_repr(self) -> str:
+        return f"bins={self.share_of_bins.numel()}, bin_width_s={self.own_width_s:g}, start_s={self.start_s:g}"
+
+
+# ---------------------------------------------------------------------------------------------------------- afterpulses
 
 
 @in_single
@@ -74,10 +335,22 @@ def add_afterpulses(
 ) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
-    `counts`: (..., C, T, H, W); `kernel`: (P,) with P >= T, from `afterpulse_kernel` (or `Afterpulsing.kernel`, which
-    has the probability in it); the window is the first T bins of a period of P. Afterpulses outside the window are
-    lost. With P = T sums grow by 1/(1 - probability) exactly.
-    Differentiable in all three. Computed in float64 by FFT round the period; dtype and device of `counts` are kept.
+    The window is the first T bins of a period of P; afterpulses outside of it are lost. With P = T sums grow by 1/(1 -
+    probability) exactly. Computed in float64 by FFT round the period; differentiable in all three tensors.
+
+    Args:
+        counts: (..., C, T, H, W).
+        probability: afterpulses of a detection.
+        kernel: (P,), P >= T, afterpulses k bins after their detection, up to the factor `probability`. That of
+            `Afterpulsing.kernel` includes the probability.
+        only_added: return the afterpulses alone.
+
+    Returns:
+        Shape, dtype and device of `counts`.
+
+    Raises:
+        ShapeError: for a kernel that is not (P,).
+        UnitError: for P < T.
     """
     check_transient(counts, "add_afterpulses")
     (kernel,) = reals("add_afterpulses", kernel=kernel)
@@ -91,7 +364,7 @@ def add_afterpulses(
 
 
 def _gain(probability: Tensor | float, kernel: Tensor, bins: int) -> tuple[Tensor, int]:
-    """Transfer function from detections to all afterpulses, and its length."""
+    """Transfer function from detections to all generations of afterpulses, and its length."""
     period = kernel.shape[0]
     transfer = probability * torch.fft.rfft(kernel)
     # only what is added is transformed: the detections themselves keep all their digits
@@ -115,33 +388,32 @@ def _check_period(period: int, bins: int) -> None:
         raise UnitError(f"add_afterpulses: expected a period of at least the window of {bins} bins, got {period}.")
 
 
-def _from_outside(kernel: Tensor, bins: int) -> Tensor:
-    window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
-    total = kernel.sum() / (1 - kernel.sum())
-    return (total - add_afterpulses(window, 1.0, kernel, only_added=True)).clamp_min(0).flatten()
-
-
 class Afterpulsing(AddedCounts):
-    """Every detection triggers others later: with `probability`, one dead time plus a random time after it.
+    """Afterpulses on counts, behind the SPAD: every detection triggers others one dead time plus a random time later.
 
-    `probability` and `tau_s`: numbers, or one each of several exponentials (carriers of several traps; probabilities
-    add up); mean delays `tau_s` are counted from the end of the dead time on, since exponentials have no memory.
-    `delays`: another law instead, `PowerLawDelays` or `MeasuredDelays`, cut off at the dead time. Probabilities are
-    those of afterpulses after the dead time, as data sheets give them; with `counted_from` "avalanche" those of all
-    carriers, of which those that are set free during the dead time are not seen.
+    The histogram is taken round the laser period: afterpulses of one cycle fall into later ones, constant light stays
+    constant. Dead time is not applied to the afterpulses themselves, nor do they keep photons from being seen: right in
+    dim light (`AfterpulsingSPAD` for the rest). A period longer than the window has counts outside of it, whose
+    afterpulses fall into the window: `background` stands for them.
 
-    Works on counts, behind the SPAD. The histogram is taken round the laser period (`period_s`, by default the window):
-    afterpulses of one cycle fall into later ones, constant light stays constant. Dead time is not applied to the
-    afterpulses themselves, nor do they keep photons from being seen: right in dim light (`AfterpulsingSPAD` for the
-    rest).
+    Args:
+        probability: afterpulses of a detection, one number, or one for each of several exponentials (traps).
+        tau_s: mean delays beyond the dead time in seconds, as many; exponentials have no memory.
+        dead_time_s: dead time in seconds, 0 for none.
+        delays: law of delays instead of `tau_s`, cut off at the dead time.
+        counted_from: "dead_time": probabilities of afterpulses after the dead time, as in data sheets; "avalanche": of
+            all carriers, of which those released during the dead time are not seen.
+        axis: time axis, which gives the bin width.
+        bin_width_s: bin width in seconds, without an axis.
+        period_s: laser period in seconds; None: the window.
+        background: constant counts of a bin of the whole exposure outside of the window, a number or (H, W)
+            (`PhotonBudget.background_counts`); 0: the detector is dark or off there.
+        learnable: make `logit_probability` and `log_tau_s` parameters.
+        grad: gradient policy.
 
-    A period that is longer than the window has counts that nobody sees, whose afterpulses do come into the window:
-    `background`, constant counts of a bin of the exposure (a number or a map; `PhotonBudget.background_counts`), is
-    taken to go on outside of it, and constant light then stays constant. 0: the detector is dark or off there.
-
-    `learnable`: `logit_probability`, `log_tau_s`, as long as there are exponentials.
-
-    Raises UnitError for probabilities whose sum is not in (0, 0.5], ShapeError where they and `tau_s` differ in number.
+    Raises:
+        UnitError: for probabilities whose sum is not in (0, 0.5].
+        ShapeError: for probabilities and `tau_s` of different numbers.
     """
 
     logit_probability: Tensor
@@ -188,6 +460,7 @@ class Afterpulsing(AddedCounts):
             self.seen()
 
     def _keep(self, probability: float | Numbers, tau_s: float | Numbers, learnable: bool) -> None:
+        """Check and register probabilities and delays."""
         where = "Afterpulsing"
         chance, tau = numbers_of(probability, "probability", where), numbers_of(tau_s, "tau_s", where)
         several = isinstance(chance, Sequence) and not isinstance(chance, str)
@@ -218,13 +491,21 @@ class Afterpulsing(AddedCounts):
 
     @property
     def tau_s(self) -> Tensor:
-        """Mean delays beyond the dead time, in seconds, float64. UnitError where another law stands for them."""
+        """Mean delays beyond the dead time, in seconds, float64.
+
+        Raises:
+            UnitError: with another law of delays.
+        """
         if self.delays is not None:
             raise UnitError(f"Afterpulsing.tau_s: expected exponentials, but the delays are {self.delays!r}.")
         return self.log_tau_s.double().exp()
 
     def seen(self) -> Tensor:
-        """Afterpulses of a detection after its dead time, by exponential: (K,) float64."""
+        """Afterpulses of a detection after its dead time, by exponential: (K,) float64.
+
+        Raises:
+            UnitError: for learnt probabilities whose sum is above 0.5.
+        """
         p = self.probability.reshape(-1)
         if not float(p.detach().sum()) <= _MOST * (1 + 1e-9):
             raise UnitError(
@@ -248,7 +529,7 @@ class Afterpulsing(AddedCounts):
         return self.seen() @ exponential_kernel(tau, dead, period_bins)
 
     def first_kernel(self, bins: int) -> Tensor:
-        """Those among them that come less than `bins` bins later, without later rounds: (bins,) float64."""
+        """Afterpulses that come less than `bins` bins later, without later rounds: (bins,) float64."""
         if self.delays is not None:
             return self.seen() * self.delays.shares(self.dead_time_s, self.bin_width_s, first=0, number=bins)
         tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
@@ -261,25 +542,29 @@ class Afterpulsing(AddedCounts):
         _check_period(period, bins)
         gain, length = remembered(self, ("gain", period, bins), lambda: _gain(1.0, self._kernel(period), bins))
         added = _filtered(x, gain.to(x.device), length)
-        beyond = self._beyond(x)
+        beyond = self._from_background(x)
         return added if beyond is None else added + beyond
 
-    def _beyond(self, x: Tensor) -> Tensor | None:
-        """Mean afterpulses in the window of constant counts outside of it; None where there are none."""
+    def _from_background(self, x: Tensor) -> Tensor | None:
+        """Mean afterpulses in the window of constant counts outside of it; None without such counts."""
         bins, period = x.shape[TIME], self._period_bins(x)
         dark = not isinstance(self.background, Tensor) and self.background == 0
         if dark or period <= bins:
             return None
-        missing = self._missing(period, bins).to(x.device).view(-1, 1, 1)
-        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
-        return (missing * level).to(x.dtype).expand_as(x)
 
-    def _missing(self, period: int, bins: int) -> Tensor:
-        """Afterpulses in the window of one count in every bin outside of it: (bins,) float64."""
-        return remembered(self, ("missing", period, bins), lambda: _from_outside(self._kernel(period), bins))
+        def missing() -> Tensor:
+            """Afterpulses (bins,) in the window of one count in every bin outside of it."""
+            kernel = self._kernel(period)
+            window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
+            inside = add_afterpulses(window, 1.0, kernel, only_added=True)
+            return (kernel.sum() / (1 - kernel.sum()) - inside).clamp_min(0).flatten()
+
+        share = remembered(self, ("missing", period, bins), missing).to(x.device).view(-1, 1, 1)
+        level = over_time(kept_map(self, "background"), x, "background", "Afterpulsing")
+        return (share * level).to(x.dtype).expand_as(x)
 
     def _kernel(self, period: int) -> Tensor:
-        """`kernel`, remembered while nothing is learnt: not to be changed in place."""
+        """`kernel`, remembered while nothing is learnt: do not change in place."""
         return remembered(self, ("kernel", period), lambda: self.kernel(period))
 
     def share(self) -> float:
@@ -287,7 +572,7 @@ class Afterpulsing(AddedCounts):
         return p / (1 - p)
 
     def _draw_delays(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
-        """In bins after the detection, in the shape, dtype and device of `like` (N,)."""
+        """Delays in bins, in shape, dtype and device of `like` (N,)."""
         if self.delays is not None:
             delays = self.delays.draw(like.numel(), self.dead_time_s, generator) / self.bin_width_s
             return delays.to(like)
@@ -309,12 +594,12 @@ class Afterpulsing(AddedCounts):
         draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:
-            """Places of all afterpulses of the detections of a piece, and of those triggered by them."""
+            """Places of all afterpulses of the detections of a piece, of all generations."""
             first = thin(piece, p, own)
             found = [first.place[:0]]
-            for block in range(0, first.place.numel(), _BLOCK):
-                at = slice(block, block + _BLOCK)
-                place = _one_each(first.place[at] + begin, first.number[at])
+            for block in range(0, first.place.numel(), _ENTRIES):
+                at = slice(block, block + _ENTRIES)
+                place = _repeat(first.place[at] + begin, first.number[at])
                 time = place.div(pixels, rounding_mode="floor") % bins
                 while time.numel():
                     lag = draw(time, own)
@@ -322,7 +607,7 @@ class Afterpulsing(AddedCounts):
                     # a round later is as far in front of the window as it is behind the end of the period
                     time, place = time.add_(lag), place.add_(lag, alpha=pixels)
                     found.append(place[time < bins])
-                    again = _passes(time, p, own)
+                    again = _passing(time, p, own)
                     time, place = time[again], place[again]
             return torch.cat(found)
 
@@ -330,12 +615,12 @@ class Afterpulsing(AddedCounts):
         total = counts.clone(memory_format=torch.contiguous_format)
         for places in by_pieces(follow, counts.reshape(-1), generator):
             total.view(-1).scatter_add_(0, places, one.expand(places.shape))
-        beyond = self._beyond(counts)
+        beyond = self._from_background(counts)
         return total if beyond is None else total + self._poisson(beyond, generator)
 
     def _lags(self, period: int, counts: Tensor) -> Callable[[Tensor, torch.Generator | None], Tensor]:
-        """Draws of the bins from a detection to its afterpulse, folded into one period: int64 as large as a tensor."""
-        if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _MOST_LAGS:
+        """Function that draws bins from a detection to its afterpulse, folded into one period, int64."""
+        if counts.device.type == "cpu" and counts.numel() >= _WORTH_TABLE and period <= _LONGEST_TABLE:
             kernel = self._kernel(period).cpu()
             return LagTable(kernel / kernel.sum()).draw
         if self.delays is None:
@@ -353,8 +638,8 @@ class Afterpulsing(AddedCounts):
         return draw
 
 
-def _one_each(place: Tensor, number: Tensor) -> Tensor:
-    """Every place as often as its number says."""
+def _repeat(place: Tensor, number: Tensor) -> Tensor:
+    """Every place, repeated `number` times."""
     if place.numel() < _FEW:
         return place.repeat_interleave(number.long())
     all_places, k = [place if bool((number >= 1).all()) else place[number >= 1]], 2
@@ -366,7 +651,7 @@ def _one_each(place: Tensor, number: Tensor) -> Tensor:
         all_places.append(place)
 
 
-def _passes(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor:
+def _passing(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor:
     """Indices of the entries that pass, each with probability `p`."""
     steps = math.floor(p * _VALUES)
     bits = sixteen_bits(like, generator)
@@ -374,27 +659,3 @@ def _passes(like: Tensor, p: float, generator: torch.Generator | None) -> Tensor
     # the last step passes in part
     finer = torch.rand(passing.shape, dtype=torch.float64, device=like.device, generator=generator)
     return passing[(bits[passing] < steps - _VALUES // 2).logical_or_(finer < p * _VALUES - steps)]
-
-
-def hot_pixel_rates(
-    height: int,
-    width: int,
-    *,
-    median_hz: float,
-    log_std: float = 0.5,
-    hot_fraction: float = 0.01,
-    hot_factor: float = 100.0,
-    generator: torch.Generator | None = None,
-) -> Tensor:
-    """A map (H, W) float64 of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
-
-    `log_std`: standard deviation of the natural logarithm. For `PhotonBudget(dark_count_rate_hz=...)`.
-    """
-    median = check_number(median_hz, "median_hz", where := "hot_pixel_rates")
-    spread = check_number(log_std, "log_std", where)
-    fraction = check_number(hot_fraction, "hot_fraction", where, high=1.0)
-    factor = check_number(hot_factor, "hot_factor", where, low=1.0)
-    size = [check_count(side, "height and width", where, low=0, most=MOST_MADE) for side in (height, width)]
-    rates = median * torch.exp(spread * torch.randn(size, dtype=torch.float64, generator=generator))
-    hot = torch.rand(size, dtype=torch.float64, generator=generator) < fraction
-    return torch.where(hot, rates * factor, rates)

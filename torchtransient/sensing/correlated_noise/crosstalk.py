@@ -1,4 +1,4 @@
-"""Crosstalk: detections that trigger neighbouring pixels."""
+"""Optical crosstalk: detections that trigger neighbouring pixels."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import check_number, check_transient, one_number
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.counts.added_counts import AddedCounts
-from torchtransient.sensing.numerics.draws import by_pieces
-from torchtransient.sensing.numerics.thinning import add_passing
+from torchtransient.sensing.numerics.draws import add_passing, by_pieces
 
 _EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _CORNERS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
@@ -25,10 +24,19 @@ _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 def add_crosstalk(
     counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
 ) -> Tensor:
-    """Mean histogram with optical crosstalk: each detection triggers each of the 4 neighbours with `probability`.
+    """Mean histogram with optical crosstalk: each detection triggers each of its neighbours with a probability.
 
-    `diagonal`: the same for the 4 neighbours across a corner. No delay: crosstalk takes less than a bin. What leaves
-    the rim of the sensor is lost. First order: crosstalk of crosstalk is left out. (..., C, T, H, W), dtype kept.
+    Without delay: crosstalk takes less than a bin. Counts across the rim of the sensor are lost. First order: crosstalk
+    of crosstalk is left out. Differentiable in all three.
+
+    Args:
+        counts: (..., C, T, H, W).
+        probability: of each of the 4 neighbours across an edge.
+        diagonal: of each of the 4 neighbours across a corner.
+        only_added: return the crosstalk alone.
+
+    Returns:
+        Shape and dtype of `counts`.
     """
     check_transient(counts, "add_crosstalk")
     probability = one_number(probability, "probability", "add_crosstalk")
@@ -48,9 +56,16 @@ def add_crosstalk(
 
 
 class Crosstalk(AddedCounts):
-    """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`. `learnable`: `logit_probability`.
+    """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`.
 
-    `diagonal_ratio`: probability across a corner over that across an edge.
+    Args:
+        probability: of each neighbour across an edge, in (0, 0.25].
+        diagonal_ratio: probability across a corner over that across an edge, in [0, 1].
+        learnable: make `logit_probability` a parameter.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for values outside of their ranges.
     """
 
     logit_probability: Tensor
@@ -74,16 +89,16 @@ class Crosstalk(AddedCounts):
 
     @property
     def probability(self) -> Tensor:
-        """Of one neighbour per detection, float64."""
+        """Probability for one neighbour across an edge, float64."""
         return self.logit_probability.double().sigmoid()
 
     def _probabilities(self) -> tuple[Tensor, Tensor | float]:
-        """Of an edge and of a corner."""
+        """Probabilities across an edge and across a corner."""
         p = self.probability
         if not bool(p <= _MOST * (1 + 1e-9)):
             raise UnitError(
-                f"Crosstalk: expected probability in (0, {_MOST:g}], got {float(p.detach()):g}. If it is learnt, lower "
-                "the learning rate."
+                f"Crosstalk: expected probability in (0, {_MOST:g}], got {float(p.detach()):g}. If it is "
+                "learnt, lower the learning rate."
             )
         return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
 
@@ -108,7 +123,7 @@ class Crosstalk(AddedCounts):
         together = max(_BLOCK // max(height * width, 1), 1)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> None:
-            """Every detection of a neighbour triggers with the same probability: one draw for all neighbours."""
+            """Add crosstalk to the frames of a piece, one draw for all neighbours at one distance."""
             for first in range(0, piece.shape[0], together):
                 rimmed = torch.nn.functional.pad(piece[first : first + together], (1, 1, 1, 1))
                 into = result[begin + first : begin + first + rimmed.shape[0]]

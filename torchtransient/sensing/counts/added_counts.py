@@ -12,8 +12,7 @@ from torchtransient.sensing.base.layout import TIME, check_transient
 from torchtransient.sensing.base.policies import record_score
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.counts.shot_noise import poisson_log_prob
-from torchtransient.sensing.numerics.draws import WHOLE_FLOAT32, fast_poisson
-from torchtransient.sensing.numerics.worker_threads import side_by_side
+from torchtransient.sensing.numerics.draws import WHOLE_FLOAT32, fast_poisson, parallel_map
 
 # Events per entry, on average, above which following them one by one is given up for Poisson numbers.
 _MOST_EVENTS = 16
@@ -30,7 +29,7 @@ def look_at_items(counts: Tensor) -> tuple[Tensor, Tensor]:
     shape = (*counts.shape[:-4], 1, 1, 1, 1)
     rows = counts.reshape(math.prod(shape), math.prod(counts.shape[-4:]))
     large = counts.device.type == "cpu" and counts.numel() >= _WORTH_THREADS
-    found = side_by_side(_look_at_rows, rows.tensor_split(_PIECES, 1)) if large else [_look_at_rows(rows)]
+    found = parallel_map(_look_at_rows, rows.tensor_split(_PIECES, 1)) if large else [_look_at_rows(rows)]
     whole, total = found[0]
     for also, more in found[1:]:
         whole, total = whole & also, total + more

@@ -19,8 +19,7 @@ from torchtransient.sensing.base.layout import TIME, check_transient
 from torchtransient.sensing.base.policies import record_score, standard_normal, straight_through
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.counts.added_counts import whole_items
-from torchtransient.sensing.numerics.draws import WHOLE_FLOAT32, by_pieces
-from torchtransient.sensing.numerics.thinning import halve, thin
+from torchtransient.sensing.numerics.draws import WHOLE_FLOAT32, by_pieces, halve, thin
 from torchtransient.sensing.numerics.time_convolution import Boundary
 
 _BLOCK = 1 << 18  # entries at a time, so that temporaries stay in the cache

@@ -1,1 +1,1 @@
-"""The arithmetic of dead time: cycles of several detections, detectors that run free, their stationary state."""
+"""Dead time of clocked and free-running detectors: renewal chains, means, draws, likelihoods and inverses."""

@@ -39,8 +39,7 @@ from torchtransient.sensing.chain.compose import Compose
 from torchtransient.sensing.chain.pixel_groups import PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera, SweepJitter
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
-from torchtransient.sensing.correlated_noise.afterpulse_delays import MeasuredDelays, PowerLawDelays
-from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing, hot_pixel_rates
+from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing, MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk
 from torchtransient.sensing.counts.shot_noise import ShotNoise
@@ -55,7 +54,7 @@ from torchtransient.sensing.itof.itof_codes import (
     square_code,
 )
 from torchtransient.sensing.itof.itof_pixels import ItofCalibration, ReversedCode, TapDifference, TwoTapCode
-from torchtransient.sensing.optics.photon_budget import Optics, PhotonBudget, ambient_photon_rate
+from torchtransient.sensing.optics.photon_budget import Optics, PhotonBudget, ambient_photon_rate, hot_pixel_rates
 from torchtransient.sensing.optics.polarization import (
     Analyzers,
     PolarizationMosaic,

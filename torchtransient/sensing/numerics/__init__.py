@@ -1,1 +1,1 @@
-"""Draws of many counts, convolutions, sums and linear solvers: what several detectors compute with."""
+"""Random draws of whole histograms, convolutions and running sums along time."""

@@ -1,22 +1,21 @@
-"""Convolution along time with a kernel of bins, directly or by FFT, into an open or a periodic window."""
+"""Convolutions and running sums along the time axis of (..., C, T, H, W)."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.axes import fast_length
-from torchtransient.checks import count, is_one_of, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.sensing.base.layout import TIME, check_transient, reals, without_autocast
+from torchtransient.checks import count
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.base.layout import TIME, check_choice, check_transient, reals, without_autocast
 
 Boundary = Literal["zero", "periodic"]
 Method = Literal["auto", "direct", "fft"]
-
 # Up to here a direct convolution is as fast as the transform, and it keeps the relative precision of faint late bins.
 _DIRECT_TAPS = 192
 # Short kernels over images: whole images are added, shifted in time, which leaves the layout as it is.
@@ -24,28 +23,33 @@ _DIRECT_TAPS = 192
 _SHIFTED_TAPS = 96
 _SHIFTED_TAPS_BACKWARD = 24
 _SHIFTED_PIXELS = 64
-
-
-def check_choice(value: str, choices: object, name: str, where: str) -> None:
-    """ShapeError unless `value` is one of the strings of a Literal type."""
-    allowed = get_args(choices)
-    if not is_one_of(value, allowed):
-        raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {shown(value)}.")
+_WIDE = 64  # images at least this large are summed row by row: torch.cumsum strides through memory along time
 
 
 @without_autocast
 def convolve_time(
     x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero", method: Method = "auto"
 ) -> Tensor:
-    """y[t] = sum over j of kernel[j] x[t - first - j], along the time axis of (..., C, T, H, W).
+    """Convolve along time: y[t] = sum over j of kernel[j] x[t - first - j].
 
-    `kernel`: (K,), the share of a bin's light that arrives `first + j` bins later. Boundary "zero": what leaves the
-    window is lost, nothing comes in; "periodic": the window is one period of a repeating signal, sums are conserved.
-    "fft" works in float64, since the rounding of a float32 transform (1e-7 of the largest bin) would drown late bins,
-    and pads to T + K - 1 and more for "zero"; "direct" sums in the dtype given; "auto" chooses by the length of the
-    kernel. Half precision is computed in float32. Differentiable in both arguments; dtype and device of `x` are kept.
+    "direct" sums in the dtype of `x`. "fft" works in float64, since the rounding of a float32 transform (1e-7 of the
+    largest bin) would drown late bins, and pads to T + K - 1 and more for "zero". Half precision is computed in
+    float32. Differentiable in `x` and `kernel`.
 
-    Raises ShapeError for wrong layouts, an empty kernel or an unknown choice.
+    Args:
+        x: (..., C, T, H, W).
+        kernel: (K,), share of a bin's light that arrives `first + j` bins later.
+        first: lag of kernel[0] in bins, of either sign.
+        boundary: "zero": light that leaves the window is lost, none enters; "periodic": the window is one period, sums
+            are conserved.
+        method: "auto" chooses by the length of the kernel.
+
+    Returns:
+        Shape, dtype and device of `x`.
+
+    Raises:
+        ShapeError: for wrong layouts or an empty kernel.
+        ArgumentError: for an unknown boundary or method.
     """
     check_transient(x, "convolve_time")
     check_choice(boundary, Boundary, "boundary", "convolve_time")
@@ -70,29 +74,19 @@ def convolve_time(
 
 
 def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
-    """(kernel, first) as far as it matters in a window of `bins`: folded into one period, or cut to lags inside.
-
-    A kernel that misses the window altogether comes back empty.
-    """
-    return _fold(kernel, first, bins) if boundary == "periodic" else _crop(kernel, first, bins)
-
-
-def _fold(kernel: Tensor, first: int, period: int) -> tuple[Tensor, int]:
-    """The kernel modulo the period, when it is longer than one."""
-    if kernel.numel() <= period:
-        return kernel, first % period
-    lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % period
-    return kernel.new_zeros(period).index_add(0, lags, kernel), 0
-
-
-def _crop(kernel: Tensor, first: int, bins: int) -> tuple[Tensor, int]:
-    """The part of the kernel whose lags lie in (-bins, bins); all others miss the window."""
+    """Fold (kernel, first) into one period, or crop it to lags inside a window of `bins`; empty if it misses it."""
+    if boundary == "periodic":
+        if kernel.numel() <= bins:
+            return kernel, first % bins
+        lags = (torch.arange(kernel.numel(), device=kernel.device) + first) % bins
+        return kernel.new_zeros(bins).index_add(0, lags, kernel), 0
     begin = min(max(0, 1 - bins - first), kernel.numel())
     end = max(min(kernel.numel(), bins - first), begin)
     return kernel[begin:end], first + begin
 
 
 def _by_shifts(x: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Tensor:
+    """Sum of shifted images, which keeps the layout."""
     bins, taps = x.shape[TIME], kernel.numel()
     work = x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
     if boundary == "periodic":
@@ -134,10 +128,20 @@ def _by_fft(rows: Tensor, kernel: Tensor, first: int, boundary: Boundary) -> Ten
 
 
 def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: int) -> Tensor:
-    """Rows (..., T), float64, times a transfer function, circular in `length`, moved by `first`: (..., keep).
+    """Multiply rows by a transfer function.
 
-    Results that rounding has put below zero are 0: a transform leaves 1e-17 of either sign where there is no light, and
-    a negative rate is none that a detector could draw from. The gradient is that of the transform alone.
+    Results that rounding puts below zero are set to 0 (a transform leaves 1e-17 of either sign in the dark, and no
+    detector draws from a negative rate); the gradient is that of the transform alone.
+
+    Args:
+        rows: (..., T) float64.
+        transfer: (length // 2 + 1,) complex128.
+        length: period of the transform, in bins.
+        first: shift to later bins.
+        keep: bins of the result.
+
+    Returns:
+        (..., keep) float64.
     """
     if rows.numel() == 0:
         return rows.new_zeros(*rows.shape[:-1], keep)
@@ -147,3 +151,55 @@ def filter_rows(rows: Tensor, transfer: Tensor, length: int, first: int, keep: i
     slack = 4 * torch.finfo(torch.float64).eps * math.log2(2 * length) * scale
     value = y.detach()
     return y - torch.where((value < 0) & (value >= -slack), value, 0.0)
+
+
+# --------------------------------------------------------------------------------------------------------- running sums
+
+
+def _sum_before(x: Tensor, reverse: bool) -> Tensor:
+    """Sum of the earlier bins (of the later ones with `reverse`), without gradient."""
+    if x.device.type != "cpu" or x.shape[-1] * x.shape[-2] < _WIDE:
+        wide = x.to(torch.float64)
+        if reverse:
+            return wide.flip(TIME).cumsum(TIME).flip(TIME) - wide
+        return wide.cumsum(TIME) - wide
+    out = torch.empty(x.shape, dtype=torch.float64, device=x.device)
+    bins = x.shape[TIME]
+    total = torch.zeros_like(x.select(TIME, 0), dtype=torch.float64)
+    for k in range(bins - 1, -1, -1) if reverse else range(bins):
+        out.select(TIME, k).copy_(total)
+        total += x.select(TIME, k)
+    return out
+
+
+class _SumBefore(torch.autograd.Function):
+    @staticmethod
+    def forward(x: Tensor, reverse: bool) -> Tensor:
+        return _sum_before(x, reverse)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.dtype, ctx.reverse = inputs[0].dtype, inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return _apply(gradients[0], not ctx.reverse).to(ctx.dtype), None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        return _sum_before(tangents[0], ctx.reverse)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], x: Tensor, reverse: bool) -> tuple[Tensor, int]:
+        # time is counted from the end, so a batch in front changes nothing
+        return _apply(x.movedim(in_dims[0] or 0, 0), reverse), 0
+
+
+def _apply(x: Tensor, reverse: bool) -> Tensor:
+    result: Tensor = _SumBefore.apply(x, reverse)  # type: ignore[no-untyped-call]
+    return result
+
+
+def sum_before(x: Tensor) -> Tensor:
+    """Sum of the earlier bins of (..., T, H, W), float64, differentiable to any order."""
+    return _apply(x, False)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
+from torchtransient.checks import MOST_MADE
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import (
@@ -323,3 +324,36 @@ class PhotonBudget(Sensor):
             cycles=self.cycles,
             exposure_s=self.exposure_s,
         )
+
+
+def hot_pixel_rates(
+    height: int,
+    width: int,
+    *,
+    median_hz: float,
+    log_std: float = 0.5,
+    hot_fraction: float = 0.01,
+    hot_factor: float = 100.0,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Draw a map of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
+
+    Args:
+        height, width: of the map.
+        median_hz: median in Hz.
+        log_std: standard deviation of the natural logarithm.
+        hot_fraction: share of hot pixels.
+        hot_factor: rate of a hot pixel over that of others, at least 1.
+        generator: source of randomness.
+
+    Returns:
+        (H, W) float64 in Hz, for `PhotonBudget(dark_count_rate_hz=...)`.
+    """
+    median = check_number(median_hz, "median_hz", where := "hot_pixel_rates")
+    spread = check_number(log_std, "log_std", where)
+    fraction = check_number(hot_fraction, "hot_fraction", where, high=1.0)
+    factor = check_number(hot_factor, "hot_factor", where, low=1.0)
+    size = [check_count(side, "height and width", where, low=0, most=MOST_MADE) for side in (height, width)]
+    rates = median * torch.exp(spread * torch.randn(size, dtype=torch.float64, generator=generator))
+    hot = torch.rand(size, dtype=torch.float64, generator=generator) < fraction
+    return torch.where(hot, rates * factor, rates)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.base.layout import (
+    check_choice,
     check_count,
     check_number,
     check_transient,
@@ -18,7 +19,6 @@ from torchtransient.sensing.base.layout import (
     without_autocast,
 )
 from torchtransient.sensing.base.sensor import Sensor
-from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
 
 _LARGEST = 1 << 15  # points across a PSF, whose square still fits into memory

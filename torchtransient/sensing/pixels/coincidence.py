@@ -32,8 +32,8 @@ from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, rec
 from torchtransient.sensing.base.sensor import RandomSensor, common_bins
 from torchtransient.sensing.base.wrapped_detector import cycles_of, several_of
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.dead_time.dead_time_cycle import highest_level
-from torchtransient.sensing.dead_time.free_running_draws import log_likelihood
+from torchtransient.sensing.dead_time.clocked import highest_level
+from torchtransient.sensing.dead_time.clocked_counts import safe_xlogy
 from torchtransient.sensing.numerics.draws import check_rates
 from torchtransient.sensing.pixels.coincidence_draws import Seen, Trains, draw_coincidences
 from torchtransient.sensing.pixels.macro_pixel import checked_detector, groups_of
@@ -331,7 +331,7 @@ class CoincidencePixel(RandomSensor):
             for (share, _), known in zip(self.groups, seen, strict=True):
                 rate = self._lit(x.double(), share)[0].movedim(TIME, -1)
                 detected, armed = (rows.view(rate.shape) for rows in (known.detected, known.armed))
-                total = total + (log_likelihood(detected, rate) - armed * rate).sum(-1)
+                total = total + (safe_xlogy(detected, rate) - armed * rate).sum(-1)
             return total
 
         record_score(log_prob, "CoincidencePixel")
@@ -351,7 +351,7 @@ class CoincidencePixel(RandomSensor):
         """Of bins as independent binomials, each of which is exact; `grad="score"` scores the draws themselves."""
         p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
         quiet = self.cycles - n
-        value = log_likelihood(n, p) + log_likelihood(quiet, 1 - p)
+        value = safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p)
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
         return (value + ways).sum(TIME).to(x.dtype)
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from torchtransient.checks import MOST_MADE, as_whole, is_one_of, several, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_seconds, reals
-from torchtransient.sensing.numerics.time_convolution import check_choice, filter_rows
+from torchtransient.sensing.base.layout import check_choice, check_seconds, reals
+from torchtransient.sensing.numerics.time_convolution import filter_rows
 from torchtransient.sensing.response.response_shapes import (
     above_floor,
     integrated_counts,

@@ -6,9 +6,9 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError
-from torchtransient.sensing.base.layout import bin_width_of
+from torchtransient.sensing.base.layout import bin_width_of, check_choice
 from torchtransient.sensing.base.sensor import Sensor
-from torchtransient.sensing.numerics.time_convolution import Boundary, Method, check_choice, convolve_time
+from torchtransient.sensing.numerics.time_convolution import Boundary, Method, convolve_time
 from torchtransient.sensing.response.composed_responses import ComposedResponse as ComposedResponse
 from torchtransient.sensing.response.composed_responses import MeasuredResponse as MeasuredResponse
 from torchtransient.sensing.response.responses import GaussianResponse as GaussianResponse

@@ -17,10 +17,9 @@ from torch import Tensor, nn
 
 from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import check_number, check_seconds
+from torchtransient.sensing.base.layout import check_choice, check_number, check_seconds
 from torchtransient.sensing.base.remembered import remembered
 from torchtransient.sensing.base.sensor import PhysicalModule
-from torchtransient.sensing.numerics.time_convolution import check_choice
 from torchtransient.sensing.response.response_shapes import (
     FWHM_PER_SIGMA,
     emg_cdf,

@@ -16,10 +16,17 @@ from torchtransient.sensing.spad.spad import log_of_firing
 
 @in_single
 def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
-    """Photons per frame from the number of frames that saw any: -log(1 - counts/frames), any shape.
+    """Photons per frame from the number of frames that saw any: -log(1 - counts / frames). Differentiable.
 
-    A pixel that fired in every frame is given the rate of a share 1 - 1/(2 frames). Differentiable. Raises UnitError
-    for more counts than frames.
+    Args:
+        counts: any shape.
+        frames: number of frames.
+
+    Returns:
+        Shape of `counts`; for a pixel that fired in every frame the rate of a share 1 - 1/(2 frames).
+
+    Raises:
+        UnitError: for more counts than frames.
     """
     number = check_count(frames, "frames", "frames_to_rate")
     (counts,) = reals("frames_to_rate", counts=counts)
@@ -33,10 +40,16 @@ def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
 
 
 class BinaryFrames(RandomSensor):
-    """Counts (..., C, T, H, W) of frames, out of `frames`, that saw a photon, from the mean photons of one frame.
+    """Quanta sensor: counts of binary frames that saw a photon, from the mean photons of one frame.
 
-    Every bin along T is a gate or moment of its own, exposed `frames` times, so that bins are independent binomials
-    with probability 1 - exp(-mean). All four policies. Source: Fossum et al., Sensors 16 (2016).
+    Every bin along T is a gate or moment of its own, exposed `frames` times: independent binomials with probability 1 -
+    exp(-mean). All four policies. Source: Fossum et al., Sensors 16 (2016).
+
+    Args:
+        frames: number of frames.
+        grad: gradient policy.
+
+    Input and output are (..., C, T, H, W).
     """
 
     takes, gives = ("electrons",), "counts"

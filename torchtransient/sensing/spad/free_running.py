@@ -24,6 +24,7 @@ from torchtransient.sensing.base.layout import (
     bin_width_of,
     bins_of_period,
     check_bins,
+    check_choice,
     check_count,
     check_seconds,
     check_tensor,
@@ -32,18 +33,15 @@ from torchtransient.sensing.base.layout import (
 )
 from torchtransient.sensing.base.policies import VARIANCE_FLOOR, GradPolicy, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
-from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins, whole_and_part
-from torchtransient.sensing.dead_time.free_running_draws import (
-    Path,
-    bin_chances,
-    draw_path,
-    log_likelihood,
-    path_log_prob,
+from torchtransient.sensing.dead_time.clocked_counts import StepCounts, draw_steps, safe_xlogy, steps_log_prob
+from torchtransient.sensing.dead_time.free_running import (
+    FreeRunningState,
+    sample_trains,
+    stationary_state,
+    stationary_steps,
 )
-from torchtransient.sensing.dead_time.free_running_ring import train_counts
-from torchtransient.sensing.dead_time.free_running_state import FreeRunningState, stationary_state
+from torchtransient.sensing.dead_time.renewal import check_dead_bins, split_dead_time
 from torchtransient.sensing.numerics.draws import check_rates
-from torchtransient.sensing.numerics.time_convolution import check_choice
 
 DeadTime = Literal["non_paralyzable", "paralyzable"]
 _SIDE_BY_SIDE = 1 << 10  # detectors drawn at a time
@@ -51,7 +49,19 @@ _SIDE_BY_SIDE = 1 << 10  # detectors drawn at a time
 
 @in_single
 def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non_paralyzable") -> Tensor:
-    """Detections per second at a constant photon rate n: n/(1 + n td), or n exp(-n td) for "paralyzable"."""
+    """Detections per second in constant light: n / (1 + n td), or n exp(-n td) for a paralyzable detector.
+
+    Args:
+        rate_hz: photon rate n times efficiency, any shape.
+        dead_time_s: dead time td in seconds.
+        kind: "non_paralyzable" or "paralyzable".
+
+    Returns:
+        Shape of `rate_hz`, in Hz.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN.
+    """
     dead = check_seconds(dead_time_s, "dead_time_s", "free_running_rate")
     check_choice(kind, DeadTime, "kind", "free_running_rate")
     (rate_hz,) = reals("free_running_rate", rate_hz=rate_hz)
@@ -65,7 +75,7 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     """Stationary state for rates (..., T, H, W), in the same layout."""
     if rate.numel() == 0:
         empty = rate.to(torch.float64)
-        return FreeRunningState(empty, empty, empty, whole_and_part(torch.as_tensor(dead_bins))[0])
+        return FreeRunningState(empty, empty, empty, split_dead_time(torch.as_tensor(dead_bins))[0])
     wide = rate.to(torch.float64).movedim(TIME, -1)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     rows = stationary_state(wide.reshape(-1, wide.shape[-1]), dead)
@@ -80,14 +90,20 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
 def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin of a free-running detector in its stationary state.
 
-    `rate`: (..., C, T, H, W) photons (times efficiency) per period and bin; the T bins are one whole period.
-    `dead_bins`: dead time in bins, at least 1/2, also longer than a period; a number or a scalar tensor, in which the
-    result is differentiable (once; piecewise smooth). dtype and device of `rate` are kept; computed in float64.
-
     Photons arrive at a constant rate inside a bin, any number of them; dead times are exact to fractions of a bin.
-    Detections inside a bin follow a straight line: exact in constant light and for dead times of whole periods,
-    otherwise right to third order in the rate of a bin (see docs/photon_counting.md for errors). Raises
-    TorchTransientError for a phase locked so narrowly that bins cut in 32 do not show it.
+    Exact in constant light and for dead times of whole periods, otherwise third order in the rate of a bin (errors:
+    docs/photon_counting.md). Computed in float64; differentiable once, also in `dead_bins` (piecewise smooth).
+
+    Args:
+        rate: photons (times efficiency) per period and bin, (..., C, T, H, W), T bins being one period.
+        dead_bins: dead time in bins, at least 1/2, also longer than a period; a number or scalar tensor.
+
+    Returns:
+        Shape, dtype and device of `rate`.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
+        TorchTransientError: for a phase locked so narrowly that bins cut in 32 do not show it.
     """
     check_rates(check_bins(rate, "nonparalyzable_histogram"), "nonparalyzable_histogram")
     check_dead_bins(dead_bins)
@@ -95,7 +111,7 @@ def nonparalyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
 
 
 def _mean_of_exponentials(start: Tensor, step: Tensor) -> Tensor:
-    """Mean of exp(-x) over x from `start` to `start + step`, of either sign: finite wherever both ends are >= 0.
+    """Mean of exp(-x) over x from `start` to `start + step`, of either sign.
 
     Counted from the smaller end, so that no factor overflows where the other one is 0.
     """
@@ -113,8 +129,17 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     """Expected detections per period and bin when every photon, counted or not, starts the dead time anew.
 
     Integral over the bin of n(t) exp(-flux of the dead time before t), exact for rates that are constant in a bin.
-    `rate`: (..., C, T, H, W) per period and bin, the T bins being one period; `dead_bins`: dead time in bins, >= 0,
-    also longer than a period; differentiable in both. dtype and device are kept; computed in float64.
+    Computed in float64; differentiable in both arguments.
+
+    Args:
+        rate: per period and bin, (..., C, T, H, W), T bins being one period.
+        dead_bins: dead time in bins, >= 0, also longer than a period; a number or scalar tensor.
+
+    Returns:
+        Shape, dtype and device of `rate`.
+
+    Raises:
+        UnitError: for rates or dead times that are negative, infinite or NaN.
     """
     check_rates(check_bins(rate, "paralyzable_histogram"), "paralyzable_histogram")
     dead_bins = one_number(dead_bins, "dead_bins", "paralyzable_histogram")
@@ -144,28 +169,38 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
 
 
 class FreeRunningSPAD(RandomSensor):
-    """Histogram (..., C, T, H, W) over laser phase, in counts, of a SPAD that runs free for `cycles` laser periods.
+    """SPAD that runs free for `cycles` laser periods: histogram (..., C, T, H, W) over laser phase, in counts.
 
-    The input is the rate per period and bin of a detector that is never dead; its T bins are one whole laser period,
-    which `period_s` looks at: UnitError for an axis of another length, ShapeError for light with another T.
-    `dead_time_s`: at least one bin ("paralyzable": any), also longer than the period; `kind`: "non_paralyzable" or
-    "paralyzable"; `learnable` keeps log(dead time) as a parameter `log_dead_time_s`.
+    The input is the rate per period and bin of a detector that is never dead; its T bins are one laser period.
 
-    Samples, non-paralyzable: one detector over all `cycles` periods, from its stationary state on. Up to a thousand
-    detections, and wherever a phase is remembered for long (dead time and wait make up a period or a part of one), are
-    drawn one after the other. More are drawn with means and correlations inside a period of the chain of detections,
-    and correlations between periods (which make totals up to hundreds of times less variable in saturation) of its
-    central limit theorem; whole numbers then add up to a quarter of a count^2 to the variance of a total, and the cost
-    does not grow with `cycles`. TorchTransientError for a phase that is remembered over more than four million
-    detections. Paralyzable: independent binomials with the exact mean and N d (1 - d) as variance: totals of a real
-    one vary less, down to a quarter (variance over mean 0.28 for 0.84 at 1.3 photons a dead time, 0.33 for 0.98 at 0.6
-    with longer ones).
+    Non-paralyzable draws are one detector over all `cycles` periods, from its stationary state on. Up to a thousand
+    detections, and near resonance (dead time and wait make up a period or a part of one), they go event by event;
+    beyond, they have means and correlations inside a period of the chain of detections, and correlations between
+    periods (which make totals up to hundreds of times less variable in saturation) of its central limit theorem.
+    Rounding to integers adds up to a quarter of a count^2 to the variance of a total; the cost does not grow with
+    `cycles`. Paralyzable draws are independent binomials with the exact mean and N d (1 - d) as variance: totals of a
+    real detector vary less, down to a quarter (variance over mean 0.28 for 0.84 at 1.3 photons a dead time, 0.33 for
+    0.98 at 0.6 with longer ones).
 
-    Policies: all. `gaussian`: normal numbers with the covariance of the draws (paralyzable: independent bins), whose
-    size is differentiated as that of independent bins. `score`: that of `cycles` periods drawn on their own, dead and
-    armed detectors at their starts included; its draws lack the correlations between periods. `variance` is that of
-    single bins, N d (1 - d): right to a few per cent up to ten photons per period, 0.5 to 1.3 times the true one at a
-    hundred.
+    All policies. "gaussian": normal numbers with the covariance of the draws (paralyzable: independent bins), whose
+    size is differentiated as that of independent bins. "score": that of `cycles` independent periods; its draws lack
+    the correlations between periods. `variance` is that of single bins, N d (1 - d): right to a few per cent up to ten
+    photons per period, 0.5 to 1.3 times the true one at a hundred.
+
+    Args:
+        cycles: laser periods.
+        dead_time_s: at least one bin ("paralyzable": any), also longer than the period.
+        axis: time axis, or
+        bin_width_s: bin width in seconds.
+        period_s: laser period, checked against axis and input.
+        kind: "non_paralyzable" or "paralyzable".
+        learnable: make log(dead time) a parameter `log_dead_time_s`.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for a dead time below one bin, or an axis that is not one period.
+        ShapeError: for light with another T.
+        TorchTransientError: for a phase that is remembered over more than four million detections.
     """
 
     takes, gives, window_is_period = ("rate",), "counts", True
@@ -233,14 +268,15 @@ class FreeRunningSPAD(RandomSensor):
                 f"{dead_time_s:g} s. Use narrower bins, or no dead time (ShotNoise) where it does not matter."
             )
 
-    def _path(self, x: Tensor, generator: torch.Generator | None) -> Path:
-        """Periods of the non-paralyzable detector, each drawn on its own, step by step."""
+    def _path(self, x: Tensor, generator: torch.Generator | None) -> StepCounts:
+        """Steps of independent periods of the non-paralyzable detector."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s))
             rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
-            return draw_path(bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
+            return draw_steps(stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
 
     def _train(self, x: Tensor, generator: torch.Generator | None, normal: bool) -> Tensor:
+        """Counts of the non-paralyzable detector over consecutive periods."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s))
             rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
@@ -252,7 +288,7 @@ class FreeRunningSPAD(RandomSensor):
             counts, left = torch.zeros_like(rows), self.trains
             while left:  # several rows of one light side by side: few pixels cost as much as one
                 number = min(left, max(1, _SIDE_BY_SIDE // rows.shape[0]))
-                found = train_counts(rows.repeat(number, 1), dead, periods, generator, normal=normal)
+                found = sample_trains(rows.repeat(number, 1), dead, periods, generator, normal=normal)
                 counts, left = counts + found.view(number, *rows.shape).sum(0), left - number
             return counts.view(wide.shape).movedim(-1, TIME).to(x.dtype)
 
@@ -279,7 +315,7 @@ class FreeRunningSPAD(RandomSensor):
         p, n = self.probabilities(x.double()), measurement.double()
         quiet = self.cycles - n
         ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
-        return (log_likelihood(n, p) + log_likelihood(quiet, 1 - p) + ways).sum(TIME)
+        return (safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p) + ways).sum(TIME)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.kind == "paralyzable":
@@ -288,7 +324,7 @@ class FreeRunningSPAD(RandomSensor):
 
         def log_prob() -> Tensor:
             rate = x.double()
-            return path_log_prob(path, bin_chances(rate, state_image(rate, self._dead_bins)), self.cycles)
+            return steps_log_prob(path, stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles)
 
         record_score(log_prob, type(self).__name__)
         return path.counts.to(x.dtype)

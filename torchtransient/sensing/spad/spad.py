@@ -31,27 +31,36 @@ from torchtransient.sensing.base.layout import (
 )
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise, record_score
 from torchtransient.sensing.base.sensor import RandomSensor
-from torchtransient.sensing.dead_time.dead_time_cycle import check_dead_bins, double_detections
-from torchtransient.sensing.dead_time.dead_time_draws import (
-    DrawnRows,
-    draw_cycles,
-    gaussian_cycles,
+from torchtransient.sensing.dead_time.clocked import mean_detections, second_detections
+from torchtransient.sensing.dead_time.clocked_counts import (
+    armed_time,
+    check_cycles,
+    coates_of_rows,
+    cycles_log_prob,
+    draw_cycle_steps,
+    normal_cycles,
     sample_cycles,
-    score_of_cycles,
 )
-from torchtransient.sensing.dead_time.dead_time_inverse import armed_time, check_cycles, rates_of_counts
-from torchtransient.sensing.dead_time.dead_time_means import detected_columns
+from torchtransient.sensing.dead_time.renewal import check_dead_bins
 from torchtransient.sensing.numerics.draws import check_rates, sample_first_photons
-from torchtransient.sensing.numerics.running_sums import sum_before
+from torchtransient.sensing.numerics.time_convolution import sum_before
 
 
 @in_single
 def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
-    """Probability (..., C, T, H, W) that the first photon of a cycle falls into each bin, and (..., C, H, W) of none.
+    """Probabilities of the first photon of a cycle: (1 - exp(-rate[k])) exp(-sum of the rates before).
 
-    `rate`: expected detections per cycle and bin, >= 0. Sums over bins are made in float64, in the exponent, so that
-    1e4 bins lose no digits; in a saturated pixel the late bins get probability and gradient 0, as they should. Raises
-    UnitError for rates that are negative, infinite or NaN.
+    Sums over bins are made in float64, in the exponent, so that 1e4 bins lose no digits; in a saturated pixel the late
+    bins have probability and gradient 0.
+
+    Args:
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+
+    Returns:
+        Probability of each bin (..., C, T, H, W), and of no photon (..., C, H, W).
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN.
     """
     check_rates(check_bins(rate, "first_photon_probabilities"), "first_photon_probabilities")
     before = sum_before(rate)
@@ -61,7 +70,12 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class CoatesEstimate(NamedTuple):
-    """`rate`: detections per cycle and bin; `valid`: bool, where cycles were still armed and not all of them fired."""
+    """Estimate of the light behind a histogram.
+
+    Attributes:
+        rate: detections per cycle and bin of a detector that is never dead, (..., C, T, H, W).
+        valid: mask of bins where cycles were still armed and not all of them fired.
+    """
 
     rate: Tensor
     valid: Tensor
@@ -73,6 +87,7 @@ def _rows(x: Tensor) -> Tensor:
 
 
 def _image(rows: Tensor, like: Tensor) -> Tensor:
+    """Rows (P, T) in the layout of `like`."""
     return rows.view(like.movedim(TIME, -1).shape).movedim(-1, TIME)
 
 
@@ -82,44 +97,61 @@ def _columns(x: Tensor) -> Tensor:
 
 
 def _of_columns(columns: Tensor, like: Tensor) -> Tensor:
+    """Columns (T, P) in the layout of `like`."""
     return columns.view(like.movedim(TIME, 0).shape).movedim(0, TIME)
 
 
 def detections_with_dead_time(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
-    """Detections per cycle and bin, armed at the start of each cycle, with dead time: float64 (..., C, T, H, W).
+    """Expected detections per cycle and bin of a detector armed at the start of each cycle, with dead time.
 
-    `rate`: expected detections per cycle and bin of a detector that is never dead, >= 0, constant inside a bin.
-    `dead_bins`: non-paralyzable dead time in bins, at least 1/2, a number or a scalar tensor; differentiable in both.
-    Dead times are exact to fractions of a bin, and a bin may hold any number of photons and detections: bins of more
-    than a photon are cut. Total variation from the exact mean: below 1e-5 (docs/photon_counting.md). Raises UnitError
-    for rates that are negative, infinite or NaN.
+    Exact for dead times of fractions of a bin; bins of more than a photon are cut. Total variation from the exact mean:
+    below 1e-5 (docs/photon_counting.md). Differentiable to any order in both arguments.
+
+    Args:
+        rate: expected detections per cycle and bin of a detector that is never dead, (..., C, T, H, W), constant in a
+            bin.
+        dead_bins: non-paralyzable dead time in bins, at least 1/2; a number or scalar tensor.
+
+    Returns:
+        (..., C, T, H, W) float64.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
-    check_transient(rate, "detections_with_dead_time")
+    check_bins(rate, "detections_with_dead_time")
     check_rates(rate, "detections_with_dead_time")
     check_dead_bins(dead_bins)
-    if rate.numel() == 0:
-        return rate.to(torch.float64)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    return _of_columns(detected_columns(_columns(rate), dead), rate)
+    return _of_columns(mean_detections(_columns(rate), dead), rate)
 
 
 @in_single
 def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> CoatesEstimate:
-    """Undo pile-up: rate[k] = -log(1 - counts[k] / cycles still armed at k). The maximum likelihood estimate.
+    """Undo pile-up by the maximum likelihood estimate of Coates: rate[k] = -log(1 - counts[k] / cycles still armed at
+    k).
 
-    `counts`: (..., C, T, H, W) detections of `cycles` cycles; `dead_bins`: dead time in bins, at least 1, for several
-    detections per cycle, None for one. With it the cycles that come back inside a bin count for as long as they are
-    armed in it: the inverse of `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Where no cycle was
-    armed any more the rate is 0, where every armed one fired it is that of a share 1 - 1/(2 cycles); both are marked
-    not valid. Differentiable in `counts`, with a dead time once. dtype and device are kept. Raises UnitError for a
-    dead time below one bin.
+    With a dead time, cycles rearmed inside a bin count for as long as they are armed in it: the inverse of
+    `detections_with_dead_time` (to 1e-6 in bins of up to 15 photons). Differentiable in `counts`, with a dead time
+    once.
+
+    Args:
+        counts: detections, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins, at least 1, for several detections per cycle; None for one.
+
+    Returns:
+        Rate in dtype and device of `counts`; 0 where no cycle was armed, that of a share 1 - 1/(2 cycles) where all
+        fired, both not valid.
+
+    Raises:
+        UnitError: for a dead time below one bin.
     """
     check_transient(counts, "coates")
     number = check_count(cycles, "cycles", "coates")
     if dead_bins is not None and counts.numel():
         refuse_cut_off(dead_bins, "dead_bins", "coates")
         dead = float(one_number(dead_bins, "dead_bins", "coates"))
-        rate, valid = rates_of_counts(_rows(counts), number, dead)
+        rate, valid = coates_of_rows(_rows(counts), number, dead)
         return CoatesEstimate(_image(rate, counts).to(counts.dtype), _image(valid, counts))
     armed = number - sum_before(counts)
     usable = ~(armed <= 0.5)  # NaN stays NaN
@@ -134,36 +166,34 @@ def coates(counts: Tensor, cycles: int, dead_bins: float | None = None) -> Coate
 def sample_detections(
     rate: Tensor, cycles: int, dead_bins: float | None = None, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """A histogram of `cycles` cycles, without gradient, in the shape and dtype of `rate` (..., C, T, H, W).
+    """Draw a histogram of `cycles` cycles, without gradient.
 
-    `dead_bins` None: one detection per cycle, multinomial by a tree of binomials. Else bin by bin (pieces of bins where
-    they hold more than a photon): of the armed cycles a binomial share fires, and those that fired are armed again
-    after the dead time. Means are those of `detections_with_dead_time`, correlations those of the cycles.
+    One detection per cycle is multinomial, by a tree of binomials. With a dead time, bin by bin (or piece by piece
+    where bins hold more than a photon), a binomial share of the armed cycles fires and is rearmed after the dead time.
+    Means are those of `detections_with_dead_time`, correlations those of the cycles.
+
+    Args:
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins, at least 1/2; None for one detection per cycle.
+        generator: source of randomness.
+
+    Returns:
+        Counts in shape and dtype of `rate`.
+
+    Raises:
+        UnitError: for rates that are negative, infinite or NaN, and for dead times below half a bin.
     """
-    check_transient(rate, "sample_detections")
+    check_bins(rate, "sample_detections")
     number = check_count(cycles, "cycles", "sample_detections")
     rate = rate.detach()
     if dead_bins is None:
         return sample_first_photons(number, rate, generator)
     check_dead_bins(dead_bins)
     check_rates(rate, "sample_detections")
-    if rate.numel() == 0:
-        return rate.clone()
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
     counts = sample_cycles(_columns(rate), dead, number, generator)
     return _of_columns(counts, rate).to(rate.dtype)
-
-
-def _drawn(
-    rate: Tensor, cycles: int, dead_bins: float, generator: torch.Generator | None
-) -> tuple[Tensor, list[DrawnRows]]:
-    check_dead_bins(dead_bins)
-    check_rates(rate, "sample_detections")
-    if rate.numel() == 0:
-        return rate.clone(), []
-    dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=rate.device)
-    counts, drawn = draw_cycles(_rows(rate), dead, cycles, generator)
-    return _image(counts, rate).to(rate.dtype), drawn
 
 
 def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Generator | None = None) -> Tensor:
@@ -175,17 +205,27 @@ def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Gener
 
 
 class SynchronousSPAD(RandomSensor):
-    """Histogram (..., C, T, H, W), in counts, of `cycles` laser cycles from detections per cycle and bin.
+    """SPAD in step with the laser: histogram (..., C, T, H, W), in counts, of `cycles` cycles.
 
-    The input is the rate of an always-armed detector: signal, ambient light and dark counts, as `PhotonBudget` gives
-    it. `gate`: (T,) profile between 0 and 1 that multiplies the rate (bins before the gate opens do not pile up).
-    `dead_time_s` with `axis` or `bin_width_s`: several detections per cycle (`detections_with_dead_time`), the detector
-    being armed at the start of each; without it, the first photon of a cycle is the only one (dead until the next).
+    The input is the rate of an always-armed detector per cycle and bin: signal, ambient light and dark counts, as
+    `PhotonBudget` gives it. Without a dead time the first photon of a cycle is the only one; with one the detector is
+    armed at the start of each cycle and fires several times (`detections_with_dead_time`).
 
-    Policies: all four. The normal surrogate has the covariance of the cycles, between bins too; the score is that of
-    the draws, bin by bin. With a dead time `log_prob` is that of every bin given those before it, exact but for where
-    in a bin detections lay; `inverse` needs a dead time of at least one bin. Afterpulses and crosstalk are modules of
-    their own, behind.
+    All policies. "gaussian" has the covariance of the cycles, between bins too; "score" is that of the draws, bin by
+    bin. With a dead time `log_prob` is that of every bin given those before it, exact but for the place of detections
+    in a bin. Afterpulses and crosstalk are modules of their own, behind.
+
+    Args:
+        cycles: number of laser cycles.
+        gate: (T,) profile in [0, 1] that multiplies the rate; bins before the gate opens do not pile up.
+        dead_time_s: dead time in seconds, with `axis` or `bin_width_s`; None for one detection per cycle.
+        axis: time axis, or
+        bin_width_s: bin width in seconds.
+        grad: gradient policy.
+
+    Raises:
+        ShapeError: for a gate that is not (T,).
+        UnitError: for gate values outside [0, 1], and dead times below half a bin.
     """
 
     takes, gives = ("rate",), "counts"
@@ -224,7 +264,7 @@ class SynchronousSPAD(RandomSensor):
         self.register_buffer("gate", gate)
 
     def _gated(self, x: Tensor) -> Tensor:
-        check_transient(x, "SynchronousSPAD")
+        check_bins(x, "SynchronousSPAD")
         if self.gate is None:
             return x
         if self.gate.shape[0] != x.shape[TIME]:
@@ -244,19 +284,17 @@ class SynchronousSPAD(RandomSensor):
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
         variance = p * (1 - p)
-        if self.dead_bins is not None and self.dead_bins < 1 and x.numel():
+        if self.dead_bins is not None and self.dead_bins < 1:
             # a cycle may fire twice in a bin
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            variance = variance + 2 * _image(double_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
+            variance = variance + 2 * _image(second_detections(_rows(self._gated(x)), dead), x).to(x.dtype)
         return variance * self.cycles
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.dead_bins is not None:
             rate = check_rates(self._gated(x), "SynchronousSPAD")
-            if rate.numel() == 0:
-                return rate * self.cycles
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            return _image(gaussian_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
+            return _image(normal_cycles(_rows(rate), dead, self.cycles, generator), x).to(x.dtype)
         p = self.probabilities(x)
         return p * self.cycles + multinomial_noise(p, self.cycles, generator)
 
@@ -272,17 +310,25 @@ class SynchronousSPAD(RandomSensor):
             return super().forward(x, generator)
         check_generator(generator, "SynchronousSPAD")
         with torch.no_grad():
-            measurement, drawn = _drawn(self._gated(x), self.cycles, self.dead_bins, generator)
+            rate = check_rates(self._gated(x), "SynchronousSPAD")
+            dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
+            counts, drawn = draw_cycle_steps(_rows(rate), dead, self.cycles, generator)
 
         def log_prob() -> Tensor:
-            rate, dead = _rows(self._gated(x)), torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
-            return score_of_cycles(drawn, rate, dead, self.cycles).view(x.select(TIME, 0).shape)
+            return cycles_log_prob(drawn, _rows(self._gated(x)), dead, self.cycles).view(x.select(TIME, 0).shape)
 
         record_score(log_prob, type(self).__name__)
-        return measurement
+        return _image(counts, x).to(x.dtype)
 
     def inverse(self, counts: Tensor) -> CoatesEstimate:
-        """The rate behind a histogram (`coates`), divided by the gate; bins where the gate is shut are not valid."""
+        """Rate behind a histogram (`coates`), divided by the gate; bins with a shut gate are not valid.
+
+        Args:
+            counts: (..., C, T, H, W).
+
+        Raises:
+            UnitError: for a dead time below one bin.
+        """
         estimate = coates(counts, self.cycles, self.dead_bins)
         if self.gate is None:
             return estimate
@@ -323,14 +369,27 @@ def first_photon_log_prob(
     constant: bool = True,
     where: str = "first_photon_log_prob",
 ) -> Tensor:
-    """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)). (..., C, T, H, W).
+    """Log-probability of every bin given the bins before: binomial(armed cycles, 1 - exp(-rate)).
 
-    Its sum over time is that of the histogram. `constant` False leaves the binomial coefficient out, which does not
-    depend on the rate. Concave in the rate. With `dead_bins`, cycles that come back inside a bin count for the part of
-    it in which they could fire: linear in the counts, greatest where the mean is right, to second order in the photons
-    of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are possible; a count
-    at rate 0 has log-probability -inf. Raises UnitError, in the name of `where`, when the counts need more than
-    `cycles` cycles.
+    Its sum over time is that of the histogram; concave in the rate. With a dead time, cycles rearmed inside a bin count
+    for the part of it in which they could fire: linear in the counts, greatest where the mean is right, to second order
+    in the photons of a bin (the estimate of `coates` is closer). Values and gradients are finite wherever counts are
+    possible; a count at rate 0 has log-probability -inf.
+
+    Args:
+        counts: detections, (..., C, T, H, W).
+        rate: expected detections per cycle and bin, (..., C, T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins; None for one detection per cycle.
+        constant: include the binomial coefficient, which does not depend on the rate.
+        where: name of the caller, for errors.
+
+    Returns:
+        (..., C, T, H, W) in the dtype of `rate`.
+
+    Raises:
+        ShapeError: for fewer than 3 dimensions, or shapes that do not broadcast.
+        UnitError: for counts that need more than `cycles` cycles.
     """
     number = check_count(cycles, "cycles", where)
     (counts,), (rate,) = reals(where, torch.float64, counts=counts), reals(where, rate=rate)
@@ -341,10 +400,10 @@ def first_photon_log_prob(
     dead_bins = None if dead_bins is None else one_number(dead_bins, "dead_bins", where)
     n, r = counts.to(torch.float64), rate.to(torch.float64)
     if dead_bins is None:
-        sooner, exposed = torch.zeros_like(r), number - sum_before(n.detach())
+        short, exposed = torch.zeros_like(r), number - sum_before(n.detach())
     else:
         time = armed_time(n.detach(), number, float(dead_bins))
-        sooner, exposed = time.sooner(r), time.exposed
+        short, exposed = time.short_exposures(r), time.exposed
     quiet = exposed - n
     # with a dead time the armed cycles are known on average only
     refuse_cut_off(dead_bins, "dead_bins", where)
@@ -353,7 +412,7 @@ def first_photon_log_prob(
     hit = n != 0
     # where on the input: the logarithm of 0 has no finite gradient
     fire = log_of_firing(torch.where(hit, r, 0.5))
-    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - sooner
+    value = torch.where(hit, n * fire, torch.zeros_like(r)) - r * quiet - short
     if constant:
         value = value + (torch.lgamma(n + quiet + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1))
     return value.to(rate.dtype)

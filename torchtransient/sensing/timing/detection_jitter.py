@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_transient
+from torchtransient.sensing.base.layout import TIME, bin_width_of, check_choice, check_transient
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
-from torchtransient.sensing.numerics.time_convolution import Boundary, check_choice, convolve_time, window_lags
+from torchtransient.sensing.numerics.time_convolution import Boundary, convolve_time, window_lags
 from torchtransient.sensing.response.impulse_response import check_response
 from torchtransient.sensing.response.responses import Response, WithinBin, kernel_of
 

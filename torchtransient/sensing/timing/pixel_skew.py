@@ -13,13 +13,20 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_seconds, check_transient, number_or_tensor
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_choice,
+    check_seconds,
+    check_transient,
+    number_or_tensor,
+)
 from torchtransient.sensing.base.pixel_maps import check_map, pixels_of
 from torchtransient.sensing.base.policies import GradPolicy, gaussian_noise
 from torchtransient.sensing.base.sensor import PhysicalModule, Sensor
 from torchtransient.sensing.counts.moved_counts import MovedCounts
-from torchtransient.sensing.numerics.thinning import halve
-from torchtransient.sensing.numerics.time_convolution import Boundary, check_choice
+from torchtransient.sensing.numerics.draws import halve
+from torchtransient.sensing.numerics.time_convolution import Boundary
 
 
 def _whole_and_part(delay_bins: Tensor | float, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -9,11 +9,18 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import TIME, bin_width_of, check_count, check_seconds, check_transient
+from torchtransient.sensing.base.layout import (
+    TIME,
+    bin_width_of,
+    check_choice,
+    check_count,
+    check_seconds,
+    check_transient,
+)
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.base.sensor import RandomSensor
 from torchtransient.sensing.counts.moved_counts import shifted
-from torchtransient.sensing.numerics.time_convolution import Boundary, check_choice, convolve_time
+from torchtransient.sensing.numerics.time_convolution import Boundary, convolve_time
 from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA, normal_integral
 
 

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.base.layout import TIME, check_count, check_number, check_transient, reals
+from torchtransient.sensing.base.layout import TIME, check_choice, check_count, check_number, check_transient, reals
 from torchtransient.sensing.base.policies import GradPolicy
 from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
-from torchtransient.sensing.numerics.time_convolution import Boundary, check_choice
+from torchtransient.sensing.numerics.time_convolution import Boundary
 
 ActsOn = Literal["detections", "rates"]
 
