@@ -17,12 +17,12 @@ from torchtransient.losses import (
     FreeRunningNLL,
     PoissonNLL,
     ReadNoiseNLL,
+    armed_periods,
     first_photon_nll,
     free_running_nll,
     poisson_nll,
     read_noise_nll,
 )
-from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD, coates
 
 BINS = 20
@@ -371,3 +371,33 @@ def test_errors_of_values_say_who_was_called(case):
     if {"cycles", "periods"} & set(case.options):
         with pytest.raises(UnitError, match=f"^{case.function.__name__}: expected counts"):
             case(x, 1000 * y)
+
+
+def test_predictions_that_are_whole_here_and_there_are_no_counts():
+    """A model that is dark in most bins: every bin is looked at before anybody is warned."""
+    model = torch.zeros(4, 1, 64, 8, 8)
+    model[..., 1::2] = 0.37
+    target = torch.rand(model.shape) + 0.5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TorchTransientWarning)
+        losses.poisson_nll(model.clamp_min(1e-6), target)
+        losses.poisson_nll(model, target, floor=1e-3)
+    with pytest.warns(TorchTransientWarning, match="holds counts"):
+        losses.poisson_nll((10 * model).round(), target, floor=1e-3)
+
+
+def test_histograms_of_detectors_that_run_free():
+    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: the rest of the bin, the next, and a part of the one behind."""
+    counts = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64).reshape(3, 1, 1)
+    found = armed_periods(counts, 10, 1.5).flatten().tolist()
+    y = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
+    wanted = [10.0] * 3
+    for k, n in ((0, 2.0), (2, 1.0)):
+        for ahead in range(4):
+            shut = (torch.clamp(y + 1.5 - ahead, 0, 1) - torch.clamp(y - ahead, 0, 1)).mean().item()
+            wanted[(k + ahead) % 3] -= n * shut
+    assert found == pytest.approx(wanted, abs=1e-3)
+    with pytest.raises(ShapeError, match=r"armed_periods: expected counts \(\.\.\., T, H, W\), got \(3, 1\)"):
+        armed_periods(counts[..., 0], 10, 1.5)
+    with pytest.raises(UnitError, match="armed_periods: expected counts, got complex numbers"):
+        armed_periods(counts + 0j, 10, 1.5)
