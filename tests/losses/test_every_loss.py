@@ -1,4 +1,4 @@
-"""What holds of every loss (input, target): batches, masks, reductions, precision, derivatives, errors."""
+"""The contract of every loss: batches, masks, reductions, precision, derivatives, pickling, errors."""
 
 from __future__ import annotations
 

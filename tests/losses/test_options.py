@@ -1,4 +1,4 @@
-"""Options of every loss: a gradient goes through or is refused. The error of a wrong call names what was called."""
+"""Options of every loss that are tensors with a gradient: it goes through, or is refused."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import torch
 from support.loss_cases import AXIS, BAND, BINS, CASES
 from support.sweeps import together
 from torchtransient import FrequencyAxis, TimeAxis, losses
-from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
@@ -186,13 +186,6 @@ def test_a_capture_with_transient_and_phasor_beside_a_phasor():
     alone = result(2 * p, "phasor", None, frequencies=BAND)
     torch.testing.assert_close(losses.squared_loss(both, alone), losses.squared_loss(p, 2 * p))
     torch.testing.assert_close(losses.squared_loss(both, x + 1), losses.squared_loss(x, x + 1))
-
-
-def test_what_is_no_result_is_refused_as_before():
-    x = torch.rand(1, BINS, 2, 2)
-    for other in ({"transient": x}, [x], None, x.numpy()):
-        with pytest.raises(TorchTransientError, match="expected two dense tensors"):
-            losses.squared_loss(x, other)
 
 
 def test_renders_of_the_library():
