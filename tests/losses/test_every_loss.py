@@ -92,6 +92,24 @@ def test_modules_hold_the_options_of_functions(case):
         case.module(redution="sum")
 
 
+class Halved(losses.PoissonNLL):
+    """A subclass of a user, with a constructor and a forward of its own."""
+
+    def __init__(self, weight):
+        super().__init__(constant=True)
+        self.weight = weight
+
+    def forward(self, input, target, mask=None):
+        return self.weight * super().forward(input, target, mask)
+
+
+def test_modules_have_subclasses():
+    x, y = torch.full((1, 4, 2, 2), 2.0), torch.ones(1, 4, 2, 2)
+    module = pickle.loads(pickle.dumps(Halved(0.5)))
+    torch.testing.assert_close(module(x, y), 0.5 * losses.poisson_nll(x, y, constant=True))
+    assert "constant=True" in repr(module)
+
+
 @every
 def test_items_of_a_batch_do_not_see_each_other(case):
     x, y = case.tensors()

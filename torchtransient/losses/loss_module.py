@@ -24,9 +24,11 @@ class LossModule(nn.Module):
     _signature: ClassVar[inspect.Signature]
 
     def __init_subclass__(
-        cls, *, function: Callable[..., Tensor], by_place: tuple[str, ...] = (), **keywords: Any
+        cls, *, function: Callable[..., Tensor] | None = None, by_place: tuple[str, ...] = (), **keywords: Any
     ) -> None:
         super().__init_subclass__(**keywords)
+        if function is None:  # a subclass of a loss
+            return
         tensors = len(inspect.signature(cls.forward).parameters.keys() - {"self", "mask"})
         options = dict(list(inspect.signature(function).parameters.items())[tensors:])
         del options["mask"]
