@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
 
 
 def draw(*shape, seed=0):
@@ -78,14 +78,10 @@ def test_similarity_of_volumes_is_that_of_three_views():
     assert losses.projection_ssim_loss(a, b, window=7, reduction="none").shape == (2, 1)
 
 
-def test_errors():
+def test_pictures_that_are_too_small():
     a = draw(1, 8, 8)
-    with pytest.raises(ShapeError, match="odd window"):
-        losses.ssim_loss(a, a, window=4)
     with pytest.raises(ShapeError, match="smaller window"):
         losses.ssim_loss(a, a, window=17)
-    with pytest.raises(UnitError, match="value_range"):
-        losses.ssim_loss(a, a, window=3, value_range=0.0)
     with pytest.raises(ShapeError, match="real volume"):
         losses.maximum_projections(a + 0j)
     with pytest.raises(ShapeError, match="volumes"):
