@@ -1,4 +1,4 @@
-"""Layouts, dtypes, empty batches, levels and devices, over the list of all losses."""
+"""Layouts, dtypes, empty batches and levels, over the list of all losses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from support.loss_cases import AXIS, BAND, CASES
 from support.sweeps import together
 from torchtransient import losses
-from torchtransient.errors import DeviceError, ShapeError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 
 NAN, INF = float("nan"), float("inf")
 # Likelihoods with the measurement first, as (model, counts) like the others.
@@ -235,18 +235,3 @@ def test_no_floor_is_one_of_likelihoods():
     for name in ("log ratio", "Wasserstein", "phasor", "read noise", "SSIM", "spacing"):
         with pytest.raises(UnitError, match="greater than zero"):
             LEVELS[name](0.0)
-
-
-# ------------------------------------------------------------------------------------------------------------- devices
-
-
-@every
-def test_inputs_are_on_one_device(case):
-    """Tensors without memory are on a device of their own."""
-    x, y = case.tensors()
-    mask = torch.ones(y.shape[-2:], dtype=torch.bool)
-    with pytest.raises(DeviceError, match="expected the mask on cpu, got one on meta"):
-        case(x, y, mask.to("meta"))
-    if case.pair:
-        with pytest.raises(DeviceError, match="on one device"):
-            case(x, y.to("meta"))

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchtransient.checks import MOST, finite, is_one_of, shown
-from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 from torchtransient.floating import is_true
 from torchtransient.units import SHORTEST_OPL
 
@@ -39,14 +39,12 @@ def check_pair(
     Raises:
         ShapeError: for other types than dense tensors, and for two shapes, broadcastable or not.
         UnitError: for two integer tensors, and for complex ones unless `complex_too`.
-        DeviceError: for two devices.
     """
     input, target = check_dense((input, target), where)
     if input.shape != target.shape:
         raise ShapeError(
             f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
         )
-    check_device(input, target, where, names)
     dtype = working_dtype((input, target), where, complex_too=complex_too)
     return input.to(dtype), target.to(dtype)
 
@@ -60,15 +58,6 @@ def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
         number = {1: "a dense tensor", 2: "two dense tensors"}.get(len(tensors), "dense tensors")
         raise ShapeError(f"{where}: expected {number}, got {' and '.join(kinds)}.")
     return cast("tuple[Tensor, ...]", tensors)
-
-
-def check_device(x: Tensor, other: Tensor, where: str, names: str) -> None:
-    """Raise DeviceError for tensors on two devices."""
-    if x.device != other.device:
-        raise DeviceError(
-            f"{where}: expected {names} on one device, got {x.device} and {other.device}. Move one of them with "
-            ".to(device)."
-        )
 
 
 def working_dtype(tensors: tuple[Tensor, ...], where: str, *, complex_too: bool = False) -> torch.dtype:
@@ -104,7 +93,6 @@ def check_level(
     Raises:
         UnitError: for other numbers; for a length (`..._opl`) below 0.3 fs, since that is a time in seconds.
         ShapeError: for a tensor that does not broadcast.
-        DeviceError: for a tensor on another device.
     """
     dtype = like.real.dtype if like.is_complex() else like.dtype
     limits = torch.finfo(dtype)
@@ -136,8 +124,6 @@ def check_level(
 def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
-    if value.ndim:
-        check_device(value, like, where, f"{name} and tensors")
     try:
         value.expand(like.shape)
     except RuntimeError:
@@ -173,22 +159,19 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
     """Return the mask expanded to the shape of `like`.
 
-    Raises ShapeError unless it broadcasts, UnitError unless it is boolean (0.5 would count as True), DeviceError.
+    Raises ShapeError unless it broadcasts, and UnitError unless it is boolean (0.5 would count as True).
     """
-    shape, device = like.shape, like.device
     if mask is None:
         return None
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         kind = mask.dtype if isinstance(mask, Tensor) else type(mask).__name__
         raise UnitError(f"{where}: expected a mask of truth values, True where it counts, got {kind}. Use mask > 0.")
-    if mask.device != device:
-        raise DeviceError(f"{where}: expected the mask on {device}, got one on {mask.device}. Use mask.to(device).")
     try:
-        return mask.expand(shape)
+        return mask.expand(like.shape)
     except RuntimeError:
         raise ShapeError(
-            f"{where}: expected a mask that broadcasts to {tuple(shape)}, got {tuple(mask.shape)}. A mask of pixels "
-            "of a transient (..., C, T, Y, X) has T = 1."
+            f"{where}: expected a mask that broadcasts to {tuple(like.shape)}, got {tuple(mask.shape)}. A mask of "
+            "pixels of a transient (..., C, T, Y, X) has T = 1."
         ) from None
 
 

@@ -14,7 +14,6 @@ from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_device,
     check_mask,
     check_pair,
     check_reduction,
@@ -120,7 +119,6 @@ def measurement_consistency(
             f"{where}: expected the operator to make a tensor of the measurement's shape {tuple(measured.shape)} of a "
             f"volume {tuple(volume.shape)}, got {got}."
         )
-    check_device(prediction, measured, where, "what the operator makes and the measurement")
     dim = shared_dim(compare, dim, measured, where)
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)

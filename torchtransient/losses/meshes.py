@@ -18,7 +18,6 @@ from torchtransient.floating import is_true
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_device,
     check_mask,
     check_whole,
     counted,
@@ -217,7 +216,6 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
                 f"{tuple(index.shape)}."
             )
         _check_faces(index, mesh, f"{where}: {name}")
-    check_device(vertices, others, where, "both meshes")
     cells = check_whole("cells", cells, where)
     dtype = working_dtype((vertices, others), where)
     first, second = vertices.to(dtype)[faces.long()], others.to(dtype)[other_faces.long()]
@@ -292,7 +290,6 @@ def _check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
     """Raise UnitError for floating or boolean faces, ShapeError for numbers that are none of vertices (..., V, 3)."""
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
         raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
-    check_device(faces, vertices, where, "vertices and faces")
     wide, number = faces.long(), vertices.shape[-2]
     if not is_true((wide >= 0) & (wide < number)):
         raise ShapeError(f"{where}: expected faces of numbers from 0 to {number - 1}, got others.")

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_device, check_mask
+from torchtransient.losses.comparison import check_mask
 
 Reduction = Literal["mean", "item", "none"]
 _ROOM = __name__.rpartition(".")[0]
@@ -118,14 +118,13 @@ def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
 
 
 def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
-    """Return the weight of each element, 0 where masked. Raises ShapeError, UnitError, DeviceError."""
+    """Return the weight of each element, 0 where masked. Raises ShapeError, UnitError."""
     mask = check_mask(mask, like, where)
     if weight is None:
         return mask
     if not isinstance(weight, Tensor) or weight.is_complex():
         got = weight.dtype if isinstance(weight, Tensor) else type(weight).__name__
         raise UnitError(f"{where}: expected weight as a tensor of real numbers, got {got}.")
-    check_device(weight, like, where, "weight and tensors")
     try:
         full = weight.expand(like.shape).to(torch.float64)
     except RuntimeError:
