@@ -117,7 +117,7 @@ def test_widths_of_bins_in_seconds(width):
             loss(LIGHT, LIGHT, bin_width_opl=width)
     for module in (tt.losses.WassersteinLoss, tt.losses.CumulativeLoss):
         with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
-            module(bin_width_opl=width)
+            module(bin_width_opl=width)(LIGHT, LIGHT)
 
 
 def test_one_frequency_needs_no_list():

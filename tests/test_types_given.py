@@ -31,6 +31,10 @@ ANYTHING = {
 # What hands a value on to a function of the user's, whose errors are its own.
 HANDED_ON = {
     "losses.measurement_consistency(volume)": "an operator of the case", "training.accumulate(loss_of)": "a function",
+    # options that a module hands to its function
+    **dict.fromkeys(("losses.FirstPhotonNLL(cycles)", "losses.FreeRunningNLL(periods)",
+      "losses.FreeRunningNLL(dead_bins)", "losses.ReadNoiseNLL(read_noise)",
+      "losses.MeasurementConsistency(operator)"), "a function"),
 }  # fmt: skip
 # Without a case, and why.
 LEFT = {

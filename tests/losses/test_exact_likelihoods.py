@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.losses.dead_time_likelihoods import armed_periods
+from torchtransient.losses import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD
 
 BINS = 64

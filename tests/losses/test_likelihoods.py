@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import pickle
 import warnings
 
 import pytest
@@ -11,18 +10,14 @@ import torch
 
 from support import loss_cases
 from torchtransient import losses
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, TorchTransientWarning, UnitError
+from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError
 from torchtransient.losses import (
-    FirstPhotonNLL,
-    FreeRunningNLL,
-    PoissonNLL,
-    ReadNoiseNLL,
+    armed_periods,
     first_photon_nll,
     free_running_nll,
     poisson_nll,
     read_noise_nll,
 )
-from torchtransient.losses.dead_time_likelihoods import armed_periods
 from torchtransient.sensing import FreeRunningSPAD, SynchronousSPAD, coates
 
 BINS = 20
@@ -77,36 +72,6 @@ def test_the_score_has_mean_zero_at_the_truth(loss, draw):
     loss(x, n, reduction="sum").backward()
     z = x.grad.mean(0) / (x.grad.std(0) / repeats**0.5)
     assert float(z.abs().max()) < 4.5
-
-
-@each
-def test_finite_for_no_light_and_no_counts(loss, draw):
-    for n_value, r_value in ((0.0, 0.0), (0.0, 0.3), (3.0, 0.0), (60.0, 0.0), (3.0, 1e-30), (60.0, 1e-38)):
-        n = torch.full((1, 4, 1, 1), n_value)
-        r = torch.full((1, 4, 1, 1), r_value, requires_grad=True)
-        value = loss(r, n, floor=1e-4)
-        value.backward()
-        assert bool(torch.isfinite(value)) and bool(torch.isfinite(r.grad).all())
-        leaf = r.detach().clone().requires_grad_()
-        default = loss(leaf, n)
-        default.backward()
-        assert bool(torch.isfinite(default.detach())) and bool(torch.isfinite(leaf.grad.square()).all())
-
-
-@each
-def test_reductions_and_dtype(loss, draw):
-    n, r = draw(rates(), seeded()), rates()
-    each_bin = loss(r, n, reduction="none")
-    assert each_bin.shape == r.shape
-    torch.testing.assert_close(loss(r, n, reduction="sum"), each_bin.sum())
-    torch.testing.assert_close(loss(r, n), each_bin.mean())
-    single = loss(r.float(), n.float(), reduction="none")
-    assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), each_bin, rtol=1e-4, atol=1e-3)
-    with pytest.raises(ArgumentError, match="reduction"):
-        loss(r, n, reduction="median")
-    with pytest.raises(ShapeError, match="one shape"):
-        loss(r, n[:, 1:])
 
 
 def test_poisson_value():
@@ -180,21 +145,6 @@ def test_read_noise_value():
     assert torch.autograd.gradcheck(lambda s: read_noise_nll(m, y, s), sigma)
     with pytest.raises(UnitError, match="read_noise greater than zero"):
         read_noise_nll(m, y, 0.0)
-
-
-def test_modules_are_the_functions():
-    n, r = SynchronousSPAD(CYCLES).sample(rates(), seeded()), rates()
-    pairs = [
-        (PoissonNLL(), poisson_nll(r, n)),
-        (PoissonNLL(constant=True, reduction="sum"), poisson_nll(r, n, constant=True, reduction="sum")),
-        (FirstPhotonNLL(CYCLES, 4.5, constant=True), first_photon_nll(r, n, CYCLES, dead_bins=4.5, constant=True)),
-        (ReadNoiseNLL(3.0, constant=False), read_noise_nll(r, n, 3.0, constant=False)),
-        (FirstPhotonNLL(CYCLES), first_photon_nll(r, n, CYCLES)),
-        (FreeRunningNLL(CYCLES, 2.5), free_running_nll(r, n, periods=CYCLES, dead_bins=2.5)),
-        (ReadNoiseNLL(3.0), read_noise_nll(r, n, 3.0)),
-    ]
-    for module, wanted in pairs:
-        assert torch.equal(pickle.loads(pickle.dumps(module))(r, n), wanted)
 
 
 def test_fit_by_likelihood_beats_the_raw_histogram():
@@ -371,3 +321,33 @@ def test_errors_of_values_say_who_was_called(case):
     if {"cycles", "periods"} & set(case.options):
         with pytest.raises(UnitError, match=f"^{case.function.__name__}: expected counts"):
             case(x, 1000 * y)
+
+
+def test_predictions_that_are_whole_here_and_there_are_no_counts():
+    """A model that is dark in most bins: every bin is looked at before anybody is warned."""
+    model = torch.zeros(4, 1, 64, 8, 8)
+    model[..., 1::2] = 0.37
+    target = torch.rand(model.shape) + 0.5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TorchTransientWarning)
+        losses.poisson_nll(model.clamp_min(1e-6), target)
+        losses.poisson_nll(model, target, floor=1e-3)
+    with pytest.warns(TorchTransientWarning, match="holds counts"):
+        losses.poisson_nll((10 * model).round(), target, floor=1e-3)
+
+
+def test_histograms_of_detectors_that_run_free():
+    """Of (2, 0, 1) in 10 periods, dead for 1.5 bins: the rest of the bin, the next, and a part of the one behind."""
+    counts = torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64).reshape(3, 1, 1)
+    found = armed_periods(counts, 10, 1.5).flatten().tolist()
+    y = (torch.arange(10_000, dtype=torch.float64) + 0.5) / 10_000
+    wanted = [10.0] * 3
+    for k, n in ((0, 2.0), (2, 1.0)):
+        for ahead in range(4):
+            shut = (torch.clamp(y + 1.5 - ahead, 0, 1) - torch.clamp(y - ahead, 0, 1)).mean().item()
+            wanted[(k + ahead) % 3] -= n * shut
+    assert found == pytest.approx(wanted, abs=1e-3)
+    with pytest.raises(ShapeError, match=r"armed_periods: expected counts \(\.\.\., T, H, W\), got \(3, 1\)"):
+        armed_periods(counts[..., 0], 10, 1.5)
+    with pytest.raises(UnitError, match="armed_periods: expected counts, got complex numbers"):
+        armed_periods(counts + 0j, 10, 1.5)

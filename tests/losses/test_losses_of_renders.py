@@ -12,7 +12,6 @@ import torchtransient as tt
 from support.loss_cases import CASES
 from tools.small_room import VARIANT, make_room
 from torchtransient import losses
-from torchtransient.errors import GradientError, UnitError
 
 GREY = "wall.bsdf.reflectance.value"
 BAND = tt.FrequencyAxis.uniform(0.2, 0.2, 5)
@@ -98,29 +97,6 @@ def test_of_two_renders(loss, renderer, shared):
     torch.testing.assert_close(of_found, of_wanted, rtol=0, atol=0)
     for pair in ((out, target.transient), (out.transient, target)):
         torch.testing.assert_close(loss(*pair, **options), wanted, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(
-    "loss, options",
-    [
-        (losses.poisson_nll, {}),
-        (losses.first_photon_nll, {"cycles": 1000}),
-        (losses.free_running_nll, {"periods": 1000, "dead_bins": 2.0}),
-        (losses.read_noise_nll, {"read_noise": 0.5}),
-    ],
-    ids=lambda value: getattr(value, "__name__", ""),
-)
-def test_counts_and_renders_that_are_swapped(loss, options, renderer, shared):
-    """The render first; in the place of the counts its gradient tells it."""
-    out, target = shared
-    generator = torch.Generator().manual_seed(1)
-    counts = target.map(lambda t: torch.poisson(t.clamp_min(0), generator=generator))
-    slope_of(loss(out, counts, **options), renderer)
-    with pytest.raises(GradientError, match=f"^{loss.__name__}: expected the prediction first"):
-        loss(counts, out, **options)
-    whole = counts.map(lambda t: t.long())
-    with pytest.raises(UnitError, match=f"^{loss.__name__}: expected a prediction of a floating dtype first"):
-        loss(whole, out.detach(), **options)
 
 
 def test_of_pictures_volumes_and_a_second_render(renderer, shared):

@@ -52,7 +52,7 @@ def asks_for_dim(case):
 
 def test_what_asks_for_dim_is_said():
     """The paragraph names all losses that do, and no other."""
-    (text,) = re.findall(r"\nIt is asked for by (.*?)\. All", PAGE, re.DOTALL)
+    (text,) = re.findall(r"\nIt is asked for by (.*?)\.\s+All", PAGE, re.DOTALL)
     functions = {name for name in dir(losses) if name.islower() and inspect.isfunction(getattr(losses, name))}
     asking = {case.function.__name__ for case in CASES if asks_for_dim(case)}
     for function, call in OTHERS.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 
 import pytest
 import torch
@@ -119,19 +118,10 @@ def test_an_operator_of_the_library_learns_a_volume():
 
 
 def test_says_what_the_operator_did_not_make():
-    with pytest.raises(ArgumentError, match="compare: expected a function"):
-        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, compare="squared")
-    for root, error in ((3, ArgumentError), (lambda x: 1.0, ShapeError)):
-        with pytest.raises(error, match="root"):
-            losses.root_loss(draw(1, 4, 3, 3), draw(1, 4, 3, 3), root=root)
     with pytest.raises(ShapeError, match=r"measurement's shape \(1, 4, 3, 3\)"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v[..., :-1])
     with pytest.raises(ShapeError, match="dimension 4"):
         losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), lambda v: v, scale_invariant=True, dim=4)
-    with pytest.raises(ShapeError, match="list and Tensor"):
-        losses.measurement_consistency([1.0], draw(1, 4, 3, 3), lambda v: v)
-    with pytest.raises(ArgumentError, match="the operator: expected a function"):
-        losses.measurement_consistency(draw(1, 4, 3, 3), draw(1, 4, 3, 3), 3)
 
 
 # ------------------------------------------------------------------------------------------------------------- compare
@@ -153,41 +143,4 @@ def test_compares_by_every_module_of_the_room(case):
             torch.testing.assert_close(loss(x, y, mask), wanted, rtol=0, atol=0)
         assert module in losses.MeasurementConsistency(lambda v: v, module, reduction=reduction).modules()
     with pytest.raises(ArgumentError, match=r"reduction 'sum' of compare, too, got .* with 'none'"):
-        losses.MeasurementConsistency(lambda v: v, module, reduction="sum")
-
-
-def swallows(input, target, **options):
-    return (input - target).square().mean()
-
-
-def counts_first(counts, mean, *, mask, reduction):
-    return losses.poisson_nll(mean, counts, mask=mask, reduction=reduction)
-
-
-def returns_a_list(input, target, mask, reduction):
-    return [0.0]
-
-
-NO_COMPARES = {
-    "cycles": losses.first_photon_nll,
-    "L1Loss": torch.nn.L1Loss(),
-    "mask": torch.nn.functional.mse_loss,
-    "target, mask=": losses.TotalVariation(),
-    "positional": losses.total_variation,
-    "takes counts": counts_first,
-    "'read_noise'": losses.read_noise_nll,
-    "heed reduction 'none', got ()": swallows,
-    "heed reduction 'none', got list": returns_a_list,
-}
-
-
-@pytest.mark.parametrize("says, compare", NO_COMPARES.items(), ids=NO_COMPARES.keys())
-def test_says_what_compare_lacks(says, compare):
-    volume = draw(1, 4, 3, 3)
-    if isinstance(compare, torch.nn.Module):
-        compare.reduction = "none"
-    with pytest.raises(ArgumentError, match=r"measurement_consistency: expected compare .*" + re.escape(says)):
-        losses.measurement_consistency(volume, volume, lambda v: v, compare=compare, reduction="none")
-    if "heed" not in says:
-        with pytest.raises(ArgumentError, match=r"MeasurementConsistency: expected compare .*" + re.escape(says)):
-            losses.MeasurementConsistency(lambda v: v, compare, reduction="none")
+        losses.MeasurementConsistency(lambda v: v, module, reduction="sum")(x, y)

@@ -116,7 +116,7 @@ def test_frequencies_above_half_of_one_over_the_bin(sign):
     calls = [
         lambda band: losses.transient_phasors(record, AXIS, band),
         lambda band: losses.transient_phasor_loss(record, record, axis=AXIS, frequencies=band),
-        lambda band: losses.TransientPhasorLoss(AXIS, band),
+        lambda band: losses.TransientPhasorLoss(AXIS, band)(record, record),
     ]
     for call in calls:
         for frequency in (10.001, 20.5, 1e6):

@@ -11,8 +11,8 @@ import torch
 
 from support.loss_cases import AXIS, BAND, BINS, CASES
 from support.sweeps import together
-from torchtransient import Chirps, RateAxis, TimeAxis, losses
-from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
+from torchtransient import Chirps, FrequencyAxis, RateAxis, TimeAxis, losses
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
@@ -196,13 +196,6 @@ def test_a_capture_with_transient_and_phasor_beside_a_phasor():
     torch.testing.assert_close(losses.squared_loss(both, x + 1), losses.squared_loss(x, x + 1))
 
 
-def test_what_is_no_result_is_refused_as_before():
-    x = torch.rand(1, BINS, 2, 2)
-    for other in ({"transient": x}, [x], None, x.numpy()):
-        with pytest.raises(TorchTransientError, match="expected two dense tensors"):
-            losses.squared_loss(x, other)
-
-
 def test_renders_of_the_library():
     """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
     from torchtransient.capture import Capture, Scan, Wall
@@ -230,3 +223,48 @@ def test_renders_of_the_library():
     torch.testing.assert_close(
         functools.partial(losses.ssim_loss, window=3)(rendered, rendered.steady), torch.tensor(0.0)
     )
+
+
+def phasors(frequencies, start):
+    axis = FrequencyAxis(frequencies, start)
+    return SimpleNamespace(
+        transient=None, gated=None, steady=None, axis=None, frequencies=axis, phasor=torch.ones(1, 2, 2, 2) + 0j
+    )
+
+
+@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
+def test_starts_of_frequency_axes_are_told_apart_by_phase(frequencies, shift, one):
+    """What a start turns is the start times the highest frequency, in cycles."""
+    a, b = phasors(frequencies, 1.0), phasors(frequencies, 1.0 + shift)
+    if one:
+        assert losses.phasor_loss(a, b).item() == 0
+        return
+    with pytest.raises(UnitError, match="one axis"):
+        losses.phasor_loss(a, b)
+
+
+@pytest.mark.parametrize(
+    ("other", "one"),
+    [
+        (TimeAxis(1.0, 0.1, 10), True),
+        (TimeAxis(1.00005, 0.1, 10), True),
+        (TimeAxis(1.0, 0.101, 10), False),  # ends later
+        (TimeAxis(0.99, 0.101, 10), False),  # begins sooner, ends alike
+        (TimeAxis(1.01, 0.1, 10), False),
+        (TimeAxis(1.0005, 0.1, 10), False),
+        (TimeAxis(1.0, 0.1, 11), False),
+        (TimeAxis(1.0, 1.0 / 11, 11), False),  # as long, in other bins
+    ],
+)
+def test_axes_that_are_one(other, one):
+    """Start, end and number of bins, each to a thousandth of a bin."""
+    cubes = [torch.rand(1, axis.num_bins, 2, 2) for axis in (TimeAxis(1.0, 0.1, 10), other)]
+    a, b = (
+        SimpleNamespace(transient=cube, phasor=None, gated=None, steady=None, frequencies=None, gates=None, axis=axis)
+        for cube, axis in zip(cubes, (TimeAxis(1.0, 0.1, 10), other), strict=True)
+    )
+    if one:
+        assert losses.wasserstein_loss(a, b).item() > 0
+    else:
+        with pytest.raises((UnitError, ShapeError), match=r"one axis|shape"):
+            losses.wasserstein_loss(a, b)

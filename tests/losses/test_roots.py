@@ -104,7 +104,3 @@ def test_log_ratio_takes_a_background_of_each_pixel():
     background = torch.rand(3, 3) + 0.1
     found = losses.log_ratio_loss(a, b, background=background)
     torch.testing.assert_close(found, ((a + background).log() - (b + background).log()).square().mean())
-    with pytest.raises(UnitError, match="background greater than zero"):
-        losses.log_ratio_loss(a, b, background=background - 1)
-    with pytest.raises(UnitError, match="background"):
-        losses.log_ratio_loss(a, b, background=0.0)

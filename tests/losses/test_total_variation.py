@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
+from torchtransient.reconstruction.hidden_volume import HiddenVolume
+from torchtransient.reconstruction.voxels import VoxelGrid
 
 
 def box(n=16, low=4, high=10, height=3.0):
@@ -72,17 +75,11 @@ def test_relative_smoothing_scales_with_the_volume():
     torch.testing.assert_close(losses.total_variation(1e-9 * noise, reduction="none"), 1e-9 * one, rtol=1e-7, atol=0)
 
 
-def test_thin_volumes_and_errors():
+def test_thin_volumes():
     picture = torch.rand(1, 1, 5, 5, dtype=torch.float64)
     assert losses.total_variation(picture, reduction="none").shape == picture.shape
     with pytest.raises(ShapeError, match=r"\(..., Z, Y, X\)"):
         losses.total_variation(torch.zeros(4, 4))
-    with pytest.raises(ShapeError, match="spacing"):
-        losses.total_variation(picture, spacing=(1.0, 1.0))
-    with pytest.raises(UnitError, match="spacing"):
-        losses.total_variation(picture, spacing=(1.0, 0.0, 1.0))
-    with pytest.raises(UnitError, match="smoothing"):
-        losses.total_variation(picture, smoothing=-1.0)
 
 
 @pytest.mark.parametrize("isotropic", [True, False])
@@ -98,3 +95,33 @@ def test_squares_of_differences_neither_vanish_nor_overflow(isotropic, size):
         found.backward()
         wanted.backward()
         torch.testing.assert_close(single.grad.double(), double.grad, rtol=1e-3, atol=1e-6)
+
+
+def volume(planes, depth=1.0):
+    grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 0.5 + depth]], (4, 5, planes))
+    return HiddenVolume(torch.rand(1, planes, 5, 4, generator=torch.Generator().manual_seed(0)), grid, "f-k migration")
+
+
+@pytest.mark.parametrize("planes", [1, 2, 3])
+def test_volumes_of_few_planes(planes):
+    """Two planes are evenly spaced, whatever lies between them, and one plane has no spacing: voxels are cubes then."""
+    given = volume(planes)
+    spacing = (1.0 / planes if planes > 1 else 0.4, 0.4, 0.5)
+    expected = losses.total_variation(given.values, spacing=spacing)
+    torch.testing.assert_close(losses.total_variation(given), expected)
+    if planes == 3:
+        uneven = dataclasses.replace(given.grid, depths=given.grid.depths + torch.tensor([0.0, 0.0, 1e-3]))
+        with pytest.raises(ShapeError, match="evenly spaced planes"):
+            losses.total_variation(dataclasses.replace(given, grid=uneven))
+
+
+@pytest.mark.parametrize("spacing", [(0.1, 0.5, 0.2), (0.4, 0.2, 0.1), (0.3, 0.2, 0.7)])
+def test_smoothing_that_is_not_given(spacing):
+    """A thousandth of the mean modulus of each volume over the smallest spacing."""
+    both = torch.rand(2, 4, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    both[1] *= 30
+    found = losses.total_variation(both, spacing=spacing, reduction="none")
+    for volume, own in zip(both, found, strict=True):
+        given = 1e-3 * float(volume.mean()) / min(spacing)
+        wanted = losses.total_variation(volume, spacing=spacing, smoothing=given, reduction="none")
+        torch.testing.assert_close(own, wanted, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,4 @@
-"""The list of losses that `tests/losses/test_every_loss.py` runs over: one entry brings all of its tests."""
+"""The table of losses: one entry brings the contract tests of `tests/losses`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def halved(x):
 
 @dataclass(frozen=True)
 class LossCase:
-    """`function(input, target, mask=, reduction=)`, the module of the same options, and what is claimed of both."""
+    """A loss: its function, its module, their options, and the properties that the contract tests hold it to."""
 
     name: str
     function: Callable[..., torch.Tensor]

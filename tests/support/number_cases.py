@@ -35,6 +35,17 @@ MESH = (torch.eye(3), torch.tensor([[0, 1, 2]]))
 SPHERE, FOAM = {"type": "sphere"}, (262.0, 0.53, 1.12, 0.0036)
 
 
+class _Called(Case):
+    """The module of a loss, called with tensors: its function checks what it holds."""
+
+    def __init__(self, case, *tensors):
+        super().__init__(case.module, **{**case.options, **case.said})
+        self.tensors = case.arguments(*tensors)
+
+    def __call__(self, **given):
+        return super().__call__(**given)(*self.tensors)
+
+
 def _of_losses() -> dict[str, Case]:
     """Functions and modules of losses and metrics, by the cases that their own tests have."""
     found = {}
@@ -45,7 +56,7 @@ def _of_losses() -> dict[str, Case]:
         base = {**case.options, **case.said}
         found.setdefault(function, Case(case.function, *case.arguments(x, y), **base))
         if id(case.module) in names:
-            found.setdefault(f"losses.{names[id(case.module)]}", Case(case.module, **case.options))
+            found.setdefault(f"losses.{names[id(case.module)]}", _Called(case, x, y))
     for case in METRICS:
         found.setdefault(f"metrics.{case.function.__name__}", Case(case.function, *case.pair(), **case.options))
     return found

@@ -1,8 +1,10 @@
-"""What losses share: pairs of tensors of one shape, masks, scales of items, reductions.
+"""Parts of every loss: checks of pairs of tensors, options and masks; scales of items; reductions.
 
-A mask is a boolean tensor that broadcasts to the tensors compared; True counts. What it leaves out has no part in the
-value and none in the gradient, whatever stands there (NaN of a dead pixel, too). A loss of whole records reads bins
-that do not count as empty in both, and leaves out the pixels that have no bin left.
+A mask is a boolean tensor that broadcasts to the tensors compared; True counts. Masked elements, NaN included, have no
+part in value and gradient. Losses of whole records take masked bins for empty ones in both records, and leave out
+pixels without any bin that counts.
+
+The argument `where` of the checks is the name of the public function, which begins their messages.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchtransient.checks import MOST, finite, is_one_of, shown
-from torchtransient.errors import ArgumentError, DeviceError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 from torchtransient.floating import is_true
 from torchtransient.units import SHORTEST_OPL
 
@@ -24,6 +26,7 @@ Reduction = Literal["none", "sum", "mean"]
 
 
 def check_reduction(reduction: Reduction, where: str) -> None:
+    """Raise ArgumentError unless `reduction` is one of the three."""
     if not is_one_of(reduction, get_args(Reduction)):
         raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {shown(reduction)}.")
 
@@ -31,21 +34,23 @@ def check_reduction(reduction: Reduction, where: str) -> None:
 def check_pair(
     input: object, target: object, where: str, *, complex_too: bool = False, names: str = "input and target"
 ) -> tuple[Tensor, Tensor]:
-    """Both in their common dtype (`working_dtype`). Raises ShapeError for no tensors or two shapes, UnitError for other
-    numbers, DeviceError.
+    """Return both in their `working_dtype`.
+
+    Raises:
+        ShapeError: for other types than dense tensors, and for two shapes, broadcastable or not.
+        UnitError: for two integer tensors, and for complex ones unless `complex_too`.
     """
     input, target = check_dense((input, target), where)
     if input.shape != target.shape:
         raise ShapeError(
             f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
         )
-    check_device(input, target, where, names)
     dtype = working_dtype((input, target), where, complex_too=complex_too)
     return input.to(dtype), target.to(dtype)
 
 
 def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
-    """The same. Raises ShapeError unless all are tensors, and none a sparse one."""
+    """Return the tensors. Raises ShapeError for other types and for sparse tensors."""
     kinds = [
         str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
     ]
@@ -55,19 +60,11 @@ def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
     return cast("tuple[Tensor, ...]", tensors)
 
 
-def check_device(x: Tensor, other: Tensor, where: str, names: str) -> None:
-    """Raises DeviceError for two tensors on two devices."""
-    if x.device != other.device:
-        raise DeviceError(
-            f"{where}: expected {names} on one device, got {x.device} and {other.device}. Move one of them with "
-            ".to(device)."
-        )
-
-
 def working_dtype(tensors: tuple[Tensor, ...], where: str, *, complex_too: bool = False) -> torch.dtype:
-    """The dtype in which tensors are compared: that of the most precise floating one, float32 at least; networks give
-    half precision under autocast. Whole numbers and truth values, counts and frames of detectors, take that of the
-    others. Raises UnitError.
+    """Return the dtype of a comparison: that of the most precise floating tensor, float32 at least.
+
+    Integer and boolean tensors (counts, frames) have no say. Raises UnitError if all are, and for complex tensors
+    unless `complex_too`.
     """
     dtypes = [x.dtype for x in tensors if x.dtype.is_floating_point or x.dtype.is_complex]
     if not dtypes:
@@ -87,11 +84,15 @@ def _single(dtype: torch.dtype) -> torch.dtype:
 def check_level(
     name: str, value: Tensor | float, like: Tensor, where: str, *, zero: bool = False, square: bool = False
 ) -> Tensor:
-    """A floor, a background or a width that goes with `like`, in its precision: a number, or a tensor that broadcasts
-    to it. Greater than zero (`zero`: or zero), and one that the precision holds (`square`: its square, too).
+    """Return a level (floor, background, width) in the precision of `like`.
 
-    Raises UnitError for other numbers, ShapeError for a tensor that does not fit, DeviceError. Values of tensors are
-    not looked at in `torch.vmap` over them.
+    Args:
+        value: number, or tensor that broadcasts to `like`; greater than zero (`zero`: or zero), and a normal number of
+            the precision (`square`: its square too). Values of tensors are not checked under `torch.vmap`.
+
+    Raises:
+        UnitError: for other numbers; for a length (`..._opl`) below 0.3 fs, since that is a time in seconds.
+        ShapeError: for a tensor that does not broadcast.
     """
     dtype = like.real.dtype if like.is_complex() else like.dtype
     limits = torch.finfo(dtype)
@@ -123,8 +124,6 @@ def check_level(
 def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
-    if value.ndim:
-        check_device(value, like, where, f"{name} and tensors")
     try:
         value.expand(like.shape)
     except RuntimeError:
@@ -134,29 +133,8 @@ def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
         ) from None
 
 
-def check_option(
-    name: str,
-    value: Tensor | float | None,
-    where: str,
-    *,
-    needed: bool = False,
-    zero: bool = False,
-    square: bool = False,
-) -> None:
-    """`check_level` of what a module holds, before there are tensors that it goes with: in double precision.
-
-    None is the default of what is not `needed`.
-    """
-    if value is None:
-        if needed:
-            raise UnitError(f"{where}: expected {name}, a number, got None.")
-        return
-    shape, device = (value.shape, value.device) if isinstance(value, Tensor) else ((), None)
-    check_level(name, value, torch.empty(shape, dtype=torch.float64, device=device), where, zero=zero, square=square)
-
-
 def check_number(name: str, value: object, where: str) -> float:
-    """One finite number. Raises UnitError, also for a tensor with a gradient, which ends where a number is taken."""
+    """Return one finite number. Raises UnitError, also for a tensor with a gradient, which a number would drop."""
     if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
         raise UnitError(
             f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
@@ -166,12 +144,12 @@ def check_number(name: str, value: object, where: str) -> float:
 
 
 def _tangent(x: Tensor) -> Tensor | None:
-    """Of forward mode, which `requires_grad` does not know."""
+    """Return the tangent of forward mode, which `requires_grad` does not show."""
     return cast("Tensor | None", forward_ad.unpack_dual(x).tangent)  # type: ignore[no-untyped-call]
 
 
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
-    """A number of things, 1 or more; 3.0 is three. Raises UnitError for no number, `error` for others."""
+    """Return a whole number of at least 1; 3.0 is one. Raises UnitError for no number, `error` for others."""
     number = math.nan if isinstance(value, bool) else check_number(name, value, where)
     if not 1 <= number <= MOST or number != int(number):
         raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
@@ -179,44 +157,42 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
 
 
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
-    """The mask, expanded to the shape of `like`. Raises ShapeError unless it broadcasts to it, UnitError unless it is
-    boolean, DeviceError.
+    """Return the mask expanded to the shape of `like`.
+
+    Raises ShapeError unless it broadcasts, and UnitError unless it is boolean (0.5 would count as True).
     """
-    shape, device = like.shape, like.device
     if mask is None:
         return None
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         kind = mask.dtype if isinstance(mask, Tensor) else type(mask).__name__
         raise UnitError(f"{where}: expected a mask of truth values, True where it counts, got {kind}. Use mask > 0.")
-    if mask.device != device:
-        raise DeviceError(f"{where}: expected the mask on {device}, got one on {mask.device}. Use mask.to(device).")
     try:
-        return mask.expand(shape)
+        return mask.expand(like.shape)
     except RuntimeError:
         raise ShapeError(
-            f"{where}: expected a mask that broadcasts to {tuple(shape)}, got {tuple(mask.shape)}. A mask of pixels "
-            "of a transient (..., C, T, Y, X) has T = 1."
+            f"{where}: expected a mask that broadcasts to {tuple(like.shape)}, got {tuple(mask.shape)}. A mask of "
+            "pixels of a transient (..., C, T, Y, X) has T = 1."
         ) from None
 
 
 def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
-    """`x` where the mask counts, `fill` elsewhere, without a gradient there."""
+    """Return `x` where the mask counts, and `fill` without gradient elsewhere."""
     # where on the input: a NaN that is replaced after the arithmetic still has a NaN gradient
     return x if mask is None else torch.where(mask, x, torch.full_like(x, fill))
 
 
 def squared_modulus(x: Tensor) -> Tensor:
-    """`|x|^2`, real or complex, with a slope at zero (that of the modulus has none)."""
+    """Return `|x|^2`, real or complex, with a finite slope at zero."""
     return x.real.square() + x.imag.square() if x.is_complex() else x.square()
 
 
 def real_product(x: Tensor, y: Tensor) -> Tensor:
-    """`Re(x conj(y))` of two real or two complex tensors."""
+    """Return `Re(x conj(y))` of two real or two complex tensors."""
     return x.real * y.real + x.imag * y.imag if x.is_complex() else x * y
 
 
 def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None = None) -> Tensor:
-    """The values, their sum or their mean over what counts; 0 where nothing does."""
+    """Return the values, their sum, or their mean over what counts; 0 where nothing counts."""
     check_reduction(reduction, where)
     value = counted(value, mask)
     if reduction == "none":
@@ -229,7 +205,7 @@ def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None 
 
 
 def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
-    """Mean of `|x|` over what counts of each item (`layouts.item_dims`), without gradient; broadcasts to `x`."""
+    """Mean of `|x|` over the counted elements of each item (`layouts.item_dims`), detached; broadcasts to `x`."""
     size = counted(x.detach(), mask).abs()
     if not dims:  # torch takes no dimensions for all of them
         return size
@@ -239,7 +215,7 @@ def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> T
 
 
 def item_scale(x: Tensor, other: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
-    """`item_mean` of `x`; that of `other` where `x` is dark altogether, and 1 where both are."""
+    """Return `item_mean` of `x`, or that of `other` where `x` is all zero, or 1 where both are."""
     own, others = item_mean(x, dims, mask), item_mean(other, dims, mask)
     scale = torch.where(own > 0, own, others)
     return torch.where(scale > 0, scale, torch.ones_like(scale))

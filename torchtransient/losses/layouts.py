@@ -1,10 +1,10 @@
-"""Where time is in what losses are given, and which dimensions are one item of a batch: one rule for all of them.
+"""Position of time and extent of an item in the tensors that losses compare.
 
-Shapes do not say it: (2, 3, 20, 5) is two lists of five points, or two channels of three bins. So there is `dim`, the
-dimension of time (of frequency), with the channels right before it: -3 of images (..., C, T, Y, X), -2 of lists of
-points (..., C, T, N), -5 of exhaustive captures (..., C, T, Ly, Lx, Sy, Sx). An item of a batch is its channels and
-everything behind them. Without `dim`, (C, T, Y, X) and (B, C, T, Y, X) are taken, of four
-bins or more: fewer may be channels. What is left to say is a batch of lists of as many channels.
+Shapes are ambiguous: (2, 3, 20, 5) is two lists of five points with three channels, or two channels of three bins. The
+argument `dim` of losses is the dimension of time (of frequency for phasors), with the channels right before it: -3 of
+images (..., C, T, Y, X), -2 of lists of points (..., C, T, N), -5 of exhaustive captures (..., C, T, Ly, Lx, Sy, Sx).
+An item of a batch is its channels and all dimensions behind them. Without `dim`, only (C, T, Y, X) and (B, C, T, Y, X)
+of four bins or more are taken. A batch of lists of four channels or more has such a shape: give `dim=-2`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import Reduction, check_level, check_reduction
+from torchtransient.losses.comparison import check_level
 
 _IMAGES = -3
 # One or three numbers before points are channels of a list rather than bins.
@@ -24,8 +24,10 @@ _LAYOUTS = "-3 of (..., C, T, Y, X), -2 of lists (..., C, T, N), -5 of exhaustiv
 
 
 def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
-    """The dimension of time of `x`, below zero. Raises ShapeError where it is not there, or neither said nor clear;
-    `instead`: what else a user may say.
+    """Return the dimension of time of `x` as a negative number.
+
+    Raises ShapeError if it is out of range, or not given for an ambiguous shape; `instead`: an alternative to `dim=`
+    for the message.
     """
     if dim is None:
         if x.ndim not in (4, 5) or x.shape[_IMAGES] < _FEWEST_BINS:
@@ -43,7 +45,7 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
 
 
 def check_dim(dim: int, where: str) -> int:
-    """Raises ShapeError for what is no number of a dimension."""
+    """Return `dim` as a whole number. Raises ShapeError."""
     number = as_whole(dim)
     if number is None or abs(number) > MOST:
         raise ShapeError(
@@ -52,15 +54,8 @@ def check_dim(dim: int, where: str) -> int:
     return number
 
 
-def check_held(reduction: Reduction, dim: int | None, where: str) -> None:
-    """The options that most modules hold. Raises ShapeError."""
-    check_reduction(reduction, where)
-    if dim is not None:
-        check_dim(dim, where)
-
-
 def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
-    """`time_dim` of a record, which has one bin or more."""
+    """Return `time_dim` of a record. Raises ShapeError for records without bins."""
     place = time_dim(x, dim, where)
     if not x.shape[place]:
         raise ShapeError(f"{where}: expected one or more bins in dimension {place}, got {tuple(x.shape)}.")
@@ -68,7 +63,7 @@ def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
 
 
 def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
-    """The width of a bin, metres of optical path, in the precision of `like`. Raises UnitError, also for none."""
+    """Return the width of a bin, metres of path, in the precision of `like`. Raises UnitError, also for None."""
     if width_opl is None:
         raise UnitError(
             f"{where}: expected bin_width_opl, metres of optical path, with tensors, got None. Give "
@@ -78,14 +73,14 @@ def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
 
 
 def item_dims(x: Tensor, dim: int | None, where: str, instead: str = "") -> tuple[int, ...]:
-    """Dimensions of an item, from its channels on. Without `dim`, a tensor of one dimension is one item."""
+    """Return the dimensions of an item, from its channels on. Without `dim`, a tensor (N,) is one item."""
     if dim is None and x.ndim < 2:
         return tuple(range(-x.ndim, 0))
     return tuple(range(max(time_dim(x, dim, where, instead) - 1, -x.ndim), 0))
 
 
 def as_columns(x: Tensor, dim: int) -> Tensor:
-    """(..., T, N, 1) of a tensor with time as its dimension `dim` < 0: the layout of the sensors."""
+    """Reshape a tensor with time in dimension `dim` < 0 to (..., T, N, 1), the layout of sensors."""
     if dim == _IMAGES:
         return x
     place = dim + x.ndim

@@ -1,21 +1,19 @@
-"""What a hidden volume would have measured against what was measured: what holds a reconstruction to its data."""
+"""Squared error, and the consistency of a hidden volume with its measurement under any loss."""
 
 from __future__ import annotations
 
-import functools
 import inspect
 from collections.abc import Callable
-from typing import cast
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import flag, function
+from torchtransient.checks import function
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
-    check_device,
     check_mask,
     check_pair,
     check_reduction,
@@ -24,18 +22,49 @@ from torchtransient.losses.comparison import (
     reduce,
     squared_modulus,
 )
-from torchtransient.losses.layouts import check_held, item_dims
-from torchtransient.losses.pair_losses import PairLoss, PairModule, check_compare, shared_dim
+from torchtransient.losses.layouts import item_dims, time_dim
+from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, VALUES, Light, Volume, reads
+
+
+class PairLoss(Protocol):
+    """A loss of two tensors; `functools.partial` holds further options."""
+
+    def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
+
+
+class PairModule(Protocol):
+    """A loss of two tensors as a module, which holds its `reduction`."""
+
+    reduction: Reduction
+
+    def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
 
 
 @reads(input=LIGHT, target=LIGHT)
 def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
-    """`|input - target|^2` of each element, real or complex, any shape. Symmetric. Raises ShapeError, UnitError."""
-    check_reduction(reduction, "squared_loss")
-    input, target = check_pair(input, target, "squared_loss", complex_too=True)
-    mask = check_mask(mask, input, "squared_loss")
-    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, "squared_loss", mask)
+    """Squared error, `|input - target|^2`. Symmetric.
+
+    Args:
+        input: real or complex tensor, any shape.
+        target: of the same shape.
+        mask: elements that count.
+        reduction: "mean" over elements that count, "sum", or "none".
+
+    Returns:
+        Scalar, or the shape of the input for "none"; in the unit of the input, squared.
+
+    Raises:
+        ShapeError: for two shapes.
+    """
+    where = "squared_loss"
+    input, target = check_pair(input, target, where, complex_too=True)
+    mask = check_mask(mask, input, where)
+    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, where, mask)
+
+
+class SquaredLoss(LossModule, function=squared_loss, by_place=("reduction",)):
+    """`squared_loss` with its reduction held."""
 
 
 @reads(volume=VALUES, measured=LIGHT)
@@ -50,23 +79,38 @@ def measurement_consistency(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`compare(A volume, measured)`: what a volume would have measured against what was.
+    """Compare the measurement that a volume predicts with the one that was made, `compare(operator(volume), measured)`.
 
-    `operator` is `A`: an operator of `tt.nlos` such as `FK`, or any function from `volume` (..., C, Z, Y, X) to the
-    shape of `measured` (..., C, T, Y, X); `mask` is one of the measurement. `compare`: a function (input, target) with
-    `mask` and `reduction`, of which `functools.partial` holds what else it wants, or a module of this room that holds
-    the same `reduction`. Losses of torch.nn take no mask: write a function. With `scale_invariant` A volume is first
-    multiplied by the real number that brings each item nearest to the measurement in least squares: powers of lasers
-    and albedos are seldom calibrated. `dim`, where time is in the measurement, then says what is an item
-    (`losses.layouts`); a function `compare` that wants it is told, and what `compare` holds is taken. That number may
-    be negative, so keep volumes non-negative where their sign matters; it is 1 for a volume that is dark altogether,
-    whose gradient then leads out of the dark.
-    Not symmetric; zero where A volume is the measurement. Raises ShapeError where A volume is no tensor of the
-    measurement's shape, and for another `compare`.
+    Args:
+        volume: (..., C, Z, Y, X).
+        measured: measurement (..., C, T, Y, X).
+        operator: operator of `tt.nlos` such as `FK`, or any function from a volume to the shape of the measurement.
+        compare: loss `(input, target, *, mask, reduction)`, of which `functools.partial` holds further options, or a
+            module of `tt.losses` with the same `reduction`. Losses of `torch.nn` take no mask: wrap them in a function.
+        scale_invariant: multiply the prediction of each item by the real number that brings it nearest to the
+            measurement in least squares, since powers and albedos are seldom calibrated. The number may be negative; it
+            is 1 for a dark volume, whose gradient then leads out of the dark.
+        dim: dimension of time in the measurement, which says what an item is (`losses.layouts`); given to `compare`
+            where it takes one, and taken from there where it holds one.
+        mask: elements of the measurement that count.
+        reduction: "mean", "sum" or "none".
+
+    Returns:
+        What `compare` returns.
+
+    Raises:
+        ShapeError: if the prediction is not a tensor of the measurement's shape.
+        ArgumentError: for a module with another reduction, or a `compare` with another `dim`.
     """
     where = "measurement_consistency"
-    check_held(reduction, dim, where)
-    compared, known = _checked(operator, compare, scale_invariant, reduction, where)
+    function(f"{where}: the operator", operator, "tensors")
+    check_reduction(reduction, where)
+    held = getattr(compare, "reduction", None)
+    if isinstance(compare, nn.Module) and held != reduction:
+        raise ArgumentError(
+            f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
+            "Give both the same."
+        )
     volume, measured = check_dense((volume, measured), where)
     prediction = operator(volume)
     if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
@@ -75,53 +119,46 @@ def measurement_consistency(
             f"{where}: expected the operator to make a tensor of the measurement's shape {tuple(measured.shape)} of a "
             f"volume {tuple(volume.shape)}, got {got}."
         )
-    check_device(prediction, measured, where, "what the operator makes and the measurement")
-    check_mask(mask, measured, where)
-    dim = shared_dim(compare, known, dim, measured, where)
+    dim = shared_dim(compare, dim, measured, where)
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)
         prediction = _scaled(*pair, check_mask(mask, measured, where), item_dims(measured, dim, where))
-    said = {"dim": dim} if dim is not None and "dim" in known else {}
-    value = compared(prediction, measured, mask, **said)
-    # of a tensor of one dimension, a record, even what is not reduced may be one number
-    dims = value.ndim if isinstance(value, Tensor) else -1
-    if dims < 0 or (dims > 0 if reduction != "none" else dims == 0 and measured.ndim > 1):
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise ArgumentError(f"{where}: expected compare to heed reduction {reduction!r}, got {got} of it.")
-    return value
+    if isinstance(compare, nn.Module):
+        return cast(PairModule, compare)(prediction, measured, mask)
+    options: dict[str, Any] = {"dim": dim} if dim is not None and takes_dim(compare) else {}
+    return cast(PairLoss, compare)(prediction, measured, mask=mask, reduction=reduction, **options)
 
 
-def _checked(
-    operator: object, compare: PairLoss | PairModule, scale_invariant: bool, reduction: Reduction, where: str
-) -> tuple[Callable[..., Tensor], dict[str, inspect.Parameter]]:
-    """`compare` as a function (input, target, mask) with that reduction, and its parameters. Raises ShapeError."""
-    function(f"{where}: the operator", operator, "tensors")
-    flag(f"{where}: scale_invariant", scale_invariant)
-    known = check_compare(compare, where, reduction)
-    if not isinstance(compare, nn.Module):
-        return functools.partial(_compared, compare, reduction), known
-    held = getattr(compare, "reduction", None)
-    if held != reduction:
+class MeasurementConsistency(LossModule, function=measurement_consistency, by_place=("operator", "compare")):
+    """`measurement_consistency` of (volume, measured), with its operator and options held.
+
+    An operator or a `compare` that is a module is a submodule and moves with this one.
+    """
+
+
+def takes_dim(compare: object) -> bool:
+    """Return True for a function with an argument `dim`."""
+    return "dim" in inspect.signature(cast(Callable[..., Any], compare)).parameters
+
+
+def shared_dim(compare: object, dim: int | None, like: Tensor, where: str) -> int | None:
+    """Return the dimension of time, as given or as `compare` holds it. Raises ArgumentError if both differ."""
+    held = getattr(compare, "dim", None)
+    if not isinstance(compare, nn.Module) and takes_dim(compare):
+        held = inspect.signature(cast(Callable[..., Any], compare)).parameters["dim"].default
+    place = None if dim is None else time_dim(like, dim, where)
+    if held is None or held is inspect.Parameter.empty:
+        return place
+    if place is not None and time_dim(like, held, where) != place:
         raise ArgumentError(
-            f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
-            "Give both the same."
+            f"{where}: expected time in one dimension, got dim={dim}, and dim={held} held by compare. Leave "
+            "the latter out."
         )
-    return cast(PairModule, compare), known
-
-
-def _compared(
-    compare: Callable[..., Tensor],
-    reduction: Reduction,
-    input: Tensor,
-    target: Tensor,
-    mask: Tensor | None,
-    **said: int,
-) -> Tensor:
-    return compare(input, target, mask=mask, reduction=reduction, **said)
+    return time_dim(like, held, where)
 
 
 def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:
-    """The prediction times the number that brings each item nearest to the measurement."""
+    """Scale each item of the prediction to least squares of the measurement."""
     if not prediction.numel():
         return prediction
     seen = counted(prediction, mask)
@@ -134,49 +171,3 @@ def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tup
     along = real_product(seen, counted(measured, mask)).sum(dims, keepdim=True)
     scale = torch.where(dark, torch.ones_like(along), along / torch.where(dark, torch.ones_like(power), power))
     return seen * scale
-
-
-class SquaredLoss(nn.Module):
-    """`squared_loss(input, target)` with its reduction held."""
-
-    def __init__(self, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction, "SquaredLoss")
-        self.reduction = reduction
-
-    def forward(self, input: Light, target: Light, mask: Tensor | None = None) -> Tensor:
-        return squared_loss(input, target, mask=mask, reduction=self.reduction)
-
-
-class MeasurementConsistency(nn.Module):
-    """`measurement_consistency(input, target)` of a volume and a measurement, with its operator and options held.
-
-    An operator that is a module is a part of this one and moves with it.
-    """
-
-    def __init__(
-        self,
-        operator: Callable[[Tensor], Tensor],
-        compare: PairLoss | PairModule = squared_loss,
-        *,
-        scale_invariant: bool = False,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__()
-        check_held(reduction, dim, "MeasurementConsistency")
-        _checked(operator, compare, scale_invariant, reduction, "MeasurementConsistency")
-        self.operator, self.compare = operator, compare
-        self.scale_invariant, self.dim, self.reduction = scale_invariant, dim, reduction
-
-    def forward(self, input: Volume, target: Light, mask: Tensor | None = None) -> Tensor:
-        return measurement_consistency(
-            input,
-            target,
-            self.operator,
-            compare=self.compare,
-            scale_invariant=self.scale_invariant,
-            dim=self.dim,
-            mask=mask,
-            reduction=self.reduction,
-        )

@@ -1,7 +1,7 @@
-"""Losses of Monte Carlo renders: a loss that is not linear in a render is biased by the noise of that render.
+"""Losses of Monte Carlo renders, whose noise biases every loss that is not linear in them.
 
-`E[f(render)] = f(E render) + f'' variance / 2 + ...`: a squared error grows by the variance, which the scene's
-parameters change, too. The product of the residuals of two independent renders does not (docs/noisy_renders.md).
+`E[f(render)] = f(E render) + f'' variance / 2 + ...`: a squared error grows by the variance, which depends on the
+scene's parameters. The product of the residuals of two independent renders does not (docs/noisy_renders.md).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.checks import finite, shown
 from torchtransient.errors import UnitError
@@ -17,15 +17,15 @@ from torchtransient.losses.comparison import (
     Reduction,
     check_mask,
     check_pair,
-    check_reduction,
     check_whole,
     counted,
     real_product,
     reduce,
 )
+from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, Light, reads
 
-# Of Mitsuba's indices of samples, 32 bits.
+# Mitsuba's indices of samples have 32 bits.
 _MOST_SAMPLES = 2**32
 
 
@@ -33,32 +33,53 @@ _MOST_SAMPLES = 2**32
 def two_render_loss(
     first: Light, second: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """`Re[(first - target) conj(second - target)]` of each element, real or complex, any shape: a squared error.
+    """Unbiased squared error of a render, by two of them: `Re[(first - target) conj(second - target)]`. ::
 
-    `first` and `second`: two renders of the same scene with different seeds. Independent noise of both has no part in
-    the mean, so that value and gradient are unbiased, at any number of samples: that of the squared error of a render
-    without noise (of the same target: noise of the target stays). May be negative, as unbiased estimates of small
-    numbers are. Symmetric in the renders. Two renders in one call, and which loss when: docs/noisy_renders.md. Raises
-    ShapeError, UnitError.
+        out = renderer({key: torch.stack([x, x])}, seed=(1, 2))
+        loss = two_render_loss(out.transient[0], out.transient[1], target)
+
+    Value and gradient have the mean of the squared error of a render without noise, at any number of samples; noise of
+    the target stays. May be negative. Symmetric in the renders.
+
+    Args:
+        first: render, real or complex, any shape.
+        second: render of the same scene with another seed.
+        target: measurement of the same shape.
+        mask: elements that count.
+        reduction: "mean" over elements that count, "sum", or "none".
+
+    Returns:
+        Unit of the renders, squared; scalar, or the shape of the target for "none".
+
+    Raises:
+        ShapeError: for different shapes.
     """
     where = "two_render_loss"
-    check_reduction(reduction, where)
     first, target = check_pair(first, target, where, complex_too=True, names="first and target")
     second, target = check_pair(second, target, where, complex_too=True, names="second and target")
-    first = first.to(target.dtype)  # a second one of more precision, or complex
+    first = first.to(target.dtype)
     mask = check_mask(mask, target, where)
     a, b = (counted(render, mask) - counted(target, mask) for render in (first, second))
     return reduce(real_product(a, b), reduction, where, mask)
 
 
+class TwoRenderLoss(LossModule, function=two_render_loss, by_place=("reduction",)):
+    """`two_render_loss` with its reduction held."""
+
+    def forward(self, first: Light, second: Light, target: Light, *, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
+        return self.loss(first, second, target, mask=mask)
+
+
 @dataclass(frozen=True)
 class SampleSchedule:
-    """Samples per pixel of a fit: few at first, where noise averages out over steps, more where bias is left.
+    """Samples per pixel over the steps of a fit: few first, where noise averages out, more where bias is left. ::
 
-    `schedule(step)`: `first` up to the share `hold` of `steps`, then doubled in equal parts of what is left, and `last`
-    from the end on. By doubling, since every other number of samples is compiled and recorded anew; the last doubling
-    stops at `last`, so that (64, 100, 10) ends at 100. Numbers only: `renderer(values, spp=schedule(step), seed=step)`.
-    Raises UnitError for numbers that are no such schedule.
+        schedule = SampleSchedule(64, 512, steps)
+        out = renderer(values, spp=schedule(step), seed=step)
+
+    `first` up to the share `hold` of `steps`, then doubled in equal parts of the rest, and `last` from the end on; (64,
+    100, 10) ends at 100. Doubling, since every other number of samples is compiled and recorded anew. Raises UnitError
+    for `last` below `first` and a `hold` outside of [0, 1].
     """
 
     first: int
@@ -78,7 +99,7 @@ class SampleSchedule:
             )
 
     def __call__(self, step: int) -> int:
-        """Samples per pixel of that step, counted from 0."""
+        """Return the samples per pixel of a step, counted from 0."""
         number = finite("SampleSchedule: step", step)
         if number < 0:
             raise UnitError(f"SampleSchedule: expected a step of 0 or more, got {shown(step)}.")
@@ -91,12 +112,19 @@ class SampleSchedule:
 
     @staticmethod
     def needed(spp: int, bias: float, allowed: float) -> int:
-        """Samples per pixel at which a `bias` of a loss at `spp` is at most `allowed`, which is in its unit.
+        """Return the samples per pixel at which the bias of a loss, which falls as one over them, is small enough.
 
-        The bias of a loss of a render falls with one over the samples; that of a squared error is `squared_loss(first,
-        target) - two_render_loss(first, second, target)`. Take a tenth of what the noise of the target makes of the
-        loss. By doubling `spp`, at least itself, also where the estimate of the bias is below zero. Raises UnitError,
-        also where more than 2^32 samples would be needed, which no renderer takes.
+        Args:
+            spp: samples per pixel at which the bias was measured.
+            bias: bias of the loss; of a squared error `squared_loss(first, target) - two_render_loss(first, second,
+                target)`.
+            allowed: bias to reach, in the same unit; a tenth of the noise of the target in the loss, for instance.
+
+        Returns:
+            `spp` doubled as often as needed, at least `spp`.
+
+        Raises:
+            UnitError: if more than 2^32 samples would be needed, which no renderer takes.
         """
         where = "SampleSchedule.needed"
         number = check_whole("spp", spp, where, UnitError)
@@ -104,7 +132,7 @@ class SampleSchedule:
         if limit <= 0:
             raise UnitError(f"{where}: expected allowed above zero, got {shown(allowed)}.")
         ratio = finite(f"{where}: bias", bias) / limit
-        # not infinite, which a quotient of numbers may be
+        # a quotient may be infinite
         doublings = math.ceil(math.log2(min(ratio, 2.0**64))) if ratio > 1 else 0
         found = number << doublings
         if doublings and found > _MOST_SAMPLES:
@@ -113,15 +141,3 @@ class SampleSchedule:
                 f"{shown(bias)} and {shown(allowed)}. Allow a tenth of what the noise of the target makes of the loss."
             )
         return found
-
-
-class TwoRenderLoss(nn.Module):
-    """`two_render_loss(first, second, target)` with its reduction held."""
-
-    def __init__(self, reduction: Reduction = "mean") -> None:
-        super().__init__()
-        check_reduction(reduction, "TwoRenderLoss")
-        self.reduction = reduction
-
-    def forward(self, first: Light, second: Light, target: Light, *, mask: Tensor | None = None) -> Tensor:
-        return two_render_loss(first, second, target, mask=mask, reduction=self.reduction)

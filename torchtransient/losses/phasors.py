@@ -1,9 +1,9 @@
-"""Losses of phasors: the oscillations that a band of frequencies makes of a transient, compared without a branch cut.
+"""Losses of phasors: the amplitudes of a band of frequencies of a transient, compared without a branch cut.
 
-The phasor of a record is the sum of its bins times `exp(-2 pi i nu (opl - start))`, `nu` in cycles per metre of optical
-path and `opl` at the middle of the bin. A delay by `d` turns it by `2 pi nu d`. Squares of differences of phasors
-see `2 - 2 cos` of that angle, which is smooth where the angle itself jumps by a whole turn. Frequencies that are low
-against one over the delay see it from afar; high ones resolve it and repeat.
+The phasor of a record is the sum of its bins times `exp(-2 pi i nu (opl - start))`, with `nu` in cycles per metre of
+optical path and `opl` at the middle of the bin. A delay by `d` turns it by `2 pi nu d`; squared differences of phasors
+are `2 - 2 cos` of that angle, which is smooth where the angle jumps. Frequencies that are low against one over the
+delay have a slope from afar, high ones resolve it and repeat.
 """
 
 from __future__ import annotations
@@ -11,31 +11,29 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.checks import flag, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.comparison import (
     Reduction,
     check_dense,
     check_level,
     check_mask,
-    check_option,
     check_pair,
-    check_reduction,
     counted,
     item_scale,
     reduce,
     squared_modulus,
     working_dtype,
 )
-from torchtransient.losses.layouts import bins_dim, check_held, item_dims
+from torchtransient.losses.layouts import bins_dim, item_dims, time_dim
+from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import PHASOR, TRANSIENT, Phasors, Transient, reads
 
-# The phasors of dark pixels are noise: relative to the mean modulus of an item, below what has a phase.
+# Relative to the mean modulus of an item: phasors below are noise and have no phase.
 _PHASE_FLOOR = 1e-3
-# The highest frequency of a discrete transform is half of one over the bin, however that was computed.
+# The highest frequency of a discrete transform, half of one over the bin, is taken however it was computed.
 _ROUNDING = 1e-9
 
 
@@ -47,22 +45,28 @@ def transient_phasors(
     *,
     dim: int | None = None,
 ) -> Tensor:
-    """Phasors (..., C, F, Y, X), complex, of transients (..., C, T, Y, X): a dense transform to F frequencies.
+    """Transform transients to phasors at F frequencies.
 
-    `dim`: where time is, and frequency then (`losses.layouts`). As from a renderer with
-    `frequencies=`, but for the bins: those count as at their middles, which lacks a factor `sinc(nu bin_width_opl)`.
-    Phases are computed in double precision. Raises ShapeError where T is not that of the axis; UnitError for
-    wavelengths below two bins, whose phasors are those of longer ones. Two bins, the last frequency of a discrete
-    transform, are taken: the phasor there does not know the sign of a delay.
+    As from a renderer with `frequencies=`, but for a factor `sinc(nu bin_width_opl)`, since light counts as at the
+    middle of its bin. Phases are computed in double precision.
+
+    Args:
+        transient: (..., C, T, Y, X), or another layout with `dim`.
+        axis: time axis of T bins; None: that of a result.
+        frequencies: F frequencies, wavelengths of two bins or more. At two bins the phasor is blind to the sign of a
+            delay.
+        dim: dimension of time (`losses.layouts`).
+
+    Returns:
+        Complex phasors (..., C, F, Y, X).
+
+    Raises:
+        ShapeError: if T is not the number of bins of the axis, or without `dim` where the shape is ambiguous.
+        UnitError: for wavelengths below two bins, which alias.
     """
-    return _phasors(transient, axis, frequencies, dim, "transient_phasors")
-
-
-def _phasors(
-    given: object, time_axis: TimeAxis | None, band: FrequencyAxis | None, dim: int | None, where: str
-) -> Tensor:
-    axis, frequencies = _check_axes(time_axis, band, where)
-    (transient,) = check_dense((given,), where)
+    where = "transient_phasors"
+    axis, frequencies = _check_axes(axis, frequencies, where)
+    (transient,) = check_dense((transient,), where)
     place = bins_dim(transient, dim, where) + transient.ndim
     lead, bins, trail = transient.shape[:place], transient.shape[place], transient.shape[place + 1 :]
     if bins != axis.num_bins:
@@ -73,29 +77,10 @@ def _phasors(
     dtype = working_dtype((transient,), where)
     turns = torch.outer(frequencies.per_metre, axis.centers_opl - frequencies.start_opl)
     angle = -2 * math.pi * (turns - turns.round())
-    # A product of complex numbers, twice the work: autocast narrows a product of real ones, and its derivative wherever
-    # the backward pass runs, and leaves complex ones alone.
+    # A product of complex numbers, twice the work: autocast narrows products of real ones, in the backward pass too.
     table = torch.polar(torch.ones_like(angle), angle).to(transient.device, torch.promote_types(dtype, torch.complex64))
     record = transient.to(dtype).reshape(*lead, bins, math.prod(trail)).to(table.dtype)
     return (table @ record).reshape(*lead, frequencies.num_frequencies, *trail)
-
-
-def _check_axes(
-    axis: TimeAxis | None, frequencies: FrequencyAxis | None, where: str
-) -> tuple[TimeAxis, FrequencyAxis]:
-    """Raises UnitError for no axes, and for frequencies that bins cannot tell from lower ones."""
-    if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
-        raise ArgumentError(
-            f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
-            f"{type(frequencies).__name__}. Results that have an axis need no other."
-        )
-    highest, most = max(abs(f) for f in frequencies.frequencies), 0.5 / axis.bin_width_opl
-    if highest > most * (1 + _ROUNDING):
-        raise UnitError(
-            f"{where}: expected a wavelength of two bins at least, frequencies of {most:.4g} per metre at most, got "
-            f"{highest:.4g}. Take narrower bins or lower frequencies; in hertz with FrequencyAxis.from_hertz."
-        )
-    return axis, frequencies
 
 
 @reads(input=PHASOR, target=PHASOR)
@@ -109,49 +94,46 @@ def phasor_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`|P - Q|^2` of each element of two complex tensors, such as phasors (..., C, F, Y, X). Symmetric.
+    """Squared difference of phasors, `|P - Q|^2`. Symmetric.
 
-    `phase_only`: of `P / sqrt(|P|^2 + floor^2)` and Q likewise, each between 0 and 1, so that brightness has no part:
-    `2 - 2 cos` of the angle between them where both are bright, 1 where one is dark. `floor`, in the unit of the
-    phasors, says what is dark and bounds the gradient by 4/floor; None: 1e-3 of the mean modulus of each item of each;
-    `dim`, where frequency is, then says what is an item (`losses.layouts`). Raises ShapeError for two shapes, UnitError
-    for real numbers.
+    Args:
+        input: complex phasors P (..., C, F, Y, X), or any shape.
+        target: phasors Q of the same shape.
+        phase_only: compare `P / sqrt(|P|^2 + floor^2)`, so that brightness has no part: `2 - 2 cos` of the angle
+            between two bright phasors, 1 where one is dark.
+        floor: modulus below which phasors are dark, above zero; bounds the gradient by 4/floor. None: 1e-3 of the mean
+            modulus of each item of each.
+        dim: dimension of frequency, which says what an item is (`losses.layouts`).
+        mask: elements that count.
+        reduction: "mean" over elements that count, "sum", or "none".
+
+    Returns:
+        Unit of the phasors, squared (`phase_only`: none); scalar, or the shape of the input for "none".
+
+    Raises:
+        UnitError: for real tensors, and a floor that is not above zero.
+        ShapeError: for two shapes, or without `dim` and `floor` where the shape is ambiguous.
     """
-    return _phasor_loss(input, target, (phase_only, floor, dim), mask, reduction, "phasor_loss")
-
-
-def _phasor_loss(
-    ours: object,
-    theirs: object,
-    phases: tuple[bool, Tensor | float | None, int | None],
-    mask: Tensor | None,
-    reduction: Reduction,
-    where: str,
-) -> Tensor:
-    phase_only, floor, dim = phases
-    flag(f"{where}: phase_only", phase_only)
-    check_held(reduction, dim, where)
-    check_option("floor", floor, where)
-    input, target = check_pair(ours, theirs, where, complex_too=True)
+    where = "phasor_loss"
+    input, target = check_pair(input, target, where, complex_too=True)
     if not input.is_complex():
         raise UnitError(f"{where}: expected complex phasors, got {input.dtype}. See transient_phasor_loss.")
+    level = None if floor is None else check_level("floor", floor, input, where)
+    dim = None if dim is None else time_dim(input, dim, where)
     mask = check_mask(mask, input, where)
     input, target = counted(input, mask), counted(target, mask)
     if phase_only:
-        if floor is None:
+        if level is None:
             item = item_dims(input, dim, where, " or floor=")
             scale, other = (_PHASE_FLOOR * item_scale(*x, item, mask) for x in ((input, target), (target, input)))
         else:
-            scale = other = check_level("floor", floor, input, where)
+            scale = other = level
         input, target = _phase(input, scale), _phase(target, other)
     return reduce(squared_modulus(input - target), reduction, where, mask)
 
 
-def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
-    """`P / sqrt(|P|^2 + floor^2)`, by numbers near one: squares of bright phasors exceed single precision."""
-    size = torch.maximum(phasor.detach().abs(), floor)
-    scaled = phasor / size
-    return scaled / (squared_modulus(scaled) + (floor / size) ** 2).sqrt()
+class PhasorLoss(LossModule, function=phasor_loss):
+    """`phasor_loss` with its options held."""
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)
@@ -167,85 +149,61 @@ def transient_phasor_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`phasor_loss` of the phasors of two transients (..., C, T, Y, X), for each pixel and frequency.
+    """`phasor_loss` of the phasors of two transients, for each pixel and frequency. Symmetric.
 
-    Parseval: over all frequencies of a discrete transform its mean is that of the squared difference times T; over a
-    band it forgets what the band does not see. `mask` (..., C, T, Y, X): bins that do not count are empty in both,
-    pixels of which none does are left out. `reduction="none"`: (..., C, F, Y, X). Errors as those of
-    `transient_phasors` and `phasor_loss`. `dim`: where time is (`losses.layouts`).
+    Parseval: over all frequencies of a discrete transform its mean is that of the squared difference times T; a band
+    compares only its part.
+
+    Args:
+        input: transient (..., C, T, Y, X), or another layout with `dim`.
+        target: of the same shape.
+        axis, frequencies: as in `transient_phasors`.
+        phase_only, floor: as in `phasor_loss`.
+        dim: dimension of time (`losses.layouts`).
+        mask: bins that count, (..., C, T, Y, X); the others are empty in both, and pixels without any are left out.
+        reduction: "mean" over pixels that count, "sum", or "none".
+
+    Returns:
+        Scalar, or (..., C, F, Y, X) for "none".
+
+    Raises:
+        ShapeError, UnitError: as `transient_phasors` and `phasor_loss`.
     """
     where = "transient_phasor_loss"
-    check_reduction(reduction, where)
     input, target = check_pair(input, target, where)
     dim = bins_dim(input, dim, where)
     mask = check_mask(mask, input, where)
-    ours, theirs = (_phasors(counted(x, mask), axis, frequencies, dim, where) for x in (input, target))
+    ours, theirs = (transient_phasors(counted(x, mask), axis, frequencies, dim=dim) for x in (input, target))
     pixels = None if mask is None else mask.any(dim, keepdim=True)
-    return _phasor_loss(ours, theirs, (phase_only, floor, dim), pixels, reduction, where)
+    return phasor_loss(
+        ours, theirs, phase_only=phase_only, floor=floor, dim=dim, mask=pixels, reduction=reduction
+    )
 
 
-class PhasorLoss(nn.Module):
-    """`phasor_loss(input, target)` with its options held."""
+class TransientPhasorLoss(LossModule, function=transient_phasor_loss, by_place=("axis", "frequencies")):
+    """`transient_phasor_loss` with its axes and options held."""
 
-    def __init__(
-        self,
-        *,
-        phase_only: bool = False,
-        floor: float | None = None,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__()
-        check_held(reduction, dim, "PhasorLoss")
-        flag("PhasorLoss: phase_only", phase_only)
-        check_option("floor", floor, "PhasorLoss")
-        self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
 
-    def forward(self, input: Phasors, target: Phasors, mask: Tensor | None = None) -> Tensor:
-        return phasor_loss(
-            input,
-            target,
-            phase_only=self.phase_only,
-            floor=self.floor,
-            dim=self.dim,
-            mask=mask,
-            reduction=self.reduction,
+def _check_axes(
+    axis: TimeAxis | None, frequencies: FrequencyAxis | None, where: str
+) -> tuple[TimeAxis, FrequencyAxis]:
+    """Return the axes. Raises ArgumentError if one is missing, UnitError for frequencies that alias."""
+    if not isinstance(axis, TimeAxis) or not isinstance(frequencies, FrequencyAxis):
+        raise ArgumentError(
+            f"{where}: expected a TimeAxis and a FrequencyAxis, got {type(axis).__name__} and "
+            f"{type(frequencies).__name__}. Results that have an axis need no other."
         )
-
-
-class TransientPhasorLoss(nn.Module):
-    """`transient_phasor_loss(input, target, axis, frequencies)` with its axes and options held."""
-
-    def __init__(
-        self,
-        axis: TimeAxis | None = None,
-        frequencies: FrequencyAxis | None = None,
-        *,
-        phase_only: bool = False,
-        floor: float | None = None,
-        dim: int | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__()
-        check_held(reduction, dim, "TransientPhasorLoss")
-        if axis is not None:
-            _check_axes(axis, frequencies, "TransientPhasorLoss")
-        elif not isinstance(frequencies, FrequencyAxis):
-            raise UnitError(f"TransientPhasorLoss: expected frequencies, a FrequencyAxis, got {shown(frequencies)}.")
-        flag("TransientPhasorLoss: phase_only", phase_only)
-        check_option("floor", floor, "TransientPhasorLoss")
-        self.axis, self.frequencies = axis, frequencies
-        self.phase_only, self.floor, self.dim, self.reduction = phase_only, floor, dim, reduction
-
-    def forward(self, input: Transient, target: Transient, mask: Tensor | None = None) -> Tensor:
-        return transient_phasor_loss(
-            input,
-            target,
-            axis=self.axis,
-            frequencies=self.frequencies,
-            phase_only=self.phase_only,
-            floor=self.floor,
-            dim=self.dim,
-            mask=mask,
-            reduction=self.reduction,
+    highest, most = max(abs(f) for f in frequencies.frequencies), 0.5 / axis.bin_width_opl
+    if highest > most * (1 + _ROUNDING):
+        raise UnitError(
+            f"{where}: expected a wavelength of two bins at least, frequencies of {most:.4g} per metre at most, got "
+            f"{highest:.4g}. Take narrower bins or lower frequencies; in hertz with FrequencyAxis.from_hertz."
         )
+    return axis, frequencies
+
+
+def _phase(phasor: Tensor, floor: Tensor) -> Tensor:
+    """`P / sqrt(|P|^2 + floor^2)`, by numbers near one, since squares of bright phasors overflow."""
+    size = torch.maximum(phasor.detach().abs(), floor)
+    scaled = phasor / size
+    return scaled / (squared_modulus(scaled) + (floor / size) ** 2).sqrt()

@@ -1,7 +1,7 @@
-"""Results in place of tensors: losses take a render, a capture or what a method found, and read what they compare.
+"""Results as inputs of losses: renders, captures, volumes and readings in place of tensors.
 
-By attributes alone, so that any object with them will do: this room knows no renderer. Beside the tensor a result knows
-where its time is (`dim`) and its axis, which stand for arguments that are not given.
+A result is any object with the attribute that is compared (`transient`, `phasor`, `steady`, ...). Its `axis`, the width
+of its bins and its dimension of time replace arguments that are not given.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ class HasTransient(Protocol):
 
 
 class HasPhasor(Protocol):
-    """The same of a phasor film: `phasor` with `frequencies`."""
+    """Result of a phasor film: `phasor` with `frequencies`."""
 
     @property
     def phasor(self) -> Tensor | None: ...
 
 
 class HasGated(Protocol):
-    """The same of a gated film: `gated` with `gates`."""
+    """Result of a gated film: `gated` with `gates`."""
 
     @property
     def gated(self) -> Tensor | None: ...
 
 
 class HasSteady(Protocol):
-    """A render's picture."""
+    """Render with a picture, `steady`."""
 
     @property
     def steady(self) -> Tensor | None: ...
@@ -71,7 +71,7 @@ DepthMap = Tensor | HasDepth
 
 LIGHT = ("transient", "phasor", "gated", "rates", "beats")
 TRANSIENT, PHASOR, STEADY, VALUES, DEPTH = ("transient",), ("phasor",), ("steady",), ("values",), ("depth_m",)
-# What says where on its axis a tensor lies: two results are compared on one.
+# The axes of each attribute, which two results have to share.
 _AXES = {
     "transient": ("axis",), "rates": ("axis", "rate_axis"), "beats": ("axis", "chirps"), "phasor": ("frequencies",),
     "gated": ("gates",),
@@ -83,27 +83,29 @@ _ROUNDING = 1e-3
 
 
 def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:
-    """A function of which the arguments named may be results: it gets the first of their attributes that is there.
+    """Decorate a function so that the named arguments may be results, of which it receives a tensor.
 
-    Arguments `dim`, `bin_width_opl` and `axis` that are not given are those of the results. Raises ShapeError for a
-    result that has none of the attributes, UnitError for results on two axes.
+    Args:
+        measures: attributes per argument, by preference. Of two results the same attribute is read where both have it.
+
+    Options `dim`, `bin_width_opl`, `axis` and `spacing` that are not given are those of the results. The function
+    raises ShapeError for a result without any of the attributes, UnitError for results on two axes.
     """
 
     def wrapped(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
         signature = inspect.signature(function)
-        names = ", ".join(signature.parameters)
         places = {name: list(signature.parameters).index(name) for name in measures}
 
         @functools.wraps(function)
         def reading(*args: Arguments.args, **keywords: Arguments.kwargs) -> Returned:
             given = [args[i] if i < len(args) else keywords.get(name) for name, i in places.items()]
-            # tensors, as a rule, of which nothing is asked here: compiled and mapped functions see none of this
+            # compiled and mapped functions see nothing of what follows
             if all(isinstance(x, Tensor) for x in given):
                 return function(*args, **keywords)
             try:
                 bound = signature.bind(*args, **keywords)
-            except TypeError as error:  # which does not say of what
-                raise TypeError(f"{function.__name__}: {error}. Its arguments are {names}.") from None
+            except TypeError:
+                return function(*args, **keywords)  # Python's own message names the function
             _read(bound.arguments, measures, set(signature.parameters), function.__name__)
             return function(*bound.args, **bound.kwargs)
 
@@ -113,7 +115,7 @@ def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned
 
 
 def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known: set[str], where: str) -> None:
-    """Put tensors in the places of results, and what the results know in places that are empty."""
+    """Replace results by their tensors, and options that are not given by those of the results."""
     results = {name: arguments[name] for name in measures if _is_result(arguments.get(name))}
     taken = {name: _attribute(x, measures[name], list(results.values()), name, where) for name, x in results.items()}
     for attribute, settings in _AXES.items():
@@ -129,7 +131,7 @@ def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known
 
 
 def _settings(x: object, attribute: str, known: set[str], where: str) -> dict[str, Any]:
-    """What a result knows beside its tensor, by the names of arguments."""
+    """Return the options that a result sets."""
     if attribute == "values" and "spacing" in known:
         return {"spacing": _spacing(getattr(x, "grid", None), where)}
     if attribute not in LIGHT:
@@ -144,7 +146,7 @@ def _settings(x: object, attribute: str, known: set[str], where: str) -> dict[st
 
 
 def _spacing(grid: Any, where: str) -> tuple[float, float, float] | None:
-    """Of the voxels of a volume. Raises ShapeError for planes that are not even."""
+    """Return the spacing of voxels along Z, Y, X, metres. Raises ShapeError for uneven planes."""
     if grid is None:
         return None
     steps = grid.depths.diff()
@@ -158,7 +160,7 @@ def _spacing(grid: Any, where: str) -> tuple[float, float, float] | None:
 
 
 def _is_result(x: object) -> bool:
-    """Whether it has one of the attributes, be it None: a dictionary has `values`, which are no tensor."""
+    """Return True for an object with one of the attributes as a tensor or None; `values` of a dictionary is neither."""
     if isinstance(x, Tensor):
         return False
     return any(hasattr(x, name) and isinstance(getattr(x, name), Tensor | None) for name in _EVERY)
@@ -169,7 +171,7 @@ def _there(x: object, names: tuple[str, ...]) -> list[str]:
 
 
 def _attribute(x: object, wanted: tuple[str, ...], results: list[object], name: str, where: str) -> str:
-    """Which attribute is taken of a result: one that all others have as well, where there is one."""
+    """Return the attribute to read: one that all results have, if any."""
     there = _there(x, wanted)
     if not there:
         held = " and ".join(_there(x, _EVERY)) or "nothing of the kind"

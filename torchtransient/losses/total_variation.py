@@ -1,11 +1,11 @@
-"""Total variation of hidden volumes: a penalty that is low where they are flat between sharp borders."""
+"""Total variation of hidden volumes, a penalty that is low for flat regions between sharp borders."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchtransient.checks import Numbers, flag, shown
+from torchtransient.checks import Numbers, shown
 from torchtransient.errors import ShapeError
 from torchtransient.losses.comparison import (
     Reduction,
@@ -13,14 +13,13 @@ from torchtransient.losses.comparison import (
     check_level,
     check_mask,
     check_number,
-    check_option,
-    check_reduction,
     counted,
     item_scale,
     reduce,
     squared_modulus,
     working_dtype,
 )
+from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import VALUES, Volume, reads
 
 _DIMS = (-3, -2, -1)
@@ -37,21 +36,31 @@ def total_variation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Modulus of the gradient of each voxel of a volume (..., Z, Y, X), real or complex (Rudin, Osher, Fatemi 1992).
+    """Modulus of the gradient of each voxel, by differences to the next voxel along Z, Y and X.
 
-    Differences to the next voxel along Z, Y, X over `spacing`, metres between voxels (None: those of the grid of
-    a `HiddenVolume`, or per voxel); none past the end, none to voxels that do not count.
-    `isotropic`: the root of the sum of their squares; else the sum of their moduli, which favours faces along the axes.
-    Times the volume of a voxel, its sum is the area of a surface times the step across it
-    (anisotropic: of its projections onto the axes).
+    Times the volume of a voxel, the sum is the area of a surface times the step across it (anisotropic: the area of its
+    projections onto the axes).
 
-    `smoothing`, in units of the volume per metre, makes `sqrt(d^2 + s^2) - s` of a modulus d, whose gradient is zero in
-    flat places and nowhere infinite; it is less than d by s at most. None: 1e-3 of the mean modulus of each Z, Y, X per
-    spacing; 0: the modulus itself, with gradient zero in flat places. Raises ShapeError, UnitError.
+    Args:
+        volume: real or complex volume (..., Z, Y, X).
+        spacing: metres between voxels along Z, Y, X; None: that of the grid of a `HiddenVolume`, or 1.
+        isotropic: root of the sum of squares; False: sum of moduli, which favors faces along the axes.
+        smoothing: s in `sqrt(d^2 + s^2) - s` of a modulus d, units of the volume per metre: gradients are zero in flat
+            places and finite everywhere. None: 1e-3 of the mean modulus of each Z, Y, X over the least spacing; 0: the
+            modulus itself, with gradient zero in flat places.
+        mask: voxels that count; there are no differences to the others.
+        reduction: "mean" over voxels that count, "sum", or "none".
+
+    Returns:
+        Unit of the volume per metre (without spacing: per voxel); scalar, or the shape of the volume for "none".
+
+    Raises:
+        ShapeError: for less than three dimensions, and a spacing of other than three numbers.
+        UnitError: for a spacing that is not above zero, or a smoothing below zero.
+
+    Source: Rudin, Osher and Fatemi 1992.
     """
     where = "total_variation"
-    check_reduction(reduction, where)
-    flag(f"{where}: isotropic", isotropic)
     (volume,) = check_dense((volume,), where)
     if volume.ndim < 3:
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
@@ -72,6 +81,13 @@ def total_variation(
         squares = [torch.stack(squares).sum(0)]
     value = torch.stack([_smooth_root(square, smooth / scale) for square in squares]).sum(0) * scale
     return reduce(value, reduction, where, mask)
+
+
+class TotalVariation(LossModule, function=total_variation, by_place=("spacing",)):
+    """`total_variation` with its options held."""
+
+    def forward(self, volume: Volume, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
+        return self.loss(volume, mask=mask)
 
 
 def _check_spacing(spacing: Numbers | None, like: Tensor, where: str) -> tuple[float, float, float]:
@@ -98,9 +114,7 @@ def _difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -> Tensor
 
 
 def _scale(differences: list[Tensor], smooth: Tensor) -> Tensor:
-    """The largest difference of each item (..., 1, 1, 1), or the smoothing where that is larger, without gradient: the
-    squares of its shares neither overflow nor vanish.
-    """
+    """Largest difference of each item (..., 1, 1, 1), or the smoothing if larger, detached: a unit for safe squares."""
     parts = [(d.real.abs() + d.imag.abs() if d.is_complex() else d.abs()).detach().amax(_DIMS, True)
              for d in differences]  # fmt: skip
     largest = torch.stack(parts).amax(0)
@@ -112,37 +126,6 @@ def _scale(differences: list[Tensor], smooth: Tensor) -> Tensor:
 def _smooth_root(square: Tensor, smooth: Tensor) -> Tensor:
     """`sqrt(d^2 + s^2) - s` without its cancellation: `d^2 / (sqrt(d^2 + s^2) + s)`."""
     under = square + smooth.square()
-    # The root has no slope at zero, where s = 0 leaves one: there it is taken as zero.
+    # with slope zero at zero, which s = 0 reaches
     root = torch.where(under == 0, torch.ones_like(under), under).sqrt()
     return square / (root + smooth)
-
-
-class TotalVariation(nn.Module):
-    """`total_variation(volume)` with its options held."""
-
-    def __init__(
-        self,
-        spacing: Numbers | None = None,
-        *,
-        isotropic: bool = True,
-        smoothing: float | None = None,
-        reduction: Reduction = "mean",
-    ) -> None:
-        super().__init__()
-        check_reduction(reduction, "TotalVariation")
-        flag("TotalVariation: isotropic", isotropic)
-        check_option("smoothing", smoothing, "TotalVariation", zero=True, square=True)
-        checked = _check_spacing(spacing, torch.empty((), dtype=torch.float64), "TotalVariation")
-        self.spacing = None if spacing is None else checked
-        self.isotropic = isotropic
-        self.smoothing, self.reduction = smoothing, reduction
-
-    def forward(self, volume: Volume, mask: Tensor | None = None) -> Tensor:
-        return total_variation(
-            volume,
-            spacing=self.spacing,
-            isotropic=self.isotropic,
-            smoothing=self.smoothing,
-            mask=mask,
-            reduction=self.reduction,
-        )

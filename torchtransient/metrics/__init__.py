@@ -1,6 +1,6 @@
 """Metrics of depth, phase, polarization, histograms, pictures and hidden volumes, and their sums over batches.
 
-Torch only, never Mitsuba. Functions `(input, target)` of tensors or results; `Running` holds one over an epoch.
+Torch only, never Mitsuba. Functions `(input, target)` of tensors or results; `Running` sums one over an epoch.
 """
 
 from torchtransient.metrics.depth import depth_abs_rel as depth_abs_rel
@@ -26,7 +26,7 @@ from torchtransient.metrics.phase import wrapped_difference as wrapped_differenc
 from torchtransient.metrics.polarization import aolp_mae as aolp_mae
 from torchtransient.metrics.polarization import dop_mae as dop_mae
 from torchtransient.metrics.polarization import dop_rmse as dop_rmse
-from torchtransient.metrics.running import Running as Running
+from torchtransient.metrics.tally import Running as Running
 from torchtransient.metrics.volumes import front_depth as front_depth
 from torchtransient.metrics.volumes import front_depth_mae as front_depth_mae
 from torchtransient.metrics.volumes import front_view as front_view

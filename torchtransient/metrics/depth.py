@@ -1,9 +1,7 @@
-"""Depth maps against the truth, where there is a surface.
+"""Metrics of depth maps, over the pixels where the target has a surface.
 
-Maps are (..., Y, X) in one unit, metres. Pixels whose target is not finite (NaN or infinite: no surface there) do not
-count, nor those that `mask` leaves out. An estimate that is not finite where one is asked for is an error: what a
-method gives no answer for is left out by `mask`, and its share belongs beside the metric. Sources: Eigen, Puhrsch and
-Fergus 2014 for the relative error and the thresholds.
+An input that is not finite where the target has a surface raises UnitError: a method that declines hard pixels would
+look better than one that tries them. Leave them out by `mask`, and report their share.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ _MAP = 2
 def _compared(
     input: object, target: object, mask: Tensor | None, where: str, *, positive_only: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Estimate, truth and the pixels that count; 1 elsewhere."""
+    """Return estimate and truth, 1 where no pixel counts, and the mask of pixels that count."""
     ours, theirs = check_pair(input, target, where)
     surface = torch.isfinite(theirs) & (theirs > 0) if positive_only else torch.isfinite(theirs)
     given = check_mask(mask, theirs, where)
@@ -36,10 +34,20 @@ def _compared(
 def depth_mae(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean of `|input - target|` over the pixels of depth maps (..., Y, X), metres.
+    """Mean absolute error of depths, `mean(|input - target|)`.
 
-    `reduction`: "mean" of all pixels, (); "item", of each map, (...); "none", of each pixel, (..., Y, X). NaN where no
-    pixel counts. Raises ShapeError, UnitError.
+    Args:
+        input: depth maps (..., Y, X), metres.
+        target: of the same shape and unit. Pixels that are not finite (no surface) do not count.
+        mask: pixels that count.
+        reduction: "mean" of all pixels, "item" of each map, or "none".
+
+    Returns:
+        Metres; scalar, (...) for "item", (..., Y, X) for "none"; NaN where no pixel counts.
+
+    Raises:
+        UnitError: for an input that is not finite where the target has a surface.
+        ShapeError: for two shapes.
     """
     where = "depth_mae"
     x, y, counts = _compared(input, target, mask, where)
@@ -50,7 +58,7 @@ def depth_mae(
 def depth_rmse(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Root of the mean of `(input - target)^2` over the pixels of depth maps (..., Y, X), metres; as `depth_mae`."""
+    """Root mean square error of depths, `sqrt(mean((input - target)^2))`, metres; arguments as in `depth_mae`."""
     where = "depth_rmse"
     x, y, counts = _compared(input, target, mask, where)
     return Tally((x - y).double().square(), counts, _MAP, Finish(Kind.ROOT)).result(reduction, where).to(x.dtype)
@@ -60,10 +68,7 @@ def depth_rmse(
 def depth_bias(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean of `input - target` over the pixels of depth maps (..., Y, X), metres: above zero where it is too far.
-
-    As `depth_mae` otherwise.
-    """
+    """Mean error of depths, `mean(input - target)`, metres, positive if too far; arguments as in `depth_mae`."""
     where = "depth_bias"
     x, y, counts = _compared(input, target, mask, where)
     return Tally(x - y, counts, _MAP).result(reduction, where)
@@ -71,10 +76,22 @@ def depth_bias(
 
 @reads(input=DEPTH, target=DEPTH)
 def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None = None) -> Tensor:
-    """Median of `|input - target|` over all pixels that count of depth maps (..., Y, X), metres, shape ().
+    """Median absolute error of depths over all pixels that count.
 
-    Of an even number of pixels the lower of the two in the middle, as `torch.median`. NaN where no pixel counts. A
-    median is not made of sums: `Running` does not take it. Raises ShapeError, UnitError.
+    Of an even number of pixels the lower of the two in the middle, as `torch.median`. `Running` refuses it, since a
+    median is not made of sums.
+
+    Args:
+        input: depth maps (..., Y, X), metres.
+        target: of the same shape and unit. Pixels that are not finite (no surface) do not count.
+        mask: pixels that count.
+
+    Returns:
+        Scalar, metres; NaN where no pixel counts.
+
+    Raises:
+        UnitError: for an input that is not finite where the target has a surface.
+        ShapeError: for two shapes.
     """
     x, y, counts = _compared(input, target, mask, "depth_median_error")
     return torch.where(counts, (x - y).abs(), torch.nan).flatten().nanmedian()
@@ -84,9 +101,9 @@ def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None
 def depth_abs_rel(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean of `|input - target| / target` over the pixels of depth maps (..., Y, X), without unit.
+    """Mean relative error of depths, `mean(|input - target| / target)`; arguments as in `depth_mae`.
 
-    Targets of zero and below have no relative error and do not count. As `depth_mae` otherwise.
+    Pixels with a target of zero or below do not count. Source: Eigen, Puhrsch and Fergus 2014.
     """
     where = "depth_abs_rel"
     x, y, counts = _compared(input, target, mask, where, positive_only=True)
@@ -102,10 +119,22 @@ def depth_delta(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Share of pixels with `max(input / target, target / input) < threshold` of depth maps (..., Y, X), in [0, 1].
+    """Share of pixels with `max(input / target, target / input) < threshold`.
 
-    The usual thresholds are 1.25, 1.25**2 and 1.25**3. Estimates of zero and below are outside of every threshold;
-    targets of zero and below do not count. As `depth_mae` otherwise; UnitError for a threshold that is not above 1.
+    Args:
+        input: depth maps (..., Y, X), metres. Depths of zero and below are outside of every threshold.
+        target: of the same shape and unit. Pixels that are not finite or not above zero do not count.
+        threshold: above 1; usually 1.25, 1.25^2 and 1.25^3.
+        mask: pixels that count.
+        reduction: as in `depth_mae`.
+
+    Returns:
+        Shares in [0, 1], shapes as those of `depth_mae`.
+
+    Raises:
+        UnitError: for a threshold that is not above 1, and as `depth_mae`.
+
+    Source: Eigen, Puhrsch and Fergus 2014.
     """
     where = "depth_delta"
     most = check_number("threshold", threshold, where)
@@ -126,9 +155,10 @@ def depth_gross_errors(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Share of pixels with `|input - target| > beyond_m` of depth maps (..., Y, X), in [0, 1].
+    """Share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
 
-    `beyond_m`: metres, above zero. As `depth_mae` otherwise.
+    Args:
+        beyond_m: metres, above zero.
     """
     where = "depth_gross_errors"
     most = positive(f"{where}: beyond_m", beyond_m)

@@ -1,8 +1,7 @@
-"""Distances of histograms over time, pixel by pixel, as distributions: of records normalized to one.
+"""Distances of histograms over time, pixel by pixel, of records normalized to one.
 
-Transients are (..., C, T, Y, X), or other layouts with `dim`, as in `tt.losses`. Bins are not negative. A pixel whose
-target holds no light has no distribution and does not count; an input without light where the target has some is an
-error, since no distance of it is right: leave it out by `mask`, or measure by a loss that knows brightness.
+Pixels without light in the target do not count. An input without light where the target has some raises UnitError,
+since no distance of it is right: leave it out by `mask`, or take a loss that compares brightness.
 """
 
 from __future__ import annotations
@@ -29,12 +28,21 @@ def histogram_total_variation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `sum |p - q| / 2` over the pixels of two transients (..., C, T, Y, X), in [0, 1].
+    """Total variation distance of each pixel, `sum |p - q| / 2`: the share of light in wrong bins.
 
-    p and q are the records of a pixel over their sums: the share of the light that is in wrong bins. `dim`: where time
-    is (`tt.losses`). `mask` (broadcasts to the transients): bins that do not count are empty in both. `reduction`:
-    "mean" of all pixels, (); "item", of each item of a batch, its channels and pixels together, (...); "none", of each
-    pixel, (..., C, Y, X). NaN where nothing counts. Raises ShapeError, UnitError.
+    Args:
+        input: transients (..., C, T, Y, X), or another layout with `dim`, not negative; normalized to p.
+        target: of the same shape; normalized to q.
+        dim: dimension of time, as in `tt.losses`.
+        mask: bins that count; the others are empty in both.
+        reduction: "mean" of all pixels, "item" of each item of a batch (its channels and pixels), or "none".
+
+    Returns:
+        In [0, 1]; scalar, (...) for "item", (..., C, Y, X) for "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for negative bins, for bins that are not finite, and for a dark input where the target has light.
+        ShapeError: for two shapes, or without `dim` where the shape is ambiguous.
     """
     where = "histogram_total_variation"
     p, q, lit, place = _distributions(input, target, dim, mask, where)
@@ -51,11 +59,18 @@ def histogram_wasserstein_opl(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean Wasserstein-1 distance over time of the pixels of two transients (..., C, T, Y, X), metres of path.
+    """Wasserstein-1 distance over time of each pixel, metres of path: how far light has to be moved.
 
-    How far light has to be moved to make one record of the other (Vallender 1974: the area between the cumulative
-    distributions). Light counts as at the middle of its bin. `axis`: None takes that of results. As
-    `histogram_total_variation` otherwise; `tt.losses.wasserstein_loss` fills dark pixels up instead.
+    Light counts as at the middle of its bin. `tt.losses.wasserstein_loss` fills up dark pixels instead of refusing
+    them.
+
+    Args:
+        axis: time axis; None: that of results. Other arguments as in `histogram_total_variation`.
+
+    Raises:
+        ArgumentError: for tensors without an axis.
+
+    Source: Vallender 1974, the area between cumulative distributions.
     """
     where = "histogram_wasserstein_opl"
     known = _axis(axis, where)
@@ -73,7 +88,7 @@ def histogram_wasserstein_s(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`histogram_wasserstein_opl` in seconds."""
+    """Wasserstein-1 distance over time of each pixel, seconds; arguments as in `histogram_wasserstein_opl`."""
     where = "histogram_wasserstein_s"
     known = _axis(axis, where)
     moved, lit, place = _moved(input, target, known, dim, mask, where)
@@ -90,11 +105,15 @@ def histogram_kl(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `KL(q || p) = sum q log(q / p)` over the pixels of two transients (..., C, T, Y, X), nats.
+    """Kullback-Leibler divergence of each pixel, `KL(q || p) = sum q log(q / p)`, nats. Not symmetric.
 
-    p of the input, q of the target (Kullback and Leibler 1951). Infinite where the target has light in a bin that is
-    empty in the input. `smoothing` s, in [0, 1]: the input is taken as `(1 - s) p + s / T`, over the T bins that
-    count. As `histogram_total_variation` otherwise; not symmetric.
+    Infinite where the target has light in a bin that is empty in the input.
+
+    Args:
+        smoothing: s in [0, 1]; the input is taken as `(1 - s) p + s / T` over the T bins that count. Other arguments as
+            in `histogram_total_variation`.
+
+    Source: Kullback and Leibler 1951.
     """
     where = "histogram_kl"
     part = share(f"{where}: smoothing", smoothing)
@@ -117,20 +136,20 @@ def _axis(axis: TimeAxis | None, where: str) -> TimeAxis:
 def _moved(
     input: object, target: object, axis: TimeAxis, dim: int | None, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, int]:
-    """Bins that light has to be moved by in each pixel."""
+    """Return the bins that light has to be moved by in each pixel, the pixels that count, the dimension of time."""
     p, q, lit, place = _distributions(input, target, dim, mask, where)
     if p.shape[place] != axis.num_bins:
         raise ShapeError(
             f"{where}: expected the {axis.num_bins} bins of the axis in dimension {place}, got {tuple(p.shape)}."
         )
-    # without the last one, which is zero but for rounding
+    # without the last sum, which is zero but for rounding
     return (p - q).narrow(place, 0, axis.num_bins - 1).cumsum(place).abs().sum(place), lit, place
 
 
 def _distributions(
     input: object, target: object, dim: int | None, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Records over their sums (even ones for pixels that do not count), the pixels that count, the place of time."""
+    """Return normalized records (zero for dark pixels), the pixels that count, the dimension of time."""
     x, y = check_pair(input, target, where)
     place = bins_dim(x, dim, where)
     given = check_mask(mask, x, where)
@@ -143,7 +162,7 @@ def _distributions(
                 f"{where}: expected {name} without negative bins, got {int((kept < 0).sum())} of them. A record less "
                 "its background is no distribution: use .clamp_min(0), or a loss of tt.losses."
             )
-        # over the highest bin first: sums of bins that single precision holds may be more than it holds
+        # over the highest bin first: sums may overflow single precision
         top = kept.amax(place, keepdim=True)
         records.append(kept / torch.where(top > 0, top, torch.ones_like(top)))
     ours, theirs = (record.sum(place, keepdim=True) for record in records)

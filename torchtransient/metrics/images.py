@@ -1,7 +1,6 @@
-"""Pictures, and transients as pictures, by kornia's PSNR and SSIM.
+"""PSNR and SSIM of pictures, and of transients as pictures, by kornia.
 
-Pictures are (..., C, Y, X), of a result its `steady`. A transient (..., C, T, Y, X) is compared summed over time or bin
-by bin. The range of the values decides both metrics, so it is checked: a target beyond it is an error.
+The range of the values decides both metrics, so a target beyond its range raises UnitError.
 """
 
 from __future__ import annotations
@@ -33,12 +32,21 @@ def psnr(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `10 log10(value_range^2 / mean((input - target)^2))` over pictures (..., C, Y, X), decibels.
+    """Peak signal-to-noise ratio, `10 log10(value_range^2 / mean((input - target)^2))` of each picture, decibels.
 
-    `value_range`: of the values; None: the highest value of each target. `mask` (broadcasts): pixels that count; of a
-    picture without any there is no value. Equal pictures are infinitely alike, and so is a mean with such. `reduction`:
-    "mean" of all pictures, (); "item" or "none", of each, (...). NaN where nothing counts. Raises ShapeError;
-    UnitError for NaN and infinite values, for a target that lies beyond its range, and without a range for dark ones.
+    Args:
+        input: pictures (..., C, Y, X).
+        target: of the same shape.
+        value_range: range of the values; None: the highest value of each target.
+        mask: pixels that count.
+        reduction: "mean" over pictures, "item" or "none" of each.
+
+    Returns:
+        Decibels, infinite for equal pictures; scalar, or (...) for "item" and "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for values that are not finite, a target beyond its range, and a dark target without a range.
+        ShapeError: for two shapes.
     """
     where = "psnr"
     x, y, given, limit = _pictures(input, target, value_range, mask, where)
@@ -55,11 +63,23 @@ def ssim(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean structural similarity of pictures (..., C, Y, X), in [-1, 1] (Wang, Bovik, Sheikh, Simoncelli 2004).
+    """Structural similarity, `1 - tt.losses.ssim_loss`, in [-1, 1].
 
-    `1 - tt.losses.ssim_loss`: Gaussian windows of `window` pixels, reflected at the borders. `reduction`: "mean" of all
-    pixels, (); "item", of each picture, (...); "none", of each pixel. As `psnr` otherwise; pixels that `mask` leaves
-    out are 0 in both for the windows that reach them.
+    Args:
+        input: pictures (..., C, Y, X).
+        target: of the same shape.
+        window: width of the Gaussian window in pixels, odd; reflected at the borders.
+        value_range: range of the values; None: the highest value of each target.
+        mask: pixels that count; the others are 0 in both for the windows that reach them.
+        reduction: "mean" of all pixels, "item" of each picture, or "none".
+
+    Returns:
+        Scalar, (...) for "item", the shape of the input for "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError, ShapeError: as `psnr`; ShapeError for pictures smaller than the window.
+
+    Source: Wang, Bovik, Sheikh and Simoncelli 2004.
     """
     where = "ssim"
     x, y, given, limit = _pictures(input, target, value_range, mask, where)
@@ -77,14 +97,26 @@ def transient_psnr(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`psnr` of transients (..., C, T, Y, X) as pictures.
+    """`psnr` of transients as pictures.
 
-    `view`: "sum", the light of all bins, (..., C, Y, X); "bins", each bin a picture, (..., T, C, Y, X), with one range
-    for all bins of an item: `value_range`, or None: the highest value of the target. `mask` broadcasts to the
-    transients; pixels of a sum count where one of their bins does. As `psnr` otherwise.
+    Args:
+        input: transients (..., C, T, Y, X).
+        target: of the same shape.
+        view: "sum", the light of all bins, (..., C, Y, X), or "bins", each bin a picture, (..., T, C, Y, X), with one
+            range for all bins of an item.
+        value_range: range of the values of the view; None: the highest value of the target.
+        dim: dimension of time, which is -3.
+        mask: bins that count; a pixel of a sum counts where one of its bins does.
+        reduction: as in `psnr`.
+
+    Returns:
+        Decibels, shapes as those of `psnr` of the view.
+
+    Raises:
+        UnitError, ShapeError: as `psnr`; ShapeError for other layouts.
     """
     where = "transient_psnr"
-    x, y, given, limit = _transients(input, target, view, (value_range, dim, mask), where)
+    x, y, given, limit = _transients(input, target, view, value_range, dim, mask, where)
     return _psnr(x, y, given, limit).result(reduction, where)
 
 
@@ -100,12 +132,12 @@ def transient_ssim(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`ssim` of transients (..., C, T, Y, X) as pictures, by `view` as in `transient_psnr`.
+    """`ssim` of transients as pictures; `view` and other arguments as in `transient_psnr`.
 
-    Empty bins are alike: over bins most of which are dark, a mean says little.
+    Empty bins are alike, and dominate a mean over the bins of most scenes.
     """
     where = "transient_ssim"
-    x, y, given, limit = _transients(input, target, view, (value_range, dim, mask), where)
+    x, y, given, limit = _transients(input, target, view, value_range, dim, mask, where)
     return _ssim(x, y, given, limit, window).result(reduction, where)
 
 
@@ -113,13 +145,13 @@ def _psnr(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor) -> Tally:
     from kornia.metrics import psnr as decibels
 
     shape = x.shape[:-3]
-    # in full, as -1 says nothing of pictures without pixels
+    # -1 is ambiguous for pictures without pixels
     stacked = (shape.numel(), *x.shape[-3:])
     ours, theirs = ((picture / limit).double().reshape(stacked) for picture in (x, y))
     masks = None if mask is None else mask.reshape(stacked)
     values, counts = [], []
     for k in range(len(ours)):
-        # a picture without a pixel, whose mean would be none
+        # a picture without a pixel has no mean
         there = masks is None or bool(masks[k].any())
         a, b = (ours[k], theirs[k]) if masks is None else (ours[k][masks[k]], theirs[k][masks[k]])
         values.append(decibels(a, b, 1.0) if there and a.numel() else x.new_zeros((), dtype=torch.float64))
@@ -130,7 +162,7 @@ def _psnr(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor) -> Tally:
 
 
 def _ssim(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor, window: int) -> Tally:
-    # in units of the range, which the loss would measure anew; what does not count is zero already
+    # in units of the range; masked pixels are zero already
     unlike = ssim_loss(x / limit, y / limit, window=window, value_range=1.0, reduction="none")
     return Tally(1 - unlike, mask, -_IMAGES)
 
@@ -150,11 +182,12 @@ def _transients(
     input: object,
     target: object,
     view: View,
-    options: tuple[float | None, int | None, Tensor | None],
+    value_range: float | None,
+    dim: int | None,
+    mask: Tensor | None,
     where: str,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    """Pictures of transients, what counts of them and their ranges."""
-    value_range, dim, mask = options
+    """Return the pictures of both transients, their mask and their ranges."""
     if view not in get_args(View):
         raise ArgumentError(f"{where}: expected view 'sum' or 'bins', got {view!r}.")
     x, y = check_pair(input, target, where)
@@ -184,7 +217,7 @@ def _measured(x: Tensor, y: Tensor, mask: Tensor | None, where: str) -> tuple[Te
 def _range(
     target: Tensor, value_range: float | None, dims: tuple[int, ...], mask: Tensor | None, where: str
 ) -> Tensor:
-    """What values are divided by, broadcasting to the target."""
+    """Return the range of the values, which broadcasts to the target."""
     if value_range is not None:
         limit = check_level("value_range", value_range, target.new_empty(()), where)
         if not target.numel():

@@ -1,4 +1,4 @@
-"""Where points of a hidden scene are found: distances in metres between peaks of a volume and the truth."""
+"""Localization error of points of a hidden scene: distances between peaks of a volume and the truth."""
 
 from __future__ import annotations
 
@@ -24,16 +24,27 @@ def localization_rmse(
     grid: VoxelGrid | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root of the mean square of the distances of points (N, 3) from the peaks of volumes (..., Z, Y, X), metres.
+    """Root mean square distance of points from the peaks of volumes near them, metres.
 
-    The peak of a point is the highest voxel within `radius_m` metres of it, moved along each axis of the grid by the
-    parabola through it and its neighbors, at most half a voxel. Take a radius below half the distance of two points,
-    and look at the picture: what is searched near the truth is found near it. A point without anything above zero
-    within the radius is not found and counts with the radius. `points`: world coordinates, metres. `grid`: of the
-    voxels; None takes that of a `HiddenVolume`.
+    The peak of a point is the highest voxel within the radius, moved along each axis of the grid by the parabola
+    through it and its neighbors, at most half a voxel. A search near the truth finds something near it: take a radius
+    below half the distance of two points, and look at the picture. A point without a value above zero within the radius
+    counts with the radius.
 
-    `reduction`: "mean" of all points, (); "item", of each volume, (...); "none", the distance of each point, (..., N).
-    Raises ShapeError, UnitError, also for a radius in which a point has no voxel; ArgumentError without a grid.
+    Args:
+        input: volumes (..., Z, Y, X) or a `HiddenVolume`.
+        points: world coordinates (N, 3), metres.
+        radius_m: radius of the search, metres.
+        grid: grid of the voxels; None: that of a `HiddenVolume`.
+        reduction: "mean" of all points, "item" of each volume, or "none", the distance of each point.
+
+    Returns:
+        Metres, without gradient; scalar, (...) for "item", (..., N) for "none".
+
+    Raises:
+        UnitError: for a point without a voxel within the radius.
+        ArgumentError: for a tensor without a grid.
+        ShapeError: for a volume of another shape than its grid.
     """
     where = "localization_rmse"
     check_reduction(reduction, where)
@@ -61,13 +72,13 @@ def localization_rmse(
 
 
 def _distances(volumes: Tensor, grid: VoxelGrid, point: Tensor, radius: float, where: str) -> Tensor:
-    """(B,) metres between a point (3,) and its peak in each volume (B, Z, Y, X)."""
+    """Distances (B,), metres, of a point (3,) from its peak in each volume (B, Z, Y, X)."""
     offset = point - grid.first
     away = [
         along - float(offset @ direction)
         for along, direction in zip(_places(grid), (grid.normal, grid.along_y, grid.along_x), strict=True)
     ]
-    # of the voxels in a cube around the point, those in the ball: the whole volume may be large
+    # voxels of the ball among those of a cube around it, since the volume may be large
     box = [torch.nonzero(one.abs() <= radius).flatten() for one in away]
     z, y, x = (one[kept].square() for one, kept in zip(away, box, strict=True))
     near = z[:, None, None] + y[:, None] + x <= radius**2
@@ -92,13 +103,13 @@ def _distances(volumes: Tensor, grid: VoxelGrid, point: Tensor, radius: float, w
 
 
 def _places(grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
-    """(Z,), (Y,), (X,): metres of voxels along the axes of a grid."""
+    """Return the positions of voxels along the axes of a grid, (Z,), (Y,), (X,), metres."""
     rows, columns = (torch.arange(n, dtype=torch.float64) * step for n, step in zip(grid.size, grid.pitch, strict=True))
     return grid.depths, rows, columns
 
 
 def _step(volume: Tensor, along: Tensor, place: list[int], axis: int) -> float:
-    """Metres from a voxel to the top of the parabola through it and its neighbors along an axis; 0 at the border."""
+    """Distance, metres, from a voxel to the top of the parabola through its neighbors along an axis; 0 at borders."""
     i = place[axis]
     if not 0 < i < len(along) - 1:
         return 0.0

@@ -1,6 +1,6 @@
-"""Quantities that repeat: phases modulo 2 pi, angles of polarization modulo pi, distances modulo a camera's range.
+"""Metrics of periodic quantities: phases, angles of polarization, distances modulo the range of a camera.
 
-A difference is taken the short way round. Phases come as real tensors, or as phasors, of which the phase is compared.
+Differences are taken the short way round. Phases are real tensors, or phasors, whose phases are compared.
 """
 
 from __future__ import annotations
@@ -21,9 +21,18 @@ _PICTURE = 2
 
 
 def wrapped_difference(input: Tensor, target: Tensor, *, period: float = 2 * math.pi) -> Tensor:
-    """`input - target` the short way round, in [-period/2, period/2]; real tensors of one shape (...), in one unit.
+    """Difference the short way round, `input - target` in [-period/2, period/2].
 
-    Half a period is either of both ends. Raises ShapeError, UnitError.
+    Args:
+        input: real tensor, any shape.
+        target: of the same shape and unit.
+        period: in the same unit, above zero.
+
+    Returns:
+        Tensor of that shape; half a period is either of both ends.
+
+    Raises:
+        ShapeError: for two shapes.
     """
     where = "wrapped_difference"
     x, y = check_pair(input, target, where)
@@ -45,13 +54,23 @@ def phase_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of the modulus of the wrapped difference of phases, or of the phases of phasors, (..., Y, X).
+    """Mean absolute wrapped difference of phases.
 
-    Unit of `period`: radians by default; `math.pi` for angles of polarization, `c / (2 f)` for distances that a
-    modulation frequency f wraps. Phasors, complex, are compared by their phase, as a part of the period: a target of
-    exactly zero has none and does not count. `weight` (broadcasts): how much each element counts, the target's modulus
-    for instance. `reduction`: "mean" of all, (); "item", of each picture, (...); "none", (..., Y, X). NaN where nothing
-    counts. Raises ShapeError; UnitError, also for estimates that are NaN, infinite or phasors of zero where they count.
+    Args:
+        input: phases (..., Y, X) in the unit of `period`, or complex phasors.
+        target: of the same kind and shape. Phasors of zero have no phase and do not count.
+        period: 2 pi for radians, pi for angles of polarization, `c / (2 f)` for distances that a modulation frequency f
+            wraps.
+        weight: weight of each element, tensor that broadcasts, the modulus of the target for instance.
+        mask: elements that count.
+        reduction: "mean" of all, "item" of each picture, or "none".
+
+    Returns:
+        In the unit of `period`; scalar, (...) for "item", (..., Y, X) for "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for an input that is not finite, or a phasor of zero, where it counts; for phases and phasors mixed.
+        ShapeError: for two shapes.
     """
     where = "phase_mae"
     difference, counts = _difference(input, target, period, weight, mask, where)
@@ -68,7 +87,7 @@ def phase_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root of the mean square of the wrapped difference of phases (..., Y, X); as `phase_mae`."""
+    """Root mean square wrapped difference of phases (..., Y, X); arguments as in `phase_mae`."""
     where = "phase_rmse"
     difference, counts = _difference(input, target, period, weight, mask, where)
     squares = difference.double().square()
@@ -85,10 +104,10 @@ def phase_bias(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Circular mean of `input - target`: the angle of the mean of `exp(i difference)`, in (-period/2, period/2].
+    """Circular mean of the difference of phases: the angle of the mean of `exp(i (input - target))`, signed.
 
-    Fisher, Statistical Analysis of Circular Data, 1993. Signed, and right across the jump, where a mean of wrapped
-    differences is not; of differences spread evenly over the circle it means nothing. As `phase_mae` otherwise.
+    Right across the jump, where a mean of wrapped differences is wrong; meaningless for differences spread evenly over
+    the circle. In (-period/2, period/2]; arguments as in `phase_mae`. Source: Fisher 1993.
     """
     where = "phase_bias"
     difference, counts = _difference(input, target, period, weight, mask, where)
@@ -101,7 +120,7 @@ def phase_bias(
 def _difference(
     input: object, target: object, period: float, weight: Tensor | None, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor | None]:
-    """The wrapped difference, and how much each of it counts."""
+    """Return the wrapped difference and its weights."""
     turn = positive(f"{where}: period", period)
     if isinstance(input, Tensor) and isinstance(target, Tensor) and input.is_complex() != target.is_complex():
         raise UnitError(
@@ -125,5 +144,5 @@ def _difference(
             f"{where}: expected phasors other than zero where the target is, got {int((x == 0).sum())} of zero, which "
             "have no phase. Leave them out with mask=, and say how many those are."
         )
-    # no product of both, which single precision may not hold
+    # a product of both may overflow single precision
     return _wrapped(torch.angle(x) - torch.angle(y), 2 * math.pi) * (turn / (2 * math.pi)), counts

@@ -1,8 +1,7 @@
-"""Degree and angle of polarization against the truth, of Stokes components.
+"""Metrics of degree and angle of polarization, of Stokes components.
 
-Tensors hold the four components along `stokes_dim`: -4 of a picture (..., 4, C, Y, X), which is what is read of a
-result (`steady`), and -5 of a transient (..., 4, C, T, Y, X). What is dark in the target has no polarization and does
-not count. Frames have to agree: see `tt.stokes`.
+The four components are along `stokes_dim`: -4 of pictures (..., 4, C, Y, X), -5 of transients (..., 4, C, T, Y, X).
+Elements that are dark in the target have no polarization and do not count. Frames have to agree: see `tt.stokes`.
 """
 
 from __future__ import annotations
@@ -43,13 +42,27 @@ def dop_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `|DoP(input) - DoP(target)|` of Stokes tensors, without unit.
+    """Mean absolute error of the degree of polarization, `mean(|DoP(input) - DoP(target)|)`.
 
-    `part`: of "total", "linear" or "circular" (signed) polarization. `floor`: in the unit of the light; entries whose
-    target is not brighter do not count, nor those that `mask` (shape without the components) leaves out. An estimate
-    without light there is an error. `reduction`: "mean" of all, (); "item", of each picture, without its last two
-    dimensions; "none", the shape without the components. NaN where nothing counts. Degrees above one, of noise, are
-    compared as they are. Raises ShapeError, UnitError, ArgumentError.
+    Degrees above one, of noise, are compared as they are.
+
+    Args:
+        input: Stokes components (..., 4, C, Y, X), or a polarized result with `steady`.
+        target: of the same shape.
+        stokes_dim: dimension of the components.
+        part: "total", "linear" or "circular" (signed) polarization.
+        floor: brightness, in the unit of the light, that the target has to exceed to count.
+        mask: elements that count, in the shape without the components.
+        reduction: "mean" of all, "item" of each picture, or "none".
+
+    Returns:
+        Scalar, the shape without components and picture for "item", without components for "none"; NaN where nothing
+        counts.
+
+    Raises:
+        UnitError: for an input without light, or not finite, where the target counts.
+        ShapeError: for two shapes, and without four components along `stokes_dim`.
+        ArgumentError: for another `part`.
     """
     where = "dop_mae"
     difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
@@ -66,7 +79,7 @@ def dop_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root of the mean square of `DoP(input) - DoP(target)` of Stokes tensors, without unit; as `dop_mae`."""
+    """Root mean square error of the degree of polarization; arguments as in `dop_mae`."""
     where = "dop_rmse"
     difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
     return Tally(difference.square(), counts, _PICTURE, Finish(Kind.ROOT)).result(reduction, where)
@@ -82,12 +95,17 @@ def aolp_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of the modulus of the difference of angles of linear polarization modulo pi, radians, in [0, pi/2].
+    """Mean absolute error of the angle of linear polarization, modulo pi, radians in [0, pi/2].
 
-    `weighted`: each entry counts with the linear part `|(S1, S2)|` of its target, since the angle of light that is
-    hardly polarized is noise; False: all count alike. Entries whose target has a linear part of `floor` (unit of the
-    light) or less have no angle and do not count; an estimate without linear part there is an error. For angles in
-    place of Stokes tensors: `phase_mae(..., period=math.pi)`. As `dop_mae` otherwise.
+    For angles in place of Stokes components take `phase_mae(..., period=math.pi)`.
+
+    Args:
+        weighted: weight each element by the linear part `|(S1, S2)|` of its target, since the angle of light that is
+            hardly polarized is noise; False: equal weights.
+        floor: linear part that the target has to exceed to count. Other arguments as in `dop_mae`.
+
+    Raises:
+        UnitError: for an input without linear polarization where the target counts.
     """
     where = "aolp_mae"
     check_reduction(reduction, where)
@@ -127,7 +145,7 @@ def _stokes_pair(input: object, target: object, stokes_dim: int, where: str) -> 
 
 
 def _picture(name: str, x: object, where: str) -> object:
-    """The tensor of a result. A batch of four renders without polarization would pass for one with it."""
+    """Return the tensor of a polarized result: a batch of four unpolarized renders has its shape."""
     if isinstance(x, Tensor):
         return x
     steady = getattr(x, "steady", None)
@@ -148,7 +166,7 @@ def _counts(level: Tensor, floor: float, mask: Tensor | None, where: str) -> Ten
 
 
 def _finite(pair: tuple[Tensor, Tensor], counts: Tensor, dim: int, where: str) -> list[Tensor]:
-    """Both with horizontal light where nothing counts."""
+    """Return both tensors, with horizontal light where nothing counts."""
     found = []
     for x, name in zip(pair, ("input", "target"), strict=True):
         full = counts.unsqueeze(dim).expand(x.shape)

@@ -1,28 +1,33 @@
-"""What metrics share: elements with weights, their means over a batch or an item, and checks of what is compared.
+"""Sums of metrics over pixels, items, batches and processes.
 
-Every metric of this room is a weighted mean of elements (pixels, points, pictures), and a function of that mean: the
-root of a mean square, the angle of a mean direction. Two sums tell it, so batches and processes add up. Sums are taken
-in double precision. Where nothing counts there is no mean: the answer is NaN, since any number would be an opinion.
+Every metric is a function of a weighted mean of elements (pixels, points, pictures): the mean, the root of a mean
+square, the angle of a mean direction. Two sums determine it, so batches and processes add up, in double precision.
+Where nothing counts there is no mean, and the metric is NaN.
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
-from torch import Tensor
+import torch.distributed as dist
+from torch import Tensor, nn
 
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_device, check_mask
+from torchtransient.losses.comparison import check_mask
 
 Reduction = Literal["mean", "item", "none"]
+_ROOM = __name__.rpartition(".")[0]
 
 
 class Kind(IntEnum):
-    """What a metric is of the mean of its elements. Numbers, which processes can send each other."""
+    """Function of the mean that a metric is; a number, which processes send to each other."""
 
     MEAN = 0
     ROOT = 1
@@ -31,19 +36,19 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Finish:
-    """The step from the mean of the elements, complex for directions, to the metric."""
+    """Step from the mean of the elements, complex for directions, to the metric."""
 
     kind: Kind = Kind.MEAN
     scale: float = 1.0
 
     def of(self, total: Tensor, weight: Tensor) -> Tensor:
-        """The metric of two sums; NaN without weight."""
+        """Return the metric of two sums, NaN without weight."""
         counts = weight > 0
         mean = total / torch.where(counts, weight, torch.ones_like(weight))
         if self.kind == Kind.ANGLE:
             mean = torch.angle(mean)
         elif self.kind == Kind.ROOT:
-            # with the slope of its lowest point at zero, where that of the root is infinite
+            # with slope zero at zero, where that of the root is infinite
             exact = mean == 0
             mean = torch.where(exact, mean, torch.where(exact, torch.ones_like(mean), mean).sqrt())
         return torch.where(counts, mean * self.scale, torch.full_like(mean, torch.nan))
@@ -51,7 +56,7 @@ class Finish:
 
 @dataclass
 class Collector:
-    """Given as a `reduction`: takes the sums of a metric, (real, imaginary, weight), while its mean is returned."""
+    """Reduction that receives the sums of a metric, (real, imaginary, weight), while its mean is returned."""
 
     sums: Tensor | None = None
     finish: Finish | None = None
@@ -59,9 +64,9 @@ class Collector:
 
 @dataclass(frozen=True)
 class Tally:
-    """Elements (...) of a metric and how much each counts; the last `item` dimensions are one item of a batch.
+    """Elements (...) of a metric and their weights; the last `item` dimensions are one item of a batch.
 
-    `weights`: truth values or numbers of at least 0, None for ones; what stands where nothing counts does not matter.
+    `weights`: a mask or numbers of at least 0, None for ones. Elements without weight may hold anything.
     """
 
     values: Tensor
@@ -70,7 +75,7 @@ class Tally:
     finish: Finish = Finish()
 
     def result(self, reduction: Reduction | Collector, where: str) -> Tensor:
-        """The metric of all elements, of each item (...), or of each element, NaN where nothing counts."""
+        """Return the metric of all elements, of each item, or of each element; NaN where nothing counts."""
         if isinstance(reduction, Collector):
             total, weight = self._sums(tuple(range(self.values.ndim)))
             imaginary = total.imag if total.is_complex() else torch.zeros_like(total)
@@ -97,12 +102,13 @@ class Tally:
 
 
 def check_reduction(reduction: object, where: str) -> None:
+    """Raise ArgumentError for other reductions."""
     if not isinstance(reduction, Collector) and reduction not in get_args(Reduction):
         raise ArgumentError(f"{where}: expected reduction 'mean', 'item' or 'none', got {reduction!r}.")
 
 
 def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
-    """Raises UnitError for NaN and infinite numbers where `mask` counts."""
+    """Raise UnitError for NaN and infinite numbers where `mask` counts."""
     wrong = ~torch.isfinite(x) if mask is None else ~torch.isfinite(x) & mask
     if not is_true(~wrong):
         raise UnitError(
@@ -112,14 +118,13 @@ def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
 
 
 def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
-    """How much each element counts: the weight where the mask counts. Raises ShapeError, UnitError, DeviceError."""
+    """Return the weight of each element, 0 where masked. Raises ShapeError, UnitError."""
     mask = check_mask(mask, like, where)
     if weight is None:
         return mask
     if not isinstance(weight, Tensor) or weight.is_complex():
         got = weight.dtype if isinstance(weight, Tensor) else type(weight).__name__
         raise UnitError(f"{where}: expected weight as a tensor of real numbers, got {got}.")
-    check_device(weight, like, where, "weight and tensors")
     try:
         full = weight.expand(like.shape).to(torch.float64)
     except RuntimeError:
@@ -131,3 +136,99 @@ def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where
     if not is_true(torch.isfinite(full) & (full >= 0)):
         raise UnitError(f"{where}: expected weights that are finite and not below zero, got others.")
     return full
+
+
+class Running(nn.Module):
+    """A metric over the batches of an epoch and the processes of a run. ::
+
+        rmse = tt.metrics.Running(tt.metrics.depth_rmse)
+        for batch in validation:
+            rmse.update(network(batch["light"]), batch["depth"], mask=batch["alive"])
+        print(rmse.compute())                                        # of all pixels of all batches
+
+    `compute` is the metric of all batches at once, however they are cut: the root of the mean square of all pixels, not
+    a mean of roots. A call updates, and returns the metric of its batch.
+
+    Each process has its own sums, on the device of its last batch. They are not buffers: `DistributedDataParallel` does
+    not overwrite them, `.half()` does not round them, a `state_dict` does not hold them.
+
+    Args:
+        metric: metric of `tt.metrics` with a reduction.
+        options: options of the metric, held.
+
+    Raises:
+        ArgumentError: for other functions, a median for instance, and for options that the metric does not take.
+    """
+
+    sums: Tensor
+    _finish: Finish | None
+
+    def __init__(self, metric: Callable[..., Tensor], **options: Any) -> None:
+        super().__init__()
+        self.name = str(getattr(metric, "__name__", shown(metric)))
+        known = set(inspect.signature(metric).parameters) if inspect.isfunction(metric) else set()
+        if "reduction" not in known or not metric.__module__.startswith(_ROOM):
+            raise ArgumentError(
+                f"Running: expected a metric of tt.metrics with a reduction, depth_rmse for instance, got {self.name}."
+            )
+        # the collector is the reduction
+        known -= {"reduction"}
+        if set(options) - known:
+            wrong = ", ".join(sorted(set(options) - known))
+            raise ArgumentError(f"Running: {self.name} takes {', '.join(sorted(known))}, got {wrong}.")
+        self.metric, self.options = metric, options
+        self.reset()
+
+    def update(self, *args: Any, **keywords: Any) -> Tensor:
+        """Add a batch, with the arguments of the metric. Returns the metric of this batch."""
+        if "reduction" in keywords:
+            raise ArgumentError("Running: expected no reduction, got one. Call the metric for maps and items.")
+        collector = Collector()
+        with torch.no_grad():
+            value = self.metric(*args, **{**self.options, **keywords}, reduction=collector)
+        if collector.sums is None or collector.finish is None:
+            raise ArgumentError(f"Running: expected a metric of tt.metrics, got {self.name}, which gives no sums.")
+        self.sums, self._finish = self.sums.to(collector.sums.device) + collector.sums, collector.finish
+        return value
+
+    def forward(self, *args: Any, **keywords: Any) -> Tensor:
+        return self.update(*args, **keywords)
+
+    def compute(self, *, across_ranks: bool = False) -> Tensor:
+        """Return the metric of all batches since the last reset, float64, NaN if nothing has counted.
+
+        Args:
+            across_ranks: include the batches of all processes of the default group, which all have to call this. The
+                sums of each process stay its own.
+
+        Raises:
+            ArgumentError: if `across_ranks` without a process group.
+        """
+        sums, finish = self.sums, self._finish
+        if across_ranks:
+            if not (dist.is_available() and dist.is_initialized()):
+                raise ArgumentError("Running: expected a process group for across_ranks=True, got none.")
+            # a process without a batch has no finish of its own
+            sums = sums.to(_device_of_group(sums.device), copy=True)
+            kinds = sums.new_tensor([int(finish.kind), finish.scale] if finish else [0.0, 0.0])
+            dist.all_reduce(sums)
+            dist.all_reduce(kinds, op=dist.ReduceOp.MAX)
+            finish = Finish(Kind(int(kinds[0])), float(kinds[1]))
+        finish = finish or Finish()
+        total = torch.complex(sums[0], sums[1]) if finish.kind == Kind.ANGLE else sums[0]
+        return finish.of(total, sums[2])
+
+    def reset(self) -> None:
+        """Forget all batches."""
+        self.sums = torch.zeros(3, dtype=torch.float64)
+        self._finish = None
+
+    def extra_repr(self) -> str:
+        return ", ".join([self.name, *(f"{name}={value!r}" for name, value in self.options.items())])
+
+
+def _device_of_group(device: torch.device) -> torch.device:
+    """Return the device of sums over processes: a process without a batch has CPU sums, which nccl does not take."""
+    if device.type == "cpu" and dist.get_backend() == "nccl":
+        return torch.device("cuda", torch.cuda.current_device())
+    return device

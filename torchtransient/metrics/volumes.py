@@ -1,7 +1,7 @@
-"""Hidden volumes against the truth: as seen from the wall, voxel by voxel, and by the depth of their surfaces.
+"""Metrics of hidden volumes: as seen from the wall, voxel by voxel, and by the depth of their surfaces.
 
-Volumes are (..., Z, Y, X), or a `HiddenVolume`, whose grid has to be that of the other. Values are higher where
-something is, on a scale of their own.
+Volumes are (..., Z, Y, X), or a `HiddenVolume`, both on one grid. Values are higher where there is something, on a
+scale of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import flag, share, shown
+from torchtransient.checks import share, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.comparison import check_dense, check_mask, check_pair
 from torchtransient.losses.results import Volume
@@ -20,25 +20,42 @@ from torchtransient.reconstruction.surfaces import depth_map
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 _PICTURE, _VOLUME = 2, 3
-# Of the pitch of voxels: grids that went through files are equal but for rounding.
+# Relative to the pitch of voxels: grids read from files are rounded.
 _ROUNDING = 1e-3
 
 
 def front_view(volume: Volume) -> Tensor:
-    """(..., Y, X): the highest value behind each place of the wall of volumes (..., Z, Y, X), nothing below zero.
+    """Project a volume to the wall: the highest value behind each place, at least zero.
 
-    Differentiable by the volume. Half precision is taken in float32. Raises ShapeError, UnitError for complex values.
+    Args:
+        volume: real volumes (..., Z, Y, X) or a `HiddenVolume`.
+
+    Returns:
+        Pictures (..., Y, X), differentiable, float32 or float64.
+
+    Raises:
+        UnitError: for complex values.
     """
     values = _values(volume, "front_view")
     return values.clamp_min(0).amax(-3)
 
 
 def front_depth(volume: Volume, depths: Any = None, *, threshold: float = 0.1) -> Tensor:
-    """(..., Y, X): depth of the highest value behind each place of the wall, metres; NaN where there is no surface.
+    """Depth of the highest value behind each place of the wall, by a parabola through its plane and both neighbors.
 
-    `tt.nlos.depth_map` of volumes (..., Z, Y, X): a parabola through the highest plane and its neighbors, and a surface
-    where the value reaches `threshold`, a share of the volume's highest. `depths`: a grid or (Z,) metres; None: those
-    of a `HiddenVolume`. What is NaN is no surface for the metrics of depth. Raises ShapeError, UnitError.
+    As `tt.nlos.depth_map`. Metrics of depth take NaN for no surface.
+
+    Args:
+        volume: volumes (..., Z, Y, X) or a `HiddenVolume`.
+        depths: grid or (Z,) metres; None: those of a `HiddenVolume`.
+        threshold: share of the highest value of the volume that a surface reaches.
+
+    Returns:
+        Metres, (..., Y, X), NaN where there is no surface.
+
+    Raises:
+        ShapeError: for a tensor without depths.
+        UnitError: for complex values.
     """
     where = "front_depth"
     values = _values(volume, where)
@@ -58,12 +75,23 @@ def front_depth_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `|input - target|` of the front depths of two volumes (..., Z, Y, X), metres, where both have a surface.
+    """Mean absolute error of the front depths of two volumes, metres, where both have a surface.
 
-    Where only one of them has one is not measured here: say it with `picture_iou` of the front views beside this.
-    `depths` and `threshold` as in `front_depth`; `mask` (..., Y, X): places that count. `reduction`: "mean" of all
-    places, (); "item", of each volume, (...); "none", of each place. NaN where nothing counts. Raises ShapeError,
-    UnitError.
+    `picture_iou` of the front views is its companion, and measures where only one of them has one.
+
+    Args:
+        input: volumes (..., Z, Y, X) or a `HiddenVolume`.
+        target: of the same shape.
+        depths, threshold: as in `front_depth`.
+        mask: places that count, (..., Y, X).
+        reduction: "mean" of all places, "item" of each volume, or "none".
+
+    Returns:
+        Metres; scalar, (...) for "item", (..., Y, X) for "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for volumes on two grids.
+        ShapeError: for two shapes, or tensors without depths.
     """
     where = "front_depth_mae"
     check_reduction(reduction, where)
@@ -85,12 +113,21 @@ def picture_correlation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean correlation of pictures (..., Y, X), front views for instance, in [-1, 1].
+    """Correlation of pictures, such as front views, in [-1, 1]; independent of brightness.
 
-    `centered`: Pearson's coefficient; False: the cosine, of the pictures as they are. Neither knows brightness. A
-    target that is flat (`centered=False`: dark) is like nothing, and does not count; an input that is, with another
-    target, counts as 0. `mask`: pixels that count. `reduction`: "mean" of all pictures, (); "item" or "none", of each,
-    (...). NaN where nothing counts. Raises ShapeError; UnitError for NaN and infinite values.
+    Args:
+        input: pictures (..., Y, X). A flat one counts as 0.
+        target: of the same shape. A flat one (`centered=False`: a dark one) does not count.
+        centered: Pearson's coefficient; False: the cosine.
+        mask: pixels that count.
+        reduction: "mean" over pictures, "item" or "none" of each.
+
+    Returns:
+        Scalar, or (...) for "item" and "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for values that are not finite.
+        ShapeError: for two shapes.
     """
     return _correlation(input, target, _PICTURE, centered, mask, "picture_correlation").result(
         reduction, "picture_correlation"
@@ -105,9 +142,9 @@ def volume_correlation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean correlation of volumes (..., Z, Y, X), voxel by voxel; otherwise as `picture_correlation`.
+    """Correlation of volumes (..., Z, Y, X), voxel by voxel; arguments as in `picture_correlation`.
 
-    Strict: a surface that is one plane off is like nothing. UnitError for volumes on two grids.
+    Strict: a surface that is one plane off does not correlate. Raises UnitError for volumes on two grids.
     """
     where = "volume_correlation"
     x, y = _volumes(input, target, where)
@@ -122,12 +159,21 @@ def picture_iou(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean intersection over union of what is seen in pictures (..., Y, X), front views for instance, in [0, 1].
+    """Intersection over union of the shapes in pictures, such as front views, in [0, 1].
 
-    Something is where a pixel is above zero and reaches `threshold`, a share of the highest value of its picture;
-    truth values are taken as they are. The mean is over pictures, not pixels; a picture in which neither shows
-    anything does not count. `mask`: pixels that count. `reduction`: "mean" of all pictures, (); "item" or "none", of
-    each, (...). NaN where nothing counts. Raises ShapeError; UnitError for NaN and infinite values.
+    Args:
+        input: pictures (..., Y, X), or boolean masks. A shape is where a pixel is above zero and reaches the threshold.
+        target: of the same shape. Pictures in which neither has a shape do not count.
+        threshold: share of the highest value of a picture.
+        mask: pixels that count.
+        reduction: "mean" over pictures, "item" or "none" of each.
+
+    Returns:
+        Scalar, or (...) for "item" and "none"; NaN where nothing counts.
+
+    Raises:
+        UnitError: for values that are not finite.
+        ShapeError: for two shapes.
     """
     where = "picture_iou"
     return _iou(input, target, _PICTURE, threshold, mask, where).result(reduction, where)
@@ -141,9 +187,9 @@ def volume_iou(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean intersection over union of volumes (..., Z, Y, X), voxel by voxel; otherwise as `picture_iou`.
+    """Intersection over union of volumes (..., Z, Y, X), voxel by voxel; arguments as in `picture_iou`.
 
-    UnitError for volumes on two grids.
+    Raises UnitError for volumes on two grids.
     """
     where = "volume_iou"
     x, y = _volumes(input, target, where)
@@ -153,19 +199,18 @@ def volume_iou(
 def _correlation(
     input: object, target: object, dims: int, centered: bool, mask: Tensor | None, where: str
 ) -> Tally:
-    subtract = flag(f"{where}: centered", centered)
     x, y, kept = _compared(input, target, dims, mask, where)
     x, y, kept = (one.flatten(-dims) for one in (x, y, kept))
     dtype, number = x.dtype, kept.sum(-1, keepdim=True).clamp_min(1)
-    # relative to the highest values, of which no square leaves double precision
+    # relative to the highest values, whose squares double precision holds
     x, y = (one.double() / _highest(one.double().abs()) for one in (x, y))
-    if subtract:
+    if centered:
         flat_x, flat_y = (_spread(one, kept) == 0 for one in (x, y))
         x, y = (torch.where(kept, one - one.sum(-1, keepdim=True) / number, 0.0) for one in (x, y))
     else:
         flat_x, flat_y = ((one == 0).all(-1) for one in (x, y))
     defined = ~flat_x & ~flat_y
-    # chosen before the root, whose slope at 0 would be infinite
+    # before the root, whose slope at 0 is infinite
     norms = torch.where(defined, x.square().sum(-1) * y.square().sum(-1), 1.0).sqrt()
     found = torch.where(defined, (x * y).sum(-1) / norms, 0.0).clamp(-1, 1)
     return Tally(found.to(dtype), ~flat_y)
@@ -177,7 +222,7 @@ def _highest(x: Tensor) -> Tensor:
 
 
 def _spread(x: Tensor, kept: Tensor) -> Tensor:
-    """Highest less lowest of what counts; 0 of nothing."""
+    """Return the highest less the lowest counted value, 0 without any."""
     if not x.shape[-1]:
         return x.sum(-1)
     high, low = (torch.where(kept, x, sign * torch.inf) for sign in (-1, 1))
@@ -200,7 +245,7 @@ def _there(x: Tensor, least: float) -> Tensor:
 def _compared(
     input: object, target: object, dims: int, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Both, 0 where nothing counts, and what counts."""
+    """Return both, 0 where nothing counts, and the mask."""
     x, y = check_pair(input, target, where)
     if x.ndim < dims:
         layout = "(..., Y, X)" if dims == _PICTURE else "(..., Z, Y, X)"
@@ -216,7 +261,7 @@ def _compared(
 
 
 def _taken(x: object, where: str) -> Tensor:
-    """The tensor of a volume."""
+    """Return the tensor of a volume."""
     values = x if isinstance(x, Tensor) else getattr(x, "values", None)
     if not isinstance(values, Tensor):
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X) or a HiddenVolume, got {shown(x)}.")
@@ -224,7 +269,7 @@ def _taken(x: object, where: str) -> Tensor:
 
 
 def _values(x: object, where: str) -> Tensor:
-    """The same, real, in single precision or better."""
+    """Return the tensor of a real volume, in single precision or better."""
     (values,) = check_dense((_taken(x, where),), where)
     if values.is_complex():
         raise UnitError(f"{where}: expected a volume of real numbers, got {values.dtype}. Give its modulus.")
@@ -239,7 +284,7 @@ def _volumes(input: object, target: object, where: str) -> tuple[Tensor, Tensor]
 
 
 def _check_grids(input: object, target: object, where: str) -> None:
-    """Raises UnitError for two volumes whose voxels stand in two places."""
+    """Raise UnitError for volumes on two grids."""
     a, b = (getattr(x, "grid", None) for x in (input, target))
     if not (isinstance(a, VoxelGrid) and isinstance(b, VoxelGrid)):
         return
@@ -252,7 +297,7 @@ def _check_grids(input: object, target: object, where: str) -> None:
 
 
 def _frame(grid: VoxelGrid) -> Tensor:
-    """(Z + 2, 3): where one corner of every plane and two of the wall stand, which says where all voxels do."""
+    """Positions (Z + 2, 3) of a corner of every plane and of two corners of the wall, which determine a grid."""
     rows, columns = ((n - 1) * step for n, step in zip(grid.size, grid.pitch, strict=True))
     first = grid.first + grid.depths[:, None] * grid.normal
     return torch.cat([first, torch.stack([grid.first + rows * grid.along_y, grid.first + columns * grid.along_x])])

@@ -1,0 +1,64 @@
+"""Base class of losses as torch modules, made from their functions."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+
+class LossModule(nn.Module):
+    """A loss function as a module that holds its options. ::
+
+        class RootLoss(LossModule, function=root_loss, by_place=("root", "reduction")):
+            \"\"\"`root_loss` with its options held.\"\"\"
+
+    The constructor takes the options of `function`, those named in `by_place` by position too. They become attributes,
+    and submodules where they are modules. The function checks them when the module is called. A function of other
+    tensors than (input, target) has a `forward` with those.
+    """
+
+    function: ClassVar[Callable[..., Tensor]]
+    _signature: ClassVar[inspect.Signature]
+
+    def __init_subclass__(
+        cls, *, function: Callable[..., Tensor] | None = None, by_place: tuple[str, ...] = (), **keywords: Any
+    ) -> None:
+        super().__init_subclass__(**keywords)
+        if function is None:  # a subclass of a loss
+            return
+        tensors = len(inspect.signature(cls.forward).parameters.keys() - {"self", "mask"})
+        options = dict(list(inspect.signature(function).parameters.items())[tensors:])
+        del options["mask"]
+        places = [options.pop(name).replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in by_place]
+        named = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options.values()]
+        cls.function, cls._signature = staticmethod(function), inspect.Signature([*places, *named])
+
+        def initialize(self: LossModule, *args: Any, **options: Any) -> None:
+            nn.Module.__init__(self)
+            try:
+                bound = cls._signature.bind(*args, **options)
+            except TypeError as error:
+                raise TypeError(f"{cls.__name__}.__init__(): {error}") from None
+            bound.apply_defaults()
+            for name, value in bound.arguments.items():
+                setattr(self, name, value)
+
+        own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        initialize.__signature__ = inspect.Signature([own, *places, *named])  # type: ignore[attr-defined]
+        initialize.__name__, initialize.__qualname__ = "__init__", f"{cls.__qualname__}.__init__"
+        cls.__init__ = initialize  # type: ignore[method-assign,assignment]
+
+    def loss(self, *tensors: Any, mask: Tensor | None) -> Tensor:
+        """Return the function of tensors with the options held."""
+        options = {name: getattr(self, name) for name in self._signature.parameters}
+        return self.function(*tensors, mask=mask, **options)
+
+    def forward(self, input: Any, target: Any, mask: Tensor | None = None) -> Tensor:
+        return self.loss(input, target, mask=mask)
+
+    def extra_repr(self) -> str:
+        held = {name: getattr(self, name) for name in self._signature.parameters}
+        return ", ".join(f"{name}={value!r}" for name, value in held.items() if not isinstance(value, nn.Module))
