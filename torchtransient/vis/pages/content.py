@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -59,6 +59,28 @@ class Planes:
     ratios: Tensor | None = None
     phase: Tensor | None = None
     error: Tensor | None = None
+
+    def named(self) -> dict[str, Tensor]:
+        """Return the planes (T, H, W) by the names that pages give them."""
+        found = {f"c{k}": channel for k, channel in enumerate(self.light)}
+        if self.ratios is not None:
+            found |= dict(zip(("s1", "s2", "s3"), self.ratios, strict=True))
+        found |= {} if self.phase is None else {"phase": self.phase}
+        return found | ({} if self.error is None else {"error": self.error})
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Planes:
+        """Return the planes with ``function`` applied to each tensor."""
+        parts = (self.light, self.ratios, self.phase, self.error)
+        light, *others = (None if part is None else function(part) for part in parts)
+        assert light is not None
+        return Planes(light, *others)
+
+    @classmethod
+    def cat(cls, parts: Sequence[Planes]) -> Planes:
+        """Return bins of several parts in one."""
+        first = parts[0]
+        held = [name for name in ("light", "ratios", "phase", "error") if getattr(first, name) is not None]
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts], -3) for name in held})
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torchtransient.vis.pages.content import Content
 # Okabe and Ito's colours, which are told apart without red, green or blue cones; lines have dashes of their own too.
 PIXEL_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
-_PICTURE = 430
+_PICTURE = 440
 _MODES = {
     "colour": "colour", "light": "intensity", "peak": "peak time", "rainbow": "rainbow", "dop": "degree of polarization",
     "aolp": "angle of linear polarization", "real": "real part", "phase": "phase", "speed": "speed of approach",

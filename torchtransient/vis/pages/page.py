@@ -6,7 +6,7 @@ import base64
 import json
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ _SCRIPT = Path(__file__).with_name("view.js")
 NOTEBOOK_BYTES = 8_000_000
 # Beyond it the numbers of a page fill a browser's memory.
 _MOST_CODES = 250_000_000
-_RATIOS = ("s1", "s2", "s3")
+# Parts of a content that tell how small it becomes.
+_SAMPLED = 24
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def page_of(content: Content, title: str, max_bytes: int) -> Page:
     from bokeh.embed import file_html
     from bokeh.resources import INLINE
 
-    content, encoded = _fitted(content, max_bytes - 2_000_000)
+    content, encoded = _fitted(content, max_bytes - 1_800_000)
     notes = (*_errors_said(content, encoded.tables), *content.notes)
     maps, modes = colour_maps(), modes_of(content)
     root = layout_of(content, modes, " ".join(map(escape, notes)), title, maps)
@@ -111,58 +112,69 @@ def described(content: Content, tables: dict[str, Table], modes: dict[str, str],
 def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
     """Codes of a content with as many bins and pixels as there is room for."""
     times = pixels = 1
-    entries = len(content.planes) * len(_codes_of(content.planes[0], _tables(content, first=True), 1))
     while True:
-        shown = content if times == pixels == 1 else binned(content, times, pixels)
-        t, h, w = shown.shape
-        if t * h * w * entries <= _MOST_CODES:
-            tables = _tables(shown)
-            encoded = Encoded(tables, [])
-            with ThreadPoolExecutor(2) as pool:
-                for planes in shown.planes:
-                    codes = _codes_of(planes, tables)
-                    packed = pool.map(_packed, codes.values())
-                    encoded.packed.append(dict(zip(codes, packed, strict=True)))
-                    if encoded.size > max_bytes:
-                        break
+        t, h, w = (n // k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
+        if t * h * w <= 64 or _expected(content, times, pixels) <= 1.1 * max_bytes:
+            shown = content if times == pixels == 1 else binned(content, times, pixels)
+            encoded = _encoded(shown)
             if encoded.size <= max_bytes or t * h * w <= 64:
                 return shown, encoded
-        if t > 64 and shown.planes[0].phase is None and times <= 4 * pixels:
+        # Slices and frequencies are no bins of light.
+        if t > 64 and content.kind not in ("phasors", "gates", "volume") and times <= 4 * pixels:
             times *= 2
         else:
             pixels *= 2
 
 
+def _expected(content: Content, times: int, pixels: int) -> float:
+    """Bytes of a content on the page, from some of its bins."""
+    bins, rows, columns = content.shape
+    some = max(times, bins // _SAMPLED // times * times)
+    parts = []
+    number = min(8, bins // some)
+    for start in ((2 * k + 1) * (bins - some) // (2 * number) for k in range(number)):
+        planes = content.planes[:: max(1, len(content.planes) // _SAMPLED)]
+        parts.append([part.map(lambda x, a=start: x[..., a : a + some, :, :]) for part in planes])  # type: ignore[misc]
+    joined = [Planes.cat([part[n] for part in parts]) for n in range(len(parts[0]))]
+    share = len(parts) * some * len(joined) / (bins * len(content.planes))
+    slider = replace(content.slider, centers=np.arange(float(len(parts) * some)))
+    sample = replace(content, planes=tuple(joined), slider=slider)
+    encoded = _encoded(sample if times == pixels == 1 else binned(sample, times, pixels))
+    codes = len(encoded.packed[0]) * len(content.planes) * bins * rows * columns / (times * pixels**2)
+    return encoded.size / share if codes <= _MOST_CODES else float("inf")
+
+
+def _encoded(content: Content) -> Encoded:
+    tables = _tables(content)
+    packed = []
+    with ThreadPoolExecutor(2) as pool:
+        for planes in content.planes:
+            codes = _codes_of(planes, tables)
+            packed.append(dict(zip(codes, pool.map(_packed, codes.values()), strict=True)))
+    return Encoded(tables, packed)
+
+
 def _packed(codes: NDArray[np.uint8]) -> bytes:
-    packer = zlib.compressobj(1, zlib.DEFLATED, 31)
-    return packer.compress(np.ascontiguousarray(codes)) + packer.flush()
+    # Noise has no strings that repeat: runs of zeros and short codes for frequent numbers are what there is to gain.
+    packer = zlib.compressobj(1, zlib.DEFLATED, 31, 9, zlib.Z_RLE)
+    return packer.compress(codes) + packer.flush()
 
 
-def _tables(content: Content, first: bool = False) -> dict[str, Table]:
-    planes = content.planes[:1] if first else content.planes
-    light = light_table("light", 1.0, 1e-3) if first else table_of(content.quantity, [part.light for part in planes])
-    tables = {f"c{k}": light for k in range(planes[0].light.shape[0])}
+def _tables(content: Content) -> dict[str, Table]:
+    planes = content.planes
+    light = table_of(content.quantity, [part.light for part in planes])
+    tables = dict.fromkeys((f"c{k}" for k in range(len(planes[0].light))), light)
     if planes[0].ratios is not None:
-        tables |= dict.fromkeys(_RATIOS, RATIO)
+        tables |= dict.fromkeys(("s1", "s2", "s3"), RATIO)
     if planes[0].phase is not None:
         tables["phase"] = PHASE
     if planes[0].error is not None:
-        tables["error"] = light if first else table_of("error", [part.error for part in planes if part.error is not None])
+        tables["error"] = table_of("error", [part.error for part in planes if part.error is not None])
     return tables
 
 
-def _codes_of(planes: Planes, tables: dict[str, Table], bins: int | None = None) -> dict[str, NDArray[np.uint8]]:
-    """Codes by plane. Channels behind the first are stored as differences of codes, which are small."""
-    codes = {f"c{k}": tables[f"c{k}"].encode(light[:bins]) for k, light in enumerate(planes.light)}
-    for name in list(codes)[1:]:
-        codes[name] -= codes["c0"]
-    if planes.ratios is not None:
-        codes |= {name: RATIO.encode(part[:bins]) for name, part in zip(_RATIOS, planes.ratios, strict=True)}
-    if planes.phase is not None:
-        codes["phase"] = PHASE.encode(planes.phase[:bins])
-    if planes.error is not None:
-        codes["error"] = tables["error"].encode(planes.error[:bins])
-    return codes
+def _codes_of(planes: Planes, tables: dict[str, Table]) -> dict[str, NDArray[np.uint8]]:
+    return {name: tables[name].encode(plane) for name, plane in planes.named().items()}
 
 
 def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:

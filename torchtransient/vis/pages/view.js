@@ -30,17 +30,8 @@
 
     plane(entry, name) {
       const id = `codes-${entry}-${name}`;
-      if (!this.kept.has(id)) this.kept.set(id, this.read(id, entry, name));
+      if (!this.kept.has(id)) this.kept.set(id, unpacked(id));
       return this.kept.get(id);
-    }
-
-    async read(id, entry, name) {
-      const codes = await unpacked(id);
-      if (/^c[1-9]/.test(name)) {  // stored as differences from the first channel
-        const first = await this.plane(entry, "c0");
-        for (let i = 0; i < codes.length; i++) codes[i] += first[i];
-      }
-      return codes;
     }
 
     async frame(entry, name, t) { return (await this.plane(entry, name)).subarray(t * N, (t + 1) * N); }
@@ -254,6 +245,12 @@
     return (0xff000000 | ((v & 255) << 16) | (v & 0xff00) | (v >> 16)) >>> 0;
   };
   const palettes = {};
+  const toByte = (x) => {
+    const v = x <= 0 ? 0 : x >= 1 ? 1 : x;
+    return Math.round(255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
+  };
+  // The bar of pictures in colour: greys as bright as the light.
+  meta.maps.screen = Array.from({ length: 256 }, (_, i) => `#${toByte(i / 255).toString(16).padStart(2, "0").repeat(3)}`);
   for (const [name, colours] of Object.entries(meta.maps)) palettes[name] = Uint32Array.from(colours, rgba);
 
   const shareOf = (v, scale) => (scale.log ? Math.log(v / scale.low) / Math.log(scale.high / scale.low)
@@ -269,10 +266,6 @@
     }
   }
 
-  const toByte = (x) => {
-    const v = x <= 0 ? 0 : x >= 1 ? 1 : x;
-    return Math.round(255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055));
-  };
   const byteOf = (v, scale) => {
     if (!Number.isFinite(v)) return 255;
     if (!scale.log) return toByte(v / scale.high);
@@ -356,7 +349,7 @@
       paint(target, shown, scale, single === "light" ? MAGENTA : GREY);
     }
     model("image").change.emit();
-    drawBar(scale, mode === "colour" && item !== "difference" && !meta.signed ? "grey" : scale.palette);
+    drawBar(scale, mode === "colour" && item !== "difference" && !meta.signed ? (scale.log ? "grey" : "screen") : scale.palette);
   }
 
   let barKey = "";
@@ -672,16 +665,17 @@
     }, true);
   }
 
-  // The bin with most light, and a pixel of middling brightness in it.
+  // The bin in which most pixels see light (brightness counts by its logarithm), and a pixel of middling brightness in it.
   async function begin() {
     if (!meta.server) {
       let best = -1;
       const step = Math.max(1, Math.floor(N / 512));
-      const frames = complex ? 1 : T;
+      const frames = complex ? 1 : T, smallest = quantile(tables.c0, 0, 1);
+      const weight = Float32Array.from(tables.c0, (v) => (Math.abs(v) > 0 ? 1 + Math.log(Math.abs(v) / smallest) : 0));
       for (let t = 0; t < frames; t++) {
         const codes = await store.frame(entriesOf(0)[entriesOf(0).length >> 1], "c0", t);
         let sum = 0;
-        for (let i = 0; i < N; i += step) sum += Math.abs(tables.c0[codes[i]]) || 0;
+        for (let i = 0; i < N; i += step) sum += weight[codes[i]];
         if (sum > best) [best, state.t] = [sum, t];
       }
     } else {
