@@ -101,6 +101,7 @@ class Content:
         unit: "m", or "pixels".
         marks: points on the picture, such as the laser's.
         notes: sentences about what was left out.
+        stride: rows and columns from one pixel of the picture to the next.
     """
 
     kind: str
@@ -116,6 +117,7 @@ class Content:
     unit: str = "pixels"
     marks: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = field(default_factory=tuple)
+    stride: int = 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -181,10 +183,10 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
         return _phasors(as_tensor(x.phasor, who), known, who)
     if getattr(x, "gated", None) is not None:
         gates = getattr(x, "gates", None)
-        return _light(as_tensor(x.gated, who), _gates(x.gated.shape[-3], gates), "gates", _errors(x), who)
+        return light_content(as_tensor(x.gated, who), _gates(x.gated.shape[-3], gates), "gates", _errors(x), who)
     if getattr(x, "transient", None) is not None:
         cube = as_tensor(x.transient, who)
-        return _light(cube, _times(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who)
+        return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who)
     cube = as_tensor(x, who)
     if cube.is_complex():
         return _phasors(cube, frequencies, who)
@@ -192,7 +194,7 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
         return _rates(cube, axis, rate_axis, who)
     if cube.ndim == 3:
         cube = cube[None]
-    return _light(cube, _times(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
+    return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
 
 
 class _Named:
@@ -213,7 +215,8 @@ def _errors(x: Any) -> Tensor | None:
     return found[0] if found.ndim == 4 else found
 
 
-def _times(bins: int, axis: TimeAxis | None, who: str) -> Slider:
+def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
+    """Return the slider of bins of time, which count where there is no axis."""
     if axis is None:
         return Slider("bin", "", np.arange(bins, dtype=np.float64))
     if not isinstance(axis, TimeAxis):
@@ -235,7 +238,10 @@ def _grey(cube: Tensor, channel: int = 0) -> tuple[Tensor, tuple[str, ...]]:
     return cube.mean(channel, keepdim=True), (f"Mean over {count} channels.",)
 
 
-def _light(cube: Tensor, slider: Slider, kind: str, error: Tensor | None, who: str) -> Content:
+def light_content(
+    cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None, who: str = "view"
+) -> Content:
+    """Return what a page shows of light (C, T, H, W), or polarized (4, C, T, H, W)."""
     if cube.ndim == 5 and cube.shape[0] == 4:
         mean = cube.mean(1)
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
@@ -281,7 +287,7 @@ def _rates(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
         raise ShapeError(f"{who}: light over {len(mean)} rates needs rate_axis=RateAxis(...), got {shown(rate_axis)}.")
     centers = tuple(rate_axis.centers.tolist())
     return Content(
-        "rates", _times(mean.shape[1], axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
+        "rates", slider_of(mean.shape[1], axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
         tuple(Planes(part[None]) for part in mean), layer_name="rate", layer_numbers=centers, notes=notes,
     )  # fmt: skip
 
@@ -289,7 +295,7 @@ def _rates(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
 def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
     mean, notes = _rows(cube, who, "beats (C, 2, T, H, W)")
     planes = tuple(Planes(part[None]) for part in mean)
-    slider = _times(mean.shape[1], axis, who)
+    slider = slider_of(mean.shape[1], axis, who)
     return Content(
         "beats", slider, ("",), ("up chirp", "down chirp"), planes, quantity="beat power", layer_name="chirp", notes=notes
     )
@@ -320,7 +326,7 @@ def _capture(capture: Capture, who: str) -> Content:
         parts = [_phasors(cube[:, :, n], capture.frequencies, who) for n in range(cube.shape[2])]
         return replace(parts[0], planes=tuple(part.planes[0] for part in parts), **common)
     light = [_grey(cube[:, :, n]) for n in range(cube.shape[2])]
-    slider = _times(cube.shape[1], capture.axis, who)
+    slider = slider_of(cube.shape[1], capture.axis, who)
     return Content("capture", slider, planes=tuple(Planes(part) for part, _ in light), notes=light[0][1], **common)
 
 

@@ -149,7 +149,7 @@ def _picture(content: Content, maps: dict[str, list[str]]) -> Any:
     m = bokeh.models
     _, rows, columns = content.shape
     # Pictures have their first row at the top, walls and volumes at the bottom.
-    extent = (0.0, float(columns), 0.0, float(rows)) if content.extent is None else content.extent
+    extent = (0.0, float(columns * content.stride), 0.0, float(rows * content.stride)) if content.extent is None else content.extent
     left, right, low, high = extent
     scale = _PICTURE / max(right - left, high - low)
     width, height = max(120, round((right - left) * scale)), max(90, round((high - low) * scale))

@@ -67,21 +67,26 @@ class Encoded:
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
     """Return the page of a content, binned until it has at most ``max_bytes``."""
     import_bokeh()
-    from bokeh.embed import file_html
-    from bokeh.resources import INLINE
-
     content, encoded = _fitted(content, max_bytes - 1_800_000)
     notes = (*_errors_said(content, encoded.tables), *content.notes)
     maps, modes = colour_maps(), modes_of(content)
     root = layout_of(content, modes, " ".join(map(escape, notes)), title, maps)
-    html = file_html(root, INLINE, title=title)
     chunks = [
         f'<script type="text/plain" id="codes-{entry}-{name}">{base64.b64encode(packed).decode("ascii")}</script>'
         for entry, planes in enumerate(encoded.packed)
         for name, packed in planes.items()
     ]
     meta = described(content, encoded.tables, modes, maps)
-    return Page(with_script(html, meta, chunks), notes)
+    return Page(with_script(html_of(root, title), meta, chunks), notes)
+
+
+def html_of(root: Any, title: str) -> str:
+    """Return the page of bokeh's models, with bokeh in it."""
+    from bokeh.embed import file_html
+    from bokeh.resources import INLINE
+
+    html: str = file_html(root, INLINE, title=title)
+    return html
 
 
 def with_script(html: str, meta: dict[str, Any], chunks: list[str]) -> str:
@@ -99,7 +104,7 @@ def described(content: Content, tables: dict[str, Table], modes: dict[str, str],
     return {
         "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
         "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
-        "channels": content.planes[0].light.shape[0], "extent": content.extent, "quantity": content.quantity,
+        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride, "quantity": content.quantity,
         "slider": {
             "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
             "secondUnit": slider.second_unit, "factor": slider.factor,

@@ -3,7 +3,7 @@
 (() => {
   const meta = JSON.parse(document.getElementById("meta").textContent);
   const [T, H, W] = meta.shape;
-  const N = H * W, K = meta.channels;
+  const N = H * W, K = meta.channels, stride = meta.stride;
   const GREY = 0xff888888, MAGENTA = 0xffff00ff;
   const centers = meta.slider.centers;
   const complex = "phase" in meta.tables, polarized = "s1" in meta.tables;
@@ -57,7 +57,7 @@
     }
 
     frame(entry, name, t) { return this.read(`frame/${entry}/${name}/${t}`); }
-    curve(entry, name, i) { return this.read(`curve/${entry}/${name}/${Math.floor(i / W)}/${i % W}`); }
+    curve(entry, name, i) { return this.read(`curve/${entry}/${name}/${Math.floor(i / W) * stride}/${(i % W) * stride}`); }
   }
 
   const store = meta.server ? new Served() : new Inline();
@@ -427,7 +427,7 @@
   const COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7"];
 
   function drawMarkers() {
-    const [left, right, low, high] = meta.extent ?? [0, W, 0, H];
+    const [left, right, low, high] = meta.extent ?? [0, W * stride, 0, H * stride];
     const chosen = state.pixels.slice(-most());
     model("pixels").data = {
       x: chosen.map((p) => left + ((p.column + 0.5) / W) * (right - left)),
@@ -454,7 +454,7 @@
       const total = curve.y.reduce((a, b) => a + b, 0);
       const top = curve.y.reduce((best, v, t) => (v > curve.y[best] ? t : best), 0);
       const error = curve.errors && !state.accumulate && ["light", "colour"].includes(state.mode) ? ` ± ${number(curve.errors[state.t])}` : "";
-      return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} row ${curve.pixel.row}, column ${curve.pixel.column}</td>`
+      return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} row ${curve.pixel.row * stride}, column ${curve.pixel.column * stride}</td>`
         + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${number(total)}</td>`
         + `<td class="at">${number(centers[top])} ${meta.slider.unit}</td></tr>`;
     });
@@ -584,7 +584,7 @@
   }
 
   const pixelAt = (x, y) => {
-    const [left, right, low, high] = meta.extent ?? [0, W, 0, H];
+    const [left, right, low, high] = meta.extent ?? [0, W * stride, 0, H * stride];
     const column = Math.floor(((x - left) / (right - left)) * W), row = Math.floor(((y - low) / (high - low)) * H);
     return row >= 0 && row < H && column >= 0 && column < W ? { row, column } : null;
   };
