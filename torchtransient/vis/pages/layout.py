@@ -99,7 +99,7 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         m.Select(title="brightness", name="curve", options=["linear", "logarithmic"], value="linear", width=105),
         m.Slider(title="exposure (stops)", name="exposure", start=-10, end=20, value=0, step=0.5, width=170),
     ]
-    flags = [("accumulate", content.planes[0].phase is None and content.kind not in ("gates", "volume"), False), ("log axis", True, False)]
+    flags = [("accumulate", "peak" in modes and content.kind != "volume", False), ("log axis", True, False)]
     switches = [m.Checkbox(label=name, name=name.replace(" ", "_"), active=on, visible=shown, width=105) for name, shown, on in flags]
     picks = []
     if len(content.items) > 1:
@@ -237,6 +237,7 @@ def _laser_grid(content: Content) -> Any:
     """The laser spots of an exhaustive scan; a click chooses one."""
     rows, columns = content.layer_grid  # type: ignore[misc]  # of contents that have one
     figure = _panel("laser spot: click", (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row")
+    figure.name = "spots"
     m = import_bokeh().models
     spots = [(n % columns, n // columns) for n in range(rows * columns)]
     every = m.ColumnDataSource(data={"x": [x for x, _ in spots], "y": [y for _, y in spots]})

@@ -91,6 +91,8 @@ def html_of(root: Any, title: str) -> str:
 
 def with_script(html: str, meta: dict[str, Any], chunks: list[str]) -> str:
     """Return a page of bokeh with the page's own script and numbers before its end."""
+    # Browsers ask servers for an icon.
+    html = html.replace("<head>", '<head><link rel="icon" href="data:,">', 1)
     head, end, rest = html.rpartition("</body>")
     said = json.dumps(meta).replace("</", "<\\/")
     script = _SCRIPT.read_text(encoding="utf-8")
