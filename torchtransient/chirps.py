@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from torch import Tensor
 
 from torchtransient.axes import LOWEST_HERTZ, TimeAxis
-from torchtransient.checks import count, finite, is_one_of, of_class, positive, shown
+from torchtransient.checks import Numbers, count, finite, is_one_of, numbers, of_class, positive, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.pulses import Array, Pulse
 from torchtransient.units import SPEED_OF_LIGHT
@@ -78,12 +78,12 @@ class Chirps:
 
     @property
     def rate_scale_s(self) -> float:
-        """Optical path length that a rate of 1 m/s looks like, k = f0 T / B, seconds: 1.9 for 1 GHz in 10 us."""
+        """Seconds that rates are turned into lengths with, k = f0 T / B; 1.9 for 1 GHz in 10 us at 1550 nm."""
         return SPEED_OF_LIGHT / self.wavelength_m * self.duration_s / self.bandwidth_hz
 
     @property
     def resolution_opl(self) -> float:
-        """Optical path length of one turn of the beat during a chirp, c / B, metres: a bin of the transform."""
+        """Optical path length of one turn of the beat during a chirp, c / B, metres; a bin of the transform."""
         return SPEED_OF_LIGHT / self.bandwidth_hz
 
     @property
@@ -97,20 +97,34 @@ class Chirps:
 
     @property
     def line_shape(self) -> Pulse:
-        """Power spectrum of a single arrival over optical path length: |transform of the window|^2, of unit integral.
+        """Power spectrum of a single arrival over optical path length, |transform of the window|^2, of unit integral.
 
         A table that ends where less than 1e-3 of the line lies outside: 4 c / B from its middle, 101 of a rectangular
         window.
         """
         lines = np.arange(_FARTHEST_LINES * _PER_LINE + 1) / _PER_LINE
         power = self._amplitude(lines) ** 2
-        # By Parseval: the integral over all lines is the mean of the squared window.
-        cosines = WINDOWS[self.window]
-        whole = cosines[0] ** 2 + sum(a * a for a in cosines[1:]) / 2
+        whole = _norm(WINDOWS[self.window]) ** 2
         inside = 2 * np.cumsum(0.5 * (power[1:] + power[:-1])) / _PER_LINE
         last = max(int(np.argmax(inside >= (1 - _OUTSIDE) * whole)) + 1, _NEAREST_LINES * _PER_LINE)
         at = np.concatenate([-lines[last:0:-1], lines[: last + 1]])
         return Pulse.tabulated(at * self.resolution_opl, np.concatenate([power[last:0:-1], power[: last + 1]]))
+
+    def longer(self, times: float) -> Chirps:
+        """Return chirps of the same sweep that last ``times`` as long: the same beats in lines as much narrower.
+
+        Light that is rendered with them on an axis of narrow bins has hardly a line of its own, which is what
+        `sensing.CoherentReceiver` draws fields of. Raises UnitError for numbers that are not positive.
+        """
+        factor = positive("Chirps.longer: times", times)
+        return replace(self, bandwidth_hz=factor * self.bandwidth_hz, duration_s=factor * self.duration_s)
+
+    def line_amplitude(self, opl: Numbers) -> Array:
+        """Evaluate the transform of the window over optical path length, of any shape, metres; its square has unit
+        integral over lines of c / B. Real, since the phase counts from the middle of the chirp.
+        """
+        cosines = WINDOWS[self.window]
+        return self._amplitude(numbers("Chirps.line_amplitude: opl", opl) / self.resolution_opl) / _norm(cosines)
 
     def _amplitude(self, lines: Array) -> Array:
         """Return the transform of the window at frequencies in turns per chirp."""
@@ -145,6 +159,11 @@ class Chirps:
         first = math.floor((2 * near - shift) / width) - _NEAREST_LINES * parts
         last = math.ceil((2 * far + shift) / width) + _NEAREST_LINES * parts
         return TimeAxis((first - 0.5) * width, width, last - first + 1)
+
+
+def _norm(cosines: tuple[float, ...]) -> float:
+    """Return the root of the mean of the squared window, which is its integral over all lines by Parseval."""
+    return math.sqrt(cosines[0] ** 2 + sum(a * a for a in cosines[1:]) / 2)
 
 
 def _limits(name: str, given: tuple[float, float]) -> tuple[float, float]:

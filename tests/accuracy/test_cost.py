@@ -390,6 +390,7 @@ def test_complex_quantities_and_samplers_alone():
     (found,) = (p for p in report.points if p.quantity == "phase")
     assert found.relative_error == pytest.approx(expected, rel=0.25)
     assert found.total_error == pytest.approx(expected, rel=0.25)
+    assert str(report) == report.table()
     alone = tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, progress=False)
     assert all(np.isnan(p.total_error) for p in alone.points) and alone.settings["finest"] == {}
 
@@ -442,11 +443,29 @@ def test_settings_that_a_film_does_not_have():
     gated = tt.TransientRenderer(renderer.scene, gates=[tt.Gate.rectangular(7.0, 8.0)])
     with pytest.raises(ArgumentError, match="bin_widths: a gated film has no bins"):
         tt.cost_of_accuracy(gated, spp=(4,), bin_widths=(0.1,), progress=False)
-    with pytest.raises(ShapeError, match="of the reference's shape"):
-        tt.cost_of_accuracy(
-            renderer, spp=(4,), bin_widths=(0.05, 0.1), quantities={"bins": lambda out: out.transient.sum((-2, -1))},
-            progress=False,
-        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "given, error, message",
+    [
+        ({"transient": lambda out: out.steady}, ArgumentError, "'transient' is measured in any case"),
+        ({f"d loss / d {ALBEDO}": energy}, ArgumentError, "is measured in any case"),
+        ([("energy", energy)], ArgumentError, "expected a dictionary {name: function of a RenderOutput}"),
+        (energy, ArgumentError, "expected a dictionary"),
+        ({1: energy}, ArgumentError, "expected names"),
+        ({"none": lambda out: None}, ArgumentError, "'none': expected a function that returns a tensor"),
+        ({"empty": lambda out: out.transient[:, :0]}, ShapeError, "'empty': expected one number at least"),
+        (
+            {"bins": lambda out: out.transient.sum((0, -2, -1))},
+            ShapeError,
+            r"'bins': .* got \(64,\) with \d+ spp \[owen, tent, bins of 0.05 m\] and \(32,\) .*bins of 0.1 m",
+        ),
+    ],
+)
+def test_quantities_that_cannot_be_compared(given, error, message):
+    settings = {"gradients": [ALBEDO], "bin_widths": (0.05, 0.1), "samplers": ("owen",), "repeats": 2}
+    with pytest.raises(error, match=f"^quantities.*{message}"):
+        tt.cost_of_accuracy(wall_renderer(), spp=(4,), quantities=given, progress=False, **settings)
 
 
 def test_a_scene_is_no_renderer():

@@ -64,6 +64,45 @@ def test_render_to_a_tolerance(folder):
         assert wrong.exit_code == 2 and options[0] in wrong.output
 
 
+def test_render_of_a_plan(folder):
+    """The picture, the reasons and the settings are those of ``torchtransient plan``; options go before them."""
+    options = ("--num-bins", 30, "--seed", 3)
+    result = run("render", "box.xml", "-o", "out.npz", "--plan", "--quiet", *options)
+    assert result.exit_code == 0, result.output
+    plan = tt.plan("box.xml", num_bins=30, seed=3)
+    expected, stored = plan.renderer()(seed=3), read_result(folder / "out.npz")
+    assert stored.axis == plan.time_axis and stored.axis.num_bins == 30
+    torch.testing.assert_close(stored.transient, expected.transient)
+    assert run("plan", "box.xml", *options).stdout.splitlines()[:6] == result.stdout.splitlines()[:6]
+    assert stored.metadata["plan"]["max_depth"] == plan.max_depth
+    assert stored.metadata["stats"]["variant"] == plan.variant == "llvm_ad_mono"
+
+
+@pytest.mark.parametrize("described", [True, False])
+def test_render_of_a_plan_for_gates(folder, described):
+    """The film of the options, or else that of the scene, says what is planned; with --rtol until its error is met."""
+    gates = "rectangular 6 6.5"
+    histogram = SCENE[SCENE.index('<film type="trans') : SCENE.index("</film>")]
+    film = f'<film type="gated_hdr_film"><string name="gates" value="{gates}"/>'
+    film += '<integer name="width" value="8"/><integer name="height" value="8"/>'
+    (folder / "gated.xml").write_text(SCENE.replace(histogram, film) if described else SCENE, encoding="utf-8")
+    options = () if described else ("--gates", gates)
+    result = run("render", "gated.xml", "-o", "out.npz", "--plan", "--error", "relative", "--rtol", 0.2, "--seed", 3,
+                 "--quiet", *options)  # fmt: skip
+    assert result.exit_code == 0, result.output
+    given = None if described else tt.Gate.rectangular(6.0, 6.5)
+    plan = tt.plan("gated.xml", "gates", gates=given, error="relative", seed=3)
+    expected = plan.renderer().to_tolerance(rtol=0.2, seed=3, progress=False)
+    torch.testing.assert_close(read_result(folder / "out.npz").gated, expected.output.gated)
+    assert "Russian roulette: none" in result.stdout and "reached" in result.stdout
+
+
+def test_pictures_that_a_plan_does_not_show_are_refused_before_the_render(folder):
+    result = run("render", "box.xml", "--plan", "--gates", "rectangular 6 7", "--overview", "a.png", "--quiet")
+    assert result.exit_code == 2 and "leave it out for gates" in result.stderr and not (folder / "box.h5").exists()
+    assert "--plan" in run("render", "box.xml", "--error", "relative").stderr
+
+
 def test_render_with_error_bars(folder):
     result = run("render", "box.xml", "-o", "out.npz", "--errors", "--overview", "out.png", "--seed", 3, "--quiet")
     assert result.exit_code == 0, result.output
@@ -252,7 +291,7 @@ def test_cost_of_settings(folder):
     }
     assert "recommended for 99.00%: transient: transient_path, owen" in result.stdout
     result = run("cost", "box.xml", "--spp", "4,8", "--sampler", "owen", "--error", 1e-9, "--quiet")
-    assert result.exit_code == 0 and "expected an error of transient that a measured setting reaches" in result.stdout
+    assert result.exit_code == 1 and "expected an error of transient that a measured setting reaches" in result.stdout
 
 
 @pytest.mark.slow
@@ -313,6 +352,7 @@ def test_the_command_as_a_module(folder):
         (("plan", "box.xml", "--outputs", "phasor"), "Give --frequencies, or make the film"),
         (("plan", "box.xml", "--outputs", "sound"), "--outputs takes some of transient, phasor"),
         (("render", "box.xml", "--sensor", 4), "--sensor: the scene has 1"),
+        (("render", "box.xml", "--plan", "--error", "relative", "--frequencies", 1), "--error relative is about bins"),
     ],
 )
 def test_errors_speak_of_options(folder, arguments, message):

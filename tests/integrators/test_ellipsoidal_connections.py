@@ -274,17 +274,19 @@ def test_calls_are_recorded():
     assert out.stats.recorded == ("launched",)
 
 
-def test_a_wall_that_moves():
-    """Faces follow the scene, in recorded calls too."""
-    key = "back.to_world"
-    recorded, fresh = (renderer(room(), parameters=[key], spp=16) for _ in range(2))
-    pose = recorded.values[key].detach().clone()
+@pytest.mark.parametrize("freeze", [True, False])
+@pytest.mark.parametrize("key", ["back.to_world", "light.to_world"])
+def test_walls_and_lights_that_move(key, freeze):
+    """Faces follow the scene from call to call, there and back, and stay where it stays."""
+    one, first = (renderer(room(), parameters=[key], spp=16, freeze=freeze) for _ in range(2))
+    start = one.values[key].detach().clone()
     with torch.no_grad():
-        for seed in range(4):
-            pose[2, 3] += 0.1
-            out = recorded({key: pose}, seed=seed)
-        expected = fresh({key: pose}, seed=3)
-    torch.testing.assert_close(out.gated, expected.gated, rtol=2e-5, atol=2e-5)
+        for seed, step in enumerate((0.0, 0.1, 0.1, 0.2, 0.0)):
+            pose = start.clone()
+            pose[:3, 3] -= step * torch.tensor([0.0, 0.5, -1.0])
+            out = one({key: pose}, seed=seed)
+            expected = renderer(room(), parameters={key: pose}, spp=16)(seed=seed) if step else first(seed=seed)
+            torch.testing.assert_close(out.gated, expected.gated, rtol=2e-5, atol=2e-5)
 
 
 def without_lamp():

@@ -19,7 +19,14 @@ from support.moving_scenes import (
 )
 from support.sweeps import together
 from tools.small_room import make_room
-from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.errors import (
+    ArgumentError,
+    PhysicsError,
+    PhysicsWarning,
+    ShapeError,
+    UnitError,
+    UnknownKeyError,
+)
 from torchtransient.motion import SlowTimes
 
 VARIANT = "llvm_ad_rgb"
@@ -251,3 +258,41 @@ def test_films_and_renderers_that_are_refused():
     numbered = renderer_of(make_room(), "box.to_world", spp=1, grad_seed=7)
     with pytest.raises(ArgumentError, match="grad_seed=None or 'same'"):
         tt.over_time(numbered, {"box": TOWARDS}, tt.Frames([0.0]))
+
+
+TOO_FAR = {
+    "milliseconds for seconds": (TOWARDS, tt.Exposure(1.5), "'wall.to_world' moves by 11.6 m"),
+    "rows": (TOWARDS, tt.RollingShutter(-20.0, poses=2), "'wall.to_world' moves by"),
+    "a turn": (tt.Motion(angular=(0.0, 0.0, 20.0)), tt.Exposure(1.5), "'wall' turns around 3.7 times"),
+    "a function": (
+        lambda t: torch.eye(4) + 10 * t[:, None, None] * torch.eye(4).roll(1, 1), tt.Exposure(1.5), "moves by 11.6 m"
+    ),
+    "frames": (TOWARDS, tt.Frames([0.0, 1.0]), "'wall.to_world' moves by 10 m"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TOO_FAR)
+def test_motions_further_than_the_scene_is_large(name):
+    """1.5 s of 10 m/s between the nodes of three poses, 1.5 sqrt(3 / 5) s apart, in a scene of 3.5 m."""
+    how, exposure, said = TOO_FAR[name]
+    scene = tt.load(moving_scene(wall=wall((0, 0, 2), (0, 0, 0)), size=4), variant=VARIANT)
+
+    def look(exposure, physics):
+        renderer = tt.TransientRenderer(scene, ["wall.to_world"], spp=1, frequencies=FREQUENCIES, physics=physics)
+        tt.over_time(renderer, {"wall": how}, exposure, seed=0)
+
+    look(exposure, "ignore")
+    look(tt.Exposure(1.5e-3), "error")
+    with pytest.raises(PhysicsError, match=said):
+        look(exposure, "error")
+    with pytest.warns(PhysicsWarning, match=said):
+        look(exposure, "warn")
+
+
+def test_videos_may_leave_the_scene():
+    """As may what turns between frames."""
+    renderer = renderer_of(
+        moving_scene(wall=wall((0, 0, 2), (0, 0, 0))), "wall.to_world", spp=1, frequencies=FREQUENCIES, physics="error"
+    )
+    away = tt.Motion(linear=(0.0, 0.0, 10.0), angular=(0.0, 0.0, 20.0))
+    assert tt.over_time(renderer, {"wall": away}, tt.Frames([0.0, 0.2, 0.4, 0.6, 0.8]), seed=0).phasor.shape[0] == 5

@@ -284,6 +284,23 @@ def test_a_key_that_the_table_does_not_have(room_scene):
     assert "nope" not in table and table.get("nope") is None
 
 
+@pytest.mark.parametrize(
+    "key, meant",
+    [
+        ("lamp.to_world", "lamp.position"),
+        ("lamp.radiance.value", "lamp.intensity.value"),
+        ("spot.position", "spot.to_world"),
+        ("wall.position", "wall.to_world"),
+    ],
+)
+def test_unknown_key_of_what_another_plugin_calls_so(key, meant):
+    """A point light has a position, other lights a pose; the nearest texts would be keys of other objects."""
+    scene = {"type": "scene", "lamp": {"type": "point"}, "spot": {"type": "spot"}, "wall": {"type": "rectangle"}}
+    with pytest.raises(tt.errors.UnknownKeyError) as raised:
+        tt.load(scene, variant="llvm_ad_mono").parameters()[key]
+    assert f"has no parameter '{key}'. Did you mean '{meant}'? print" in str(raised.value)
+
+
 def test_unknown_key_suggests_the_right_one(room_scene):
     with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value"):
         tt.TransientRenderer(room_scene, parameters=["box.bsdf.reflectanse.value"])

@@ -1,5 +1,7 @@
 """Plans for small errors: no Russian roulette, shared light, and ellipsoidal connections where they pay."""
 
+import re
+
 import pytest
 import torch
 
@@ -45,9 +47,51 @@ def test_paths_stay_plain(reason):
     assert plan.rr_depth > plan.max_depth
 
 
+def test_depths_of_late_light_are_said_with_what_they_rest_on():
+    """A gate that some twenty arrivals meet: none lies deeper, and of the gate's light a part does all the same."""
+    scene, gate = box(max_depth=-1), tt.Gate.rectangular(15.0, 15.06)
+    plan = tt.plan(scene, "gates", gates=gate, integrator="transient_path")
+    line = next(line for line in plan.reasons if line.startswith("max_depth"))
+    assert plan.pilot.tail == 0 and 5 < plan.pilot.events < 100 and f"its {plan.pilot.events} arrivals" in line
+    untold = float(re.search(r"cannot tell that from ([\d.e-]+)\)", line)[1])
+    with torch.no_grad():
+        all_of_it, kept = (
+            float(plan.renderer(max_depth=depth, spp=2048)(seed=0).gated.sum()) for depth in (64, plan.max_depth)
+        )
+    assert 1e-3 < 1 - kept / all_of_it < untold
+    assert "cannot tell" not in str(tt.plan(scene, integrator="transient_path"))
+
+
+def test_the_share_beyond_a_depth_for_late_light_is_in_the_report():
+    plan = tt.plan(box(max_depth=-1), error="relative", integrator="transient_path", tail=2e-3)
+    assert 0 < plan.pilot.tail < 2e-3
+    line = next(line for line in plan.reasons if line.startswith("max_depth"))
+    assert f"{plan.pilot.tail:.2g} +- " in line and "0.02 of that of any eighth" in line
+
+
 def test_roulette_stays_where_nothing_else_ends_paths():
     plan = tt.plan(box(8, max_depth=-1), error="relative", max_depth="scene", pilot=False, time_axis="scene")
     assert plan.rr_depth is None
+
+
+def test_light_is_shared_up_to_the_depth_of_the_plan():
+    """Of a scene without a limit, too; one that is asked for leaves paths plain, and the plan says so."""
+    scene = box(max_depth=-1)
+    plan = tt.plan(scene, error="relative")
+    assert plan.integrator == "transient_path_reuse" and 0 < plan.max_depth < plan.rr_depth
+    assert plan.renderer(spp=4)(seed=0).stats.max_depth == plan.max_depth
+    unlimited = tt.plan(scene, error="relative", max_depth=-1)
+    assert (unlimited.integrator, unlimited.max_depth) == ("transient_path", -1)
+    assert any("path reuse: not used" in line and "no limit" in line for line in unlimited.reasons)
+
+
+def test_roulette_of_renderers_that_lift_the_bound_of_a_plan():
+    """Paths between walls that absorb nothing would not end."""
+    plan = tt.plan(box(8), error="relative", integrator="transient_path")
+    lifted = plan.renderer(max_depth=-1), plan.renderer().variation(max_depth=-1)
+    plain = tt.TransientRenderer(plan.scene, max_depth=-1, time_axis=plan.time_axis)(seed=0, spp=16).transient
+    for renderer in lifted:
+        torch.testing.assert_close(renderer(seed=0, spp=16).transient, plain)
 
 
 def test_dark_scenes():
@@ -75,6 +119,13 @@ def test_narrow_gates_are_connected_by_path_length(width, error):
     assert plan.connections == ("ellipsoidal" if width < 1 else None)
     out = plan.renderer(spp=16)(seed=0)
     assert out.gated.isfinite().all() and out.gated.sum() > 0
+
+
+@pytest.mark.parametrize("settings", [{"integrator": "transient_path"}, {"pilot": False, "max_depth": 8}])
+def test_connections_that_no_runs_decide_about(settings):
+    plan = tt.plan(box(8), "gates", gates=tt.Gate.rectangular(7.47, 7.53), **settings)
+    assert plan.connections is None
+    assert any("ellipsoidal connections: not used" in line for line in plan.reasons)
 
 
 @pytest.mark.parametrize("outputs", ["transient", "phasor"])

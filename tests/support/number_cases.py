@@ -73,6 +73,7 @@ def _tensors() -> dict[str, Case]:
         "TimeAxis.bin_index": Case(AXIS.bin_index, opl=1.2),
         "RateAxis": Case(tt.RateAxis, start=-2.0, bin_width=0.5, num_bins=3),
         "Chirps": Case(tt.Chirps, bandwidth_hz=1e9, duration_s=1e-5, wavelength_m=1e-6),
+        "Chirps.longer": Case(CHIRPS.longer, times=3.0),
         "Chirps.time_axis": Case(CHIRPS.time_axis, range_m=(0.0, 9.0), speed_m_s=(-1.0, 1.0), bins_per_line=3),
         "FrequencyAxis": Case(tt.FrequencyAxis, frequencies=1.0, start_opl=1.0),
         "FrequencyAxis.uniform": Case(tt.FrequencyAxis.uniform, first=1.0, step=0.5, count=3, start_opl=1.0),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchtransient.accuracy.measure import Candidate, Estimates, Task, checked_counts, measure
 from torchtransient.accuracy.report import AccuracyReport, Choice
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import Numbers, as_whole, function, numbers, positive, shown
+from torchtransient.checks import Numbers, as_whole, function, mapping, numbers, positive, shown, text
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.films import layout_of_output
 from torchtransient.rendering.output import RenderOutput
@@ -117,7 +117,8 @@ def cost_of_accuracy(
         An `AccuracyReport` with `table()`, `plot(path)`, `recommend(error=)`, `pareto()` and `to_json(path)`.
 
     Raises:
-        ArgumentError: for what is no renderer, and settings that its film does not have.
+        ArgumentError: for what is no renderer, settings that its film does not have, and ``quantities`` that are no
+            functions by name, or have a name of what is measured anyway.
         SceneError: for a key, sampler or integrator that the renderer does not know.
         UnitError: for counts out of range, and a quantity that is not finite.
         ShapeError: for a quantity whose shape depends on the setting.
@@ -136,23 +137,22 @@ def cost_of_accuracy(
             f"gradients: {missing} are not parameters of this renderer, which has {list(renderer.values)}; "
             "name them in TransientRenderer(parameters=[...])"
         )
-    functions = {
-        name: function(f"quantities: {name!r}", each, "a RenderOutput") for name, each in (quantities or {}).items()
-    }
+    own = [renderer.film.measures, *map(_gradient_name, gradients)]
+    made = _Quantities({} if quantities is None else _checked_quantities(quantities, own))
     twins = _variations(renderer, samplers, temporal_filters, integrators, max_depths, bin_widths)
     axes = [twin.axis for twin in twins.values() if twin.axis is not None]
     narrowest = min(axes, key=lambda axis: axis.bin_width_opl, default=None)
     candidates: dict[Choice, Candidate] = {}
     without: list[str] = []
     for choice, twin in twins.items():
-        candidate = {"values": _values_task(twin, functions, narrowest)}
+        candidate = {"values": _values_task(twin, made, str(choice), narrowest)}
         if gradients and twin.has_slope_for(gradients):
             candidate["gradients"] = _gradients_task(twin, tuple(gradients), loss)
         elif gradients:
             without.append(str(choice))
         candidates[choice] = candidate
     finest: dict[str, Choice] = {}
-    if len({replace(choice, sampler="") for choice in candidates}) > 1 or functions:
+    if len({replace(choice, sampler="") for choice in candidates}) > 1 or made.functions:
         for task in ("values", "gradients"):
             having = [choice for choice in sorted(candidates, key=_blur) if task in candidates[choice]]
             finest |= {task: having[0]} if having else {}
@@ -227,14 +227,65 @@ def _blur(choice: Choice) -> tuple[float, float, int, bool]:
     )
 
 
-def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], narrowest: TimeAxis | None) -> Task:
+def _checked_quantities(given: Mapping[str, Loss], own: Sequence[str]) -> dict[str, Loss]:
+    """Return functions by name. ``own``: names of what is measured in any case."""
+    checked = {}
+    for name, each in mapping("quantities", given, "{name: function of a RenderOutput}").items():
+        text("quantities", name, "names, texts")
+        if name in own:
+            raise ArgumentError(
+                f"quantities: {name!r} is measured in any case, got a function of that name too; leave it out, or give "
+                "it another name."
+            )
+        checked[name] = function(f"quantities: {name!r}", each, "a RenderOutput")
+    return checked
+
+
+@dataclass
+class _Quantities:
+    """Functions of a render by name. ``shapes``: of what each returned first, and the setting of that render."""
+
+    functions: Mapping[str, Loss]
+    shapes: dict[str, tuple[torch.Size, str]] = field(default_factory=dict)
+
+    def of(self, out: RenderOutput, setting: str) -> dict[str, NDArray[np.float32]]:
+        """Return the quantities of a render. ``setting``: how it was made, for messages."""
+        return {name: _array(self._one(name, out, setting)) for name in self.functions}
+
+    def _one(self, name: str, out: RenderOutput, setting: str) -> torch.Tensor:
+        with torch.no_grad():
+            made = self.functions[name](out)
+        try:
+            tensor = _real(torch.as_tensor(made))
+        except (TypeError, ValueError, RuntimeError):
+            raise ArgumentError(
+                f"quantities: {name!r}: expected a function that returns a tensor or a number, got {shown(made)}."
+            ) from None
+        if not bool(tensor.isfinite().all()):
+            raise UnitError(
+                f"quantities: {name!r}: expected finite numbers, got others of a render with {setting}; say what dark "
+                "pixels have (torch.where, nan_to_num, a clamped divisor)."
+            )
+        if not tensor.numel():
+            raise ShapeError(f"quantities: {name!r}: expected one number at least, got none of {setting}.")
+        first, of_first = self.shapes.setdefault(name, (tensor.shape, setting))
+        if tensor.shape != first:
+            raise ShapeError(
+                f"quantities: {name!r}: expected numbers of one shape in all settings, got {tuple(first)} with "
+                f"{of_first} and {tuple(tensor.shape)} with {setting}. Make it of what no setting changes: sums over "
+                "windows in metres, not bins."
+            )
+        return tensor
+
+
+def _values_task(renderer: TransientRenderer, made: _Quantities, choice: str, narrowest: TimeAxis | None) -> Task:
     film = renderer.film
 
     def run(spp: int, seed: int) -> Estimates:
         with torch.no_grad():
             out = renderer(seed=seed, spp=spp)
         arrays = {film.measures: _array(_real(_response(out)))}
-        return Estimates(arrays, renderer.samples_drawn(spp), lambda: _quantities_of(out, functions, spp))
+        return Estimates(arrays, renderer.samples_drawn(spp), lambda: made.of(out, f"{spp} spp [{choice}]"))
 
     spread = {}
     if narrowest is not None and renderer.axis is not None and renderer.axis != narrowest:
@@ -242,18 +293,6 @@ def _values_task(renderer: TransientRenderer, functions: Mapping[str, Loss], nar
         spread = {film.measures: lambda cube: np.einsum("kt,...thw->...khw", matrix, cube, optimize=True)}
     # After the film's own dimension come rows and columns, and real and imaginary parts of complex numbers.
     return Task(run, {film.measures: -4 if film.is_complex else -3}, to_common=spread)
-
-
-def _quantities_of(out: RenderOutput, functions: Mapping[str, Loss], spp: int) -> dict[str, NDArray[np.float32]]:
-    with torch.no_grad():
-        made = {name: torch.as_tensor(each(out)) for name, each in functions.items()}
-    for name, tensor in made.items():
-        if not bool(tensor.isfinite().all()):
-            raise UnitError(
-                f"quantities: {name!r}: expected finite numbers, got others of a render with {spp} samples per pixel; "
-                "say what dark pixels have (torch.where, nan_to_num, a clamped divisor)."
-            )
-    return {name: _array(_real(tensor)) for name, tensor in made.items()}
 
 
 def _shares(wide: TimeAxis, narrow: TimeAxis) -> NDArray[np.float32]:
@@ -268,6 +307,10 @@ def _real(tensor: torch.Tensor) -> torch.Tensor:
     return torch.view_as_real(tensor) if tensor.is_complex() else tensor
 
 
+def _gradient_name(key: str) -> str:
+    return f"d loss / d {key}"
+
+
 def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:
     # The samples of the derivative are as many as those of the render, whatever the renderer was told.
     renderer.spp_grad = None
@@ -276,7 +319,7 @@ def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Lo
         values = {key: renderer.values[key].detach().clone().requires_grad_(key in keys) for key in renderer.values}
         out = renderer(values, seed=seed, spp=spp)
         found = torch.autograd.grad(loss(out), [values[key] for key in keys])
-        arrays = {f"d loss / d {key}": _array(gradient) for key, gradient in zip(keys, found, strict=True)}
+        arrays = {_gradient_name(key): _array(gradient) for key, gradient in zip(keys, found, strict=True)}
         return Estimates(arrays, renderer.samples_drawn(spp))
 
     return Task(run, tails=True)

@@ -130,7 +130,10 @@ class Recommendation:
 
 @dataclass
 class AccuracyReport:
-    """Error against seconds and samples for every quantity and choice. Made by `cost_of_accuracy`."""
+    """Error against seconds and samples for every quantity and choice. Made by `cost_of_accuracy`.
+
+    ``str(report)`` is `table()`.
+    """
 
     points: list[CostPoint]
     method: str
@@ -367,6 +370,9 @@ class AccuracyReport:
         if any(math.isnan(p.relative_error) for p in self.points if not (p.tail and p.tail.heavy)):
             lines.append("-: the noise hides the quantity itself, so that there is nothing to be relative to")
         return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.table()
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain data; NaN becomes None and an infinite number "inf", since JSON has neither."""

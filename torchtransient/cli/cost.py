@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import click
 
 from torchtransient.cli.films import film_of_options
 from torchtransient.cli.options import load_scene, scene_options
+
+NOT_REACHED = 1
 
 
 class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
@@ -47,7 +50,8 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
 def command(scene: Path, **options: Any) -> None:
     """Measure the error of SCENE's transient, and of derivatives, against seconds and samples; print a table.
 
-    Options that may be given several times say what is compared.
+    Options that may be given several times say what is compared. The exit status is 1 where --error is reached by no
+    setting.
     """
     from torchtransient.files.result_file import check_folder
     from torchtransient.vis.overview import check_picture
@@ -60,25 +64,30 @@ def command(scene: Path, **options: Any) -> None:
     described = load_scene(scene, options["variant"], options["params"])
     report = _measure(described, film, options)
     click.echo(report.table())
+    reached = True
     if options["error"]:
         for quantity in report.quantities():
-            click.echo(_recommended(report, quantity, options["error"]))
+            found, said = _recommended(report, quantity, options["error"])
+            click.echo(said)
+            reached = reached and found
     if options["plot"]:
         report.plot(options["plot"])
         click.echo(f"{options['plot']}: the curves")
     if options["json_path"]:
         report.to_json(options["json_path"])
         click.echo(f"{options['json_path']}: the numbers")
+    if not reached:
+        sys.exit(NOT_REACHED)
 
 
-def _recommended(report: Any, quantity: str, error: float) -> str:
-    """The setting for an error in words, or why there is none: the table was measured in any case."""
+def _recommended(report: Any, quantity: str, error: float) -> tuple[bool, str]:
+    """Return True and the setting for an error in words, or False and why there is none."""
     from torchtransient.errors import ArgumentError
 
     try:
-        return f"recommended for {error:.2%}: {report.recommend(error, quantity=quantity)}"
+        return True, f"recommended for {error:.2%}: {report.recommend(error, quantity=quantity)}"
     except ArgumentError as none:
-        return str(none)
+        return False, str(none)
 
 
 def _measure(described: Any, film: Any, options: dict[str, Any]) -> Any:

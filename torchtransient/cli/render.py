@@ -12,6 +12,7 @@ import click
 from torchtransient.cli.films import film_of_options, summary
 from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
 from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
+from torchtransient.cli.plan import error_option, plan_of_options
 from torchtransient.errors import PhysicsWarning
 from torchtransient.rendering.films import layout_of_output
 
@@ -33,6 +34,8 @@ from torchtransient.rendering.films import layout_of_output
 @click.option("--set", "values", multiple=True, metavar="KEY=VALUE", help="Change a parameter of the scene.")
 @click.option("--temporal-filter", type=click.Choice(["auto", "box", "tent", "gaussian"]), default="auto")
 @click.option("--sensor", type=click.IntRange(min=0), default=0, show_default=True, help="Which of several sensors.")
+@click.option("--plan", "planned", is_flag=True, help="Render what `torchtransient plan` chooses, and say why.")
+@error_option
 @click.option("--list-parameters", is_flag=True, help="Print the keys that --set takes, and stop.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def command(scene: Path, **options: Any) -> None:
@@ -41,13 +44,17 @@ def command(scene: Path, **options: Any) -> None:
     The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
     polarized variant, the time axis in metres of optical path, and how it was made. With --frequencies or --gates, or
     for a scene with such a film, phasor (C, F, H, W) or gated (C, G, H, W) stands in place of the transient.
+    With --plan, variant, integrator, depth and time axis are those that the scene calls for at its described values,
+    where options do not say otherwise; --bin-width-opl and --num-bins may be given alone then.
     torchtransient.files.result_file.read_result reads it.
     """
     from torchtransient.files.result_file import check_target, write_result
 
     assignments(options["params"], "--param")
     _check_tolerance(options)
-    film = film_of_options(options)
+    if options["error"] and not options["planned"]:
+        raise click.UsageError("--error is for --plan, which chooses what makes that error small.")
+    film = None if options["planned"] else film_of_options(options)
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
     target = check_target(options["output"] or scene.with_suffix(".h5"))
@@ -57,10 +64,19 @@ def command(scene: Path, **options: Any) -> None:
         click.echo(described.parameters())
         return
     metadata = {"scene": scene.name, "parameters": options["params"], "set": options["values"]}
-    if options["rtol"] is None:
-        output = _render(described, values, film, options)
+    if options["planned"]:
+        plan = _planned(scene, options)
+        click.echo(plan)
+        check_pictures(options, plan.film_choice)
+        described, metadata["plan"] = plan.scene, plan.to_dict()
+        settings: dict[str, Any] = {"effects": plan}
     else:
-        found = _render_to_tolerance(described, values, film, options)
+        names = ("max_depth", "temporal_filter")
+        settings = {"film": film, "sensors": options["sensor"], **{name: options[name] for name in names}}
+    if options["rtol"] is None:
+        output = _render(described, values, settings, options)
+    else:
+        found = _render_to_tolerance(described, values, settings, options)
         output, said = found.output, "reached" if found.reached else "not reached"
         error = found.error if math.isfinite(found.error) else None  # JSON has no infinity
         metadata["tolerance"] = {
@@ -81,7 +97,12 @@ def command(scene: Path, **options: Any) -> None:
     write_pictures(output, film, options, scene.name)
 
 
-def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str, Any]) -> Any:
+def _planned(scene: Path, options: dict[str, Any]) -> Any:
+    given = options["temporal_filter"]
+    return plan_of_options(scene, options, None, temporal_filter=None if given == "auto" else given)
+
+
+def _render(described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]) -> Any:
     import torch
 
     import torchtransient as tt
@@ -95,11 +116,8 @@ def _render(described: Any, values: dict[str, Any], film: Any, options: dict[str
             spp=options["spp"],
             seed=options["seed"],
             progress=not options["quiet"],
-            film=film,
-            max_depth=options["max_depth"],
-            temporal_filter=options["temporal_filter"],
-            sensors=options["sensor"],
             errors=options["errors"],
+            **settings,
         )
 
 
@@ -112,19 +130,14 @@ def _check_tolerance(options: dict[str, Any]) -> None:
         raise click.UsageError("--rtol, --spp: give one of them; --rtol finds the samples, --max-seconds bounds them.")
 
 
-def _render_to_tolerance(described: Any, values: dict[str, Any], film: Any, options: dict[str, Any]) -> Any:
+def _render_to_tolerance(
+    described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]
+) -> Any:
     import torchtransient as tt
 
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "the window misses", PhysicsWarning)
-        renderer = tt.TransientRenderer(
-            described,
-            list(values),
-            film=film,
-            max_depth=options["max_depth"],
-            temporal_filter=options["temporal_filter"],
-            sensors=options["sensor"],
-        )
+        renderer = tt.TransientRenderer(described, list(values), **settings)
         return renderer.to_tolerance(
             values,
             rtol=options["rtol"],

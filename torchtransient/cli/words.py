@@ -13,6 +13,7 @@ _WORDS = {
     " RenderOutput.stats has the energies.": "",
     ", by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)": "",
     "tt.plan: outputs are some of": "--outputs takes some of",
+    "error='relative'": "--error relative",
     "tt.plan: ": "",
     "tt.load: ": "",
     "temporal_filter: ": "--temporal-filter: ",

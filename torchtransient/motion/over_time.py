@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
@@ -9,11 +10,13 @@ from torch import Tensor
 
 from torchtransient.checks import as_whole, function, mapping, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
+from torchtransient.floating import holds
 from torchtransient.motion.rigid import Motion
-from torchtransient.motion.slow_times import SlowTimes
+from torchtransient.motion.slow_times import Frames, SlowTimes
 from torchtransient.plugins.mitsuba_compat import POSITIONS
 from torchtransient.rendering.job import draw_seed
 from torchtransient.rendering.output import RenderOutput
+from torchtransient.rendering.poses import film_rows, pose_of, scene_size, watch_of
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import unknown_key
@@ -25,6 +28,7 @@ Moving: TypeAlias = Mapping[str, "Motion | Callable[[Tensor], Any]"] | Callable[
 
 # Parameters that a rigid motion moves.
 _PLACES = ("to_world", "position", POSITIONS)
+_UNITS = "Times are seconds, and velocities m/s and rad/s: 1.5 ms are 1.5e-3."
 
 
 @opaque
@@ -66,6 +70,9 @@ def over_time(
             without what the exposure needs; for a motion of what has no place, and for none.
         UnknownKeyError: for keys and names that the renderer does not have.
         ShapeError: for batches, and functions that return other than one value for each time.
+        PhysicsError: with ``physics="error"`` of the renderer, for what moves further than the scene is large, or turns
+            around, while the camera looks (of ``Frames``: what moves so far from one to the next). Otherwise that is a
+            ``PhysicsWarning``.
         SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
 
     Not supported: Doppler shifts of the light itself. See ``docs/motion.md``.
@@ -85,14 +92,44 @@ def over_time(
     number = as_whole(draw_seed(seed)[0])
     if number is None:
         raise UnitError(f"seed: expected one whole number for all poses, got {shown(seed)}.")
-    tensors, _, batch = renderer._collect(values)
-    if batch is not None:
-        raise ShapeError(f"over_time: expected values without a batch, got one of {batch}. Poses are the batch here.")
-    time_s = exposure.poses_s(renderer._cube_shape[0]).to(device_type(renderer.scene.variant))
-    own = dict(zip(renderer._keys, tensors, strict=True))
-    given = {**(values or {}), **_values_at(moving, time_s, own)}
-    poses: RenderOutput = renderer(given, seed=[number] * len(time_s), spp=spp, progress=progress)
+    own = pose_of(renderer, values, "over_time")
+    time_s = exposure.poses_s(film_rows(renderer)).to(device_type(renderer.scene.variant))
+    moved = _values_at(moving, time_s, own)
+    if watch_of(renderer).enabled:
+        _check_units(renderer, moving, moved, time_s, each=isinstance(exposure, Frames))
+    poses: RenderOutput = renderer(
+        {**(values or {}), **moved}, seed=[number] * len(time_s), spp=spp, progress=progress
+    )
     return poses.map(exposure.combine)
+
+
+def _check_units(
+    renderer: TransientRenderer, moving: Moving, moved: Mapping[str, Tensor], time_s: Tensor, each: bool
+) -> None:
+    """Warn of what moves further than the scene is large, or turns around, as what was given milliseconds does.
+
+    Args:
+        renderer: the renderer.
+        moving: what moves.
+        moved: its values (K, *shape) by key.
+        time_s: times (K,), seconds.
+        each: from one time to the next, not from the first to the last; turns do not count then.
+    """
+    size, watch = scene_size(renderer), watch_of(renderer)
+    for key, value in moved.items():
+        place = key.rpartition(".")[2]
+        if place not in _PLACES or len(time_s) < 2:
+            continue
+        points = value.detach()[:, None, :3, 3] if place == "to_world" else value.detach().reshape(len(value), -1, 3)
+        distance = (points.diff(dim=0) if each else points[-1] - points[0]).norm(dim=-1).amax()
+        if not holds(distance <= size):
+            travel = f"moves by {float(distance):.3g} m, in a scene that measures {size:.3g} m with its sensors"
+            watch.warn(f"motion of {key}", f"over_time: {key!r} {travel}. {_UNITS}")
+    for name, how in moving.items() if isinstance(moving, Mapping) and not each else ():
+        if isinstance(how, Motion):
+            turns = how.angular.detach().norm().cpu() * (time_s[-1] - time_s[0]).detach().cpu().abs() / (2 * math.pi)
+            if not holds(turns <= 1):
+                watch.warn(f"turns of {name}", f"over_time: {name!r} turns around {float(turns):.3g} times. {_UNITS}")
 
 
 def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -318,8 +318,9 @@ def plan(
         result = _with_ordinary_connections(result)
     if error == "relative":
         result = _without_roulette(result)
+    others = _other_ways(result, error == "relative", inventory.connections is None)
     chooses = integrator is None and pilot
-    return _with_least_variance(result, error == "relative", inventory.connections is None, seed) if chooses else result
+    return _with_least_variance(result, others, error == "relative", seed) if chooses else _without(result, others)
 
 
 def _with_ordinary_connections(given: Plan) -> Plan:
@@ -336,24 +337,35 @@ def _without_roulette(given: Plan) -> Plan:
     return replace(given, rr_depth=_NO_ROULETTE, reasons=(*given.reasons, reason))
 
 
-def _with_least_variance(given: Plan, relative: bool, connects: bool, seed: int) -> Plan:
-    """Return a plan with path reuse or ellipsoidal connections where short runs show that they pay.
+def _other_ways(given: Plan, relative: bool, connects: bool) -> list[tuple[str, dict[str, Any], float]]:
+    """Return what may have less variance than a plan: name, changes of the plan, and most time over that of the plan.
 
     Args:
         given: plan with plain paths and ordinary connections.
         relative: the variance of each bin counts over its squared mean.
         connects: connections are open, since the scene names none.
-        seed: seed of the runs.
     """
-    other: list[tuple[str, dict[str, Any], float]] = []
+    found: list[tuple[str, dict[str, Any], float]] = []
     if relative and given.integrator == _PATH:
-        other.append(("path reuse", {"integrator": _REUSE}, _TIME_OF_REUSE))
+        found.append(("path reuse", {"integrator": _REUSE}, _TIME_OF_REUSE))
     if connects and given.film == "gated" and given.integrator in (_PATH, _VOLUMES):
-        other.append(("ellipsoidal connections", {"connections": "ellipsoidal"}, _TIME_OF_ELLIPSOIDS))
+        found.append(("ellipsoidal connections", {"connections": "ellipsoidal"}, _TIME_OF_ELLIPSOIDS))
+    return found
+
+
+def _without(given: Plan, others: Sequence[tuple[str, dict[str, Any], float]]) -> Plan:
+    why = "no short runs tell whether it pays, which are for plans with a pilot run and without a given integrator"
+    return replace(given, reasons=(*given.reasons, *(f"{name}: not used; {why}" for name, _, _ in others)))
+
+
+def _with_least_variance(
+    given: Plan, others: Sequence[tuple[str, dict[str, Any], float]], relative: bool, seed: int
+) -> Plan:
+    """Return a plan with one of ``others`` where short runs show that it pays. ``seed``: seed of the runs."""
     small, chosen = replace(given, scene=cropped(given.scene, _PIXELS), parameters=()), given
     best, used, reasons = 1.0, "", list(given.reasons)
     found: dict[str, str] = {}
-    for name, changes, time in other:
+    for name, changes, time in others:
         try:
             renderers = [p.renderer(physics="ignore") for p in (small, replace(small, **changes))]
             plain, less = variances(renderers[0], renderers[1], seed, relative)

@@ -155,7 +155,7 @@ class TransientRenderer(CopiesParametrized):
         gates: Sequence[Gate] | None = None,
         rates: RateAxis | None = None,
         chirps: Chirps | None = None,
-        slow_times: Sequence[float] | None = None,
+        slow_times: Numbers | None = None,
         steady: bool = True,
         film: FilmLayout | None = None,
         physics: str = "warn",

@@ -137,7 +137,8 @@ class BuildOptions:
     Attributes:
         film: film that takes the place of every film, None to keep them.
         max_depth: bound for the integrator, None to keep its own.
-        rr_depth, connections: parameters of the integrator, None to keep its own.
+        rr_depth: parameter of the integrator, None to keep its own, as is kept where no depth ends paths.
+        connections: parameter of the integrator, None to keep its own.
         substitute: BSDFs to be built as their differentiable twins: name, and name of the texture with the parameter
             ("" for a number).
         real_bitmaps: store bitmaps as real numbers; Mitsuba keeps 8-bit images in 8 bits, which have no derivative.
@@ -320,10 +321,10 @@ def _edit_integrator(state: Any, options: BuildOptions) -> None:
             )
     if options.max_depth is not None and index is not None:
         state.nodes[index].props["max_depth"] = int(options.max_depth)
-    for name in ("rr_depth", "connections"):
-        value = getattr(options, name)
-        if value is not None and index is not None:
-            state.nodes[index].props[name] = value
+    if options.rr_depth is not None and index is not None and described_depth(state, index) != NO_LIMIT:
+        state.nodes[index].props["rr_depth"] = options.rr_depth
+    if options.connections is not None and index is not None:
+        state.nodes[index].props["connections"] = options.connections
 
 
 def _traced(state: Any, index: int) -> int:

@@ -26,6 +26,8 @@ from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.objects import without_stand_in
 
 _MAX_LISTED = 65536  # larger values are not copied: textures of a real scene would fill the memory once more
+# Names that plugins have for the same: where an object is, and how bright.
+_ONE_MEANING = ({"to_world", "position", "origin"}, {"intensity", "radiance", "irradiance", "color", "colour"})
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,23 @@ def unknown_key(key: str, known: list[str], owner: str = "the scene") -> str:
         known: all keys of the owner.
         owner: subject of the message.
     """
-    inside = [other for other in known if f".{key}." in f".{other}."]
+    inside = [other for other in known if f".{key}." in f".{other}."] or _of_one_meaning(str(key), known)
     close = inside[:3] or difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
     hint = f"Did you mean {', '.join(repr(c) for c in close)}? " if close else ""
     return f"{owner} has no parameter {key!r}. {hint}print(scene.parameters()) lists all keys."
+
+
+def _of_one_meaning(key: str, known: list[str]) -> list[str]:
+    """Return keys of the object of an unknown key that say the same of it: of a point light ``position``, the place
+    that others have as ``to_world``."""
+    parts = key.split(".")
+    for end in range(len(parts) - 1, 0, -1):
+        owner = ".".join(parts[:end]) + "."
+        own = [other for other in known if other.startswith(owner)]
+        if own:
+            meant = set().union(*(names for names in _ONE_MEANING if not names.isdisjoint(parts[end:])))
+            return [other for other in own if not meant.isdisjoint(other.removeprefix(owner).split("."))]
+    return []
 
 
 def _short(value: Any) -> str:

@@ -23,7 +23,7 @@ from torchtransient.scene.inventory import Finding, SceneInventory
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.nodes import is_transient_integrator
 from torchtransient.scene.parameters import ParameterInfo, needing_slope, unknown_key
-from torchtransient.scene.pilot import MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
+from torchtransient.scene.pilot import BLOCK_ALLOWANCE, MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
 from torchtransient.scene.slope import check_filter, filter_for
 from torchtransient.scene.variant import active_variant
 
@@ -355,7 +355,7 @@ class Finder:
         report = PilotReport(
             variant=self._pilot_variant,
             paths=arrivals.paths,
-            events=len(arrivals.opl),
+            events=arrivals.count,
             seconds=self.seconds,
             relative_error=nan if arrivals.dark else arrivals.relative_error(),
             tail=self.tail_found[0],
@@ -402,7 +402,10 @@ class Finder:
         late = self.arrivals.enough_depth_of_all_times(self.tail) if self.relative else 0
         if late > depth:
             depth = late
-            reason = f"max_depth: {depth}, so that no eighth of the time of the light loses more than 1 %"
+            reason = (
+                f"max_depth: {depth}{self._deeper(depth)}, and at most {BLOCK_ALLOWANCE * self.tail:.2g} of that of "
+                "any eighth of its time, by the few late arrivals of the pilot run"
+            )
         else:
             reason = f"max_depth: {depth}{self._deeper(depth)}, asked for was {self.tail:g}"
         if depth >= PILOT_DEPTH:
@@ -421,7 +424,11 @@ class Finder:
         if self.arrivals is None or self.arrivals.dark or depth < 0:
             return ""
         self.tail_found = self.arrivals.share(self.arrivals.depth > depth)
-        return f"; {_share(*self.tail_found)} in deeper paths"
+        text = f"; {_share(*self.tail_found)} in deeper paths"
+        unseen = self.arrivals.unseen()
+        if not self.tail_found[0] > 0 and unseen > self.tail:
+            text += f" (its {self.arrivals.count} arrivals cannot tell that from {unseen:.2g})"
+        return text
 
     @property
     def _around_a_corner(self) -> bool:

@@ -18,6 +18,7 @@ from torchtransient.sensing.chain.pixel_groups import PixelGroups as PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera as StreakCamera
 from torchtransient.sensing.chain.streak import SweepJitter as SweepJitter
 from torchtransient.sensing.coherent.beats import BeatNoise as BeatNoise
+from torchtransient.sensing.coherent.beats import CoherentReceiver as CoherentReceiver
 from torchtransient.sensing.coherent.beats import Speckle as Speckle
 from torchtransient.sensing.coherent.range_and_speed import fold_beats as fold_beats
 from torchtransient.sensing.coherent.range_and_speed import range_and_speed as range_and_speed

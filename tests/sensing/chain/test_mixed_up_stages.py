@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from support.sweeps import together
-from torchtransient import TimeAxis, sensing
+from torchtransient import Chirps, TimeAxis, sensing
 from torchtransient.errors import ShapeError, StorageError, UnitError
 
 PS, NS = 1e-12, 1e-9
@@ -40,6 +40,7 @@ ON_AN_AXIS = {
     "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
     "CoincidencePixel": lambda axis: sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, coincidence=2,
         window_s=1 * NS, axis=axis),
+    "CoherentReceiver": lambda axis: sensing.CoherentReceiver(Chirps(1e9, 1e-5, 1550e-9), axis),
     "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),
     "StreakCamera": lambda axis: sensing.StreakCamera(axis, time_fwhm_s=300 * PS, jitter_fwhm_s=300 * PS),
     "GatedIntegration": lambda axis: sensing.GatedIntegration([2 * NS], 1 * NS, axis),

@@ -63,6 +63,8 @@ def test_samples_of_a_spectrum(parts, bins):
     found, _ = range_and_speed(beats, chirps, axis)
     error = np.abs(2 * found[0].numpy() - places).max() / axis.bin_width_opl
     assert 0.5 * bins < error < bins
+    found, _ = range_and_speed(beats, chirps, axis, bins="samples")
+    np.testing.assert_allclose(2 * found[0], places, atol=2e-3 * axis.bin_width_opl)
 
 
 def test_gradient_follows_the_line():
@@ -142,6 +144,8 @@ def test_what_is_refused():
         range_and_speed(beats[:, 1:], chirps, axis)
     with pytest.raises(ArgumentError, match="Chirps"):
         range_and_speed(beats, axis, axis)
+    with pytest.raises(ArgumentError, match="sums, samples"):
+        range_and_speed(beats, chirps, axis, bins="averages")
     with pytest.raises(ShapeError, match="T ="):
         fold_beats(beats[:, 1:], axis)
     with pytest.raises(ShapeError, match="zero at an edge"):

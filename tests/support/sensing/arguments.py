@@ -42,6 +42,9 @@ CALLS = {
     "Analyzers": ({"rows": ROWS}, {}),
     "BeatNoise": ({"photons_per_unit": number(20.0), "looks": number(4.0)}, {}),
     "CodedHistogram": ({"codes": rand(3, 12)}, {}),
+    "CoherentReceiver": (
+        {"photons_per_unit": number(20.0), "looks": number(4.0)},
+        {"chirps": CHIRPS, "axis": CHIRPS.time_axis((0.0, 0.4), bins_per_line=4)}),
     "CoincidencePixel": (
         {"window_s": number(1e-9), "weights": rand(4), "bin_width_s": number(1e-10)},
         {"detector": sensing.SynchronousSPAD(100, dead_time_s=2e-9, bin_width_s=1e-10), "spads": 4, "coincidence": 2}),
@@ -173,7 +176,7 @@ CALLS = {
     "range_deviation_m": ({"response_fwhm_s": number(1e-10), "detections": 100 * rand(3)}, {}),
     "range_and_speed": (
         {"beats": torch.stack([LIGHT, LIGHT.flip(1)], 1), "threshold": number(0.0)},
-        {"chirps": CHIRPS, "axis": CHIRPS.time_axis((0.0, 0.4))}),
+        {"chirps": CHIRPS, "axis": CHIRPS.time_axis((0.0, 0.4)), "bins": "samples"}),
     "read_itof": (
         {"taps": TAPS, "frequencies_hz": number(60e6), "max_depth_m": number(2.4), "min_depth_m": number(0.0)},
         {"num_taps": 4}),

@@ -391,7 +391,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
             with dr.resume_grad():
-                velocities = Velocities.of_job(contents, film)
+                velocities = Velocities.of_job(scene, contents, film)
             context = self.render_context(scene, contents, wanted, film.arrivals(), velocities=velocities)
             lanes = None if context.record_room is None else context.record_room.lanes
             sampler = self.sampler_of(scene, sensor)

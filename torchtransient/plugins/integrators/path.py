@@ -6,7 +6,6 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.integrators.base import TransientIntegrator
 from torchtransient.plugins.properties import truth, whole_number
-from torchtransient.plugins.sampling.flat_faces import FlatFaces
 from torchtransient.plugins.transport.boundary.moving_edges import moving_edges, switched_off
 from torchtransient.plugins.transport.boundary.term import BoundaryTerm
 from torchtransient.plugins.transport.context import RenderContext
@@ -14,7 +13,7 @@ from torchtransient.plugins.transport.ellipsoidal_connections import (
     EllipsoidalMedium,
     EllipsoidalSurface,
     WindowedEmitterSampled,
-    scatters,
+    flat_faces,
     why_not,
 )
 from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
@@ -76,7 +75,7 @@ class TransientPath(TransientIntegrator):
         segment, scattering, (found, _) = self.strategies(contents)
         if contents.media is not None:
             segment.keeps_begin = True
-        lights, faces = WindowedEmitterSampled(), FlatFaces([shape for shape in scene.shapes() if scatters(shape)])
+        lights, faces = WindowedEmitterSampled(), flat_faces(scene, contents)
         if faces.count:
             lights.beside += (EllipsoidalSurface(lights, faces),)
         if contents.media is not None:

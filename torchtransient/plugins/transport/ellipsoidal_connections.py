@@ -25,8 +25,10 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.errors import SceneError
+from torchtransient.plugins.cache import Cache
+from torchtransient.plugins.kernel_arrays import registry_number
 from torchtransient.plugins.polarized import product
-from torchtransient.plugins.sampling.flat_faces import LightFaces
+from torchtransient.plugins.sampling.flat_faces import FlatFaces, LightFaces
 from torchtransient.plugins.transport.emitter_connections import EmitterSampled, is_light
 from torchtransient.plugins.transport.free_flight import medium_interaction, transmittance
 from torchtransient.plugins.transport.media import lane_numbers, medium_behind
@@ -65,6 +67,26 @@ def why_not(contents, film):
 
 
 # --------------------------------------------------------------------------------------------------------------------
+# Tables, kept as long as no shape moves. Derivatives, which are those of ordinary connections, have none.
+
+def flat_faces(scene, contents):
+    """Return the :class:`~..sampling.flat_faces.FlatFaces` that can be connected to lights."""
+    shapes = [shape for shape in scene.shapes() if scatters(shape)]
+    numbers = tuple(map(registry_number, shapes))
+    return _as_they_stand(scene, contents).get("flat faces", numbers, lambda: FlatFaces(shapes))
+
+
+def light_faces(scene, contents):
+    """Return the :class:`~..sampling.flat_faces.LightFaces` of a scene."""
+    weights = tuple(emitter.sampling_weight() for emitter in scene.emitters())
+    return _as_they_stand(scene, contents).get("light faces", weights, lambda: LightFaces(scene, emits_by_place))
+
+
+def _as_they_stand(scene, contents):
+    return contents.memory.get("memory of faces", 0, lambda: Cache(scene.shapes()))
+
+
+# --------------------------------------------------------------------------------------------------------------------
 # The last segment.
 
 class WindowedEmitterSampled(EmitterSampled):
@@ -78,7 +100,7 @@ class WindowedEmitterSampled(EmitterSampled):
 
     def prepare(self, context):
         super().prepare(context)
-        self.faces = LightFaces(context.scene, emits_by_place)
+        self.faces = light_faces(context.scene, context.contents)
         if not self.faces.count:
             raise SceneError(
                 "connections='ellipsoidal': expected an area light on a mesh or rectangle without texture, found none. "

@@ -35,7 +35,6 @@ from torchtransient.plugins.sampling.lights import DistantReference
 from torchtransient.plugins.sampling.sphere_lights import ShapeLights, SphereLights
 from torchtransient.plugins.sensors.surroundings import Surroundings
 from torchtransient.plugins.transport.surface_interactions import DetachedHits, Instances
-from torchtransient.plugins.transport.velocities import Movers
 
 # Derivatives drag points along with the vertex that sees them where they are nearer than this share of the scene's
 # radius and of the path's first segment: in corners and gaps the motion of a direction has no bounded variance. The
@@ -71,7 +70,6 @@ class SceneContents:
         patterned_lights: whether the light that leaves some surface differs from place to place.
         patterned: whether that, the scattering of a surface, or its normal does.
         untraceable: names of emitters beside which derivatives cannot be traced.
-        movers: bodies that move (:class:`.velocities.Movers`).
         observer: :class:`~..films.colour.StandardObserver` in spectral variants.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
@@ -104,7 +102,6 @@ class SceneContents:
         self.patterned |= any(scatters_by_place(bsdf) for bsdf in outermost)
         self.untraceable = [emitter.id() for emitter in scene.emitters() if lacks_directions(emitter)]
         self.observer = StandardObserver.of_variant()
-        self.movers = Movers(scene)
         # What was computed of the scene as it was: renders of one that stays as it is begin sooner.
         self.memory = Cache()
         self._built = True

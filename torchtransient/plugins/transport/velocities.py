@@ -79,6 +79,12 @@ class Movers:
         return bool(self.motions or self.meshes)
 
 
+def movers_of(scene: Any, contents: Any) -> Movers:
+    """Return the bodies of a scene that move; ``contents``: its :class:`.scene_contents.SceneContents`."""
+    found: Movers = contents.memory.get("movers", 0, lambda: Movers(scene))
+    return found
+
+
 def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
     """Return (body, ``rigid_motion``) of all bodies that have one. Raises SceneError for bodies that cannot."""
     bodies: dict[str, list[Any]] = {}
@@ -128,14 +134,15 @@ class Velocities:
     """
 
     @staticmethod
-    def of_job(contents: Any, film: Any) -> Velocities | None:
+    def of_job(scene: Any, contents: Any, film: Any) -> Velocities | None:
         """Return the velocities of a job; None where the film measures no rates.
 
         Args:
-            contents: :class:`.scene_contents.SceneContents`.
+            scene: scene of the job.
+            contents: :class:`.scene_contents.SceneContents`, which keeps what was looked up.
             film: film of the job.
         """
-        return Velocities(contents.movers, contents.sensor) if film.knows_rates else None
+        return Velocities(movers_of(scene, contents), contents.sensor) if film.knows_rates else None
 
     def __init__(self, movers: Movers, sensor: Any) -> None:
         rows = [(mi.Vector3f(0), mi.Vector3f(0))] * FIRST + [motion.rows() for motion in movers.motions]

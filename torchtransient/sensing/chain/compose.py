@@ -33,7 +33,7 @@ from torchtransient.sensing.chain.first_photon_moves import (
     moving_together,
     multinomial_log_prob,
 )
-from torchtransient.sensing.coherent.beats import BeatNoise, Speckle
+from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
 from torchtransient.sensing.itof.itof import ItofCorrelation
 
 
@@ -41,9 +41,9 @@ class Compose(Sensor):
     """Stages in the order in which light meets them: ``Compose([budget, response, detector])``.
 
     Stages are sensors, or other modules of one tensor; stages in an ``nn.Sequential`` or an ``nn.ModuleList`` are taken
-    as if they were given one by one. The input is a transient (..., C, T, H, W), or what a renderer
-    returns (an object with ``transient``, ``phasor``, ``beats`` and ``axis``): its axis is compared with those of the
-    stages, a phasor image goes to an `ItofCorrelation` in front, spectra of beats to `Speckle` or `BeatNoise`.
+    as if they were given one by one. The input is a transient (..., C, T, H, W), or what a renderer returns (an object
+    with ``transient``, ``phasor``, ``beats`` and ``axis``): its axis is compared with those of the stages, a phasor
+    image goes to an `ItofCorrelation` in front, spectra of beats to `Speckle`, `BeatNoise` or `CoherentReceiver`.
     ``grad``: set this policy in every random stage; None leaves them as they are.
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
@@ -209,10 +209,15 @@ class Compose(Sensor):
             return transient, 0
         first = unrolled(self.stages)[0]
         if isinstance(beats, Tensor):
-            if isinstance(first, Sensor) and not isinstance(first, (BeatNoise, Speckle)):
+            if isinstance(first, Sensor) and not isinstance(first, (BeatNoise, CoherentReceiver, Speckle)):
                 raise ShapeError(
                     f"Compose: expected a transient for {type(first).__name__}, got spectra of beats, which are for "
-                    "Speckle and BeatNoise. Render with time_axis=... and without chirps."
+                    "Speckle, BeatNoise and CoherentReceiver. Render with time_axis=... and without chirps."
+                )
+            if isinstance(first, CoherentReceiver) and getattr(output, "chirps", None) == first.chirps:
+                raise UnitError(
+                    "Compose: expected beats without the line of the chirp, which CoherentReceiver makes, got those of "
+                    f"{first.chirps}. Render with chirps.longer(16)."
                 )
             self.check_axis(output.axis)
             return beats, 0

@@ -3,8 +3,8 @@
 A rendered spectrum is the expected power of the beat in each bin: the variance of a circular Gaussian field, since
 light of rough surfaces arrives with random phases. A bin has the width c / B, which is one mode of a chirp: fields of
 different bins, chirps and pixels are drawn independently. That is right for light that is spread over several bins. The
-bins of a single line, of a flat surface that faces the lidar, in truth rise and fall together: positions that are read
-between bins are noisier here.
+bins of a single line, of a flat surface that faces the lidar, rise and fall together in truth: `CoherentReceiver` draws
+the fields themselves, and positions that are read between bins are less noisy there.
 
 Sources: Goodman, "Speckle phenomena in optics" (2007), chapters 3 and 4; Fink, "Coherent detection signal-to-noise"
 (Appl. Opt. 14, 1975); Jiang & Luu, "Heterodyne detection with a weak local oscillator" (Appl. Opt. 47, 2008), for
@@ -18,13 +18,18 @@ import math
 import torch
 from torch import Tensor
 
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import of_class
+from torchtransient.chirps import Chirps
 from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import check_number, check_transient
+from torchtransient.sensing.base.layout import check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.base.policies import GradPolicy, standard_normal
 from torchtransient.sensing.base.sensor import RandomSensor
 
 # Photons below which a field grows like its power in place of the root, whose slope is infinite at zero.
 _FAINT = 1e-4
+# Lines beside the light that spectra go on for.
+_MARGIN = 4
 
 
 class _Averaged(RandomSensor):
@@ -117,7 +122,7 @@ class BeatNoise(_Averaged):
         """A draw, differentiable in `x`: no normal surrogate."""
         n = self._photons(x)
         _check_power(n, "BeatNoise")
-        field = torch.where(n < _FAINT, n / math.sqrt(_FAINT), n.clamp_min(_FAINT).sqrt())
+        field = _root(n)
         # The sum over looks of |field + noise|^2 is the same if one look holds all of the field. Its real part comes
         # first; left are the square of its imaginary part, Gamma(1/2), and those of the other looks, Gamma(1) each.
         noise = math.sqrt(0.5) * standard_normal(n, generator)
@@ -126,6 +131,103 @@ class BeatNoise(_Averaged):
 
     def _photons(self, x: Tensor) -> Tensor:
         return check_transient(x, "BeatNoise") * self.photons_per_unit
+
+
+class CoherentReceiver(RandomSensor):
+    """Spectra of a chirp from fields: speckle, the line of the window and shot noise, with what neighbours share.
+
+    Each bin of the light has a circular Gaussian field whose variance is its power in photons, ``photons_per_unit``
+    times the input (..., C, T, H, W). The fields meet in the transform of the chirp, with white noise of one photon in
+    each mode, and ``looks`` squared moduli are averaged: (..., C, J, H, W), photons, samples at multiples of c / B over
+    :attr:`spectrum_axis`. So the bins of one line rise and fall together, and light of two lines that are closer than
+    c / B interferes. `Speckle` and `BeatNoise` have the same distribution of each bin for itself.
+
+    The light has no line yet: a transient of what stands, or beats that were rendered with ``chirps.longer(16)``, in
+    bins of c / B / 8 (``chirps.time_axis(..., bins_per_line=8)``); bins wider than c / B / 4 are refused.
+
+    Args:
+        chirps: the chirps.
+        axis: axis of the light.
+        photons_per_unit: detected photons in a chirp of light of one.
+        looks: spectra averaged.
+        grad: gradient policy; every one but "expected" gives the gradient of the draw. Below 1e-4 photons a field grows
+            like the power in place of its root, so that the slope is finite at zero.
+
+    Raises:
+        UnitError: for numbers out of range, bins that are too wide, and negative power and NaN in a draw.
+        ArgumentError: for other objects than chirps and axes.
+    """
+
+    gives = None  # spectra over bins of their own
+    transform: Tensor
+    window: Tensor
+
+    def __init__(
+        self, chirps: Chirps, axis: TimeAxis, *, photons_per_unit: float = 1.0, looks: int = 1,
+        grad: GradPolicy = "expected",
+    ) -> None:  # fmt: skip
+        super().__init__(grad)
+        me = "CoherentReceiver"
+        self.chirps = of_class(f"{me}: chirps", chirps, Chirps)
+        self.axis, self.num_bins = check_time_axis(axis, me), axis.num_bins
+        self.photons_per_unit = check_number(photons_per_unit, "photons_per_unit", me, open_low=True)
+        self.looks = check_count(looks, "looks", me)
+        width = chirps.resolution_opl
+        if axis.bin_width_opl > width / 4 * (1 + 1e-6):
+            raise UnitError(
+                f"{me}: expected bins of light of at most c / B / 4, {width / 4:.4g} m, got {axis.bin_width_opl:.4g} "
+                "m. Take chirps.time_axis(..., bins_per_line=8)."
+            )
+        first, last = math.floor(axis.start_opl / width) - _MARGIN, math.ceil(axis.end_opl / width) + _MARGIN
+        #: Axis of the spectra, one bin in c / B.
+        self.spectrum_axis = TimeAxis((first - 0.5) * width, width, last - first + 1)
+        places = self.spectrum_axis.centers_opl
+        self.register_buffer("transform", self._lines(places[:, None] - axis.centers_opl))
+        # Noise of the transform without a window, in a few bins more, that the window adds up.
+        more = torch.arange(-_MARGIN, len(places) + _MARGIN) - torch.arange(len(places))[:, None]
+        self.register_buffer("window", self._lines(more * width))
+
+    def expected(self, x: Tensor) -> Tensor:
+        return _over_bins(self.transform.square(), self._photons(x)) + 1
+
+    def variance(self, x: Tensor) -> Tensor:
+        """Variance of every bin; those of neighbours are not independent."""
+        return self.expected(x).square() / self.looks
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.expected(x) if self.grad == "expected" else self.gaussian(x, generator)
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            return self.gaussian(x, generator)
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """A draw, differentiable in `x`: no normal surrogate."""
+        n = self._photons(x)
+        _check_power(n, "CoherentReceiver")
+        amplitude = _root(n)
+        total = torch.zeros((), dtype=n.dtype, device=n.device)
+        noise = n.new_empty((*n.shape[:-3], self.window.shape[1], *n.shape[-2:]))
+        for _ in range(2 * self.looks):  # real and imaginary parts
+            field = _over_bins(self.transform, amplitude * standard_normal(n, generator))
+            field = field + _over_bins(self.window, standard_normal(noise, generator))
+            total = total + field.square()
+        return total / (2 * self.looks)
+
+    def _photons(self, x: Tensor) -> Tensor:
+        return check_transient(x, "CoherentReceiver") * self.photons_per_unit
+
+    def _lines(self, opl: Tensor) -> Tensor:
+        return torch.from_numpy(self.chirps.line_amplitude(opl))
+
+
+def _over_bins(matrix: Tensor, x: Tensor) -> Tensor:
+    return torch.einsum("jt,...thw->...jhw", matrix.to(x), x)
+
+
+def _root(photons: Tensor) -> Tensor:
+    """Modulus of a field of some photons, with a finite slope at none."""
+    return torch.where(photons < _FAINT, photons / math.sqrt(_FAINT), photons.clamp_min(_FAINT).sqrt())
 
 
 def _gamma(shape: float, like: Tensor, generator: torch.Generator | None) -> Tensor:

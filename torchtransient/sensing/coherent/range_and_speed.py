@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import of_class
+from torchtransient.checks import is_one_of, of_class, shown
 from torchtransient.chirps import Chirps
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.floating import in_single
 from torchtransient.sensing.base.layout import TIME, check_bins, check_number, check_time_axis
+
+Bins = Literal["sums", "samples"]
+KINDS_OF_BINS: tuple[Bins, ...] = get_args(Bins)
 
 # Offsets of a line in half a bin, of which the table is made that positions are read from.
 _OFFSETS = 257
@@ -23,19 +27,21 @@ _SAME_BIN = 1e-6
 
 @in_single
 def range_and_speed(
-    beats: Tensor, chirps: Chirps, axis: TimeAxis, *, threshold: float = 0.0
+    beats: Tensor, chirps: Chirps, axis: TimeAxis, *, threshold: float = 0.0, bins: Bins = "sums"
 ) -> tuple[Tensor, Tensor]:
     """Find distance and speed of approach by the largest bin of the up and of the down chirp.
 
-    A position between bins is that of a single line (`Chirps.line_shape`) which gives the neighbours of the largest bin
-    their difference over the sum of the three, for bins that are sums over their width (``temporal_filter="box"``). Of
-    samples of a Hann window's spectrum, as a transform makes them, and with a tent filter it is off by up to 1 / 20 of
-    a bin where c / B is one bin, 1 / 40 where it is two, 1 / 150 where it is four.
+    A position between bins is that of a single line of the window which gives the neighbours of the largest bin their
+    difference over the sum of the three. Of a Hann window's line that is taken for the other kind of bins, or was
+    rendered with a tent filter, it is off by up to 1 / 20 of a bin where c / B is one bin, 1 / 40 where it is two,
+    1 / 150 where it is four.
 
     Args:
         beats: power spectra (..., 2, T, H, W), up and down, with or without noise.
         chirps: the chirps.
         axis: axis over ``opl +- k rate``.
+        bins: "sums" over the width of a bin, as films make them (``temporal_filter="box"``), or "samples" of the
+            spectrum, as a transform and `CoherentReceiver` give them.
         threshold: power of the largest bin that is no return, and any below; in a unit of ``beats``.
 
     Returns:
@@ -45,7 +51,7 @@ def range_and_speed(
 
     Raises:
         ShapeError: unless ``beats`` has two spectra over the bins of the axis.
-        ArgumentError: for other objects than chirps and axes.
+        ArgumentError: for other objects than chirps and axes, and other bins.
 
     The largest bins of both chirps are taken for one surface: with several of them in a pixel, of unlike brightness in
     both, they may be those of two. A line beyond the axis is taken for the middle of its first or last bin.
@@ -54,6 +60,8 @@ def range_and_speed(
     check_bins(beats, me)
     of_class(f"{me}: chirps", chirps, Chirps)
     check_time_axis(axis, me)
+    if not is_one_of(bins, KINDS_OF_BINS):
+        raise ArgumentError(f"{me}: expected bins to be one of {', '.join(KINDS_OF_BINS)}, got {shown(bins)}.")
     level = check_number(threshold, "threshold", me, low=-math.inf)
     if beats.ndim < 4 or beats.shape[-4] != 2 or beats.shape[TIME] != axis.num_bins:
         raise ShapeError(
@@ -67,7 +75,7 @@ def range_and_speed(
     total = left + here + right
     usable = inner & (total > 0)
     lean = torch.where(usable, right - left, 0.0) / torch.where(usable, total, 1.0)
-    position = index.to(torch.float64) + 0.5 + _offset(lean, chirps, axis).to(torch.float64)
+    position = index.to(torch.float64) + 0.5 + _offset(lean, chirps, axis, bins).to(torch.float64)
     opl = axis.start_opl + axis.bin_width_opl * position.squeeze(TIME)
     # argmax takes NaN for the largest entry, which exceeds nothing
     opl = torch.where(here.squeeze(TIME) > level, opl, math.nan)
@@ -76,11 +84,14 @@ def range_and_speed(
     return distance.to(beats.dtype), speed.to(beats.dtype)
 
 
-def _offset(lean: Tensor, chirps: Chirps, axis: TimeAxis) -> Tensor:
+def _offset(lean: Tensor, chirps: Chirps, axis: TimeAxis, bins: Bins) -> Tensor:
     """Offset in bins, in [-1/2, 1/2], of a line that gives its neighbours that difference, over the sum of three."""
     offsets = np.linspace(0, 0.5, _OFFSETS)
-    edges = (np.arange(-1.5, 2) - offsets[:, None]) * axis.bin_width_opl
-    left, here, right = np.diff(chirps.line_shape.cumulative(edges)).T
+    if bins == "sums":
+        edges = (np.arange(-1.5, 2) - offsets[:, None]) * axis.bin_width_opl
+        left, here, right = np.diff(chirps.line_shape.cumulative(edges)).T
+    else:
+        left, here, right = chirps.line_amplitude((np.arange(-1, 2) - offsets[:, None]) * axis.bin_width_opl).T ** 2
     leans = np.maximum.accumulate((right - left) / (left + here + right))
     knots = torch.from_numpy(leans).to(lean)
     at = torch.from_numpy(offsets).to(lean)

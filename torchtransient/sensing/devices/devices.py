@@ -29,6 +29,7 @@ from torchtransient.array_files.part_files import write_text
 from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_data
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import as_whole, short_errors, short_message, shown, some_of
+from torchtransient.chirps import Chirps
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.sensing.base.layout import check_number
 from torchtransient.sensing.base.policies import GradPolicy
@@ -37,7 +38,7 @@ from torchtransient.sensing.cameras.gated import GatedIntegration
 from torchtransient.sensing.chain.compose import Compose
 from torchtransient.sensing.chain.pixel_groups import PixelGroups
 from torchtransient.sensing.chain.streak import StreakCamera, SweepJitter
-from torchtransient.sensing.coherent.beats import BeatNoise, Speckle
+from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
 from torchtransient.sensing.correlated_noise.afterpulse_delays import MeasuredDelays, PowerLawDelays
 from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing, hot_pixel_rates
 from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
@@ -112,7 +113,7 @@ KINDS: Mapping[str, Callable[..., Any]] = {
             AfterpulsingSPAD, CoincidencePixel, DetectionSkew, MacroPixel, MeasuredDelays, PixelGroups, PixelSkew,
             PowerLawDelays, ZoneSum,
             Compose, PiecewiseLinearCode, SpatialPSF, ambient_photon_rate, binary_code, circular_analyzers, defocus_psf,
-            BeatNoise, Speckle,
+            BeatNoise, Chirps, CoherentReceiver, Speckle,
         )
     },
     "PixelGroups.by_value": PixelGroups.by_value,
