@@ -78,8 +78,8 @@ class Shown:
         self.page.evaluate("document.activeElement.blur()")
         self.settle()
 
-    def check(self, label):
-        self.page.get_by_text(label, exact=True).click()
+    def toggle(self, label):
+        self.page.get_by_role("button", name=label, exact=True).click()
         self.settle()
 
     @property
@@ -91,6 +91,12 @@ class Shown:
         """The largest relative error that the page states."""
         found = re.search(r"within ([\d.e+-]+) % of those", self.notes)
         return float(found.group(1)) / 100 if found else 0.0
+
+    @property
+    def stated_floor(self):
+        """Size below which numbers are zero on the page."""
+        found = re.search(r"sizes below ([\d.e+-]+) are zero", self.notes)
+        return float(found.group(1)) if found else 0.0
 
     def rows(self):
         """The table of pixels: name, number at the cursor, its error, sum, place of the highest."""

@@ -60,8 +60,8 @@ def pick(shown, row, column, extent=None, size=None):
     return next(n for n, found in enumerate(names) if found.endswith(name))
 
 
-def near(shown, value, expected, spare=0.0):
-    assert value == pytest.approx(expected, rel=shown.stated_error + PRINTED, abs=spare)
+def near(shown, value, expected):
+    assert value == pytest.approx(expected, rel=shown.stated_error + PRINTED, abs=shown.stated_floor)
 
 
 def brightest(light, number=0):
@@ -118,7 +118,7 @@ def test_accumulated_light(show):
     shown = show(cube, axis=cases.AXIS)
     _, row, column = brightest(cube[0])
     place = pick(shown, row, column)
-    shown.check("accumulate")
+    shown.toggle("accumulate")
     for t in (20, 7, 8):
         shown.go(t)
         near(shown, shown.rows()[place][1], float(cube[0, : t + 1, row, column].sum()))
@@ -364,7 +364,7 @@ def test_pixels_by_mouse(show):
     moved = [name for name, *_ in shown.rows()]
     assert [name.replace("row 7, column 9", "row 8, column 11") for name in names] == moved
     shown.go(12)
-    near(shown, shown.rows()[-1][1], float(cube[0, 12, 8, 11]), 1e-6)
+    near(shown, shown.rows()[-1][1], float(cube[0, 12, 8, 11]))
     shown.click("picture", 11.5, 8.5)
     assert [name for name, *_ in shown.rows()] == moved[:-1]
 
@@ -376,7 +376,7 @@ def test_log_axis(show):
         return shown.page.evaluate(f"Bokeh.documents[0].get_model_by_name('{name}').visible")
 
     assert visible("histogram") and not visible("histogram_log")
-    shown.check("log axis")
+    shown.toggle("log axis")
     assert visible("histogram_log") and not visible("histogram")
 
 

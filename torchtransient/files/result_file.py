@@ -23,8 +23,9 @@ import torch
 
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture.metadata import metadata_text
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
@@ -39,7 +40,7 @@ FORMATS = ("torchtransient result 1", FORMAT)
 _WHAT = "result file"
 _READ = {"start_opl": number_of, "bin_width_opl": number_of, "num_bins": whole_of, "gates": text_of}
 _OF_ERRORS = ("differences", "squares", "steady_differences")
-_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", *_READ}
+_KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", "slow_times", *_READ}
 _KNOWN |= {"cells", *_OF_ERRORS}
 
 
@@ -47,7 +48,8 @@ _KNOWN |= {"cells", *_OF_ERRORS}
 class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    `transient` with `axis`, `phasor` with `frequencies` or `gated` with `gates`; the others are None. `others`: tensors
+    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `axis`,
+    `beats` with `chirps` and `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None. `others`: tensors
     and settings of films that have no attribute here, by name. A batch of results (``stack``, ``cat``,
     ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
@@ -63,6 +65,12 @@ class Result(ErrorBars, TensorRecord):
     channels: tuple[str, ...] = ()
     gates: tuple[Gate, ...] | None = None
     gated: torch.Tensor | None = None
+    rates: torch.Tensor | None = None
+    beats: torch.Tensor | None = None
+    rate_axis: RateAxis | None = None
+    chirps: Chirps | None = None
+    slow_phasor: torch.Tensor | None = None
+    slow_times: tuple[float, ...] | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
     differences: torch.Tensor | None = None
     squares: torch.Tensor | None = None
@@ -139,7 +147,9 @@ def read_result(path: str | Path) -> Result:
 
 def _is_known(name: str) -> bool:
     # Films of others know alone what their settings are called.
-    return name in _KNOWN or any(name == film.measures or not _is_ours(film) for film in FILMS)
+    return name in _KNOWN or any(
+        name == film.measures or name.startswith(f"{film.measures}_") or not _is_ours(film) for film in FILMS
+    )
 
 
 def _is_ours(film: type) -> bool:
@@ -162,7 +172,8 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
         response.dtype, steady.dtype
     ):  # fmt: skip
         raise ValueError(f"{film.measures} is of {response.dtype}, steady of {steady.dtype}")
-    image = (*response.shape[:-3], *response.shape[-2:])
+    rows = film.letter.count(" x ")
+    image = (*response.shape[: -3 - rows], *response.shape[-2:])
     if steady.shape != image:
         raise ValueError(f"steady is of shape {tuple(steady.shape)}, {film.measures} of {tuple(response.shape)}")
     if channels and len(channels) != steady.shape[-3]:

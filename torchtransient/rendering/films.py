@@ -449,14 +449,16 @@ class RowsOfHistograms(FilmLayout):
         return cls(*(measured(output, field.name) for field in fields(cls)))
 
     def entries(self) -> dict[str, Any]:
-        return self.plain()
+        axis = self.attributes()["axis"]
+        own = {f"{self.measures}_{name}": value for name, value in asdict(self.settings).items()}
+        return own | ({} if axis is None else Histogram(axis).plain())
 
     @classmethod
     def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
         if cls.measures not in values:
             return None
-        names = [field.name for field in fields(cls.kind)]
-        plain = {name: value.item() if hasattr(value := values[name], "item") else value for name in names}
+        found = {field.name: values[f"{cls.measures}_{field.name}"] for field in fields(cls.kind)}
+        plain = {name: value.item() if hasattr(value, "item") else value for name, value in found.items()}
         axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         return cls(cls.kind(**plain), axis)  # type: ignore[call-arg]
 

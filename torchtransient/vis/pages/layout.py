@@ -99,8 +99,10 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         m.Select(title="brightness", name="curve", options=["linear", "logarithmic"], value="linear", width=105),
         m.Slider(title="exposure (stops)", name="exposure", start=-10, end=20, value=0, step=0.5, width=170),
     ]
-    flags = [("accumulate", "peak" in modes and content.kind != "volume", False), ("log axis", True, False)]
-    switches = [m.Checkbox(label=name, name=name.replace(" ", "_"), active=on, visible=shown, width=105) for name, shown, on in flags]
+    flags = [("accumulate", "peak" in modes and content.kind != "volume"), ("log axis", True)]
+    switches = [
+        m.Toggle(label=name, name=name.replace(" ", "_"), width=100, margin=(20, 5, 5, 5)) for name, shown in flags if shown
+    ]
     picks = []
     if len(content.items) > 1:
         pair = content.items == ("A", "B")
@@ -113,11 +115,12 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         value = options[len(options) // 2][0] if content.layer_grid else options[0][0]
         picks.append(m.Select(title=content.layer_name, name="layer", options=options, value=value, width=130))
     left = m.Row(children=[_picture(content, maps)])
-    right = [m.Row(children=controls), m.Row(children=[*switches, *picks])]
+    beside = _volume_panels(content) if content.kind == "volume" else []
+    picks += _volume_tools() if content.kind == "volume" else []
     empty = {"x": [], "y": [], "low": [], "high": []}
     curves = [m.ColumnDataSource(data=dict(empty), name=f"curve_{n}") for n in range(len(PIXEL_COLOURS))]
+    right = [m.Row(children=controls), m.Row(children=[*switches, *picks])]
     right += [_histogram(content, curves, False), _histogram(content, curves, True), m.Div(text="", name="readout", width=650)]
-    beside = _volume_panels(content) if content.kind == "volume" else []
     if content.layer_grid:
         beside.append(_laser_grid(content))
     if content.kind == "rates":
@@ -212,7 +215,6 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
 
 def _volume_panels(content: Content) -> list[Any]:
     """Slices through the selected voxel from above and from the side, and a turning projection."""
-    m = import_bokeh().models
     depths, rows, columns = content.shape
     assert content.extent is not None  # grids of voxels have one
     left, right, low, high = content.extent
@@ -225,12 +227,16 @@ def _volume_panels(content: Content) -> list[Any]:
     turning = _panel("highest value, turning", (0, 160, 0, 160), "", "")
     turning.axis.visible = False
     _image(turning, "turning", (0, 160, 0, 160), 160, 160)
-    tools = [
-        m.Slider(title="turn (degrees)", name="turn", start=0, end=355, value=30, step=5, width=150),
-        m.Slider(title="threshold (of the highest)", name="threshold", start=0, end=0.95, value=0.1, step=0.05, width=150),
-        m.Toggle(label="turn", name="turns", width=70),
+    return [top, side, turning]
+
+
+def _volume_tools() -> list[Any]:
+    m = import_bokeh().models
+    return [
+        m.Slider(title="turned by (degrees)", name="turn", start=0, end=355, value=30, step=5, width=150),
+        m.Toggle(label="turn", name="turns", width=60, margin=(20, 5, 5, 5)),
+        m.Slider(title="threshold (of the highest)", name="threshold", start=0, end=0.95, value=0.1, step=0.05, width=160),
     ]
-    return [top, side, m.Column(children=[turning]), m.Column(children=tools)]
 
 
 def _laser_grid(content: Content) -> Any:
@@ -261,7 +267,7 @@ def _rate_map(content: Content, maps: dict[str, list[str]]) -> Any:
     return figure
 
 
-def _panel(title: str, extent: tuple[float, float, float, float], across: str, up: str, width: int = 190) -> Any:
+def _panel(title: str, extent: tuple[float, float, float, float], across: str, up: str, width: int = 182) -> Any:
     bokeh = import_bokeh()
     m = bokeh.models
     figure = bokeh.plotting.figure(
