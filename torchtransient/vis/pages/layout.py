@@ -63,7 +63,7 @@ def colour_maps() -> dict[str, list[str]]:
     wheel = oklch(0.58 + 0.34 * swing, 0.12 * np.abs(np.sin(2 * np.pi * turns)), np.where(turns < 0.5, 255.0, 60.0))
     sides = np.linspace(-1, 1, 256)
     both = oklch(0.95 - 0.5 * np.abs(sides), 0.14 * np.abs(sides), np.where(sides < 0, 255.0, 50.0))
-    drawn = {"cyclic": wheel, "diverging": both, "rainbow": rainbow_colours(np.linspace(0, 1, 256))}
+    drawn = {"cyclic": wheel, "diverging": both, "approach": both[::-1], "rainbow": rainbow_colours(np.linspace(0, 1, 256))}
     hexes = {name: ["#%02x%02x%02x" % tuple(int(round(255 * v)) for v in c) for c in map_] for name, map_ in drawn.items()}
     return {
         "viridis": list(viridis(256)), "inferno": list(inferno(256)), "cividis": list(cividis(256)),
@@ -242,7 +242,7 @@ def _volume_tools() -> list[Any]:
 def _laser_grid(content: Content) -> Any:
     """The laser spots of an exhaustive scan; a click chooses one."""
     rows, columns = content.layer_grid  # type: ignore[misc]  # of contents that have one
-    figure = _panel("laser spot: click", (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row")
+    figure = _panel("laser spot: click", (-0.5, columns - 0.5, -0.5, rows - 0.5), "column", "row", 240)
     figure.name = "spots"
     m = import_bokeh().models
     spots = [(n % columns, n // columns) for n in range(rows * columns)]
@@ -275,4 +275,5 @@ def _panel(title: str, extent: tuple[float, float, float, float], across: str, u
         x_axis_label=across, y_axis_label=up, toolbar_location=None, tools="", background_fill_color="#888888",
     )  # fmt: skip
     figure.grid.visible = False
+    figure.axis.ticker = m.BasicTicker(desired_num_ticks=4, num_minor_ticks=0)
     return figure

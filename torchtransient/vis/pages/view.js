@@ -218,7 +218,7 @@
   });
 
   async function scaleOf(mode, item, values) {
-    const signs = { palette: "diverging", log: false };
+    const signs = { palette: mode === "speed" && item !== "difference" ? "approach" : "diverging", log: false };
     if (mode === "aolp") return { palette: "cyclic", low: -90, high: 90, log: false, cyclic: true };
     if (mode === "phase") return { palette: "cyclic", low: -180, high: 180, log: false, cyclic: true };
     if (item === "difference" || mode === "speed" || mode === "real" || (meta.signed && mode === "light")) {
@@ -665,7 +665,8 @@
     }, true);
   }
 
-  // The bin in which most pixels see light (brightness counts by its logarithm), and a pixel of middling brightness in it.
+  // The bin in which most pixels see light (brightness counts by its logarithm), and a pixel of middling brightness in
+  // it; of a volume, the brightest voxel.
   async function begin() {
     if (!meta.server) {
       let best = -1;
@@ -683,7 +684,7 @@
     }
     const values = await scalarOf(0, "light", state.t);
     const lit = Array.from(values.keys()).filter((i) => values[i] > 0).sort((a, b) => values[a] - values[b]);
-    const middle = lit.length ? lit[lit.length >> 1] : (H >> 1) * W + (W >> 1);
+    const middle = lit.length ? lit[meta.kind === "volume" ? lit.length - 1 : lit.length >> 1] : (H >> 1) * W + (W >> 1);
     state.pixels = [{ row: Math.floor(middle / W), column: middle % W }];
   }
 
