@@ -54,7 +54,12 @@ def capture(kind="confocal", size=(8, 6), bins=24):
     grids = {"laser_grid": (4, 3)} if kind == "exhaustive" else {}
     grids |= {"laser": (0.4, 0.3)} if kind == "single" else {}
     scan = tt.nlos.Scan.grid(
-        {"type": "rectangle"}, kind=kind, size=size, sensor_origin=(0.2, 0.0, 2.0), laser_origin=(-0.2, 0.0, 2.0), **grids
+        {"type": "rectangle"},
+        kind=kind,
+        size=size,
+        sensor_origin=(0.2, 0.0, 2.0),
+        laser_origin=(-0.2, 0.0, 2.0),
+        **grids,
     )
     axis = tt.TimeAxis(1.0, 0.05, bins)
     cube = noise(1, bins, *scan.shape, seed=4) * (1 + torch.arange(scan.shape[-1]))

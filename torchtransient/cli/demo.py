@@ -73,7 +73,7 @@ def _averages(transient: torch.Tensor) -> torch.Tensor:
 @click.option("--spp", type=click.IntRange(1), default=32, show_default=True, help="Samples per pixel of a step.")
 @click.option("--steps", type=click.IntRange(1), default=30, show_default=True, help="Steps of Adam.")
 def command(output: Path, resolution: int, spp: int, steps: int) -> None:
-    """Render light in flight as a page for the browser, then find the colour of a wall from the transient, from grey."""
+    """Render light in flight as a page for the browser, then find the colour of a wall from it, from grey."""
     import torch
 
     import torchtransient as tt

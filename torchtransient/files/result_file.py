@@ -49,9 +49,9 @@ class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
     `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `axis`,
-    `beats` with `chirps` and `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None. `others`: tensors
-    and settings of films that have no attribute here, by name. A batch of results (``stack``, ``cat``,
-    ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
+    `beats` with `chirps` and `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
+    `others`: tensors and settings of films that have no attribute here, by name. A batch of results (``stack``,
+    ``cat``, ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -108,10 +109,12 @@ def signed_table(name: str, top: float) -> Table:
     sizes = top * 10.0 ** (-_SIGNED_DECADES * np.arange(_SIGNED_STEPS, -1, -1) / _SIGNED_STEPS)
     values[1:128], values[128:255] = sizes, -sizes
     half = 10.0 ** (_SIGNED_DECADES / _SIGNED_STEPS / 2)
-    return Table(name, values, half * (1 + _SAME_BITS) - 1, top * 10.0**-_SIGNED_DECADES / half, "signed", _SIGNED_DECADES)
+    return Table(
+        name, values, half * (1 + _SAME_BITS) - 1, top * 10.0**-_SIGNED_DECADES / half, "signed", _SIGNED_DECADES
+    )
 
 
-def _linear(name: str, kind: str, values: NDArray[np.float64], error: float) -> Table:
+def _linear(name: str, kind: str, values: Any, error: float) -> Table:
     table = np.full(256, np.nan, np.float32)
     table[:255] = values
     return Table(name, table, error, 0.0, kind)
@@ -126,7 +129,7 @@ def table_of(name: str, cubes: list[Tensor]) -> Table:
     """Return the table that fits real numbers of several cubes: whole, light, or of both signs."""
     top, bottom, lowest = 0.0, 0.0, math.inf
     for cube in cubes:
-        for part in cube.float().reshape(-1).split(_ENTRIES_AT_ONCE):
+        for part in cube.float().reshape(-1).split(_ENTRIES_AT_ONCE):  # type: ignore[no-untyped-call]
             low, high = (float(v) for v in torch.aminmax(part))
             if not (math.isfinite(low) and math.isfinite(high)):
                 part = torch.nan_to_num(part, nan=0.0, posinf=0.0, neginf=0.0)
@@ -144,4 +147,5 @@ def table_of(name: str, cubes: list[Tensor]) -> Table:
 
 
 def _whole(cube: Tensor) -> bool:
-    return all(bool((part == part.round()).all()) for part in cube.reshape(-1).split(_ENTRIES_AT_ONCE))
+    parts = cube.reshape(-1).split(_ENTRIES_AT_ONCE)  # type: ignore[no-untyped-call]
+    return all(bool((part == part.round()).all()) for part in parts)

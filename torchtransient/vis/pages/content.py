@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError
@@ -139,7 +139,9 @@ def content_of(
         parts = list(islice(_each(x), samples))
         if not parts:
             raise ShapeError(f"{who}: expected at least one sample, got an empty {type(x).__name__}.")
-        found = _together([_single(part, who, **known) for part in parts], [f"sample {n}" for n in range(len(parts))], who)
+        found = _together(
+            [_single(part, who, **known) for part in parts], [f"sample {n}" for n in range(len(parts))], who
+        )
         left = len(x) - len(parts) if hasattr(x, "__len__") else 0
         return replace(found, notes=(*found.notes, f"The first {len(parts)} of {len(x)} samples.")) if left else found
     return _single(x, who, **known)
@@ -186,7 +188,9 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
         return light_content(as_tensor(x.gated, who), _gates(x.gated.shape[-3], gates), "gates", _errors(x), who)
     if getattr(x, "transient", None) is not None:
         cube = as_tensor(x.transient, who)
-        return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who)
+        return light_content(
+            cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who
+        )
     cube = as_tensor(x, who)
     if cube.is_complex():
         return _phasors(cube, frequencies, who)
@@ -198,14 +202,12 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
 
 
 class _Named:
-    """Entries of a sample by name; its light is the measurement where it has one of the transient's shape."""
+    """Entries of a sample by name; its light is the measurement where it holds no other."""
 
     def __init__(self, entries: Mapping[str, Any], axis: Any) -> None:
-        self.axis = entries.get("axis", axis)
-        for name in ("transient", "phasor", "gated", "rates", "beats", "frequencies", "gates"):
-            setattr(self, name, entries.get(name))
-        if self.transient is None and self.phasor is None and self.gated is None:
-            self.transient = entries.get("measurement")
+        self.__dict__.update({"axis": axis, **entries})
+        if not {"transient", "phasor", "gated", "rates", "beats"} & set(entries):
+            self.__dict__["transient"] = entries.get("measurement")
 
 
 def _errors(x: Any) -> Tensor | None:
@@ -230,12 +232,12 @@ def _gates(count: int, gates: Any) -> Slider:
     return Slider("gate", "", np.arange(count, dtype=np.float64))
 
 
-def _grey(cube: Tensor, channel: int = 0) -> tuple[Tensor, tuple[str, ...]]:
+def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     """One channel or three; the mean of other numbers, and a note about it."""
-    count = cube.shape[channel]
+    count = len(cube)
     if count in (1, 3):
         return cube, ()
-    return cube.mean(channel, keepdim=True), (f"Mean over {count} channels.",)
+    return cube.mean(0, keepdim=True), (f"Mean over {count} channels.",)
 
 
 def light_content(
@@ -246,7 +248,7 @@ def light_content(
         mean = cube.mean(1)
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
         planes = Planes(mean[:1], ratios=ratios, error=error)
-        notes = (f"Mean over {cube.shape[1]} channels.",) if cube.shape[1] > 1 else ()
+        notes: tuple[str, ...] = () if cube.shape[1] == 1 else (f"Mean over {cube.shape[1]} channels.",)
         return Content("polarized", slider, ("",), ("",), (planes,), notes=notes)
     if cube.ndim != 4 or not cube.numel():
         raise ShapeError(
@@ -262,7 +264,7 @@ def _phasors(cube: Tensor, known: Any, who: str) -> Content:
     cube = cube[0] if cube.ndim == 5 and cube.shape[0] == 4 else cube
     if cube.ndim != 4 or not cube.is_complex() or not cube.numel():
         raise ShapeError(f"{who}: expected complex phasors (C, F, H, W), got {cube.dtype} {tuple(cube.shape)}.")
-    notes = () if cube.shape[0] == 1 else (f"Mean over {cube.shape[0]} channels.",)
+    notes: tuple[str, ...] = () if cube.shape[0] == 1 else (f"Mean over {cube.shape[0]} channels.",)
     mean = cube.mean(0)
     numbers = frequencies_of(known)
     if numbers is None:
@@ -297,7 +299,14 @@ def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
     planes = tuple(Planes(part[None]) for part in mean)
     slider = slider_of(mean.shape[1], axis, who)
     return Content(
-        "beats", slider, ("",), ("up chirp", "down chirp"), planes, quantity="beat power", layer_name="chirp", notes=notes
+        "beats",
+        slider,
+        ("",),
+        ("up chirp", "down chirp"),
+        planes,
+        quantity="beat power",
+        layer_name="chirp",
+        notes=notes,
     )
 
 
@@ -354,9 +363,7 @@ def _volume(volume: Any) -> Content:
     (rows, columns), (dy, dx) = values.shape[1:], volume.grid.pitch
     extent = (-columns * dx / 2, columns * dx / 2, -rows * dy / 2, rows * dy / 2)
     slider = Slider("depth", "m", volume.grid.depths.cpu().double().numpy())
-    return Content(
-        "volume", slider, ("",), ("",), (Planes(values[None]),), quantity="value", extent=extent, unit="m"
-    )
+    return Content("volume", slider, ("",), ("",), (Planes(values[None]),), quantity="value", extent=extent, unit="m")
 
 
 def binned(content: Content, times: int, pixels: int) -> Content:

@@ -16,7 +16,8 @@ PIXEL_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _PICTURE = 440
 _MODES = {
-    "colour": "colour", "light": "intensity", "peak": "peak time", "rainbow": "rainbow", "dop": "degree of polarization",
+    "colour": "colour", "light": "intensity", "peak": "peak time", "rainbow": "rainbow",
+    "dop": "degree of polarization",
     "aolp": "angle of linear polarization", "real": "real part", "phase": "phase", "speed": "speed of approach",
 }  # fmt: skip
 
@@ -63,12 +64,22 @@ def colour_maps() -> dict[str, list[str]]:
     wheel = oklch(0.58 + 0.34 * swing, 0.12 * np.abs(np.sin(2 * np.pi * turns)), np.where(turns < 0.5, 255.0, 60.0))
     sides = np.linspace(-1, 1, 256)
     both = oklch(0.95 - 0.5 * np.abs(sides), 0.14 * np.abs(sides), np.where(sides < 0, 255.0, 50.0))
-    drawn = {"cyclic": wheel, "diverging": both, "approach": both[::-1], "rainbow": rainbow_colours(np.linspace(0, 1, 256))}
-    hexes = {name: ["#%02x%02x%02x" % tuple(int(round(255 * v)) for v in c) for c in map_] for name, map_ in drawn.items()}
+    drawn = {
+        "cyclic": wheel,
+        "diverging": both,
+        "approach": both[::-1],
+        "rainbow": rainbow_colours(np.linspace(0, 1, 256)),
+    }
+    hexes = {name: [_hex(colour) for colour in colours] for name, colours in drawn.items()}
     return {
         "viridis": list(viridis(256)), "inferno": list(inferno(256)), "cividis": list(cividis(256)),
         "grey": list(gray(256)), **hexes,
     }  # fmt: skip
+
+
+def _hex(colour: Any) -> str:
+    red, green, blue = (round(255 * float(part)) for part in colour)
+    return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, maps: dict[str, list[str]]) -> Any:
@@ -95,13 +106,17 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
     top = [play, slider, where]
     controls = [
         m.Select(title="show", name="mode", options=list(modes.items()), value=next(iter(modes)), width=170),
-        m.Select(title="colour map", name="map", options=["inferno", "viridis", "cividis", "grey"], value="inferno", width=90),
+        m.Select(
+            title="colour map", name="map", options=["inferno", "viridis", "cividis", "grey"], value="inferno", width=90
+        ),
         m.Select(title="brightness", name="curve", options=["linear", "logarithmic"], value="linear", width=105),
         m.Slider(title="exposure (stops)", name="exposure", start=-10, end=20, value=0, step=0.5, width=170),
     ]
     flags = [("accumulate", "peak" in modes and content.kind != "volume"), ("log axis", True)]
     switches = [
-        m.Toggle(label=name, name=name.replace(" ", "_"), width=100, margin=(20, 5, 5, 5)) for name, shown in flags if shown
+        m.Toggle(label=name, name=name.replace(" ", "_"), width=100, margin=(20, 5, 5, 5))
+        for name, shown in flags
+        if shown
     ]
     picks = []
     if len(content.items) > 1:
@@ -117,17 +132,25 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
     left = m.Row(children=[_picture(content, maps)])
     beside = _volume_panels(content) if content.kind == "volume" else []
     picks += _volume_tools() if content.kind == "volume" else []
-    empty = {"x": [], "y": [], "low": [], "high": []}
+    empty: dict[str, Any] = {"x": [], "y": [], "low": [], "high": []}
     curves = [m.ColumnDataSource(data=dict(empty), name=f"curve_{n}") for n in range(len(PIXEL_COLOURS))]
     right = [m.Row(children=controls), m.Row(children=[*switches, *picks])]
-    right += [_histogram(content, curves, False), _histogram(content, curves, True), m.Div(text="", name="readout", width=650)]
+    right += [
+        _histogram(content, curves, False),
+        _histogram(content, curves, True),
+        m.Div(text="", name="readout", width=650),
+    ]
     if content.layer_grid:
         beside.append(_laser_grid(content))
     if content.kind == "rates":
         beside.append(_rate_map(content, maps))
     under = [m.Row(children=beside)] if beside else []
     return m.Column(
-        children=[heading, m.Row(children=top), m.Row(children=[m.Column(children=[left, *under]), m.Column(children=right)])],
+        children=[
+            heading,
+            m.Row(children=top),
+            m.Row(children=[m.Column(children=[left, *under]), m.Column(children=right)]),
+        ],
         name="root",
     )
 
@@ -152,13 +175,17 @@ def _picture(content: Content, maps: dict[str, list[str]]) -> Any:
     m = bokeh.models
     _, rows, columns = content.shape
     # Pictures have their first row at the top, walls and volumes at the bottom.
-    extent = (0.0, float(columns * content.stride), 0.0, float(rows * content.stride)) if content.extent is None else content.extent
+    extent = (
+        (0.0, float(columns * content.stride), 0.0, float(rows * content.stride))
+        if content.extent is None
+        else content.extent
+    )
     left, right, low, high = extent
     scale = _PICTURE / max(right - left, high - low)
     width, height = max(120, round((right - left) * scale)), max(90, round((high - low) * scale))
     ranges = (high, low) if content.extent is None else (low, high)
     figure = bokeh.plotting.figure(
-        frame_width=width, frame_height=height, x_range=m.Range1d(left, right, bounds="auto"), y_range=m.Range1d(*ranges),
+        frame_width=width, frame_height=height, x_range=m.Range1d(left, right), y_range=m.Range1d(*ranges),
         tools="pan,wheel_zoom,box_zoom,reset,save", active_drag=None, active_scroll=None, name="picture",
         x_axis_label="column" if content.unit == "pixels" else f"x ({content.unit})",
         y_axis_label="row" if content.unit == "pixels" else f"y ({content.unit})", background_fill_color="#888888",
@@ -166,7 +193,9 @@ def _picture(content: Content, maps: dict[str, list[str]]) -> Any:
     figure.grid.visible = False
     _image(figure, "image", extent, rows, columns)
     if content.marks:
-        spots = m.ColumnDataSource(data={"x": [p[0] for p in content.marks[:1]], "y": [p[1] for p in content.marks[:1]]}, name="laser")
+        spots = m.ColumnDataSource(
+            data={"x": [p[0] for p in content.marks[:1]], "y": [p[1] for p in content.marks[:1]]}, name="laser"
+        )
         figure.scatter("x", "y", source=spots, marker="star", size=14, fill_color="white", line_color="black")
     pixels = m.ColumnDataSource(data={"x": [], "y": [], "colour": []}, name="pixels")
     figure.scatter("x", "y", source=pixels, marker="circle", size=12, fill_alpha=0, line_color="white", line_width=4)
@@ -198,17 +227,24 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
     figure.x_range = m.Range1d(float(centers.min()) - step / 2, float(centers.max()) + step / 2)
     figure.y_range = m.Range1d(0 if not log else 1e-6, 1)
     if slider.second:
-        figure.extra_x_ranges = {"second": m.Range1d(figure.x_range.start * slider.factor, figure.x_range.end * slider.factor)}
-        figure.add_layout(m.LinearAxis(x_range_name="second", axis_label=f"{slider.second} ({slider.second_unit})"), "above")
+        figure.extra_x_ranges = {
+            "second": m.Range1d(figure.x_range.start * slider.factor, figure.x_range.end * slider.factor)
+        }
+        figure.add_layout(
+            m.LinearAxis(x_range_name="second", axis_label=f"{slider.second} ({slider.second_unit})"), "above"
+        )
         for end in ("start", "end"):
             link = m.CustomJS(
-                args={"second": figure.extra_x_ranges["second"]}, code=f"second.{end} = cb_obj.{end} * {slider.factor!r}"
+                args={"second": figure.extra_x_ranges["second"]},
+                code=f"second.{end} = cb_obj.{end} * {slider.factor!r}",
             )
             figure.x_range.js_on_change(end, link)
     for source, colour, dash in zip(curves, PIXEL_COLOURS, _DASHES, strict=True):
         figure.varea("x", "low", "high", source=source, fill_color=colour, fill_alpha=0.25)
         figure.step("x", "y", source=source, mode="center", line_color=colour, line_dash=dash, line_width=1.8)
-    figure.add_layout(m.Span(dimension="height", location=0.0, line_color="black", line_width=1.5, name=f"cursor_{int(log)}"))
+    figure.add_layout(
+        m.Span(dimension="height", location=0.0, line_color="black", line_width=1.5, name=f"cursor_{int(log)}")
+    )
     figure.js_on_event("tap", _event("scrub(cb_obj.x)"))
     return figure
 
@@ -235,7 +271,9 @@ def _volume_tools() -> list[Any]:
     return [
         m.Slider(title="turned by (degrees)", name="turn", start=0, end=355, value=30, step=5, width=150),
         m.Toggle(label="turn", name="turns", width=60, margin=(20, 5, 5, 5)),
-        m.Slider(title="threshold (of the highest)", name="threshold", start=0, end=0.95, value=0.1, step=0.05, width=160),
+        m.Slider(
+            title="threshold (of the highest)", name="threshold", start=0, end=0.95, value=0.1, step=0.05, width=160
+        ),
     ]
 
 

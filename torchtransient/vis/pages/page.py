@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.vis.pages.codes import PHASE, RATIO, Table, light_table, table_of
+from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
 from torchtransient.vis.pages.content import Content, Planes, binned
 from torchtransient.vis.pages.layout import colour_maps, import_bokeh, layout_of, modes_of
 
@@ -100,20 +100,26 @@ def with_script(html: str, meta: dict[str, Any], chunks: list[str]) -> str:
     return "\n".join([head, data, *chunks, f"<script>\n{script}\n</script>", end + rest])
 
 
-def described(content: Content, tables: dict[str, Table], modes: dict[str, str], maps: dict[str, Any]) -> dict[str, Any]:
+def described(
+    content: Content, tables: dict[str, Table], modes: dict[str, str], maps: dict[str, Any]
+) -> dict[str, Any]:
     """Return what `view.js` has to know, as plain data."""
     slider = content.slider
     return {
         "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
         "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
-        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride, "quantity": content.quantity,
+        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
         "slider": {
             "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
             "secondUnit": slider.second_unit, "factor": slider.factor,
         },
-        "tables": {name: [None if not np.isfinite(v) else float(v) for v in table.values] for name, table in tables.items()},
-        "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed", "modes": list(modes), "maps": maps,
+        "tables": {name: _plain(table.values) for name, table in tables.items()}, "maps": maps, "modes": list(modes),
+        "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed",
     }  # fmt: skip
+
+
+def _plain(values: NDArray[np.float32]) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
@@ -164,7 +170,7 @@ def _encoded(content: Content) -> Encoded:
 def _packed(codes: NDArray[np.uint8]) -> bytes:
     # Noise has no strings that repeat: runs of zeros and short codes for frequent numbers are what there is to gain.
     packer = zlib.compressobj(1, zlib.DEFLATED, 31, 9, zlib.Z_RLE)
-    return packer.compress(codes) + packer.flush()
+    return packer.compress(codes.data) + packer.flush()
 
 
 def _tables(content: Content) -> dict[str, Table]:

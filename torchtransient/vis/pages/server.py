@@ -100,7 +100,9 @@ def serving(path: Path, title: str, port: int = 0) -> Iterator[tuple[ThreadingHT
     modes, maps = modes_of(content, every_bin=False), colour_maps()
     notes = "Read from the file bin by bin: numbers are within 0.2 % of those of the file."
     if content.stride > 1:
-        notes += f" The picture has one row and column of {content.stride}, of {held.cube.shape[2]} x {held.cube.shape[3]}."
+        notes += (
+            f" The picture has one row and column of {content.stride}, of {held.cube.shape[2]} x {held.cube.shape[3]}."
+        )
     meta = described(content, {f"c{k}": light_table("light", 1.0, 0.1) for k in range(held.cube.shape[0])}, modes, maps)
     meta |= {"server": f"/{token}", "start": held.brightest()}
     page = with_script(html_of(layout_of(content, modes, escape(notes), title, maps), title), meta, []).encode()
