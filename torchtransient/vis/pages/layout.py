@@ -15,6 +15,7 @@ from torchtransient.vis.pages.content import Content
 PIXEL_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _PICTURE = 440
+_OWN = "<div class='own'></div>"
 _MODES = {
     "colour": "colour", "light": "intensity", "peak": "peak time", "rainbow": "rainbow",
     "dop": "degree of polarization",
@@ -102,7 +103,7 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         start=0, end=max(1, bins - 1), value=0, step=1, title=None, show_value=False, name="slider", width=560,
         disabled=bins == 1,
     )  # fmt: skip
-    where = m.Div(text="", name="where", width=380, styles={"font-size": "14px", "padding-top": "6px"})
+    where = m.Div(text=_OWN, name="where", width=380, styles={"font-size": "14px", "padding-top": "6px"})
     top = [play, slider, where]
     controls = [
         m.Select(title="show", name="mode", options=list(modes.items()), value=next(iter(modes)), width=170),
@@ -138,7 +139,7 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
     right += [
         _histogram(content, curves, False),
         _histogram(content, curves, True),
-        m.Div(text="", name="readout", width=650),
+        m.Div(text=_OWN, name="readout", width=650),
     ]
     if content.layer_grid:
         beside.append(_laser_grid(content))

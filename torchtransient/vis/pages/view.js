@@ -318,11 +318,20 @@
 
   let doc = null;
   const model = (name) => doc.get_model_by_name(name);
+  // Texts that change with every bin, past bokeh, which would lay out the whole page anew.
+  const write = (name, html) => {
+    window.Bokeh.index.find_one(model(name)).shadow_el.querySelector(".own").innerHTML = html;
+  };
   const image = (name) => { const array = model(name).data.image[0]; return array.length === undefined ? array.data : array; };
 
   let shown = null;  // values of the picture, for the readout
 
+  let drawn = "";  // what a picture over all bins was drawn for
+
   async function drawPicture() {
+    const { t: _, pixels, playing, logAxis, ...rest } = state, key = JSON.stringify(rest);
+    if (overBins.has(state.mode) && drawn === key) return;
+    drawn = key;
     const target = image("image"), { mode, item, t } = state;
     let scale;
     const plain = item !== "difference" && !meta.signed && entriesOf(item).length === 1;
@@ -458,8 +467,8 @@
         + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${number(total)}</td>`
         + `<td class="at">${number(centers[top])} ${meta.slider.unit}</td></tr>`;
     });
-    model("readout").text = `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
-      + `<div style="color:#555;margin-top:4px">Click: a pixel more, or one less. Drag a ring to move it. Space: play. Arrows: one step (shift: ten). Home, End. Click the histogram to go there.</div>`;
+    write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
+      + `<div style="color:#555;margin-top:4px">Click: a pixel more, or one less. Drag a ring to move it. Space: play. Arrows: one step (shift: ten). Home, End. Click the histogram to go there.</div>`);
   }
 
   // ----------------------------------------------------------------------------------- other views of a kind
@@ -543,14 +552,14 @@
       do {
         again = null;
         await drawPicture();
-        for (const n of [0, 1]) model(`cursor_${n}`).location = centers[state.t];
-        model("where").text = placeText(state.t);
+        model(`cursor_${Number(state.logAxis)}`).location = centers[state.t];
+        write("where", placeText(state.t));
         if (everything) { drawMarkers(); await drawCurves(); } else drawReadout();
         everything = again;
       } while (again !== null);
       page.drawn += 1;
     } catch (error) {
-      model("where").text = `<b style="color:#a00">${String(error)}</b>`;
+      write("where", `<b style="color:#a00">${String(error)}</b>`);
       throw error;
     } finally {
       busy = false;
