@@ -114,6 +114,13 @@ def test_samples_that_are_left_out():
     assert "The first 2 of 5 samples." in page.notes
 
 
+def test_samples_of_a_loader():
+    samples = [{"transient": cases.front(1, seed=n)} for n in range(3)]
+    loader = torch.utils.data.DataLoader(samples, batch_size=None)
+    of_loader, of_list = (tt.vis.view(x, axis=cases.AXIS) for x in (loader, samples))
+    assert of_loader.html.count('id="codes-') == of_list.html.count('id="codes-') == 3
+
+
 REFUSED = {
     "a batch": (lambda: tt.vis.view(torch.ones(2, 3, 5, 4, 4)), ShapeError, "expected light"),
     "nothing": (lambda: tt.vis.view([]), ShapeError, "at least one sample"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -134,7 +134,7 @@ def content_of(
     known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
     if isinstance(x, tuple) and len(x) == 2:
         return _together([_single(part, who, **known) for part in x], ("A", "B"), who)
-    if not isinstance(x, Tensor | np.ndarray | Mapping | str | Path) and hasattr(x, "__getitem__"):
+    if not isinstance(x, Tensor | np.ndarray | Mapping | str | Path) and _is_sequence(x):
         known["axis"] = getattr(x, "axis", None) if axis is None else axis
         parts = list(islice(_each(x), samples))
         if not parts:
@@ -147,9 +147,14 @@ def content_of(
     return _single(x, who, **known)
 
 
-def _each(x: Any) -> Any:
-    for number in range(len(x)) if hasattr(x, "__len__") else iter(int, 1):
-        yield x[number]
+def _is_sequence(x: Any) -> bool:
+    return hasattr(x, "__getitem__") or hasattr(x, "__iter__")
+
+
+def _each(x: Any) -> Iterator[Any]:
+    if hasattr(x, "__getitem__") and hasattr(x, "__len__"):
+        return (x[number] for number in range(len(x)))
+    return iter(x)
 
 
 def _together(parts: list[Content], names: Sequence[str], who: str) -> Content:
