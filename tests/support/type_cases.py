@@ -23,10 +23,8 @@ def _pictures() -> dict[str, Case]:
         "vis.Cell": Case(v.Cell, "a", images={"b": DARK}, curve=np.ones(3)),
         "vis.cyclic": Case(v.cyclic, 0.3, value=0.5),
         "vis.cyclic_map": Case(v.cyclic_map, kind="even"),
-        "vis.depth_picture": Case(v.depth_picture, torch.rand(3, 4)),
         "vis.light_curve": Case(v.light_curve, LIGHT),
         "vis.median_pixel": Case(v.median_pixel, STEADY),
-        "vis.normals_picture": Case(v.normals_picture, torch.rand(3, 4, 5)),
         "vis.peak_time": Case(v.peak_time, LIGHT, AXIS),
         "vis.plot_fit": Case(
             v.plot_fit, {"a": STEADY}, [2.0, 1.0], {"b": [0.5, 0.6]}, truth={"b": 0.7}, path=folder() / "f.png"
