@@ -1,4 +1,4 @@
-# `make demo` on a fresh machine: environment, a rendered and fitted Cornell box, pictures in demo_output/.
+# `make demo` on a fresh machine: environment, a rendered and fitted Cornell box, a page and pictures in demo_output/.
 # `make test`: environment, default tests. Both need Python >= 3.11 with the venv module, and pip's access to packages.
 
 VENV ?= .venv
@@ -10,7 +10,7 @@ READY := $(VENV)/.installed
 .PHONY: demo test test-portable test-slow test-browser soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
 
 help:
-	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
+	@echo "make demo       render a scene, fit a parameter, write a page and pictures to demo_output/"
 	@echo "make test       default tests          make test-slow  the long ones"
 	@echo "make test-portable  sensors, losses and reconstruction with the arithmetic of an older processor"
 	@echo "make test-browser  pages in Chromium (Debian: apt-get install -y chromium)"

@@ -218,7 +218,7 @@ class _Named:
 def _errors(x: Any) -> Tensor | None:
     if getattr(x, "cells", None) is None:
         return None
-    found: Tensor = x.error_map()
+    found = as_tensor(x.error_map(), "view")
     return found[0] if found.ndim == 4 else found
 
 
