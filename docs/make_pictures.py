@@ -1,4 +1,4 @@
-"""Render and draw the figures of docs/pictures.md: `python docs/make_pictures.py [PART ...]`, minutes on two cores.
+"""Render and draw the figures of docs/pictures.md: `python docs/make_pictures.py [PART ...]`, 20 minutes on two cores.
 
 Everything is a render, of a Cornell box or of two balls; nothing is drawn by hand.
 """
@@ -23,9 +23,11 @@ AXIS = {"num_bins": 200, "start_opl": 3.6, "bin_width_opl": 0.03}
 
 def surfaces() -> None:
     """Pictures of intensity over time."""
-    scene = tt.load(tt.scenes.cornell_box(resolution=128, mirror=True, sampler="multijitter", **AXIS), "llvm_ad_rgb")
+    description = tt.scenes.cornell_box(resolution=128, mirror=True, **AXIS)
+    # Neighbouring pixels share late light, of which independent paths see a few bright samples.
+    description["integrator"]["type"] = "transient_path_reuse"
     with torch.no_grad():
-        out = tt.render(scene, spp=2048, seed=0)
+        out = tt.render(tt.load(description, "llvm_ad_rgb"), spp=16384, seed=0, progress=True)
     tt.vis.peak_time_picture(out, OUT / "peak_time.png")
     styles = [
         tt.vis.rainbow(out),
@@ -73,7 +75,7 @@ def phasors() -> None:
     scene = tt.load(tt.scenes.cornell_box(resolution=96, **AXIS), "llvm_ad_mono")
     axis = tt.FrequencyAxis((0.5, 2.0))
     with torch.no_grad():
-        out = tt.render(scene, spp=512, seed=0, frequencies=axis)
+        out = tt.render(scene, spp=4096, seed=0, frequencies=axis)
     tt.vis.phasor_picture(out, OUT / "phasors.png", which=(0, 1), show=("real", "phase", "domain"))
     to_palette(OUT / "phasors.png")
 
@@ -81,8 +83,8 @@ def phasors() -> None:
 def gradients() -> None:
     """What the picture of all times, and that of one moment, does when the back wall moves away."""
     key = "back.to_world"
-    scene = tt.load(tt.scenes.cornell_box(resolution=96, max_depth=4, sampler="multijitter", **AXIS), "llvm_ad_mono")
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=1024)
+    scene = tt.load(tt.scenes.cornell_box(resolution=96, max_depth=4, **AXIS), "llvm_ad_mono")
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=4096)
     start = renderer.values[key].detach()
     away = torch.as_tensor(translate([0.0, 0.0, -1.0]), dtype=torch.float32)
     direction = (away - torch.eye(4)) @ start
@@ -124,7 +126,34 @@ def page() -> None:
     to_palette(OUT / "page.png")
 
 
-PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients, page)}
+def fit() -> None:
+    """The figure of a fit: nine albedos of the Cornell box."""
+    keys = [f"{paint}.reflectance.value" for paint in ("white", "red", "green")]
+    box = tt.scenes.cornell_box(64, start_opl=4.2, bin_width_opl=0.04, num_bins=150, max_depth=8)
+    scene = tt.load(box, "llvm_ad_rgb")
+    with torch.no_grad():
+        truth = tt.TransientRenderer(scene, keys)
+        target = truth(seed=1_000_003, spp=1024)
+    renderer = tt.TransientRenderer(scene, {key: torch.full((3,), 0.5) for key in keys}, spp=32)
+    values = {key: value.detach() for key, value in truth.values.items()}
+    monitor = tt.vis.FitMonitor(renderer, target=target, pixels=[(24, 8), (24, 32)], truth=values, every=2)
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05, betas=(0.8, 0.95))
+    weight = 1 / (target.steady + target.steady.mean()).square()[:, None]
+    for step in range(41):
+        optimizer.zero_grad()
+        out = renderer(seed=step)
+        loss = (weight * (out.transient - target.transient).square()).mean()
+        loss.backward()
+        monitor.step(loss, out)
+        optimizer.step()
+        with torch.no_grad():
+            for value in renderer.parameters():
+                value.clamp_(0.001, 0.999)
+    monitor.figure().savefig(OUT / "fit.png", dpi=85)
+    to_palette(OUT / "fit.png")
+
+
+PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients, fit, page)}
 
 if __name__ == "__main__":
     OUT.mkdir(parents=True, exist_ok=True)

@@ -33,8 +33,9 @@ ZERO = BELOW | {
 LARGE = {"seed", "noise_seed"}
 WITHOUT_END = {"TimeAxis.bin_index(opl)", "data.Normal(low)", "data.Normal(high)", "data.OnlineDataset(uses)",
                "data.OnlineDataset(timeout_s)", "data.generate(timeout_s)",
-               "training.Ranks.mean(value)", "data.PixelMap.nearest(fill)", "units.near_seconds(limit_s)"}  # fmt: skip
-NO_NUMBER = {"training.Ranks.mean(value)", "data.PixelMap.nearest(fill)"}
+               "training.Ranks.mean(value)", "data.PixelMap.nearest(fill)", "units.near_seconds(limit_s)",
+               "vis.FitMonitor.step(loss)"}  # fmt: skip
+NO_NUMBER = {"training.Ranks.mean(value)", "data.PixelMap.nearest(fill)", "vis.FitMonitor.step(loss)"}
 NO_REAL = [*NONE, NAN, torch.tensor(NAN), np.float64(NAN)]
 ENDLESS = [INF, -INF, np.float64(INF), 10**400]
 WHOLE = [np.int64, np.uint8, np.array, torch.tensor, lambda n: torch.tensor(n, dtype=torch.uint8)]

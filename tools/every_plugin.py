@@ -80,7 +80,20 @@ def sensors() -> dict[str, dict[str, Any]]:
         "transient_hdr_film": {**camera, "film": {"type": "transient_hdr_film"}},
         "phasor_hdr_film": {**camera, "film": {"type": "phasor_hdr_film"}},
         "gated_hdr_film": {**camera, "film": {"type": "gated_hdr_film", "gates": "gaussian 1 0.1"}},
-    }
+        "rate_hdr_film": {
+            **camera, "film": {"type": "rate_hdr_film", "rate_start": -1.0, "rate_width": 1.0, "rate_bins": 2}
+        },
+        "slow_phasor_hdr_film": {
+            **camera, "film": {"type": "slow_phasor_hdr_film", "frequencies": "0.5, 1.0", "slow_times": "0.0, 0.1"}
+        },
+        "beat_hdr_film": {
+            **camera,
+            "film": {
+                "type": "beat_hdr_film", "bin_width_opl": 0.1, "chirp_bandwidth": 1e9, "chirp_duration": 1e-6,
+                "chirp_wavelength": 1.55e-6,
+            },
+        },
+    }  # fmt: skip
 
 
 def _scan() -> dict[str, Any]:
@@ -160,6 +173,7 @@ def textures() -> dict[str, dict[str, Any]]:
         "irregular": {"type": "irregular", "wavelengths": "400,700", "values": "1,2"},
         "blackbody": {"type": "blackbody", "temperature": 5000.0},
         "rawconstant": {"type": "rawconstant", "value": 0.4},
+        "rigid_motion": {"type": "rigid_motion", "linear": [1.0, 0.5, 0.2]},
     }
 
 

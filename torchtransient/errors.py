@@ -84,7 +84,7 @@ class PhysicsWarning(TorchTransientWarning):
 
 class GradientWarning(TorchTransientWarning):
     """A derivative is computed and lacks a part: the light that moving edges hide and uncover, if edges are not
-    followed or the boundary term was switched off.
+    followed or the boundary term was switched off. Or it is zero, of a velocity on a film that measures no rates.
     """
 
 

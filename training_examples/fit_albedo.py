@@ -5,6 +5,8 @@ nine numbers (white, red and green paint, three channels each) with an ordinary 
 the render and the target agree bin by bin.
 
     python training_examples/fit_albedo.py --output demo_output
+
+`fit_albedo.html` shows the fit step by step in a browser.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ class Fit:
     target: torch.Tensor
     first: torch.Tensor
     last: torch.Tensor
+    monitor: tt.vis.FitMonitor
     losses: list[float] = field(default_factory=list)
     albedos: list[torch.Tensor] = field(default_factory=list)
 
@@ -70,7 +73,10 @@ def fit_albedo(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
     with torch.no_grad():
         target = truth(seed=TARGET_SEED, spp=target_spp).transient
         first = renderer(seed=0, spp=target_spp).transient
-    fit = Fit(renderer.axis, albedos_of(truth), target, first, first)
+    pixels = [(resolution // 3, resolution // 8), (resolution // 3, resolution // 2)]
+    paints = {key: value.detach() for key, value in truth.values.items()}
+    monitor = tt.vis.FitMonitor(renderer, target=target, pixels=pixels, truth=paints)
+    fit = Fit(renderer.axis, albedos_of(truth), target, first, first, monitor)
     fit.albedos.append(albedos_of(renderer))
 
     optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05, betas=(0.8, 0.95))
@@ -79,8 +85,10 @@ def fit_albedo(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
     for step in progress:
         optimizer.zero_grad()
         # A new seed every step: the noise averages out along the way instead of being fitted.
-        loss = squared_error(renderer(seed=step).transient, target)
+        out = renderer(seed=step)
+        loss = squared_error(out.transient, target)
         loss.backward()
+        monitor.step(loss, out)
         optimizer.step()
         schedule.step()
         with torch.no_grad():
@@ -147,6 +155,7 @@ def main(argv: Sequence[str] | None = None) -> Fit:
     fit = fit_albedo(options.steps, options.spp, options.resolution, options.target_spp)
     picture = options.output / "fit_albedo.png"
     draw(fit, picture)
+    fit.monitor.save(options.output / "fit_albedo.html")
     print(
         f"fit_albedo: largest albedo error {float(fit.errors[-1]):.4f} after {options.steps} steps "
         f"(start {float(fit.errors[0]):.4f}); {picture}"

@@ -6,6 +6,8 @@ model starts 0.3 m and 6 degrees off. Its 4x4 matrix is made from distance and t
 goes from the arrival times through the path lengths and the matrix to the two numbers.
 
     python training_examples/fit_wall.py --output demo_output
+
+`fit_wall.html` shows the fit step by step in a browser.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ class Fit:
     target: torch.Tensor
     first: torch.Tensor
     last: torch.Tensor
+    monitor: tt.vis.FitMonitor
     losses: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
     tilts_deg: list[float] = field(default_factory=list)
@@ -98,7 +101,15 @@ def fit_wall(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
         target = wall_renderer(MEASURED_ALBEDO, resolution)({KEY: truth}, seed=TARGET_SEED, spp=target_spp).transient
         first = render(0, target_spp)
     measured = mean_arrival(target, renderer.axis)
-    fit = Fit(renderer.axis, target, first, first, [], [distance.item()], [tilt_deg.item()])
+    # The two numbers, of which the layer's matrix is made. The measured wall is the brighter one.
+    monitor = tt.vis.FitMonitor(
+        {"distance [m]": distance, "tilt [degrees]": tilt_deg},
+        target=target * (MODEL_ALBEDO / MEASURED_ALBEDO),
+        pixels=[(resolution // 2, 0), (resolution // 2, resolution - 1)],
+        truth={"distance [m]": TRUE_DISTANCE, "tilt [degrees]": TRUE_TILT_DEG},
+        axis=renderer.axis,
+    )
+    fit = Fit(renderer.axis, target, first, first, monitor, [], [distance.item()], [tilt_deg.item()])
 
     # One rate per unit: metres for the distance, degrees for the tilt.
     optimizer = torch.optim.Adam(
@@ -108,9 +119,10 @@ def fit_wall(steps: int, spp: int, resolution: int, target_spp: int) -> Fit:
     progress = tqdm(range(steps), desc="fit_wall", unit="step")
     for step in progress:
         optimizer.zero_grad()
-        arrival = mean_arrival(render(step, spp), renderer.axis)
-        loss = (arrival - measured).square().mean()
+        light = render(step, spp)
+        loss = (mean_arrival(light, renderer.axis) - measured).square().mean()
         loss.backward()
+        monitor.step(loss, light)
         optimizer.step()
         schedule.step()
         fit.losses.append(loss.item())
@@ -181,6 +193,7 @@ def main(argv: Sequence[str] | None = None) -> Fit:
     fit = fit_wall(options.steps, options.spp, options.resolution, options.target_spp)
     picture = options.output / "fit_wall.png"
     draw(fit, picture)
+    fit.monitor.save(options.output / "fit_wall.html")
     millimetres = [1e3 * error for error in fit.distance_errors]
     print(
         f"fit_wall: distance error {millimetres[-1]:.3f} mm, tilt error {fit.tilt_errors[-1]:.4f} degrees after "

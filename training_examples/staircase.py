@@ -31,6 +31,8 @@ AXIS = tt.TimeAxis(start_opl=2.0, bin_width_opl=0.1, num_bins=120)
 # The gate of the recovery: the light that comes from the lamp by way of the floor alone.
 FLOOR_AXIS = tt.TimeAxis(start_opl=7.0, bin_width_opl=0.1, num_bins=16)
 WINDOWS = ((7.0, 7.3), (7.3, 7.6), (7.6, 8.0), (8.0, 10.0))
+# Bins of the film, until the light has crossed the floor, and bins of a frame.
+FILM_BINS, FRAME_BINS = 75, 3
 MOMENTS = (3.0, 4.0, 5.0, 6.0, 7.3, 8.0)
 TARGET_SEED = 1_000_003
 TEXEL_BLOCK = 15
@@ -38,10 +40,13 @@ TEXEL_BLOCK = 15
 
 @dataclass(frozen=True)
 class Sizes:
-    """Pixels, samples per pixel of the pictures and of a step, bounces, steps of the recovery, windows of time."""
+    """Pixels, samples per pixel of the light, of gradients and target, of a step, bounces, steps of the recovery,
+    windows of time.
+    """
 
     width: int
     height: int
+    spp_light: int
     spp: int
     spp_step: int
     max_depth: int
@@ -87,6 +92,16 @@ def window_slice(window: tuple[float, float]) -> slice:
     """The bins between two path lengths in metres."""
     first, last = (round((opl - AXIS.start_opl) / AXIS.bin_width_opl) for opl in window)
     return slice(first, last)
+
+
+def light_on_its_way(scene: tt.Scene, sizes: Sizes) -> tt.RenderOutput:
+    """Light over time, from paths that neighbouring pixels share: the noise of late bins is that of many more paths."""
+    plan = tt.plan(
+        scene, integrator="transient_path_reuse", time_axis=AXIS, max_depth=sizes.max_depth, temporal_filter="box",
+        pilot=False,
+    )  # fmt: skip
+    with torch.no_grad():
+        return plan.renderer(spp=sizes.spp_light)(seed=0, progress=True)
 
 
 def window_gradients(renderer: tt.TransientRenderer, key: str, sizes: Sizes) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -192,6 +207,12 @@ def draw_light(out: tt.RenderOutput, path: Path) -> None:
     save(figure, path)
 
 
+def film_light(out: tt.RenderOutput, path: Path) -> None:
+    """The front of light on its way down the stairs, as a GIF."""
+    axis = tt.TimeAxis(AXIS.start_opl, AXIS.bin_width_opl, FILM_BINS)
+    tt.vis.video(out.transient[:, :FILM_BINS], path, axis=axis, every=FRAME_BINS, fps=8, scale=2)
+
+
 def draw_gradients(texture: torch.Tensor, gradients: list[torch.Tensor], path: Path) -> None:
     """The floor's texture and, for every window of time, how much each texel adds to the light in it."""
     from matplotlib.figure import Figure
@@ -232,8 +253,9 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
         "--resolution", type=int, default=90, help="width in pixels; the height is 16/9 of it (%(default)s)"
     )
     parser.add_argument(
-        "--spp", type=int, default=64, help="samples per pixel of pictures, gradients, target (%(default)s)"
+        "--spp-light", type=int, default=256, help="samples per pixel of the light on its way (%(default)s)"
     )
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel of gradients and target (%(default)s)")
     parser.add_argument("--spp-step", type=int, default=16, help="samples per pixel and step (%(default)s)")
     parser.add_argument(
         "--max-depth", type=int, default=12, help="segments of a path; the scene's own is 65 (%(default)s)"
@@ -246,19 +268,19 @@ def main(argv: Sequence[str] | None = None) -> Recovery:
     parser.add_argument("--smoke", action="store_true", help="small enough for seconds: coarse, shows that it runs")
     if parser.parse_known_args(argv)[0].smoke:
         # Most of a small run is compiled code: a window more is a kernel more.
-        parser.set_defaults(resolution=18, spp=8, spp_step=4, max_depth=4, steps=1, windows=1)
+        parser.set_defaults(resolution=18, spp_light=8, spp=8, spp_step=4, max_depth=4, steps=1, windows=1)
     options = parser.parse_args(argv)
     height = options.resolution * 16 // 9
     steps = (options.spp_step, options.max_depth, options.steps, options.windows)
-    sizes = Sizes(options.resolution, height, options.spp, *steps)
+    sizes = Sizes(options.resolution, height, options.spp_light, options.spp, *steps)
     with tempfile.TemporaryDirectory() as folder:
         path = unpack(options.archive, Path(folder))
         scene = tt.load(path, "llvm_ad_rgb", resx=sizes.width, resy=sizes.height, max_depth=sizes.max_depth)
         key = floor_key(scene)
-        renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
-        with torch.no_grad():
-            light = renderer(seed=0, spp=sizes.spp, progress=True)
+        light = light_on_its_way(scene, sizes)
         draw_light(light, options.output / "staircase_light.png")
+        film_light(light, options.output / "staircase_light.gif")
+        renderer = tt.TransientRenderer(scene, [key], time_axis=AXIS, spp=1, spp_grad=sizes.spp)
         texture, gradients = window_gradients(renderer, key, sizes)
         draw_gradients(texture, gradients, options.output / "staircase_gradient.png")
         result = recover(scene, key, sizes)

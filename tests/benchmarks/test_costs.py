@@ -197,3 +197,11 @@ def test_variance_beside_another_checkout(tmp_path):
         assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads((tmp_path / "after.json").read_text(encoding="utf-8"))["results"]["one"]
     assert found["spp"] == 2 and found["ratio"] == pytest.approx(1) and not found["more"]
+
+
+@pytest.mark.slow
+def test_fits_that_are_watched(tmp_path):
+    report, printed = run("fit_monitor.py", tmp_path)
+    cases, ratios = report["cases"], report["ratios"]
+    assert any(name.endswith("plain") for name in cases) and len(ratios) == 2 * len(cases) - 2
+    assert "page" in printed

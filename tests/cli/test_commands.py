@@ -148,6 +148,56 @@ def test_render_writes_gates(folder):
     assert "out.h5: 3 x 2 x 8 x 8 (C x G x H x W) gates" in result.stdout
 
 
+MOTION = '<texture type="rigid_motion" name="velocity"><vector name="linear" x="0" y="0" z="2"/></texture>'
+
+
+@pytest.fixture
+def moving(folder):
+    """The rectangle comes nearer to camera and lamp."""
+    text = SCENE.replace('<shape type="rectangle">', f'<shape type="rectangle" id="wall">{MOTION}')
+    (folder / "moving.xml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_render_writes_rates(moving):
+    rates, axis = tt.RateAxis(-6.0, 0.5, 16), tt.TimeAxis(4.0, 0.5, 10)
+    options = ("--rates", "-6:0.5:16", "--start-opl", 4, "--bin-width-opl", 0.5, "--num-bins", 10, "--seed", 3)
+    result = run("render", "moving.xml", "-o", "out.h5", "--quiet", *options, "--overview", "all.png")
+    assert result.exit_code == 0, result.output
+    stored, expected = read_result("out.h5"), tt.render("moving.xml", seed=3, rates=rates, time_axis=axis)
+    torch.testing.assert_close(stored.rates, expected.rates)
+    assert (stored.rate_axis, stored.axis, stored.transient) == (rates, axis, None)
+    light = stored.rates.sum((0, 2, 3, 4))
+    assert float(light.sum()) > 0 and float(light[rates.centers > 0].sum()) == 0
+    assert "out.h5: 3 x 16 x 10 x 8 x 8 (C x R x T x H x W)" in result.stdout and Path("all.png").is_file()
+
+
+def test_render_writes_beats(moving):
+    chirps = tt.Chirps(1e9, 1e-5, 1550e-9)
+    axis = ("--start-opl", -8, "--bin-width-opl", 0.3, "--num-bins", 90)
+    result = run("render", "moving.xml", "-o", "out.npz", "--quiet", "--chirps", "1e9:1e-5:1550e-9", *axis, "--seed", 3)
+    assert result.exit_code == 0, result.output
+    stored = read_result("out.npz")
+    assert stored.chirps == chirps and stored.beats.shape == (3, 2, 90, 8, 8)
+    assert "(C x 2 x T x H x W)" in result.stdout
+    # The up chirp sees what comes nearer before the down chirp does.
+    where = (stored.beats.sum((0, 3, 4)) * torch.arange(90.0)).sum(-1)
+    assert float(where[0]) < float(where[1])
+    refused = run("render", "moving.xml", "--quiet", "--chirps", "1e9:1e-5:1550e-9", "--overview", "a.png")
+    assert refused.exit_code == 2 and "leave it out for beats" in refused.output
+
+
+def test_plan_of_rates_and_beats(moving):
+    result = run("plan", "moving.xml", "--outputs", "rates", "--json")
+    told = json.loads(result.stdout)
+    assert told["film"] == "rates" and told["rates"]["rates_num_bins"] == 64
+    result = run("plan", "moving.xml", "--outputs", "beats", "--chirps", "1e9:1e-5:1550e-9")
+    assert result.exit_code == 0 and "a bin for each line of the chirps" in result.stdout
+    result = run("plan", "moving.xml", "--outputs", "beats")
+    assert result.exit_code == 2 and "Give --chirps" in result.output
+    assert "nothing moves" in run("plan", "box.xml", "--outputs", "rates").stdout
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [

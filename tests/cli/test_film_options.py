@@ -9,8 +9,10 @@ import pytest
 import torchtransient as tt
 from torchtransient.cli.films import film_of_options, write_film_video
 from torchtransient.errors import ArgumentError, TorchTransientError
-from torchtransient.rendering.films import Gates, Histogram, Phasors
+from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates
 
+AXIS = {"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}
+RATES, CHIRPS = tt.RateAxis(-10.0, 0.5, 40), tt.Chirps(1e9, 1e-5, 1550e-9)
 GATES = (tt.Gate.rectangular(3, 4), tt.Gate.gaussian(7.0, 0.5), tt.Gate.tabulated([1, 2, 4], [0, 1, 0]))
 
 
@@ -20,6 +22,11 @@ GATES = (tt.Gate.rectangular(3, 4), tt.Gate.gaussian(7.0, 0.5), tt.Gate.tabulate
         ({"start_opl": 3.5, "bin_width_opl": 0.25, "num_bins": 5}, Histogram(tt.TimeAxis(3.5, 0.25, 5))),
         ({"frequencies": "0, 0.5,-2", "gates": None}, Phasors(tt.FrequencyAxis((0.0, 0.5, -2.0)))),
         ({"gates": "rectangular 3 4; gaussian 7.0 0.5; tabulated 1:0 2:1 4:0"}, Gates(GATES)),
+        ({"rates": "-10:0.5:40"}, Rates(RATES)),
+        ({"rates": "-10:0.5:40", **AXIS}, Rates(RATES, tt.TimeAxis(3.5, 0.25, 5))),
+        ({"chirps": "1e9:1e-5:1550e-9"}, Beats(CHIRPS)),
+        ({"chirps": "1e9:1e-5:1550e-9:hann", **AXIS}, Beats(CHIRPS, tt.TimeAxis(3.5, 0.25, 5))),
+        ({"chirps": "1e9:1e-5:1550e-9:nuttall"}, Beats(tt.Chirps(1e9, 1e-5, 1550e-9, window="nuttall"))),
         ({"start_opl": None, "frequencies": None}, None),
     ],
 )
@@ -37,6 +44,13 @@ def test_command_line(options, expected):
         ({"frequencies": "1, two"}, r"--frequencies: expected numbers with commas, got '1, two'"),
         ({"frequencies": "1", "gates": "rectangular 1 2"}, "--frequencies and --gates ask for different films"),
         ({"gates": "round 1 2"}, "kind out of"),
+        ({"rates": "-10:0.5"}, r"--rates: expected START:WIDTH:BINS in m/s, such as -10:0\.5:40, got '-10:0\.5'"),
+        ({"rates": "-10:0.5:many"}, "--rates: expected START:WIDTH:BINS"),
+        ({"rates": "-10:0:4"}, "bin_width"),
+        ({"chirps": "1e9:1e-5"}, "--chirps: expected BANDWIDTH:DURATION:WAVELENGTH"),
+        ({"chirps": "1e9:1e-5:1550e-9:round"}, "expected window to be one of"),
+        ({"rates": "-10:0.5:40", "chirps": "1e9:1e-5:1550e-9"}, "--rates and --chirps ask for different films"),
+        ({"rates": "-10:0.5:40", "frequencies": "1", **AXIS}, "--frequencies and --rates ask for different films"),
     ],
 )
 def test_command_lines_that_ask_for_nothing(options, message):

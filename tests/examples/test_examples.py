@@ -109,6 +109,7 @@ def test_staircase_with_a_floor_in_place_of_the_house(tmp_path: Path, capsys: py
     assert recovery.errors[-1] < 0.25 * recovery.errors[0]
     for name in ("light", "gradient", "recovery"):
         assert (tmp_path / "pictures" / f"staircase_{name}.png").stat().st_size > 2_000  # one panel, with --smoke
+    assert (tmp_path / "pictures" / "staircase_light.gif").read_bytes().startswith(b"GIF")
 
 
 @pytest.mark.slow

@@ -37,7 +37,8 @@ WRONG = ("contradict", "modes differ", "not finite", "error")
 NO_PART_OF_A_SCENE = {
     "aov", "depth", "direct", "moment", "path", "ptracer", "stokes", "volpath", "volpathmis", "hdrfilm", "specfilm",
     "independent", "stratified", "multijitter", "orthogonal", "ldsampler", "box", "tent", "gaussian", "mitchell",
-    "catmullrom", "lanczos", "transient_hdr_film", "phasor_hdr_film", "gated_hdr_film",
+    "catmullrom", "lanczos", "transient_hdr_film", "phasor_hdr_film", "gated_hdr_film", "rate_hdr_film",
+    "beat_hdr_film", "slow_phasor_hdr_film",
 }  # fmt: skip
 # Listed as unchecked: their data come in files of their own, or there is nothing to load.
 NOT_SWEPT = {"measured", "measured_polarized", "serialized", "blender"}

@@ -11,7 +11,7 @@ import torch
 
 from support.loss_cases import AXIS, BAND, BINS, CASES
 from support.sweeps import together
-from torchtransient import TimeAxis, losses
+from torchtransient import Chirps, RateAxis, TimeAxis, losses
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
@@ -132,6 +132,14 @@ def test_rates_and_beats_of_a_film():
         torch.testing.assert_close(found, losses.squared_loss(x, y), rtol=0, atol=0)
         with pytest.raises(UnitError, match="results on one axis"):
             losses.squared_loss(result(x, name), result(y, name, TimeAxis(0.0, 1.0, BINS)))
+    others = {
+        "rates": [{"rate_axis": RateAxis(start, 0.5, 4)} for start in (-1.0, -2.0)],
+        "beats": [{"chirps": Chirps(1e9, duration, 1550e-9)} for duration in (1e-5, 2e-5)],
+    }
+    for name, (one, other) in others.items():
+        losses.squared_loss(result(x, name, **one), result(y, name, **one))
+        with pytest.raises(UnitError, match="results on one axis"):
+            losses.squared_loss(result(x, name, **one), result(y, name, **other))
 
 
 def test_frequencies_are_an_axis():

@@ -66,7 +66,8 @@ MOVES = [
     ("bsplinecurve linearcurve", "control_points", "LS", "shape"),
     ("sdfgrid", "grid", "LS", "shape"),
     ("ellipsoids ellipsoidsmesh", "data", "LS", "shape"),
-    ("perspective batch transient_hdr_film phasor_hdr_film gated_hdr_film",
+    ("perspective batch transient_hdr_film phasor_hdr_film gated_hdr_film rate_hdr_film beat_hdr_film "
+     "slow_phasor_hdr_film",
      "to_world x_fov principal_point_offset_x principal_point_offset_y", "LS", "sensor"),
     ("orthographic", "to_world", "LS", "sensor"),
     ("thinlens", "to_world x_fov aperture_radius focus_distance", "LS", "sensor"),
@@ -81,6 +82,7 @@ MOVES = [
     ("diff_principled", "specular", "L", "index"),
     ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
     ("delayed", "lifetime", "L", "delay"),
+    ("rigid_motion", "linear angular center", "L", "velocity"),
     ("heterogeneous", "data", "M", "medium"),
     ("homogeneous", "sigma_t.value.value", "M", "medium"),
 ]  # fmt: skip

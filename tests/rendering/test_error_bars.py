@@ -243,3 +243,59 @@ def test_parts_of_a_capture():
         outs = [capture.renderer(seed=seed, spp=64, errors=True) for seed in range(40)]
     found = torch.stack([(out.transient.mean(-4) * rows).sum() for out in outs]).var()
     assert 0.3 < float(found / torch.stack([out.standard_error(rows) ** 2 for out in outs]).mean()) < 2.5
+
+
+FILMS_OF_ROWS = {
+    "rates": {"rates": tt.RateAxis(-6.0, 1.0, 12)},
+    "beats": {"chirps": tt.Chirps(1e9, 1e-6, 1550e-9)},
+}
+
+
+@pytest.mark.parametrize("name", FILMS_OF_ROWS)
+@pytest.mark.parametrize("errors", [True, "bins"])
+def test_histograms_of_several_rows(name, errors):
+    """Rows of a pixel see the same paths: the error of a sum over them is that of the sum."""
+    scene = room("llvm_ad_mono").moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0), angular=(0.0, 3.0, 0.0))})
+    renderer = tt.TransientRenderer(scene, spp=32, physics="ignore", **FILMS_OF_ROWS[name])
+    rows = renderer.film.shape[0]
+    weights = torch.ones(rows, BINS, 8, 8), torch.linspace(-1, 1, rows)[:, None, None, None] * torch.ones(BINS, 8, 8)
+    with torch.no_grad():
+        long = torch.stack([getattr(renderer(seed=900 + k, spp=4096), name)[0] for k in range(2)]).mean(0)
+        residual, estimate = np.zeros(2), np.zeros(2)
+        for seed in range(40):
+            out = renderer(seed=seed, errors=errors)
+            for i, w in enumerate(weights):
+                residual[i] += float(((getattr(out, name)[0] - long) * w).sum() ** 2)
+                estimate[i] += float(out.standard_error(w) ** 2)
+    assert ((residual / estimate > 0.3) & (residual / estimate < 1.9)).all()
+    assert out.error_map().shape == (rows, BINS, 8, 8) and out.error_map(steady=True).shape == (8, 8)
+    assert 0 < out.relative_error() < 0.2
+    with pytest.raises(ShapeError, match="weights that broadcast"):
+        out.standard_error(torch.ones(rows + 1, BINS, 8, 8))
+
+
+@pytest.mark.parametrize("name", FILMS_OF_ROWS)
+def test_rows_in_files_and_polarized(name, tmp_path):
+    from torchtransient.files.result_file import read_result, write_result
+
+    scene = room("llvm_ad_mono_polarized", 6).moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0))})
+    renderer = tt.TransientRenderer(scene, spp=8, physics="ignore", **FILMS_OF_ROWS[name])
+    with torch.no_grad():
+        out = renderer(seed=0, errors=True)
+    back = read_result(write_result(tmp_path / "a.h5", out))
+    assert out.standard_error().shape == (4,)
+    torch.testing.assert_close(back.standard_error(), out.standard_error())
+    assert back.error_map().shape == (4, *renderer.film.shape, 6, 6)
+
+
+@pytest.mark.parametrize("name", FILMS_OF_ROWS)
+def test_rows_to_a_tolerance_and_in_other_bins(name):
+    scene = room("llvm_ad_mono").moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0))})
+    renderer = tt.TransientRenderer(scene, spp=16, physics="ignore", **FILMS_OF_ROWS[name])
+    found = renderer.to_tolerance(rtol=0.5, seed=0, max_spp=2048, progress=False)
+    assert getattr(found.output, name).shape[1:] == (*renderer.film.shape, 8, 8)
+    assert found.standard_error.shape == (*renderer.film.shape, 8, 8)
+    wider = renderer.variation(time_axis=tt.TimeAxis(0.0, 0.9, 10))
+    assert wider.film.shape == (renderer.film.shape[0], 10) and wider.film.settings == renderer.film.settings
+    report = tt.cost_of_accuracy(renderer, spp=(2, 4), repeats=2, bin_widths=[0.225, 0.9], progress=False)
+    assert name in str(report)

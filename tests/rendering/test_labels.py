@@ -799,3 +799,72 @@ def test_built_scenes_are_freed():
     gc.collect()
     gc.collect()
     assert scene() is None
+
+
+# ------------------------------------------------------------------------------------------------------ velocities
+
+
+def moving_renderer(motions, parameters=(), options=None, **contents):
+    loaded = tt.load(scene_of(camera(fov=FOV), **contents), variant=VARIANT).moving(motions)
+    return tt.TransientRenderer(loaded, parameters=parameters, spp=16, physics="ignore", **options or {})
+
+
+def test_velocities_of_a_wheel_and_a_sensor():
+    """A point p of the plane has v + omega x (p - c), from which the sensor's own velocity is taken along the ray."""
+    linear, angular, center = (0.3, -0.2, 1.5), (0.4, 0.5, -2.0), (1.0, -1.0, 0.5)
+    own = (0.5, 0.25, -1.0)
+    motions = {"wall": tt.Motion(linear=linear, angular=angular, center=center), "sensor": tt.Motion(linear=own)}
+    labels = scene_labels(moving_renderer(motions, wall=plane()), names=["velocity", "radial_velocity"])
+    d = pinhole_directions()
+    p = np.array([0, 0, DISTANCE])[:, None, None] + d * DISTANCE / -d[2]
+    reach = p - np.array(center)[:, None, None]
+    v = np.array(linear)[:, None, None] + np.cross(np.array(angular), reach, axis=0, axisb=0, axisc=0)
+    close(labels["velocity"], v, atol=1e-4)
+    close(labels["radial_velocity"], ((v - np.array(own)[:, None, None]) * d).sum(0), atol=1e-4)
+
+
+def test_velocities_of_what_is_seen():
+    ball = {"type": "sphere", "radius": RADIUS}
+    still = scene_labels(renderer_of(camera(fov=FOV), ball=ball), names=["velocity", "radial_velocity", "shape"])
+    labels = scene_labels(moving_renderer({"ball": tt.Motion(linear=(0.0, 1.0, 2.0))}, ball=ball), names=["velocity"])
+    seen = still["shape"] >= 0
+    assert 0 < seen.sum() < seen.numel()
+    assert (still["velocity"][:, seen] == 0).all() and (still["radial_velocity"][seen] == 0).all()
+    assert still["velocity"][:, ~seen].isnan().all() and labels["velocity"][:, ~seen].isnan().all()
+    close(labels["velocity"][:, seen], np.broadcast_to([[0.0], [1.0], [2.0]], (3, int(seen.sum()))))
+
+
+def test_radial_velocity_is_how_the_depth_changes():
+    """Of a plane that moves along its normal, after a short time."""
+    speed, time = 1.5, 1e-2
+    depths = [
+        scene_labels(renderer_of(camera(fov=FOV), wall=plane(to_world=translate([0, 0, -z]) @ scale(20.0))))["depth"]
+        for z in (0.0, speed * time)
+    ]
+    moving = moving_renderer({"wall": tt.Motion(linear=(0.0, 0.0, -speed))}, wall=plane())
+    labels = scene_labels(moving, names=["radial_velocity"])
+    # The point that a pixel sees slides over the plane, and the depth grows faster: by the cosine twice.
+    cosine = torch.from_numpy(-pinhole_directions()[2])
+    grown = (depths[1] - depths[0]).double() / time
+    np.testing.assert_allclose(grown * cosine**2, labels["radial_velocity"], rtol=1e-3)
+
+
+def test_velocities_of_batches_and_recorded_calls():
+    key = "wall.velocity.linear"
+    linear = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 0.0], [0.0, 0.0, -3.0]])
+    names = ["radial_velocity", "velocity"]
+    frozen, traced = (
+        moving_renderer({"wall": tt.Motion()}, [key], {"freeze": freeze}, wall=plane()) for freeze in (True, False)
+    )
+    said, found = [], []
+    for one in (*linear, *linear):
+        labels, how = _labels(frozen, {key: one}, names, False, 16)
+        said += how
+        found.append(labels["velocity"])
+        close(labels["velocity"], one[:, None, None].expand(3, H, W).numpy())
+        again = scene_labels(traced, {key: one}, names)
+        assert all(torch.equal(labels[name], again[name]) for name in names)
+    assert said[:2] == [FIRST, RECORDED] and set(said[2:]) == {LAUNCHED}
+    batch = scene_labels(frozen, {key: linear}, names)
+    assert torch.equal(batch["velocity"], torch.stack(found[:3]))
+    assert batch["radial_velocity"].shape == (3, H, W)

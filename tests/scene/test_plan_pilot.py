@@ -136,7 +136,7 @@ class _events:  # noqa: N801 (stands in for the plugin's record)
     def __init__(self, opl, energy, depth, pixel):
         self.opl, self.energy, self.depth, self.pixel = opl, energy, depth, pixel
         self.paths, self.size = len(opl), (8, 8)
-        self.path = np.arange(len(opl))
+        self.path, self.rate = np.arange(len(opl)), np.zeros(len(opl))
 
 
 def replace_pixels(events, pixel):

@@ -309,7 +309,12 @@ def _pictures() -> dict[str, Case]:
     rates = LIGHT[..., :4, :4].expand(4, 8, 4, 4).unsqueeze(0)
     frames = v.frames(transient, axis=AXIS)
     cells = [v.Cell(f"{n}", {"a": np.zeros((2, 2, 3))}) for n in range(4)]
+    monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
+        "vis.FitMonitor": Case(
+            v.FitMonitor, {"a": torch.ones(2)}, target=LIGHT, pixels=[(1, 1)], truth={"a": [0.5, 0.6]}, every=3
+        ),
+        "vis.FitMonitor.step": Case(monitor.step, loss=1.0, step=3),
         "vis.contact_sheet": Case(v.contact_sheet, cells, columns=3),
         "vis.plot_overview": Case(v.plot_overview, transient, steady, AXIS, path=folder() / "o.png", pixel=(1, 1)),
         "vis.phasor_picture": Case(v.phasor_picture, phasor, frequencies=BAND, which=(1,), percentile=90.0),
@@ -371,7 +376,7 @@ SLOW = {name for name in CASES if name.startswith("vis.")} | {
 }
 # Arguments that are not in CASES, as patterns of name(argument), and why.
 LEFT = {
-    r"(RenderStats(\.of_job)?|Plan|Overview|ToleranceResult)\(.*\)": "results",
+    r"(RenderStats(\.of_job)?|RenderOutput|Plan|Overview|ToleranceResult)\(.*\)": "results",
     r"accuracy\.(SamplesNeeded|GradientEstimate|Recommendation)\(.*\)": "results",
     r"(data\.(Generated|Sample|Shard)|training\.(Checkpoint|Ranks))\(.*\)": "results",
     r"(data|nlos)\..*\.draw\(size\)": "what augmentation gives its operations",
@@ -385,6 +390,6 @@ LEFT = {
     r"nlos\.read_capture\(.*\)": "files/captures",
     r"data\.scene_labels\(.*\)": "rendering/test_labels.py",
     r"data\.ShardWriter\.(put|fail)\(.*\)": "what tt.data.generate gives",
-    r"training\.worker_init\(worker\)|vis\.Frames\(make\)|vis\.plot_fit\(truth\)": "given by torch; no number",
+    r"training\.worker_init\(worker\)|vis\.Frames\(make\)": "given by torch; no number",
     r"sensing\..*": "sensing/test_given.py and the tests of each sensor",
 }

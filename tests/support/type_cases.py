@@ -19,16 +19,15 @@ def _pictures() -> dict[str, Case]:
         losses=[2.0, 1.0],
     )  # fmt: skip
     fit.base["errors"] = {"a": [3.0]}
+    monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
         "vis.Cell": Case(v.Cell, "a", images={"b": DARK}, curve=np.ones(3)),
+        "vis.FitMonitor.save": Case(monitor.save, folder() / "fit.png"),
         "vis.cyclic": Case(v.cyclic, 0.3, value=0.5),
         "vis.cyclic_map": Case(v.cyclic_map, kind="even"),
         "vis.light_curve": Case(v.light_curve, LIGHT),
         "vis.median_pixel": Case(v.median_pixel, STEADY),
         "vis.peak_time": Case(v.peak_time, LIGHT, AXIS),
-        "vis.plot_fit": Case(
-            v.plot_fit, {"a": STEADY}, [2.0, 1.0], {"b": [0.5, 0.6]}, truth={"b": 0.7}, path=folder() / "f.png"
-        ),
         "vis.plot_shape_fit": fit,
         "vis.scan_layout": Case(v.scan_layout, scan),
     }

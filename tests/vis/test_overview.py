@@ -8,7 +8,6 @@ import torch
 from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, StorageError, UnitError
-from torchtransient.vis.fit_progress import plot_fit
 from torchtransient.vis.overview import light_curve, median_pixel, moments_of_arrival, peak_time, plot_overview
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
@@ -122,17 +121,3 @@ def test_refused(tmp_path):
         tone_map(torch.zeros(4, 2, 2))
     with pytest.raises(UnitError, match="quantile"):
         exposure_of(torch.zeros(1, 2, 2), quantile=0)
-
-
-@pytest.mark.slow
-def test_fit_picture(tmp_path):
-    images = {"start": torch.rand(3, 5, 6), "truth": torch.rand(3, 5, 6)}
-    path = tmp_path / "fit.png"
-    plot_fit(images, [1.0, 0.1, 0.0], {"red": [0.1, 0.2, 0.3]}, truth={"red": 0.3}, path=path)
-    assert path.read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(ShapeError, match="expected 2 values of 'red'"):
-        plot_fit(images, [1.0, 0.1], {"red": [0.1]}, truth={}, path=path)
-    with pytest.raises(ShapeError, match="at least one image"):
-        plot_fit({}, [1.0], {}, truth={}, path=path)
-    with pytest.raises(StorageError, match="cannot write"):
-        plot_fit(images, [1.0], {}, truth={}, path=tmp_path / "missing" / "fit.png")

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from torchtransient.vis.sources import images_of, steady_of, transient_of
 
 AXIS, RATES = tt.TimeAxis(2.0, 0.5, 6), tt.RateAxis(-2.0, 0.5, 8)
 
@@ -88,3 +89,60 @@ def test_what_is_refused(function, arguments, error, message):
     source = arguments.pop("source", light())
     with pytest.raises(error, match=message):
         getattr(tt.vis, function)(source, **arguments)
+
+
+def written(tmp_path, ending, **tensors):
+    """A result as files have it, by the names that they give."""
+    values = {
+        "start_opl": 2.0, "bin_width_opl": 0.5, "num_bins": 6, "rates_start": -2.0, "rates_bin_width": 0.5,
+        "rates_num_bins": 8, "format": "torchtransient result 1", **tensors,
+    }  # fmt: skip
+    path = tmp_path / f"out.{ending}"
+    if ending == "npz":
+        np.savez(path, **values)
+        return path
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                file[name] = value
+            else:
+                file.attrs[name] = value
+    return path
+
+
+@pytest.mark.parametrize("ending", ["npz", "h5"])
+def test_files_are_drawn_as_what_they_hold(tmp_path, ending):
+    path = written(tmp_path, ending, rates=light().numpy(), steady=light().sum((1, 2)).numpy())
+    found = tt.vis.range_doppler(str(path))
+    np.testing.assert_array_equal(image_of(found), image_of(tt.vis.range_doppler(light(), axis=AXIS, rate_axis=RATES)))
+
+
+@pytest.mark.parametrize("source", ["file", "result"])
+def test_other_pictures_show_the_sum_over_rates(tmp_path, source):
+    cube, steady = light(), light().sum((1, 2))
+    given = written(tmp_path, "npz", rates=cube.numpy(), steady=steady.numpy())
+    if source == "result":
+        given = SimpleNamespace(rates=cube, steady=steady, axis=AXIS, transient=None)
+    images, axis, word = images_of(given)
+    assert torch.equal(images, cube.sum(1)) and axis == AXIS and word == "bin"
+    assert torch.equal(steady_of(given), steady)
+    with pytest.raises(ShapeError, match="choose one entry"):
+        transient_of(SimpleNamespace(rates=torch.stack([cube] * 4), transient=None, polarized=False))
+
+
+def test_beats_are_no_times_of_arrival():
+    beats = SimpleNamespace(beats=torch.rand(1, 2, 6, 2, 2), steady=torch.ones(1, 2, 2), axis=AXIS, transient=None)
+    with pytest.raises(ShapeError, match="spectra of beats"):
+        transient_of(beats)
+    assert torch.equal(steady_of(beats), beats.steady)
+
+
+def test_files_without_rates(tmp_path):
+    path = tmp_path / "out.npz"
+    np.savez(path, transient=light().sum(1).numpy(), start_opl=2.0, bin_width_opl=0.5, num_bins=6)
+    with pytest.raises(StorageError, match="holds no light by rates"):
+        tt.vis.range_doppler(path)
+    with pytest.raises(StorageError, match="expected a result"):
+        tt.vis.range_doppler(tmp_path / "out.npy")

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import torchtransient as tt
 from support.number_case import capture
-from torchtransient.vis import files, fit_progress, overview, stamps
+from torchtransient.vis import files, overview, stamps
 from torchtransient.vis.slices import _to_metres, _to_nanoseconds
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
@@ -78,27 +78,6 @@ def tt_colour(name):
     from matplotlib.colors import to_rgba
 
     return to_rgba(name)
-
-
-def test_a_fit(kept):
-    figures, images = kept(fit_progress), {"start": CUBE[:, 0], "truth": 3 * CUBE[:, 1]}
-    values = {"red": [0.1, 0.2, 0.3], "x": [1.0, 2.0, 4.0]}
-    tt.vis.plot_fit(images, [4.0, 2.0, 1.0], values, truth={"red": 0.7}, path="")
-    tt.vis.plot_fit(images, [4.0, 0.0], {}, truth={}, path="")
-    upper, lower = figures[0].subfigs
-    exposure = exposure_of(images["truth"])
-    for panel, (title, image) in zip(upper.axes, images.items(), strict=True):
-        np.testing.assert_allclose(panel.images[0].get_array(), tone_map(image, exposure))
-        assert panel.get_title() == title and not panel.axison
-    loss, values = lower.axes
-    assert size(figures[0]) == (11, 6.6) and loss.get_yscale() == "log"
-    assert loss.lines[0].get_ydata().tolist() == [4, 2, 1]
-    drawn = [(np.asarray(line.get_ydata()).tolist(), line.get_color()) for line in values.lines]
-    assert drawn == [([0.1, 0.2, 0.3], "tab:red"), ([0.7, 0.7], "tab:red"), ([1, 2, 4], "C1")]
-    assert words(loss) == ("", "step", "loss") and words(values) == ("", "step", "value (dashed: truth)")
-    assert values.get_legend() is not None
-    loss, values = figures[1].subfigs[1].axes
-    assert loss.get_yscale() == "linear" and values.get_legend() is None
 
 
 def test_a_streak():

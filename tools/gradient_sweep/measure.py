@@ -1,7 +1,8 @@
 """Derivatives of one parameter in one scene of the sweep: reverse mode, forward mode, central finite differences.
 
-The loss is the transient weighed by a sine of the optical path length. All of them use the same seeds, so that what
-is random cancels between the two sides of a difference, and mostly between difference and derivative too.
+The loss is the transient weighed by a sine of the optical path length, and of the rate where things move. All of them
+use the same seeds, so that what is random cancels between the two sides of a difference, and mostly between difference
+and derivative too.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
     from torchtransient.scene.load import Scene
 
 Array = NDArray[np.float64]
-# Of the loss weights, per metre.
+# Of the loss weights, per metre, and per metre and second.
 PHASE = 3.0
+RATE_PHASE = 0.7
 # Components of a Stokes vector count differently, so that polarization matters.
 STOKES = (0.2, 1.0, -0.7, 1.3)
 
@@ -119,7 +121,7 @@ class Subject:
 
 
 def weights_of(film: Any) -> torch.Tensor:
-    """Weights of the loss behind a pixel, (T, C)."""
+    """Weights of the loss behind a pixel, (T, C), of a film of rates (R, T, C)."""
     import mitsuba as mi
 
     centres = film.start_opl + (np.arange(film.temporal_bins) + 0.5) * film.bin_width_opl
@@ -127,7 +129,11 @@ def weights_of(film: Any) -> torch.Tensor:
     components = np.repeat(STOKES, channels // 4) if mi.is_polarized else np.ones(channels)
     # Colours count differently, lest what is opposite in two of them cancels.
     colours = 1.0 - 0.2 * np.arange(channels) / channels
-    return torch.tensor(np.sin(PHASE * centres)[:, None] * (components * colours)[None, :])
+    weights = np.sin(PHASE * centres)[:, None] * (components * colours)[None, :]
+    if film.measures == "rates":
+        rates = film.rate_start + (np.arange(film.rate_bins) + 0.5) * film.rate_width
+        weights = np.sin(RATE_PHASE * rates + 0.5)[:, None, None] * weights
+    return torch.tensor(weights)
 
 
 # ---------------------------------------------------------------------------------------------------------- directions

@@ -22,7 +22,7 @@ DECIDED = ("agree", "contradict", "modes differ")
 UNDECIDED = ("unresolved", "no effect")
 TITLES = {
     "bsdf": "Surfaces", "shape": "Shapes", "emitter": "Emitters", "sensor": "Sensors", "texture": "Textures",
-    "spectrum": "Spectra", "phase": "Phase functions", "medium": "Media",
+    "spectrum": "Spectra", "phase": "Phase functions", "medium": "Media", "velocity": "Velocities",
     "scan": "Captures around a corner",
 }  # fmt: skip
 # Places that say nothing of a plugin's derivative: that a shape has a surface, a light or a medium at all.
@@ -38,7 +38,8 @@ outline of what is hidden. Written by `make sweep`
 - The loss is the transient of 4 x 4 pixels (exhaustive captures: 2 x 2, with 2 x 2 laser positions) weighed by a sine
   of the optical path length. What is differentiated is the loss along one fixed direction in the entries of a
   parameter: a change by its own size (textures and grids: another one in each entry; normals: by a fifth); poses and
-  positions along two directions, a metre and a fifth of a radian, inside others along one of the two.
+  positions along two directions, a metre and a fifth of a radian, inside others along one of the two. Velocities: a
+  film of rates, weighed by a sine of the rate too.
 - Derivatives and differences use the same seeds. *Errors* are standard errors over independent seeds.
 - *Scale*: {SCALE:g} of the loss with absolute weights. A comparison is decided when the standard errors of derivative
   and differences are both below {RESOLVED:.0%} of the larger of |finite difference| and scale; else it is *unresolved*.

@@ -17,8 +17,10 @@ from tools.gradient_sweep.stages import (
     grouped,
     lit_by,
     matte,
+    moving,
     polarizing_sheet,
     seen_by,
+    with_rates,
 )
 
 RGB, SPECTRAL, POLARIZED = "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"
@@ -275,6 +277,42 @@ def _fog(kind: str, sigma_t: Description, albedo: Description, phase: Descriptio
     return lambda _: filled(media.medium(kind, sigma_t, albedo, phase))
 
 
+def velocity_settings() -> Iterator[Setting]:
+    """Motions of bodies of every kind, and velocities at the vertices of a mesh."""
+
+    def setting(inside: str, body: str, make: Maker) -> Setting:
+        return Setting("velocity", "rigid_motion", inside, lambda folder: moving(make(folder), body), ("velocity.",))
+
+    plate = between_lights(matte())
+    for name, shape in shapes.shapes().items():
+        yield setting(name, "plate", lambda folder, m=shape: plate | {"plate": m(folder) | {"bsdf": matte()}})
+    yield setting("instance", "copy", lambda _: grouped(plate))
+    yield setting("rectangle, mirror", "plate", _between_lights(MIRROR))
+    for name in ("point", "spot"):
+        yield setting(name, "lamp", lambda _, n=name: lit_by(lights.emitters()[n]()))
+    for name in ("rectangle", "sphere"):
+        make = shapes.lamp_shapes()[name]
+        yield setting(
+            f"area light, {name}", "lamp",
+            lambda folder, m=make: lit_by(m(folder) | {"emitter": lights.area_emitters()["area"]()}),
+        )  # fmt: skip
+    for name in ("perspective", "thinlens", "orthographic"):
+        yield setting(name, "sensor", lambda _, n=name: seen_by(lights.sensors()[n]))
+    thin, bright = (media.volumes()["constvolume"](*bounds) for bounds in ((0.4, 0.8), (0.6, 0.9)))
+    for kind in ("homogeneous", "heterogeneous"):
+        fog = media.medium(kind, thin, bright, {"type": "hg", "g": 0.4}) | {"id": "mist"}
+        yield setting(kind, "mist", lambda _, f=fog: filled(f))
+    yield Setting("velocity", "mesh_arrays", "", _bending, ("plate.vertex_velocity",))
+
+
+def _bending(folder: Path) -> Description:
+    """A plate with velocities at its vertices."""
+    mesh = shapes.shapes()["mesh_arrays"](folder) | {"bsdf": matte()}
+    speeds = np.random.default_rng(5).normal(size=np.shape(mesh["vertices"]))
+    scene = between_lights(matte())
+    return {**scene, "plate": mesh | {"vertex_velocity": speeds}, "sensor": with_rates(scene["sensor"])}
+
+
 def scan_settings() -> Iterator[Setting]:
     """Captures around a corner: of every type, and of what light does there."""
     for one in scans.captures():
@@ -290,5 +328,6 @@ def all_settings() -> list[Setting]:
         *sensor_settings(),
         *texture_settings(),
         *medium_settings(),
+        *velocity_settings(),
         *scan_settings(),
     ]

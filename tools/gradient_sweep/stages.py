@@ -111,6 +111,22 @@ def shining_wall(pose: Matrix, radiance: float) -> Description:
     }
 
 
+def moving(scene: Description, body: str) -> Description:
+    """A scene one of whose bodies has a velocity, before a film of rates."""
+    motion = {
+        "type": "rigid_motion", "of": body,
+        "linear": [0.6, -0.4, 1.1], "angular": [0.3, 0.5, -0.2], "center": [0.4, -0.6, 0.8],
+    }  # fmt: skip
+    return {**scene, "velocity": motion, "sensor": with_rates(scene["sensor"])}
+
+
+def with_rates(sensor: Description) -> Description:
+    """A sensor with a film of rates, of wider bins of the optical path length."""
+    bins = {"temporal_bins": 100, "bin_width_opl": 0.16, "gaussian_stddev": 0.5}
+    rates = {"type": "rate_hdr_film", "rate_start": -8.0, "rate_width": 0.5, "rate_bins": 32}
+    return {**sensor, "film": sensor["film"] | bins | rates}
+
+
 # ------------------------------------------------------------------------------------------------------------ scenes
 
 

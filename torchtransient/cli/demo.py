@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,12 +29,18 @@ class Fit:
     found: list[float] = field(default_factory=list)
 
 
-def fit_colour(renderer: Any, target: torch.Tensor, steps: int, learning_rate: float = 0.06) -> Fit:
+def fit_colour(
+    renderer: Any,
+    target: torch.Tensor,
+    steps: int,
+    learning_rate: float = 0.06,
+    look: Callable[[torch.Tensor, Any], None] = lambda loss, output: None,
+) -> Fit:
     """Fit the colour of the wall with Adam, from the transient alone, and return the way.
 
     `renderer`: a TransientRenderer whose only parameter is KEY, at its start value; `target`: (C, T, H, W). Few samples
     per pixel make single bins noisy, so averages over 8 x 8 pixels and 2 bins are compared, each relative to its own
-    size (the pixels that see the lamp would outweigh all others).
+    size (the pixels that see the lamp would outweigh all others). `look` is called with loss and output of every step.
     """
     import torch
     from tqdm import tqdm
@@ -48,8 +55,10 @@ def fit_colour(renderer: Any, target: torch.Tensor, steps: int, learning_rate: f
     with tqdm(range(steps), desc="fit", unit="step") as bar:
         for step in bar:
             optimizer.zero_grad()
-            loss = (weight * (_averages(renderer(seed=step).transient) - wanted).square()).mean()
+            out = renderer(seed=step)
+            loss = (weight * (_averages(out.transient) - wanted).square()).mean()
             loss.backward()  # type: ignore[no-untyped-call]
+            look(loss, out)
             fit.losses.append(loss.item())
             fit.colours.append(colour.tolist())
             optimizer.step()
@@ -80,7 +89,7 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     from torchtransient.errors import StorageError
     from torchtransient.files.result_file import write_result
     from torchtransient.scene.variant import DEFAULT_VARIANT
-    from torchtransient.vis.fit_progress import plot_fit
+    from torchtransient.vis.fit_monitor import FitMonitor
     from torchtransient.vis.overview import plot_overview
     from torchtransient.vis.pages.layout import import_bokeh
     from torchtransient.vis.view import view
@@ -108,18 +117,13 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     click.echo("Fitting the colour of the red wall to this transient, from grey.")
     grey = [0.4, 0.4, 0.4]
     renderer = tt.TransientRenderer(scene, parameters={KEY: grey}, spp=spp)
-    with torch.no_grad():
-        before = renderer(seed=0, spp=4 * spp).steady
-    fit = fit_colour(renderer, truth.transient, steps)
-    with torch.no_grad():
-        after = renderer(seed=0, spp=4 * spp).steady
-    plot_fit(
-        {"start": before, f"after {steps} steps": after, "truth": truth.steady},
-        fit.losses,
-        {name: [colour[n] for colour in fit.colours] for n, name in enumerate(CHANNELS)},
-        truth={name: float(truth_colour[n]) for n, name in enumerate(CHANNELS)},
-        path=output / "fit.png",
+    place = resolution // 2
+    monitor = FitMonitor(
+        renderer, target=truth, pixels=[(place, place // 4), (place, place)], truth={KEY: truth_colour}, every=1
     )
+    fit = fit_colour(renderer, truth.transient, steps, look=monitor.step)
+    for name in ("fit.png", "fit.html"):
+        monitor.save(output / name)
     click.echo(f"{'':>8}  {'start':>7} {'found':>7} {'truth':>7}")
     for n, name in enumerate(CHANNELS):
         click.echo(f"{name:>8}  {grey[n]:7.4f} {fit.found[n]:7.4f} {float(truth_colour[n]):7.4f}")
@@ -128,6 +132,7 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
         ("light_in_flight.html", "light in flight, for the browser"),
         ("cornell_box.png", "overview of the transient"),
         ("fit.png", "the fit"),
+        ("fit.html", "the fit step by step, for a browser"),
         ("cornell_box.npz", "the transient itself"),
     ):
         click.echo(f"  {name:<20} {meaning}")

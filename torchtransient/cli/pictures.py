@@ -71,7 +71,8 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
     import torchtransient as tt
 
     if options["overview"]:
-        power = (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
+        transient = output.rates.sum(-4) if output.transient is None else output.transient
+        power = (transient[0], output.steady[0]) if output.polarized else (transient, output.steady)
         errors = None
         if output.cells is not None:
             errors = output.error_map()[0] if output.polarized else output.error_map()

@@ -42,8 +42,9 @@ def command(scene: Path, **options: Any) -> None:
     """Render SCENE, a Mitsuba XML file, and write the transient.
 
     The file holds transient (C, T, H, W) and steady (C, H, W), both with the four Stokes components in front in a
-    polarized variant, the time axis in metres of optical path, and how it was made. With --frequencies or --gates, or
-    for a scene with such a film, phasor (C, F, H, W) or gated (C, G, H, W) stands in place of the transient.
+    polarized variant, the time axis in metres of optical path, and how it was made. With --frequencies, --gates,
+    --rates or --chirps, or for a scene with such a film, phasor (C, F, H, W), gated (C, G, H, W), rates (C, R, T, H, W)
+    or beats (C, 2, T, H, W) stands in place of the transient; pictures of rates show their sum.
     With --plan, variant, integrator, depth and time axis are those that the scene calls for at its described values,
     where options do not say otherwise; --bin-width-opl and --num-bins may be given alone then.
     torchtransient.files.result_file.read_result reads it.

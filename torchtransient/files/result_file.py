@@ -2,12 +2,15 @@
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
-(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; or `gated` float32 (...,
-C, G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`. Polarized variants
-have the four Stokes components before C. The numbers of the axis (`start_opl`, and for a transient `bin_width_opl`, in
-metres, `num_bins`), `channels` (JSON: the names of the C channels), `format`, `metadata` (JSON) and `checksums` (JSON,
-see `checksums.py`) are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`. A cube is written in
-parts, so that no second copy of it is needed.
+(..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; `gated` float32 (..., C,
+G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`; `rates` float32 (...,
+C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_bin_width` in m/s, `rates_num_bins`);
+`beats` float32 (..., C, 2, T, H, W) with `edges_opl` and the chirps (`chirps_bandwidth_hz`, `chirps_duration_s`,
+`chirps_wavelength_m`, `chirps_window`); or `slow_phasor` complex64 (..., C, S, F, H, W) with `slow_times` float64 (S,),
+seconds, and `frequencies_per_metre`. Polarized variants have the four Stokes components before C. The numbers of the
+axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`), `channels` (JSON: the names of
+the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`) are attributes of the HDF5 file
+and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
 from __future__ import annotations
@@ -38,7 +41,11 @@ FORMAT = "torchtransient result 2"
 # Those of the first version have no checksums.
 FORMATS = ("torchtransient result 1", FORMAT)
 _WHAT = "result file"
-_READ = {"start_opl": number_of, "bin_width_opl": number_of, "num_bins": whole_of, "gates": text_of}
+_READ = {
+    **dict.fromkeys(("start_opl", "bin_width_opl", "rates_start", "rates_bin_width"), number_of),
+    **dict.fromkeys(("num_bins", "rates_num_bins"), whole_of), **dict.fromkeys(("gates", "chirps_window"), text_of),
+    **dict.fromkeys(("chirps_bandwidth_hz", "chirps_duration_s", "chirps_wavelength_m"), number_of),
+}  # fmt: skip
 _OF_ERRORS = ("differences", "squares", "steady_differences")
 _KNOWN = {"format", "metadata", "channels", "steady", "edges_opl", "frequencies_per_metre", "slow_times", *_READ}
 _KNOWN |= {"cells", *_OF_ERRORS}
@@ -48,8 +55,8 @@ _KNOWN |= {"cells", *_OF_ERRORS}
 class Result(ErrorBars, TensorRecord):
     """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
 
-    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `axis`,
-    `beats` with `chirps` and `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
+    `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `beats`
+    with `chirps`, both with `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
     `others`: tensors and settings of films that have no attribute here, by name. A batch of results (``stack``,
     ``cat``, ``torch.utils.data.default_collate``) has the metadata of each as a list under `batch`.
     """
@@ -147,9 +154,7 @@ def read_result(path: str | Path) -> Result:
 
 def _is_known(name: str) -> bool:
     # Films of others know alone what their settings are called.
-    return name in _KNOWN or any(
-        name == film.measures or name.startswith(f"{film.measures}_") or not _is_ours(film) for film in FILMS
-    )
+    return name in _KNOWN or any(name == film.measures or not _is_ours(film) for film in FILMS)
 
 
 def _is_ours(film: type) -> bool:
@@ -163,17 +168,17 @@ def _result(values: Mapping[str, Any], source: Path) -> Result:
     film = layout_of_entries({**values, **{name: read(values, name) for name, read in _READ.items() if name in values}})
     # Files of earlier versions call gated images a transient.
     response = tensor_in(values[film.measures if film.measures in values else "transient"])
-    if response.ndim < 4 or response.shape[-3] != film.count:
+    shape = film.shape
+    if response.ndim < 3 + len(shape) or response.shape[-2 - len(shape) : -2] != shape:
         raise StorageError(
             f"result file: '{source}' holds a {film.measures} of shape {tuple(response.shape)}; expected "
-            f"(..., C, {film.letter}, H, W) with {film.letter} = {film.count}."
+            f"(..., C, {film.letter}, H, W) with {film.letter} = {' x '.join(map(str, shape))}."
         )
     if response.is_complex() != film.is_complex or steady.is_complex() or torch.bool in (
         response.dtype, steady.dtype
     ):  # fmt: skip
         raise ValueError(f"{film.measures} is of {response.dtype}, steady of {steady.dtype}")
-    rows = film.letter.count(" x ")
-    image = (*response.shape[: -3 - rows], *response.shape[-2:])
+    image = (*response.shape[: -2 - len(shape)], *response.shape[-2:])
     if steady.shape != image:
         raise ValueError(f"steady is of shape {tuple(steady.shape)}, {film.measures} of {tuple(response.shape)}")
     if channels and len(channels) != steady.shape[-3]:

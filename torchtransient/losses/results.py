@@ -72,7 +72,10 @@ DepthMap = Tensor | HasDepth
 LIGHT = ("transient", "phasor", "gated", "rates", "beats")
 TRANSIENT, PHASOR, STEADY, VALUES, DEPTH = ("transient",), ("phasor",), ("steady",), ("values",), ("depth_m",)
 # What says where on its axis a tensor lies: two results are compared on one.
-_AXES = {"transient": "axis", "rates": "axis", "beats": "axis", "phasor": "frequencies", "gated": "gates"}
+_AXES = {
+    "transient": ("axis",), "rates": ("axis", "rate_axis"), "beats": ("axis", "chirps"), "phasor": ("frequencies",),
+    "gated": ("gates",),
+}  # fmt: skip
 _EVERY = (*LIGHT, *STEADY, *VALUES, *DEPTH)
 _IMAGES = -3
 # Of the width of a bin or of a frequency: axes that went through files and units are equal but for rounding.
@@ -113,8 +116,10 @@ def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known
     """Put tensors in the places of results, and what the results know in places that are empty."""
     results = {name: arguments[name] for name in measures if _is_result(arguments.get(name))}
     taken = {name: _attribute(x, measures[name], list(results.values()), name, where) for name, x in results.items()}
-    for attribute, setting in _AXES.items():
-        _check_one_axis([getattr(results[name], setting, None) for name in taken if taken[name] == attribute], where)
+    for attribute, settings in _AXES.items():
+        alike = [results[name] for name in taken if taken[name] == attribute]
+        for setting in settings:
+            _check_one_axis([getattr(x, setting, None) for x in alike], where)
     for name, attribute in taken.items():
         x = results[name]
         arguments[name] = getattr(x, attribute)

@@ -280,10 +280,12 @@ def as_capture(
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
 
-    if out.gated is not None:
+    other = next((name for name in ("gated", "rates", "beats") if getattr(out, name) is not None), None)
+    if other is not None:
+        asked = {"gated": "gates", "rates": "rates", "beats": "chirps"}[other]
         raise ArgumentError(
-            "capture: expected a time axis or frequencies; a capture has no place for gates. Render its scene with "
-            "tt.TransientRenderer(tt.nlos.capture_scene(...), gates=...)."
+            f"capture: expected a time axis or frequencies; a capture has no place for {other} light. Render its scene "
+            f"with tt.TransientRenderer(tt.nlos.capture_scene(...), {asked}=...)."
         )
     transient = out.transient
     if sensor is not None:

@@ -23,12 +23,14 @@ from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views
 from torchtransient.plugins.transport.scene_contents import SceneCache
+from torchtransient.plugins.transport.velocities import Movers, Velocities
 
 # Numbers by pixel of each label; None: the channels of the film.
 COMPONENTS = {
     "depth": 1, "z_depth": 1, "position": 3, "normals": 3, "uv": 2, "albedo": None,
-    "shape": 1, "primitive": 1, "material": 1,
+    "velocity": 3, "radial_velocity": 1, "shape": 1, "primitive": 1, "material": 1,
 }  # fmt: skip
+_VELOCITIES = ("velocity", "radial_velocity")
 # Names of things, of which there is no mean.
 NUMBERED = ("shape", "primitive", "material")
 # Surfaces that a ray passes at most: panes of leaves behind one another, and boundaries of media.
@@ -59,6 +61,13 @@ class LabelTables:
         self.observer = StandardObserver.of_variant()
         self.daylight = _daylight() if mi.is_spectral else []
         self.seen = SceneCache(scene, integrator)
+        self._movers: Movers | None = None
+
+    def velocities(self, scene: Any, sensor: Any) -> Velocities:
+        """Return the velocities that the scene's bodies have now."""
+        if self._movers is None:
+            self._movers = Movers(scene)
+        return Velocities(self._movers, sensor)
 
     def lets_light_through(self) -> bool:
         """Return True if any surface may let light pass unbent: parameters may add a lobe."""
@@ -150,6 +159,8 @@ class LabelJob:
         self._curves = film.curves if "albedo" in self.names else None
         self._passes = self.tables.lets_light_through()
         self._hides_emitters = bool(getattr(self.scene.integrator(), "hide_emitters", False))
+        asked = any(name in _VELOCITIES for name in self.names)
+        self._velocities = self.tables.velocities(self.scene, self.sensor) if asked else None
         self._spots = None
         if self.samples:
             self._spots = mi.Float(_places(self.samples).ravel())
@@ -181,7 +192,7 @@ class LabelJob:
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]
-            held += [job._spots, job._curves, job.tables.tables()]
+            held += [job._spots, job._curves, job.tables.tables(), job._velocities]
         return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
 
     def run(self, job: LabelJob) -> None:
@@ -208,6 +219,10 @@ class LabelJob:
                 values = [_along_axis(seen, si.p)]
             elif name in NUMBERED:
                 values = [mi.Int32(si.prim_index) if name == "primitive" else getattr(self.tables, name)(si, hit)]
+            elif name in _VELOCITIES:
+                v = self._velocities.of_surface(si, hit)  # type: ignore[union-attr]
+                away = dr.dot(v - self._velocities.of_sensor(origin), ray.d)  # type: ignore[union-attr]
+                values = [away] if name == "radial_velocity" else [v[k] for k in range(3)]
             elif name == "albedo":
                 values = self._albedo(si, hit)
             else:

@@ -37,7 +37,7 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
         image, cube = engine.run(part, RENDER, values)
         runs += log
         numbers.append(runs[-1].spp)
-        mean = request.mean_of(cube, 3, request.is_complex)
+        mean = request.mean_of(cube, 3 + request.rows, request.is_complex)
         sums.append(in_cells(mean, request.cells))
         running.add(mean, numbers[-1], last=b == count - 1)
         steady_sums.append(request.mean_of(image, 2))

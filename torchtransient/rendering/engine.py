@@ -475,9 +475,10 @@ class _Derivatives:
         self.calls: list[str] = []
         job = session.job
         wanted = [key for key, need in zip(job.keys, job.needs, strict=True) if need]
-        moving = needing_slope(job.scene.known_parameters(), wanted)
-        for item in job.items if moving else ():
+        known = job.scene.known_parameters()
+        for item in job.items:
             film = session.film(item)
+            moving = needing_slope(known, wanted, film.knows_rates)
             check_slope(moving, film.has_slope, film.response_name, film.slope_remedy)
 
     def install(self, item: Item, _group: Sequence[Numbered]) -> None:

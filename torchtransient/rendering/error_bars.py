@@ -50,16 +50,19 @@ class BatchErrors:
         cells: layout of the differences.
         components: Stokes components of the film's channels.
         is_complex: the film's array has real and imaginary parts in turn.
+        rows: the film has several histograms a pixel, which come before H.
 
     Attributes:
-        differences: for each run of the job (R, items, [4,] H, W, T), summed over cells; R is 1 for two batches.
-        squares: likewise (items, [4,] H, W, T), their squares, summed over R and cells.
+        differences: for each run of the job (R, items, [4,] [rows,] H, W, T), summed over cells; R is 1 for two
+            batches.
+        squares: likewise (items, [4,] [rows,] H, W, T), their squares, summed over R and cells.
         steady: likewise (R, items, [4,] H, W), pixel by pixel.
     """
 
     cells: ErrorCells
     components: int
     is_complex: bool
+    rows: bool = False
     differences: list[torch.Tensor] = field(default_factory=list)
     squares: list[torch.Tensor] = field(default_factory=list)
     steady: list[torch.Tensor] = field(default_factory=list)
@@ -78,10 +81,11 @@ class BatchErrors:
             is_complex: as in :func:`channel_mean`.
 
         Returns:
-            (items, [4,] H, W, ...).
+            (items, [4,] H, W, ...), of several histograms a pixel (items, [4,] rows, H, W, T).
         """
         mean = channel_mean(array.reshape(-1, *array.shape[-dims - 1 :]), self.components, is_complex)
-        return mean if self.components == 1 else mean.movedim(-1, 1)
+        mean = mean if self.components == 1 else mean.movedim(-1, 1)
+        return mean.movedim(-2, -4) if dims > 3 else mean
 
 
 def channel_mean(array: torch.Tensor, components: int, is_complex: bool = False) -> torch.Tensor:
@@ -183,13 +187,16 @@ def cell_weights(weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     return torch.where(mean < 0, -square.sqrt(), square.sqrt())
 
 
-def variance(differences: torch.Tensor, weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
+def variance(
+    differences: torch.Tensor, weights: torch.Tensor, cells: ErrorCells, rows: bool = False
+) -> torch.Tensor:
     """Return the variance of a weighted sum.
 
     Args:
         differences: (..., T', H', W', R) in cells.
         weights: (..., T, H, W), real.
         cells: layout of the differences.
+        rows: the last of the leading dimensions has the histograms of a pixel, which the sum is over, too.
 
     Returns:
         (...).
@@ -201,6 +208,7 @@ def variance(differences: torch.Tensor, weights: torch.Tensor, cells: ErrorCells
     spread = spread.repeat_interleave(cells.columns, -3)[..., :width, :, :]
     # Of each pixel the sum over time, as if all pixels of its cell had the weights of this one.
     sums = (spread * along[..., None, :]).sum(-1)
+    sums = sums.sum(-4) if rows else sums
     number = _sizes(height, cells.rows, along).repeat_interleave(cells.rows)[:height, None]
     number = number * _sizes(width, cells.columns, along).repeat_interleave(cells.columns)[:width]
     if cells.shared:
@@ -274,11 +282,12 @@ class ErrorBars:
 
         Args:
             weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
-                gates), behind dimensions of Stokes components and items; None for ones. (H, W) with ``steady``.
+                gates, (R, T, H, W) of rates, (2, T, H, W) of beats), behind dimensions of Stokes components and items;
+                None for ones. (H, W) with ``steady``.
             steady: of the steady image.
 
         Returns:
-            (...), without the last three dimensions (two with ``steady``).
+            (...), without the dimensions of one film, or of its steady image.
 
         Raises:
             ArgumentError: for a render without ``errors=``.
@@ -298,10 +307,10 @@ class ErrorBars:
                 f"standard_error: expected weights that broadcast to {(*differences.shape[:-4], *shape)}, got "
                 f"{tuple(given.shape)}. Weights of times are weights[:, None, None]."
             ) from error
-        return variance(differences, given, cells).sqrt().to(real.dtype)
+        return variance(differences, given, cells, not steady and self._film_dims() > 3).sqrt().to(real.dtype)
 
     def error_map(self, *, steady: bool = False) -> torch.Tensor:
-        """Return the standard error of every bin, (..., T, H, W), (..., H, W) with ``steady``.
+        """Return the standard error of every bin, (..., T, H, W) as the film has it, (..., H, W) with ``steady``.
 
         It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``
         (3 x 3 pixels of gates and frequencies): single dark bins have seen too few events to know their own.
@@ -325,7 +334,8 @@ class ErrorBars:
         error = self.standard_error()
         tensor = self._measured()
         assert tensor is not None
-        total = tensor.detach().mean(-4).sum((-3, -2, -1)).abs()
+        dims = self._film_dims()
+        total = tensor.detach().mean(-1 - dims).sum(tuple(range(-dims, 0))).abs()
         if getattr(self, "polarized", False):  # the others may sum to nothing
             error, total = error[..., 0], total[..., 0]
         found = (error / total)[total > 0]
@@ -334,6 +344,11 @@ class ErrorBars:
     def _measured(self) -> torch.Tensor | None:
         layout = layout_of_output(self)
         return None if layout is None else layout.tensor(self)
+
+    def _film_dims(self) -> int:
+        """Return the number of dimensions of one channel."""
+        layout = layout_of_output(self)
+        return 2 + len(() if layout is None else layout.shape)
 
     def _error_layout(self, steady: bool) -> tuple[torch.Tensor, tuple[int, ...], ErrorCells]:
         """Return (differences (..., T', H', W', R), (T, H, W), cells); one bin of time with ``steady``."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
@@ -19,159 +19,15 @@ from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
 from torchtransient.gates import SLOPE_REMEDY, Gate, gates_from_text, gates_to_text, jump_in
 from torchtransient.interfaces import FilmInterface, is_time_resolved
+from torchtransient.rendering.film_layout import FilmLayout as FilmLayout
+from torchtransient.rendering.film_layout import (
+    measured,
+    phasor_channels_first,
+    rows_channels_first,
+)
 
 if TYPE_CHECKING:
     from torchtransient.scene.pilot import Arrivals
-
-
-@dataclass(frozen=True)
-class FilmLayout(abc.ABC):
-    """Settings of a film, and where its measurements lie in a tensor.
-
-    A subclass is a frozen dataclass with one field, the settings; outputs have them under the name of the field. It
-    defines the names from ``measures`` to ``output`` and the abstract methods; the rest has defaults. Layouts with
-    equal settings are equal.
-    """
-
-    # Word of the plugin's `measures`: the attribute of a RenderOutput, and the name in a result file.
-    measures: ClassVar[str]
-    plugin: ClassVar[str]
-    # Letter of the dimension between channels and rows.
-    letter: ClassVar[str]
-    # Name of the settings: the keyword of TransientRenderer and tt.plan, of films that have one. A call that asks for
-    # the film, written out for messages ("film=..." of films without a keyword).
-    argument: ClassVar[str]
-    example: ClassVar[str]
-    # Name of the measurements in messages.
-    plural: ClassVar[str]
-    # Name in tt.plan(outputs=...).
-    output: ClassVar[str]
-    # The film has bins of time: a temporal filter, an axis that a plan can find, a steady image that can be left out.
-    has_bins: ClassVar[bool] = False
-    is_complex: ClassVar[bool] = False
-    # The film spreads arrivals by a pulse and an impulse response.
-    takes_pulse: ClassVar[bool] = False
-    # Keyword of another film that this one takes beside its own, empty for none.
-    beside: ClassVar[str] = ""
-    # Remedy for a response over time without a slope (`jump`): the end of an error message.
-    slope_remedy: ClassVar[str] = ""
-
-    if TYPE_CHECKING:
-
-        def __init__(self, settings: Any, /) -> None: ...
-
-    # ----------------------------------------------------------------------------------------------------- settings
-
-    @property
-    @abc.abstractmethod
-    def count(self) -> int:
-        """Number of entries along the film's own dimension."""
-
-    @property
-    def settings(self) -> Any:
-        """Value of the keyword ``argument``: the field of the dataclass."""
-        return getattr(self, fields(self)[0].name)
-
-    def attributes(self) -> dict[str, Any]:
-        """Return the settings by the name that renderers and outputs give them."""
-        return {fields(self)[0].name: self.settings}
-
-    def plain(self) -> Any:
-        """Return the settings as plain data for JSON."""
-        return self.settings
-
-    def describe(self, temporal_filter: str) -> str:
-        """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
-        return f"{self.argument}={self.settings}"
-
-    def jump(self) -> str:
-        """Return the name of a response over time that jumps and has no slope without a pulse; empty without one, and
-        for films with bins, whose temporal filter decides.
-        """
-        return ""
-
-    @classmethod
-    def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
-        """Return the film that the keywords of a call ask for, None for another one."""
-        value = arguments.get(cls.argument)
-        return None if value is None else cls(value)
-
-    # ----------------------------------------------------------------------------------------------- scene and film
-
-    @classmethod
-    @abc.abstractmethod
-    def from_film(cls, film: Any) -> Self:
-        """Return the settings of a film plugin that ``measures`` this."""
-
-    @classmethod
-    def from_properties(cls, props: Any) -> Self | None:
-        """Return the settings of a described film node, None where a plan needs none before the scene is built.
-
-        Raises:
-            SceneError: for properties that the plugin refuses.
-        """
-        return None
-
-    @abc.abstractmethod
-    def write(self, props: Any) -> None:
-        """Write the settings into the properties of a film node of this plugin."""
-
-    @classmethod
-    def fits(cls, plugin: str) -> bool:
-        """Return whether a film plugin takes the properties that :meth:`write` writes."""
-        return plugin == cls.plugin
-
-    def describes(self, film: FilmInterface) -> bool:
-        """Return whether a built film has these settings."""
-        return bool(film.measures == self.measures) and self.from_film(film) == self
-
-    # ------------------------------------------------------------------------------------------------------ tensors
-
-    def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-        """Return the array of a film in the order of torch.
-
-        Args:
-            cube: (H, W, ..., C) of a film, with or without one dimension of items.
-            leading: sizes of the dimensions of items.
-            components: Stokes components that the film's channels are made of; more than one come before C.
-
-        Returns:
-            (C, ..., H, W) behind ``leading``.
-        """
-        return cube_channels_first(cube, leading, components)
-
-    def tensor(self, output: Any) -> torch.Tensor | None:
-        """Return the film's tensor in an output or a result."""
-        tensor: torch.Tensor | None = measured(output, self.measures)
-        return tensor
-
-    @classmethod
-    def from_output(cls, output: Any) -> Self | None:
-        """Return the settings that an output or a result has, None where it holds nothing of this film."""
-        settings = measured(output, fields(cls)[0].name)
-        return None if settings is None or measured(output, cls.measures) is None else cls(settings)
-
-    # ------------------------------------------------------------------------------------------------- result files
-
-    @abc.abstractmethod
-    def entries(self) -> dict[str, Any]:
-        """Return the arrays, numbers and texts of a result file that hold the settings."""
-
-    @classmethod
-    @abc.abstractmethod
-    def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
-        """Return the settings that a result file holds, None for a file of another film."""
-
-    # --------------------------------------------------------------------------------------------------- pilot runs
-
-    @classmethod
-    def seen(cls, film: FilmInterface, arrivals: Arrivals) -> Arrivals:
-        """Return the arrivals of a pilot run, weighted by the response of a built ``film`` at their times."""
-        return arrivals
-
-    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
-        """Return parts of the light of a pilot run; a bound on depth has to keep enough of each."""
-        return [arrivals]
 
 
 @dataclass(frozen=True)
@@ -392,8 +248,11 @@ class RowsOfHistograms(FilmLayout):
     """
 
     has_bins: ClassVar[bool] = True
+    knows_rates: ClassVar[bool] = True
     beside: ClassVar[str] = "time_axis"
     kind: ClassVar[type]
+    # Names of the settings' fields as properties of the plugin.
+    properties: ClassVar[dict[str, str]]
 
     def __post_init__(self) -> None:
         given: Any = self.settings
@@ -412,16 +271,29 @@ class RowsOfHistograms(FilmLayout):
         assert isinstance(axis, TimeAxis)  # of a built film
         return axis.num_bins
 
+    @property
+    @abc.abstractmethod
+    def row_count(self) -> int:
+        """Number of histograms of a pixel."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.row_count, self.count)
+
     def attributes(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def plain(self) -> dict[str, Any]:
-        axis = self.attributes()["axis"]
-        return asdict(self.settings) | ({} if axis is None else Histogram(axis).plain())
+        axis, settings = self.attributes()["axis"], asdict(self.settings)
+        named = {f"{self.argument}_{name}": value for name, value in settings.items()}
+        return named | ({} if axis is None else Histogram(axis).plain())
 
     def describe(self, temporal_filter: str) -> str:
         words = ", ".join(f"{name}={value}" for name, value in self.attributes().items())
         return f"{words}, temporal_filter={temporal_filter!r}"
+
+    def over(self, axis: TimeAxis) -> Self:
+        return replace(self, axis=axis)  # type: ignore[call-arg]
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
@@ -432,6 +304,18 @@ class RowsOfHistograms(FilmLayout):
         axis = self.attributes()["axis"]
         if axis is not None:
             Histogram(axis).write(props)
+        for name, prop in self.properties.items():
+            props[prop] = getattr(self.settings, name)
+
+    @classmethod
+    def from_properties(cls, props: Any) -> Self | None:
+        given = {name: props[prop] for name, prop in cls.properties.items() if prop in props}
+        axis = Histogram.from_properties(props)
+        assert axis is not None
+        try:
+            return cls(cls.kind(**given), axis.axis)  # type: ignore[call-arg]
+        except (TypeError, TorchTransientError) as error:
+            raise SceneError(f"{cls.plugin}: {error}") from error
 
     def describes(self, film: FilmInterface) -> bool:
         if film.measures != self.measures:
@@ -439,26 +323,28 @@ class RowsOfHistograms(FilmLayout):
         built = self.from_film(film).attributes()
         return all(value is None or built[name] == value for name, value in self.attributes().items())
 
+    def parts(self, arrivals: Arrivals) -> list[Arrivals]:
+        """Return all light, which the steady image holds, and that of the time window."""
+        return Histogram(self.attributes()["axis"]).parts(arrivals)
+
     def channels_first(self, cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
         return rows_channels_first(cube, leading, components)
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        if measured(output, cls.measures) is None:
-            return None
-        return cls(*(measured(output, field.name) for field in fields(cls)))
+        found = [measured(output, name) for name in (cls.measures, *(field.name for field in fields(cls)))]
+        return None if any(value is None for value in found) else cls(*found[1:])
 
     def entries(self) -> dict[str, Any]:
         axis = self.attributes()["axis"]
-        own = {f"{self.measures}_{name}": value for name, value in asdict(self.settings).items()}
-        return own | ({} if axis is None else Histogram(axis).plain())
+        return self.plain() | ({} if axis is None else Histogram(axis).entries())
 
     @classmethod
     def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
         if cls.measures not in values:
             return None
-        found = {field.name: values[f"{cls.measures}_{field.name}"] for field in fields(cls.kind)}
-        plain = {name: value.item() if hasattr(value, "item") else value for name, value in found.items()}
+        given = {field.name: values[f"{cls.argument}_{field.name}"] for field in fields(cls.kind)}
+        plain = {name: value.item() if hasattr(value, "item") else value for name, value in given.items()}
         axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
         return cls(cls.kind(**plain), axis)  # type: ignore[call-arg]
 
@@ -484,6 +370,7 @@ class Rates(RowsOfHistograms):
     output: ClassVar[str] = "rates"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = RateAxis
+    properties: ClassVar[dict[str, str]] = {"start": "rate_start", "bin_width": "rate_width", "num_bins": "rate_bins"}
 
     rate_axis: RateAxis
     axis: TimeAxis | None = None
@@ -492,13 +379,9 @@ class Rates(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(RateAxis(film.rate_start, film.rate_width, film.rate_bins), Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        axis = self.rate_axis
-        props["rate_start"], props["rate_width"], props["rate_bins"] = axis.start, axis.bin_width, axis.num_bins
-
-
-_CHIRPS = {"bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength"}
+    @property
+    def row_count(self) -> int:
+        return self.rate_axis.num_bins
 
 
 @dataclass(frozen=True)
@@ -522,6 +405,10 @@ class Beats(RowsOfHistograms):
     output: ClassVar[str] = "beats"
     takes_pulse: ClassVar[bool] = True
     kind: ClassVar[type] = Chirps
+    properties: ClassVar[dict[str, str]] = {
+        "bandwidth_hz": "chirp_bandwidth", "duration_s": "chirp_duration", "wavelength_m": "chirp_wavelength",
+        "window": "chirp_window",
+    }  # fmt: skip
 
     chirps: Chirps
     axis: TimeAxis | None = None
@@ -530,11 +417,18 @@ class Beats(RowsOfHistograms):
     def from_film(cls, film: Any) -> Self:
         return cls(film.chirps, Histogram.from_film(film).axis)
 
-    def write(self, props: Any) -> None:
-        super().write(props)
-        for name, prop in _CHIRPS.items():
-            props[prop] = getattr(self.chirps, name)
-        props["chirp_window"] = self.chirps.window
+    @classmethod
+    def seen(cls, film: Any, arrivals: Arrivals) -> Arrivals:
+        """Return the arrivals of a pilot run at the places of their beats, of both spectra."""
+        k = film.chirps.rate_scale_s
+        return arrivals.shifted((k, -k))
+
+    @property
+    def row_count(self) -> int:
+        return 2
+
+    def resolution_opl(self) -> float:
+        return self.chirps.resolution_opl
 
 
 @dataclass(frozen=True)
@@ -558,6 +452,7 @@ class SlowPhasors(FilmLayout):
     plural: ClassVar[str] = "slow phasors"
     output: ClassVar[str] = "slow_phasor"
     is_complex: ClassVar[bool] = True
+    knows_rates: ClassVar[bool] = True
     beside: ClassVar[str] = "frequencies"
 
     slow_times: tuple[float, ...]
@@ -576,6 +471,10 @@ class SlowPhasors(FilmLayout):
     @property
     def count(self) -> int:
         return self.frequencies.num_frequencies
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self.slow_times), self.count)
 
     def attributes(self) -> dict[str, Any]:
         return {"slow_times": self.slow_times, "frequencies": self.frequencies}
@@ -602,9 +501,8 @@ class SlowPhasors(FilmLayout):
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        if measured(output, cls.measures) is None:
-            return None
-        return cls(measured(output, "slow_times"), measured(output, "frequencies"))
+        found = [measured(output, name) for name in (cls.measures, "slow_times", "frequencies")]
+        return None if any(value is None for value in found) else cls(*found[1:])
 
     def entries(self) -> dict[str, Any]:
         times = torch.tensor(self.slow_times, dtype=torch.float64).numpy()
@@ -690,85 +588,3 @@ def layout_of_plugin(plugin: str) -> type[FilmLayout] | None:
 def film_plugins(kinds: Sequence[type[FilmLayout]] | None = None) -> str:
     """Return the names of film plugins, for messages."""
     return ", ".join(kind.plugin for kind in (FILMS if kinds is None else kinds))
-
-
-def measured(output: Any, name: str) -> Any:
-    """Return an attribute of an output or a result, or one of its ``others``; None where it has neither."""
-    found = getattr(output, name, None)
-    return getattr(output, "others", {}).get(name) if found is None else found
-
-
-# ------------------------------------------------------------------------------------------- from memory order to torch
-
-# Dimensions of the film of an exhaustive scan, without those of items.
-_EXHAUSTIVE = 6
-
-
-def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-    """Return a steady image in the order of torch.
-
-    Args:
-        steady: (H, W, C) of a film, with or without one dimension of items.
-        leading: sizes of the dimensions of items.
-        components: Stokes components that the film's channels are made of; more than one come before C.
-
-    Returns:
-        (C, H, W) behind ``leading``.
-    """
-    steady = steady.reshape(*leading, *steady.shape[-3:])
-    return _stokes_first(steady.movedim(-1, -3), -3, components)
-
-
-def cube_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-    """Return an array over time in the order of torch.
-
-    Args:
-        cube: (H, W, T, C) of a film, (H, W, Lh, Lw, T, C) of an exhaustive scan, with or without a dimension of items.
-        leading: sizes of the dimensions of items.
-        components: Stokes components that the film's channels are made of; more than one come before C.
-
-    Returns:
-        (C, T, H, W) behind ``leading``; (C, T, Lh, Lw, H, W) of an exhaustive scan.
-    """
-    if cube.ndim >= _EXHAUSTIVE:
-        cube = cube.reshape(*leading, *cube.shape[-_EXHAUSTIVE:])
-        return _stokes_first(cube.movedim((-1, -2, -4, -3), (-6, -5, -4, -3)), -6, components)
-    cube = cube.reshape(*leading, *cube.shape[-4:])
-    return _stokes_first(cube.movedim((-1, -2), (-4, -3)), -4, components)
-
-
-def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-    """Return phasors in the order of torch, as :func:`cube_channels_first`.
-
-    Args:
-        cube: (H, W, F, 2 C) of real and imaginary parts in turn.
-        leading: sizes of the dimensions of items.
-        components: Stokes components that the film's channels are made of; more than one come before C.
-
-    Returns:
-        Complex (C, F, H, W) behind ``leading``.
-    """
-    pairs = torch.view_as_complex(cube.reshape(*cube.shape[:-1], -1, 2))
-    return cube_channels_first(pairs, leading, components)
-
-
-def rows_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components: int = 1) -> torch.Tensor:
-    """Return several arrays a pixel in the order of torch, as :func:`cube_channels_first`.
-
-    Args:
-        cube: (H, W, rows, entries, C).
-        leading: sizes of the dimensions of items.
-        components: Stokes components that the film's channels are made of; more than one come before C.
-
-    Returns:
-        (C, rows, entries, H, W) behind ``leading``.
-    """
-    cube = cube.reshape(*leading, *cube.shape[-5:])
-    return _stokes_first(cube.movedim((-1, -3, -2), (-5, -4, -3)), -5, components)
-
-
-def _stokes_first(tensor: torch.Tensor, channel_dim: int, components: int) -> torch.Tensor:
-    if components == 1:
-        return tensor
-    split: torch.Tensor = tensor.unflatten(channel_dim, (components, -1))  # type: ignore[no-untyped-call]
-    return split

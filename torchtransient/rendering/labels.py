@@ -24,10 +24,13 @@ from torchtransient.scene.load import Scene
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.variant import active_variant
 
-LABELS = ("depth", "z_depth", "position", "normals", "uv", "albedo", "shape", "primitive", "material")
+LABELS = (
+    "depth", "z_depth", "position", "normals", "uv", "albedo", "velocity", "radial_velocity", "shape", "primitive",
+    "material",
+)  # fmt: skip
 # Labels that are indices, which have no mean.
 NUMBERED = ("shape", "primitive", "material")
-_SCALARS = ("depth", "z_depth", *NUMBERED)
+_SCALARS = ("depth", "z_depth", "radial_velocity", *NUMBERED)
 
 
 @opaque
@@ -41,24 +44,31 @@ def scene_labels(
 ) -> dict[str, torch.Tensor]:
     """Return labels of the pixels of a renderer's sensors, by name.
 
-    ========= =============== ==========================================================================================
-    name      shape, dtype    content
-    ========= =============== ==========================================================================================
-    depth     (H, W) float32  metres from the sensor's origin (the pinhole, the middle of a lens, the sensor plane of an
-                              orthographic camera) to the surface along the pixel's ray: not along the axis, and not
-                              from the near clip plane. Half the optical path of a light that stands there, in air
-    z_depth   (H, W) float32  metres from the sensor's origin along its optical axis
-    position  (3, H, W)       the point of the surface in the world, metres; of a scan the scanned point
-    normals   (3, H, W)       shading normal in the world, unit length, on the side where the surface has its front: not
-                              turned to the sensor, without normal maps and bump maps
-    uv        (2, H, W)       texture coordinates
-    albedo    (C, H, W)       diffuse reflectance by channel of the film, 0 for materials without a diffuse lobe; of
-                              wavelengths the mean in daylight (D65), or evenly over the film's own response curves.
-                              Where Mitsuba has none of a material it is its brightness at the normal
-    shape     (H, W) int32    index into :func:`label_names`: the shape, or the instance of a group
-    primitive (H, W) int32    number of the triangle, ellipsoid or segment in its shape, 0 where it has one surface
-    material  (H, W) int32    index into :func:`material_names`
-    ========= =============== ==========================================================================================
+    =============== =============== ====================================================================================
+    name            shape, dtype    content
+    =============== =============== ====================================================================================
+    depth           (H, W) float32  metres from the sensor's origin (the pinhole, the middle of a lens, the sensor plane
+                                    of an orthographic camera) to the surface along the pixel's ray: not along the axis,
+                                    and not from the near clip plane. Half the optical path of a light that stands
+                                    there, in air
+    z_depth         (H, W) float32  metres from the sensor's origin along its optical axis
+    position        (3, H, W)       the point of the surface in the world, metres; of a scan the scanned point
+    normals         (3, H, W)       shading normal in the world, unit length, on the side where the surface has its
+                                    front: not turned to the sensor, without normal maps and bump maps
+    uv              (2, H, W)       texture coordinates
+    albedo          (C, H, W)       diffuse reflectance by channel of the film, 0 for materials without a diffuse lobe;
+                                    of wavelengths the mean in daylight (D65), or evenly over the film's own response
+                                    curves. Where Mitsuba has none of a material it is its brightness at the normal
+    velocity        (3, H, W)       velocity of the surface's point in the world, m/s, zero where nothing moves
+                                    (``scene.moving``)
+    radial_velocity (H, W) float32  how fast that point moves away from the sensor along the pixel's ray, m/s; of a
+                                    sensor that moves, too. Half the rate of a light that stands beside the sensor and
+                                    moves with it
+    shape           (H, W) int32    index into :func:`label_names`: the shape, or the instance of a group
+    primitive       (H, W) int32    number of the triangle, ellipsoid or segment in its shape, 0 where it has one
+                                    surface
+    material        (H, W) int32    index into :func:`material_names`
+    =============== =============== ====================================================================================
 
     Where a pixel meets nothing, floats are NaN and numbers are -1. A pixel looks through what lets more than half of
     the light pass unbent (BSDF ``null``, a ``mask`` of an opacity below one half, a thin pane), 64 such surfaces at

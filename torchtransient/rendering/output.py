@@ -13,7 +13,7 @@ from torchtransient.chirps import Chirps
 from torchtransient.errors import ShapeError
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
-from torchtransient.rendering.films import FilmLayout
+from torchtransient.rendering.film_layout import FilmLayout
 from torchtransient.scene.variant import stokes_components
 from torchtransient.tensor_record import TensorRecord
 
@@ -138,9 +138,9 @@ class RenderOutput(ErrorBars, TensorRecord):
     Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
     variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
     their names. In polarized variants the Stokes components S0, S1, S2, S3 come before C in all of them, as (4, C, T,
-    H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. ``transient``, ``phasor``
-    and ``gated`` are views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's
-    order. ``differences`` (..., T', H', W', R), ``squares`` (..., T', H', W'), ``steady_differences`` (..., H, W, R)
+    H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. All but ``steady`` are
+    views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's order.
+    ``differences`` (..., T', H', W', R), ``squares`` (..., T', H', W'), ``steady_differences`` (..., H, W, R)
     and their ``cells``, of renders with ``errors=``: what independent batches of samples differ by, mean over channels,
     for :meth:`standard_error` and :meth:`error_map`.
     ``others``: tensors and settings of films that have no attribute here, by name.

@@ -19,7 +19,7 @@ import torch
 
 from torchtransient.plugins.guards import interrupts_wait
 from torchtransient.rendering.error_bars import local_mean
-from torchtransient.rendering.films import FilmLayout
+from torchtransient.rendering.film_layout import FilmLayout
 from torchtransient.rendering.output import RenderOutput, RenderStats
 from torchtransient.scene.variant import stokes_components
 

@@ -12,20 +12,31 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from torchtransient import plugins
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.checks import Numbers, arguments_of, as_whole, count, is_one_of, several, shown, text
+from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
-from torchtransient.rendering.films import FILMS, FilmLayout, Gates, Histogram, Phasors, layout_of_plugin
+from torchtransient.rendering.films import (
+    FILMS,
+    Beats,
+    FilmLayout,
+    Gates,
+    Histogram,
+    Phasors,
+    Rates,
+    RowsOfHistograms,
+    layout_of_plugin,
+)
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.rendering.trial_runs import SPP, variances
 from torchtransient.scene.edits import NO_LIMIT, checked_pulse
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import cropped, load
 from torchtransient.scene.opaque import opaque
-from torchtransient.scene.pilot import PilotReport
+from torchtransient.scene.pilot import PilotReport, rate_axis_over
 from torchtransient.scene.plan import Choice, Draft, Effects, Finder, choose_integrator, choose_variant
 from torchtransient.scene.samplers import reason_for
 from torchtransient.scene.variant import resolve_variant
@@ -68,7 +79,7 @@ class PlannedFilm:
     def missing_settings(self) -> str:
         """Return a message for settings that neither the scene nor the call has; empty for those that a plan finds."""
         kind = self.kind
-        if kind.has_bins:
+        if kind.has_bins and kind is not Beats:
             return ""
         return (
             f"tt.plan: {kind.plural} are asked for, and neither the film nor the call has {kind.argument}. Give "
@@ -81,8 +92,19 @@ class PlannedFilm:
         Args:
             settings: film of the plan, None where the scene's is kept or an axis is to be found.
         """
-        # The pulses of a gated film widen what its gates see.
-        return settings if self.kind is Gates else Histogram(_ANY_AXIS)
+        # The pulses of a gated film widen what its gates see; those of beats are lines of their chirps.
+        if self.kind is Rates:
+            return Rates(rate_axis_over(0.0, 0.0), _ANY_AXIS)
+        return settings if self.kind in (Gates, Beats) else Histogram(_ANY_AXIS)
+
+    @property
+    def has_rows(self) -> bool:
+        """The film has rates or chirps beside its bins."""
+        return issubclass(self.kind, RowsOfHistograms)
+
+    def film_over(self, axis: TimeAxis, settings: Any) -> FilmLayout:
+        """Return the film with a time axis; ``settings``: those of a film of rows, None for others."""
+        return self.kind(axis) if settings is None else self.kind(settings, axis)  # type: ignore[call-arg]
 
 
 def planned(outputs: Sequence[str]) -> PlannedFilm:
@@ -106,7 +128,7 @@ class Plan(Effects):
 
     Attributes:
         outputs: outputs of the plan.
-        film: "transient", "steady" (one bin), "phasor" or "gated".
+        film: "transient", "steady" (one bin), "phasor", "gated", "rates" or "beats".
         parameters: keys of the parameters that will have gradients.
         reasons: one line per decision.
         pilot: results of the pilot run, None without one.
@@ -139,6 +161,18 @@ class Plan(Effects):
         """Gates of a gated film, None to keep the scene's."""
         gates: tuple[Gate, ...] | None = self._setting("gates")
         return gates
+
+    @property
+    def rates(self) -> RateAxis | None:
+        """Bins of the rate of a rate film, else None."""
+        rates: RateAxis | None = self._setting("rate_axis")
+        return rates
+
+    @property
+    def chirps(self) -> Chirps | None:
+        """Chirps of a beat film, else None."""
+        chirps: Chirps | None = self._setting("chirps")
+        return chirps
 
     def _setting(self, name: str) -> Any:
         return None if self.film_choice is None else self.film_choice.attributes().get(name)
@@ -196,6 +230,8 @@ def plan(
     time_axis: TimeAxis | str | None = None,
     frequencies: FrequencyAxis | Numbers | None = None,
     gates: Gate | Sequence[Gate] | None = None,
+    rates: RateAxis | None = None,
+    chirps: Chirps | None = None,
     pulse: Pulse | None = None,
     irf: Pulse | None = None,
     num_bins: int | None = None,
@@ -220,10 +256,12 @@ def plan(
 
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
-        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "bands".
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands".
         parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
+        rates: bins of the rate of a rate film, None for those of the scene's film, or to find some.
+        chirps: chirps of a beat film; the axis to be found is one over ``opl +- k rate``.
         pulse, irf: shapes of pulse and impulse response, which the renderer uses; they widen the axis.
         num_bins, bin_width_opl: bins of an axis to be found; a width (metres) of the scene's film is kept.
         max_depth: bound on the depth, "scene" for the scene's own, None to find one.
@@ -238,7 +276,7 @@ def plan(
             is the scene's.
         sensor: index of the sensor that is planned for, and rendered.
         seed: seed of the pilot run.
-        film: film and its settings, in place of ``frequencies`` and ``gates``.
+        film: film and its settings, in place of ``frequencies``, ``gates``, ``rates`` and ``chirps``.
         error: error that is to be small: "squared", which bright bins make, or "relative", to which every bin adds
             alike. For the latter there is no Russian roulette below the depth, and pixels share light
             (``transient_path_reuse``) where short runs show that it pays, as they show for the ellipsoidal
@@ -275,13 +313,15 @@ def plan(
     loaded = load(scene)
     wanted = _checked_outputs(outputs)
     inventory = scene_inventory(loaded, sensor)
-    given = requested_film(film, {"frequencies": frequencies, "gates": gates})
-    if given is not None and given.has_bins:
+    named = {"frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
+    given = requested_film(film, named)
+    own_axis = None if given is None else given.attributes().get("axis")
+    if own_axis is not None:
         if time_axis is not None:
             raise ArgumentError("tt.plan: film and time_axis both give a time axis; leave out one of them.")
-        time_axis = given.settings
+        time_axis = own_axis
     planned_film = planned(wanted)
-    if error == "relative" and (planned_film.all_times or planned_film.kind is Phasors):
+    if error == "relative" and (planned_film.all_times or planned_film.kind.is_complex):
         raise ArgumentError(
             f"tt.plan: error='relative' is about bins and gates, and a {planned_film.name} film sums over all times; "
             "leave it out."

@@ -35,7 +35,7 @@ from torchtransient.rendering.arguments import (
 from torchtransient.rendering.autograd import RenderCall, run
 from torchtransient.rendering.batches import with_differences
 from torchtransient.rendering.error_bars import CELL_BINS, CELL_PIXELS, BatchErrors, ErrorCells
-from torchtransient.rendering.films import FilmLayout, steady_channels_first
+from torchtransient.rendering.film_layout import FilmLayout, steady_channels_first
 from torchtransient.rendering.job import (
     SEED_RANGE,
     Item,
@@ -188,6 +188,7 @@ class TransientRenderer(CopiesParametrized):
                 "of both out."
             )
         self._asked_of_edges: set[str] = set()
+        self._asked_of_velocities: set[str] = set()
         self._watch = PhysicsWatch(physics, self.scene.warned)
         changes: dict[str, Any] = {"pulse": checked_pulse("pulse", pulse), "irf": checked_pulse("irf", irf)}
         changes |= {"film": film, "steady": bool(steady)}
@@ -312,6 +313,16 @@ class TransientRenderer(CopiesParametrized):
         return self.film.attributes().get("gates")
 
     @property
+    def rates(self) -> RateAxis | None:
+        """Bins of the rate of a rate film, else None."""
+        return self.film.attributes().get("rate_axis")
+
+    @property
+    def chirps(self) -> Chirps | None:
+        """Chirps of a beat film, else None."""
+        return self.film.attributes().get("chirps")
+
+    @property
     def values(self) -> Values:
         """Parameters by their Mitsuba keys; of a parametrized one its value, which is no leaf of a graph."""
         return Values(self, self._names)
@@ -321,7 +332,8 @@ class TransientRenderer(CopiesParametrized):
         """Temporal filter of renders, with "auto" resolved; empty for a film without one."""
         if self.temporal_filter != "auto":
             return self.temporal_filter
-        return filter_for(needing_slope(self._infos, self._keys), self._scene_filter, self._pulsed)
+        moving = needing_slope(self._infos, self._keys, self.film.knows_rates)
+        return filter_for(moving, self._scene_filter, self._pulsed)
 
     @opaque
     def variation(
@@ -340,7 +352,7 @@ class TransientRenderer(CopiesParametrized):
             temporal_filter: "box", "tent", "gaussian" or "auto".
             integrator: plugin name of a transient integrator; it takes over the parameters of this renderer's.
             max_depth: longest path, in segments; -1 for no limit.
-            time_axis: bins in place of those of this renderer's histogram.
+            time_axis: bins in place of those of this renderer's film.
 
         Returns:
             The copy, with parameters of its own.
@@ -363,7 +375,7 @@ class TransientRenderer(CopiesParametrized):
         changes: dict[str, Any] = {
             "integrator": integrator,
             "max_depth": checked_depth(max_depth),
-            "film": requested_film(None, {"time_axis": time_axis}),
+            "film": None if time_axis is None else self.film.over(time_axis),
         }
         changes = {name: value for name, value in changes.items() if value is not None}
         if changes:
@@ -390,7 +402,7 @@ class TransientRenderer(CopiesParametrized):
         Raises:
             UnknownKeyError: for keys that the renderer does not have.
         """
-        moving = needing_slope(self._infos, checked_keys(keys, tuple(self._infos)))
+        moving = needing_slope(self._infos, checked_keys(keys, tuple(self._infos)), self.film.knows_rates)
         return not moving or (has_slope(self.effective_filter, self._pulsed) and self._response[0])
 
     @opaque
@@ -452,6 +464,7 @@ class TransientRenderer(CopiesParametrized):
         temporal_filter = self.effective_filter
         self._check_slope(temporal_filter, tensors)
         self._check_edges(tensors)
+        self._check_velocities(tensors)
         request = self._error_request(errors)
         wanted = checked_samples("spp", spp) or self.spp or self._scene_spp
         if request is not None and wanted < request.batches:
@@ -504,7 +517,8 @@ class TransientRenderer(CopiesParametrized):
             raise ArgumentError(f"errors: expected True, False or 'bins', got {shown(errors)}.")
         if errors is False:
             return None
-        if len(self._cube_shape) > 4:
+        rows = len(self.film.shape) > 1
+        if len(self._cube_shape) > 4 + rows:
             raise ArgumentError("errors: expected False for exhaustive scans, whose error bars are not followed.")
         with active_variant(self.scene.variant):
             integrator = self.scene.built(self._options).scene.integrator()
@@ -513,7 +527,7 @@ class TransientRenderer(CopiesParametrized):
         # Noise that pixels share adds up or cancels: a cell of several would not tell that of one.
         pixels = 1 if shared else pixels
         cells = ErrorCells(bins, pixels, pixels, shared)
-        return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex)
+        return BatchErrors(cells, stokes_components(self.scene.variant), self.film.is_complex, rows)
 
     @opaque
     def to_tolerance(
@@ -616,7 +630,7 @@ class TransientRenderer(CopiesParametrized):
     def _check_slope(self, temporal_filter: str, tensors: Sequence[torch.Tensor]) -> None:
         if torch.is_grad_enabled():
             wanted = [key for key, tensor in zip(self._keys, tensors, strict=True) if tensor.requires_grad]
-            moving = needing_slope(self._infos, wanted)
+            moving = needing_slope(self._infos, wanted, self.film.knows_rates)
             check_filter(moving, temporal_filter, self._pulsed)
             check_slope(moving, *self._response)
 
@@ -640,6 +654,21 @@ class TransientRenderer(CopiesParametrized):
         for gap, keys in found.items():
             self._watch.warn_of_gradient(gap.message(keys), is_error=not gap.is_asked_for)
         self._asked_of_edges.update(new)
+
+    def _check_velocities(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Warn once of keys with derivatives in this call that are velocities, on a film without rates."""
+        graph = torch.is_grad_enabled()
+        new = [
+            key
+            for key, tensor in zip(self._keys, tensors, strict=True)
+            if self._infos[key].is_velocity and may_have_derivative(tensor, graph=graph)
+        ]
+        if self.film.knows_rates or set(new) <= self._asked_of_velocities:
+            return
+        with active_variant(self.scene.variant):
+            from torchtransient.plugins.transport.velocities import unmeasured
+        self._watch.warn_of_gradient(unmeasured(new))
+        self._asked_of_velocities.update(new)
 
     def _depth_bound(self, given: Mapping[str, Any] | None, tensors: Sequence[torch.Tensor]) -> DepthBound | None:
         """Return the bound on the depth if values can have derivatives and no depth is stated, else None."""

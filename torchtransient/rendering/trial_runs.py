@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from torchtransient.rendering.error_bars import local_mean
-from torchtransient.rendering.films import measured
+from torchtransient.rendering.film_layout import measured
 from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.renderer import TransientRenderer
 

@@ -288,8 +288,8 @@ def _check_loaded_sensor(number: int, sensor: Any, options: BuildOptions) -> Non
     if options.transient and not is_time_resolved(film):
         raise SceneError(
             f"sensor {number} was taken as it is with its film, a {class_of(film)}, which has no time axis; no other "
-            "film is built in its place. Make the scene with a transient_hdr_film, phasor_hdr_film or gated_hdr_film. "
-            f"{WAY_OUT}."
+            "film is built in its place. Make the scene with a transient_hdr_film, phasor_hdr_film, gated_hdr_film, "
+            f"rate_hdr_film or beat_hdr_film. {WAY_OUT}."
         )
     changes = [name for name in ("pulse", "irf") if getattr(options, name) is not None]
     changes += [] if options.steady or not getattr(film, "keeps_steady", True) else ["steady"]

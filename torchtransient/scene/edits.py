@@ -268,8 +268,8 @@ def _edit_film(state: Any, index: int, options: BuildOptions) -> None:
         if options.transient and plugin in _STEADY_FILMS:
             raise SceneError(
                 f"the film is a steady {plugin!r}, which has no time axis. Give TransientRenderer(..., time_axis=...), "
-                "frequencies=... or gates=..., or make the film a transient_hdr_film, phasor_hdr_film or "
-                "gated_hdr_film."
+                "frequencies=..., gates=..., rates=... or chirps=..., or make the film a transient_hdr_film, "
+                "phasor_hdr_film, gated_hdr_film, rate_hdr_film or beat_hdr_film."
             )
         return
     if plugin in _STEADY_FILMS and not options.transient:

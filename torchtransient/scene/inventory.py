@@ -22,6 +22,7 @@ from torchtransient.plugins.drjit_pool import threads_for_files
 from torchtransient.scene.checks import check_nodes
 from torchtransient.scene.edits import NO_LIMIT, described_depth
 from torchtransient.scene.load import Scene
+from torchtransient.scene.motions import has_velocities
 from torchtransient.scene.nodes import (
     children,
     find_child,
@@ -81,6 +82,7 @@ class SceneInventory:
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
         sampler: sampler that integrator or sensor name, None if neither does.
+        moves: some body has a velocity.
         pulsed: the film spreads arrivals by a pulse or an impulse response.
         plugins: names of all plugins.
     """
@@ -103,6 +105,7 @@ class SceneInventory:
     temporal_filter: str | None = None
     sampler: str | None = None
     pulsed: bool = False
+    moves: bool = False
     plugins: set[str] = field(default_factory=set)
 
 
@@ -163,7 +166,7 @@ def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -
         lookup: function of a file's name that finds its path as Mitsuba does.
         sensor: index of the sensor whose film is described.
     """
-    inventory = SceneInventory()
+    inventory = SceneInventory(moves=has_velocities(state))
     order = reachable(state, rendered_children(state))
     _note_unused(inventory, state, set(order))
     surfaces_of_interfaces: list[int] = []

@@ -174,8 +174,9 @@ class Scene:
         self._description.check_described("scene.moving")
         assert not isinstance(self._description, LoadedScene)  # refused above
         given = body_motions(mapping("scene.moving", motions, "{name: tt.Motion(...)}"))
-        kept = [motion for motion in self._description.motions if motion.of not in {one.of for one in given}]
-        other = Scene(replace(self._description, motions=(*kept, *given)), self._requested_variant)
+        motions_by_name = {motion.of: motion for motion in (*self._description.motions, *given)}
+        placed = tuple(motions_by_name[name] for name in sorted(motions_by_name))
+        other = Scene(replace(self._description, motions=placed), self._requested_variant)
         other._variant = self._variant
         with active_variant(other.variant):
             other.built(BuildOptions(real_bitmaps=True))  # a wrong name is told here
@@ -320,7 +321,9 @@ class Scene:
         return self
 
     def __repr__(self) -> str:
-        return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r})"
+        names = [motion.of for motion in getattr(self._description, "motions", ())]
+        moving = f", moving={names}" if names else ""
+        return f"tt.Scene({self._description.name!r}, variant={self._variant or self._requested_variant!r}{moving})"
 
 
 @opaque

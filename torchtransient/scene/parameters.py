@@ -49,6 +49,7 @@ class ParameterInfo:
         always_biased: the derivative is known to be wrong in every scene.
         edges_missing: moving edges that the derivative does not follow in this scene, in words.
         has_boundary_term: it moves edges, and the derivative follows them.
+        is_velocity: films of rates alone measure it.
         place: names of the parameter and of the plugins around it.
         checked: the sweep of gradients has compared it with finite differences in such a place
             (``docs/gradients_sweep.md``).
@@ -67,6 +68,7 @@ class ParameterInfo:
     always_biased: bool = False
     edges_missing: tuple[str, ...] = ()
     has_boundary_term: bool = False
+    is_velocity: bool = False
     place: tuple[str, ...] = ()
     checked: bool = True
 
@@ -238,6 +240,7 @@ def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect
         moves_silhouette=effect.moves_silhouette,
         moves_medium=effect.moves_medium,
         always_biased=effect.biased,
+        is_velocity=effect.role == "velocity",
     )
 
 
@@ -276,14 +279,15 @@ def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any)
     return _info(key, kind, shape, value, effect)
 
 
-def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str]) -> list[str]:
+def needing_slope(infos: Mapping[str, ParameterInfo], keys: Iterable[str], rates: bool = False) -> list[str]:
     """Return the keys that can change a path length, whose derivatives need a film with a slope in time.
 
     Args:
         infos: parameters by key.
         keys: some of the keys.
+        rates: the film measures rates, so that velocities need a slope, too.
     """
-    return [key for key in keys if infos[key].moves_path_length]
+    return [key for key in keys if infos[key].moves_path_length and (rates or not infos[key].is_velocity)]
 
 
 def is_transform(value: Any) -> bool:

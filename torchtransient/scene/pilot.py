@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.errors import ArgumentError, GradientError
 from torchtransient.gates import Gate
 from torchtransient.scene.edits import NO_LIMIT, BuildOptions, built_depth
@@ -34,6 +34,8 @@ BLOCK_ALLOWANCE = 10.0
 # Bins of an axis without a given bin width, and the most that an axis gets without being asked.
 DEFAULT_BINS = 300
 MOST_BINS = 4096
+# Bins of an axis of rates.
+RATE_BINS = 64
 
 
 @dataclass(frozen=True)
@@ -67,14 +69,15 @@ class Arrivals:
     """Arrivals of a pilot run: energies and times, and the shares of the light in parts of them.
 
     Attributes:
-        opl, energy, depth, path: optical path length (metres), energy, depth and number of the path, all (N,).
+        opl, energy, depth, path, rate: optical path length (metres), energy, depth, number and rate (m/s) of the path,
+            all (N,).
         paths: number of traced paths.
         total: energy of all arrivals.
     """
 
     def __init__(self, events: Any):
         self.opl, self.energy, self.depth, self.path = events.opl, events.energy, events.depth, events.path
-        self.paths = events.paths
+        self.rate, self.paths = events.rate, events.paths
         self.total = float(self.energy.sum())
         width, height = events.size
         across, down = min(BLOCKS, width), min(BLOCKS, height)
@@ -89,6 +92,18 @@ class Arrivals:
         seen.energy = self.energy * sum(gate.value(self.opl) for gate in gates)
         seen.total = float(seen.energy.sum())
         seen.block_total = np.bincount(self.block, seen.energy, self.blocks)
+        return seen
+
+    def shifted(self, seconds: Sequence[float]) -> Arrivals:
+        """Return the arrivals as spectra of beats have them: each one later by its rate times each of some times.
+
+        The spectra share the energy.
+        """
+        seen, count = copy.copy(self), len(seconds)
+        seen.opl = np.concatenate([self.opl + s * self.rate for s in seconds])
+        seen.energy = np.tile(self.energy / count, count)
+        for name in ("depth", "path", "rate", "block"):
+            setattr(seen, name, np.tile(getattr(self, name), count))
         return seen
 
     @property
@@ -202,6 +217,20 @@ class Arrivals:
             else:
                 low = middle + 1
         return float(times[0]), float(times[low])
+
+
+def rate_axis_over(low: float, high: float) -> RateAxis:
+    """Return 64 bins that hold rest and all rates (m/s) from ``low`` to ``high``; a rate of zero is in a bin's middle.
+
+    Of rest alone one bin, 1 m/s wide.
+    """
+    low, high = min(low, 0.0), max(high, 0.0)
+    if low == high:
+        return RateAxis(-0.5, 1.0, 1)
+    width = _round_up((high - low) / (RATE_BINS - 4))
+    first, last = math.floor(low / width + 0.5), math.floor(high / width + 0.5)
+    first -= (RATE_BINS - 1 - last + first) // 2
+    return RateAxis(float(f"{(first - 0.5) * width:.12g}"), float(f"{width:.12g}"), RATE_BINS)
 
 
 def pilot_run(

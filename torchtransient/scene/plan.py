@@ -23,7 +23,15 @@ from torchtransient.scene.inventory import Finding, SceneInventory
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.nodes import is_transient_integrator
 from torchtransient.scene.parameters import ParameterInfo, needing_slope, unknown_key
-from torchtransient.scene.pilot import BLOCK_ALLOWANCE, MOST_BINS, Arrivals, PilotReport, axis_over, pilot_run
+from torchtransient.scene.pilot import (
+    BLOCK_ALLOWANCE,
+    MOST_BINS,
+    Arrivals,
+    PilotReport,
+    axis_over,
+    pilot_run,
+    rate_axis_over,
+)
 from torchtransient.scene.slope import check_filter, filter_for
 from torchtransient.scene.variant import active_variant
 
@@ -317,14 +325,17 @@ class Finder:
             GradientError: for a filter without a slope, with parameters that change path lengths.
         """
         wants_axis = self.draft.film.kind.has_bins and not self.draft.film.all_times and time_axis is None
-        if pilot and (max_depth is None or wants_axis):
+        wants_rates = self.draft.film.has_rows and self._given_film is None
+        if pilot and (max_depth is None or wants_axis or wants_rates):
             self._run()
         depth = self._depth(max_depth)
         self._note_light(depth)
         filter_name = self._filter(temporal_filter)
         axis = self._axis(time_axis, bins, depth, _REACH.get(filter_name, 0.0))
+        film = self.draft.film_choice
+        if axis is not None:
+            film = self.draft.film.film_over(axis, self._rows(depth) if self.draft.film.has_rows else None)
         report = None if self.arrivals is None else self._report(self.arrivals)
-        film = self.draft.film_choice if axis is None else self.draft.film.kind(axis)
         return Findings(depth, film, filter_name, tuple(self.reasons), report)
 
     def _run(self) -> None:
@@ -494,9 +505,13 @@ class Finder:
     ) -> TimeAxis:
         num_bins, width = bins
         first, last = arrivals.window(depth or -1, self.missed)
-        how = ""
-        if width is None and num_bins is None and self.draft.described_axis is not None:
-            width, how = self.draft.described_axis.bin_width_opl, ", bin width of the scene's film"
+        how, film = "", self._given_film
+        own = None if film is None else film.resolution_opl()
+        why = ", a bin for each line of the chirps" if own is not None else ", bin width of the scene's film"
+        if own is None and self.draft.described_axis is not None:
+            own = self.draft.described_axis.bin_width_opl
+        if width is None and num_bins is None and own is not None:
+            width, how = own, why
             if (last - first) / width > MOST_BINS:
                 width, num_bins, how = None, MOST_BINS, f", {MOST_BINS} bins since the film's width would take more"
         if self.spread != (0.0, 0.0):
@@ -514,6 +529,39 @@ class Finder:
             f"last arrival came at {float(arrivals.opl.max()):.4g} m"
         )
         return axis
+
+    @property
+    def _given_film(self) -> Any:
+        """Film that the call gives, or else the scene's own of that kind; None without one."""
+        own = self.draft.described_film
+        return self.draft.film_choice or (own if isinstance(own, self.draft.film.kind) else None)
+
+    def _rows(self, depth: int | None) -> Any:
+        """Return the bins of the rate, or the chirps, of a film of such."""
+        given, arrivals = self._given_film, self.arrivals
+        rates = None
+        if arrivals is not None and not arrivals.dark:
+            rates = arrivals.rate[arrivals.depth <= depth] if depth is not None and depth > 0 else arrivals.rate
+        moving = rates is not None and bool(rates.any())
+        if rates is None and given is None:
+            raise SceneError(
+                "tt.plan: no light of a pilot run shows the rates of its paths. Give "
+                f"{self.draft.film.kind.example}, or let a pilot run find them."
+            )
+        if rates is not None and moving:
+            self.reasons.append(f"rates: {rates.min():.4g} to {rates.max():.4g} m/s in the pilot run")
+        if not self.inventory.moves and not moving:
+            self.reasons.append(
+                "nothing moves: all light is at rate zero; scene.moving({name: tt.Motion(...)}) gives bodies velocities"
+            )
+        if given is not None:
+            why = "the scene's own" if self.draft.film_choice is None else "as asked for"
+            self.reasons.append(f"{given.argument}: {given.settings}, {why}")
+            return given.settings
+        assert rates is not None  # see above
+        found = rate_axis_over(float(rates.min()), float(rates.max()))
+        self.reasons.append(f"rate axis: {found}, so that it holds these and rest")
+        return found
 
     # ------------------------------------------------------------------------------------------------- derivatives
 
@@ -538,7 +586,7 @@ class Finder:
             if key not in table:
                 raise SceneError(unknown_key(key, list(table)))
         self._note_edges([table[key] for key in self.draft.parameters])
-        moving = needing_slope(table, self.draft.parameters)
+        moving = needing_slope(table, self.draft.parameters, kind.knows_rates)
         pulsed = bool(self.draft.pulse or self.draft.irf or self.inventory.pulsed)
         if not kind.has_bins:
             film = self.draft.film_choice or self.draft.described_film

@@ -31,6 +31,7 @@ from torchtransient.plugins.node_walk import ShownValue, objects_below, objects_
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients, same_spectra
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.description import Plain
+from torchtransient.scene.motions import PLUGIN as MOTION
 from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
 from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, flat_drjit_copy
@@ -446,6 +447,7 @@ class XmlWriter:
         self.state, self.folder = state, folder
         self._direct = {index for _, index in children(state, state.root)}
         self._names = [node.props.id() for node in state.nodes]
+        self._moving = {node.props["of"] for node in state.nodes if node.props.plugin_name() == MOTION}
         self._written: dict[int, ElementTree.Element] = {}
         self._kinds: dict[int, str] = {}
         self._count = 0
@@ -518,8 +520,9 @@ class XmlWriter:
             raise SceneError(f"scene.save: the kind of plugin {plugin!r} is not known, so that XML has no tag for it.")
         element = ElementTree.SubElement(parent, tag, type=plugin)
         _named(element, label)
-        # Keys of shapes in groups and of sensors in batches have their names too.
+        # Keys of shapes in groups and of sensors in batches have their names too, and motions name what moves.
         named = direct or (kind in ("Shape", "Sensor") and self._names.count(node.props.id()) == 1)
+        named |= node.props.id() in self._moving
         if named and node.props.id():
             element.set("id", node.props.id())
         self._written[index] = element

@@ -11,7 +11,7 @@ from torchtransient.vis.colour_maps import cyclic_map as cyclic_map
 from torchtransient.vis.colour_maps import rainbow_map as rainbow_map
 from torchtransient.vis.contact_sheet import Cell as Cell
 from torchtransient.vis.contact_sheet import contact_sheet as contact_sheet
-from torchtransient.vis.fit_progress import plot_fit as plot_fit
+from torchtransient.vis.fit_monitor import FitMonitor as FitMonitor
 from torchtransient.vis.gradients import gradient_picture as gradient_picture
 from torchtransient.vis.overview import light_curve as light_curve
 from torchtransient.vis.overview import median_pixel as median_pixel

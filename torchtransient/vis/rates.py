@@ -15,7 +15,7 @@ from torchtransient.checks import is_one_of, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import figure_type, picture_figure, save_figure
-from torchtransient.vis.sources import Source, as_tensor, pixel_of
+from torchtransient.vis.sources import Source, as_tensor, pixel_of, read_rates
 from torchtransient.vis.tone_mapping import checked_positive
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def range_doppler(
     changed, and the distance, half the length, of what is seen from beside the light.
 
     Args:
-        source: light (C, R, T, H, W), or a result that has it as ``rates``; channels are added up.
+        source: light (C, R, T, H, W), or a result or its file that has it as ``rates``; channels are added up.
         path: file to write the figure to.
         axis, rate_axis: axes of T and R; None takes those of the result, ``axis`` and ``rate_axis``.
         pixel: (row, column); None for the mean over all pixels.
@@ -95,8 +95,8 @@ def speed_picture(
     """A matplotlib figure of the speed of approach of every pixel: blue comes nearer, red goes away, white stands.
 
     Args:
-        source: light (C, R, T, H, W), or a result that has it as ``rates``: the speed is minus half the rate; or
-            speeds (H, W) or (1, H, W) in m/s, as `sensing.range_and_speed` finds them.
+        source: light (C, R, T, H, W), or a result or its file that has it as ``rates``: the speed is
+            minus half the rate; or speeds (H, W) or (1, H, W) in m/s, as `sensing.range_and_speed` finds them.
         path: file to write the figure to.
         rate_axis: axis of R; None takes that of the result, ``rate_axis``.
         reading: "mean", the mean rate of a pixel's light, or "peak", the rate of its brightest bin, all lengths added
@@ -148,6 +148,8 @@ def _rates_of(
     source: Source, axis: TimeAxis | None, rate_axis: RateAxis | None, who: str
 ) -> tuple[Tensor, TimeAxis | None, RateAxis]:
     """Light (R, T, H, W), float64, channels added up, and its axes."""
+    if isinstance(source, str | Path):
+        source = read_rates(Path(source))
     held = getattr(source, "rates", None)
     if held is not None:
         axis = getattr(source, "axis", None) if axis is None else axis

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.array_files.array_file import damage_said, read_npy, read_some
 from torchtransient.array_files.plain_texts import json_data
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.checks import as_whole, of_class, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 
@@ -27,7 +27,9 @@ _READERS = {
     "torchtransient capture": ("torchtransient.files.capture_file", "read_capture"),
     "torchtransient volume": ("torchtransient.files.volume_file", "read_volume"),
 }
-_TENSORS = ("transient", "steady", "phasor", "gated")
+_TENSORS = ("transient", "steady", "phasor", "gated", "rates", "beats")
+# Dimensions of what one render has, without Stokes components.
+_DIMENSIONS = {"transient": 4, "gated": 4, "rates": 5, "beats": 5}
 _KNOWN = {
     *_TENSORS, "start_opl", "bin_width_opl", "num_bins", "gates", "metadata", "frequencies_per_metre",
 }  # fmt: skip
@@ -43,6 +45,7 @@ class Loaded:
     axis: TimeAxis | None = None
     frequencies: tuple[float, ...] | None = None
     gated: Tensor | None = None
+    beats: Tensor | None = None
 
 
 def transient_of(
@@ -51,15 +54,20 @@ def transient_of(
     """The intensity over time (C, T, H, W), C = 1 or 3, on the CPU without gradients, and its axis if it is known.
 
     `source`: a tensor or array (C, T, H, W), or polarized (4, C, T, H, W) of which the first component is taken; an
-    object with `transient` (and `axis`), such as a RenderOutput; or a file, `.h5`, `.npz` or `.npy`. `axis` replaces
-    the source's. Raises ShapeError for another shape, an empty cube, or an axis of another number of bins; StorageError
-    for a file that cannot be read.
+    object with `transient` (and `axis`), such as a RenderOutput; or a file, `.h5`, `.npz` or `.npy`. Of light by rates
+    the sum over these. `axis` replaces the source's. Raises ShapeError for another shape, an empty cube, or an axis of
+    another number of bins; StorageError for a file that cannot be read.
     """
     loaded = _load(source, "transient")
     if loaded.transient is None and loaded.gated is not None:
         raise ShapeError(
             f"{who}: expected a transient (C, T, H, W), and the source holds {loaded.gated.shape[-3]} images of time "
             "gates, which are no bins. Draw them with frames, frame_grid or histogram, or render with time_axis=..."
+        )
+    if loaded.transient is None and loaded.beats is not None:
+        raise ShapeError(
+            f"{who}: expected a transient (C, T, H, W), and the source holds spectra of beats, whose places are no "
+            "times of arrival. tt.sensing.range_and_speed reads distances and speeds off them."
         )
     cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
     return _checked_cube(cube, loaded.axis if axis is None else axis, who, any_channels)
@@ -201,11 +209,12 @@ def as_tensor(value: Any, who: str) -> Tensor:
 
 def _refuse_batch(source: Any) -> None:
     """Four entries of a batch must not pass for four components of polarized light, where the source can tell."""
-    given = [getattr(source, name, None) for name in ("transient", "gated")]
-    cube, polarized = next((c for c in given if c is not None), None), getattr(source, "polarized", None)
+    given = {name: getattr(source, name, None) for name in _DIMENSIONS}
+    name, cube = next(((n, c) for n, c in given.items() if c is not None), ("", None))
+    polarized = getattr(source, "polarized", None)
     if polarized is None and isinstance(getattr(source, "metadata", None), dict):
         polarized = _variant_is_polarized(source.metadata)
-    if polarized is False and cube is not None and cube.ndim > 4:
+    if polarized is False and cube is not None and cube.ndim > _DIMENSIONS[name]:
         raise ShapeError(
             f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(cube.shape)}; "
             "choose one entry."
@@ -243,12 +252,12 @@ def _load(source: Source, name: str) -> Loaded:
         source = read_file(Path(source))
     if isinstance(source, Loaded):
         return source
-    if any(hasattr(source, name) for name in ("transient", "phasor", "gated")):
+    if any(hasattr(source, name) for name in _TENSORS if name != "steady"):
         _refuse_batch(source)
         given = {key: getattr(source, key, None) for key in _TENSORS}
         known = frequencies_of(getattr(source, "frequencies", None))
         tensors = {key: as_tensor(value, key) for key, value in given.items() if value is not None}
-        return Loaded(**tensors, axis=getattr(source, "axis", None), frequencies=known)
+        return Loaded(**_summed(tensors), axis=getattr(source, "axis", None), frequencies=known)
     tensor = as_tensor(source, "picture")
     if name == "phasor":
         return Loaded(phasor=tensor)
@@ -270,11 +279,38 @@ def read_any(path: Path) -> Any:
     return read_file(path)
 
 
+def _axis_in(values: Mapping[str, Any]) -> TimeAxis | None:
+    if "num_bins" not in values:
+        return None
+    return TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+
+
+def read_rates(path: Path) -> Any:
+    """Light by rates of a file with its axes: an object with `rates`, `axis` and `rate_axis`. Errors as `read_file`."""
+    if path.suffix.lower() not in (*_HDF5, ".npz"):
+        raise StorageError(f"picture: expected a result, .h5 or .npz, got '{path}'.")
+    names = ("rates_start", "rates_bin_width", "rates_num_bins")
+    values = read_some(path, "picture", {*names, *_KNOWN}.__contains__)
+    if "rates" not in values:
+        raise StorageError(f"picture: '{path}' holds no light by rates; render it with rates=tt.RateAxis(...).")
+    with damage_said(path, "picture", "a result"):
+        start, width, bins = (values[name] for name in names)
+        rate_axis = RateAxis(float(start), float(width), int(bins))
+        return SimpleNamespace(rates=as_tensor(values["rates"], "rates"), axis=_axis_in(values), rate_axis=rate_axis)
+
+
+def _summed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors with the sum over rates in place of light by rates."""
+    rates = tensors.pop("rates", None)
+    return tensors if rates is None else {**tensors, "transient": rates.sum(-4)}
+
+
 def read_file(path: Path) -> Any:
     """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
 
-    Of a result, the names `transient`, `steady`, `phasor`, `gated` and the numbers of the axis are read, each if it is
-    there, and compared with their checksums. Raises StorageError for a missing, damaged or unknown file.
+    Of a result, the names `transient`, `steady`, `phasor`, `gated`, `rates`, `beats` and the numbers of the axis are
+    read, each if it is there, and compared with their checksums. Raises StorageError for a missing, damaged or unknown
+    file.
     """
     if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
         raise StorageError(f"picture: expected a result, .h5, .npz or .npy, got '{path}'.")
@@ -282,15 +318,13 @@ def read_file(path: Path) -> Any:
         return read_npy(path, "picture")
     values = read_some(path, "picture", _KNOWN.__contains__)
     with damage_said(path, "picture", "a result"):
-        axis = None
-        if "num_bins" in values:
-            axis = TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
+        axis = _axis_in(values)
         if "gates" in values and "gated" not in values:
             values["gated"] = values.pop("transient")  # as files of earlier versions call it
         arrays = {key: as_tensor(values[key], key) for key in _TENSORS if key in values}
-    if any(arrays[key].ndim > 4 for key in ("transient", "gated") if key in arrays) and "metadata" in values:
+    if any(arrays[key].ndim > n for key, n in _DIMENSIONS.items() if key in arrays) and "metadata" in values:
         _refuse_batch(SimpleNamespace(**arrays, metadata=json_data(str(values["metadata"]), f"picture: '{path}'")))
     if not arrays:
         raise StorageError(f"picture: '{path}' holds none of {', '.join(_TENSORS[:-1])} and {_TENSORS[-1]}.")
-    return Loaded(**arrays, axis=axis, frequencies=frequencies_of(values.get("frequencies_per_metre")))
+    return Loaded(**_summed(arrays), axis=axis, frequencies=frequencies_of(values.get("frequencies_per_metre")))
 

@@ -173,6 +173,7 @@ NOT_NUMBERS_OF_A_DEVICE = {
     "width", "samples", "closed", "acts_on", "args", "kwargs", "calibration", "depth_map_m", "direction",
     "phase_map_rad",
     "phase_offset_rad", "start_s", "afterpulsing", "columns", "delays", "detector", "sensors", "weights", "which",
+    "chirps", "window",
 }  # fmt: skip
 
 

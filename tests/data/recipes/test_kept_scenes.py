@@ -79,7 +79,7 @@ def test_samples_are_finite(monkeypatch):
 
 
 def test_measures_are_the_same_for_all():
-    one = Measures("transient", (4, 5, 6), tt.TimeAxis(0, 1, 6), None, None, ("y",), 4)
+    one = Measures("transient", (4, 5, 6), tt.TimeAxis(0, 1, 6), None, None, None, None, ("y",), 4)
     one.check(one, "this", "that")
     for name, other in (("size", (4, 5, 7)), ("spp", 5), ("channels", ("r", "g")), ("name", "gated")):
         with pytest.raises(ShapeError, match=f"recipe: this has {name} .*, that has .*"):

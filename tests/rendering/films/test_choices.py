@@ -17,8 +17,9 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
 from torchtransient.files.result_file import read_result, write_result
-from torchtransient.rendering import films
-from torchtransient.rendering.films import Gates, Histogram, Phasors, measured
+from torchtransient.rendering import film_layout, films
+from torchtransient.rendering.film_layout import measured
+from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors
 from torchtransient.rendering.output import RenderOutput, RenderStats
 
 VARIANT = "llvm_ad_rgb"
@@ -38,12 +39,20 @@ GIVEN = {
     "time_axis": tt.TimeAxis(3.5, 0.25, 5),
     "frequencies": tt.FrequencyAxis((0.0, 0.5, -2.0), 1.5),
     "gates": (tt.Gate.rectangular(3, 4), tt.Gate.gaussian(7.0, 0.5), tt.Gate.tabulated([1, 2, 4], [0, 1, 0])),
+    "rates": tt.RateAxis(-1.5, 0.5, 4),
+    "chirps": tt.Chirps(1e9, 1e-5, 1550e-9, window="blackman"),
+    "slow_times": (0.0, 1e-3, 2.5e-3, 4e-3),
 }
 each = pytest.mark.parametrize("argument", GIVEN)
 
 
+def arguments_for(argument):
+    beside = next(kind.beside for kind in films.FILMS if kind.argument == argument)
+    return {name: GIVEN[name] for name in (argument, beside) if name}
+
+
 def choice_for(argument):
-    return films.film_of_arguments({argument: GIVEN[argument]})
+    return films.film_of_arguments(arguments_for(argument))
 
 
 def film_node(choice):
@@ -55,18 +64,19 @@ def film_node(choice):
 def output_of(choice, leading=(), components=1):
     generator = torch.Generator().manual_seed(0)
     entries = components * 3 * (2 if choice.is_complex else 1)
-    cube = torch.rand(*leading, 3, 2, choice.count, entries, generator=generator)
-    response = choice.channels_first(cube.reshape(-1, *cube.shape[-4:]).squeeze(0), leading, components)
-    shape = (*leading, *((components,) if components > 1 else ()), 3, choice.count, 3, 2)
-    assert tuple(response.shape) == shape
-    return RenderOutput.of(choice, torch.zeros(*shape[:-3], 3, 2), response, stats=STATS, channels=("R", "G", "B"))
+    cube = torch.rand(*leading, 3, 2, *choice.shape, entries, generator=generator)
+    items = cube.reshape(-1, *cube.shape[len(leading) :])
+    response = choice.channels_first(items if leading else items[0], leading, components)
+    image = (*leading, *((components,) if components > 1 else ()), 3)
+    assert tuple(response.shape) == (*image, *choice.shape, 3, 2)
+    return RenderOutput.of(choice, torch.zeros(*image, 3, 2), response, stats=STATS, channels=("R", "G", "B"))
 
 
 def test_the_list():
-    assert list(films.FILMS) == [Histogram, Phasors, Gates]
+    assert list(films.FILMS) == [Histogram, Phasors, Gates, Rates, Beats, SlowPhasors]
     assert [type(choice_for(argument)) for argument in GIVEN] == list(films.FILMS)
     for name in ("measures", "plugin", "argument", "output", "letter"):
-        assert len({getattr(kind, name) for kind in films.FILMS}) == 3, name
+        assert len({getattr(kind, name) for kind in films.FILMS}) == 6, name
     assert all(plugins.kind_of(kind.plugin) == "film" for kind in films.FILMS)
 
 
@@ -79,7 +89,8 @@ def test_plugin_and_back(argument):
     assert film.plugin == choice.plugin and film.measures == choice.measures
     assert films.layout_of_film(film) == choice and films.layout_of_plugin(choice.plugin) is type(choice)
     assert bool(film.temporal_filter) == choice.has_bins
-    assert film.cube_shape()[2] == choice.count
+    assert film.cube_shape()[2:-1] == choice.shape and choice.shape[-1] == choice.count
+    assert choice.from_properties(film_node(choice)) in (choice, None)
 
 
 @each
@@ -99,7 +110,7 @@ def test_output_and_file(tmp_path, argument, ending, leading, components):
     choice = choice_for(argument)
     out = output_of(choice, leading, components)
     assert films.layout_of_output(out) == choice and not out.others
-    for name in ("transient", "phasor", "gated"):
+    for name in ("transient", "phasor", "gated", "rates", "beats", "slow_phasor"):
         assert (getattr(out, name) is None) == (name != choice.measures)
     back = read_result(write_result(tmp_path / f"a.{ending}", out))
     assert films.layout_of_output(back) == choice
@@ -146,16 +157,24 @@ def test_files_that_do_not_fit_together(tmp_path):
     with pytest.raises(StorageError, match=r"gated of shape .* G = 1"):
         read_result(path)
     np.savez(path, **{name: value for name, value in values.items() if name not in ("gates", "gated")})
-    with pytest.raises(StorageError, match="transient or phasor or gated"):
+    with pytest.raises(StorageError, match="transient or phasor or gated or rates or beats or slow_phasor"):
         read_result(path)
     with pytest.raises(StorageError, match="neither"):
         write_result(path, replace(output_of(choice_for("gates")), gated=None))
+    path = write_result(tmp_path / "b.npz", output_of(choice_for("rates")))
+    with np.load(path) as file:
+        values = first_version({name: file[name] for name in file.files})
+    np.savez(path, **{**values, "rates_num_bins": np.array(3)})
+    with pytest.raises(StorageError, match=r"rates of shape \(3, 4, 5, 3, 2\).* R x T = 3 x 5"):
+        read_result(path)
 
 
 def test_one_film_is_asked_for():
     assert films.film_of_arguments({}) is None and films.film_of_arguments({"gates": None}) is None
-    with pytest.raises(ArgumentError, match="a transient film, a phasor film or a gated film; give one of them"):
+    with pytest.raises(ArgumentError, match="a rates film, a beats film or a slow_phasor film; give one of them"):
         films.film_of_arguments({"time_axis": GIVEN["time_axis"], "gates": GIVEN["gates"]})
+    with pytest.raises(ArgumentError, match="give one of them"):
+        films.film_of_arguments({"rates": GIVEN["rates"], "chirps": GIVEN["chirps"]})
     room = tt.scenes.cornell_box(4)
     with pytest.raises(ArgumentError, match="film, time_axis"):
         tt.TransientRenderer(room, film=choice_for("gates"), time_axis=GIVEN["time_axis"])
@@ -196,6 +215,7 @@ def test_a_single_setting():
         (Histogram, 3), (Histogram, None), (Histogram, (0.0, 1.0, 3)),
         (Gates, 3), (Gates, []), (Gates, "rectangular 1 2"), (Gates, [GIVEN["gates"]]), (Gates, None),
         (Phasors, []), (Phasors, None), (Phasors, "high"), (Phasors, [[0.5]]), (Phasors, GIVEN["time_axis"]),
+        (Rates, 3), (Rates, None), (Rates, GIVEN["time_axis"]), (Beats, 1e9), (Beats, None), (Beats, GIVEN["rates"]),
     ],
 )  # fmt: skip
 def test_objects_refuse_what_their_keywords_refuse(kind, wrong):
@@ -209,7 +229,7 @@ def test_objects_refuse_what_their_keywords_refuse(kind, wrong):
 @each
 def test_an_object_says_the_same_as_the_argument(argument):
     scene = tt.load(tt.scenes.cornell_box(4, max_depth=2), variant=VARIANT)
-    named = tt.TransientRenderer(scene, **{argument: GIVEN[argument]}, spp=2)
+    named = tt.TransientRenderer(scene, **arguments_for(argument), spp=2)
     plain = tt.TransientRenderer(scene, film=choice_for(argument), spp=2)
     assert named.film == plain.film == choice_for(argument) and repr(named) == repr(plain)
 
@@ -233,6 +253,19 @@ def test_settings_in_a_scene():
     assert Histogram.from_properties({}) == Histogram(tt.TimeAxis(0.0, 0.003, 2048))
     found = Histogram.from_properties({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7})
     assert found == Histogram(tt.TimeAxis(2.0, 0.5, 7))
+    with pytest.raises(SceneError, match=r"rate_hdr_film: .*bin_width"):
+        Rates.from_properties({"rate_start": -1.0, "rate_width": 0.0, "rate_bins": 4})
+
+
+def test_rows_without_an_axis_have_that_of_the_scenes_film():
+    film = {"temporal_bins": 5, "start_opl": 3.5, "bin_width_opl": 0.25}
+    scene = tt.scenes.cornell_box(4, max_depth=2)
+    scene["sensor"]["film"] = scene["sensor"]["film"] | film
+    for argument in ("rates", "chirps"):
+        renderer = tt.TransientRenderer(scene, **{argument: GIVEN[argument]}, spp=2, physics="ignore")
+        out = renderer()
+        assert films.layout_of_output(out) == choice_for(argument)
+        assert tuple(choice_for(argument).tensor(out).shape) == (3, *choice_for(argument).shape, 4, 4)
 
 
 @each
@@ -272,15 +305,15 @@ def test_layouts_of_torch(leading, components):
 
     steady, cube, pairs = drawn("hwsc"), drawn("hwtsc"), drawn("hwlmtsc")
     layouts = (
-        (films.steady_channels_first, steady, "hwsc", "schw"),
-        (films.cube_channels_first, cube, "hwtsc", "scthw"),
-        (films.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
+        (film_layout.steady_channels_first, steady, "hwsc", "schw"),
+        (film_layout.cube_channels_first, cube, "hwtsc", "scthw"),
+        (film_layout.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
     )
     for function, values, letters, order in layouts:
         found = function(joined(values), leading, components).numpy()
         np.testing.assert_array_equal(found, expected(values, letters, order))
     waves = cube[..., None] * np.array([2.0, -3.0])
-    found = films.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
+    found = film_layout.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
     np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
 
 

@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from torchtransient.rendering.films import cube_channels_first, phasor_channels_first, steady_channels_first
+from torchtransient.rendering.film_layout import cube_channels_first, phasor_channels_first, steady_channels_first
 
 H, W, T, CHANNELS, COMPONENTS = 2, 3, 5, 2, 4
 LEADING = [(), (7,), (2, 3)]

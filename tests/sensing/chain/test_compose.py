@@ -211,7 +211,7 @@ def test_gates_are_no_bins(stages):
     assert after.expected(images).shape == images.shape
 
 
-@pytest.mark.parametrize("held", [["gated"], ["phasor"], ["moments"], []])
+@pytest.mark.parametrize("held", [["gated"], ["phasor"], ["rates"], ["beats"], ["moments"], []])
 def test_outputs_without_a_transient_say_what_they_hold(held):
     """Not "give out.transient", which is None."""
     tensors = {name: torch.ones(1, 2, 1, 1) for name in held}

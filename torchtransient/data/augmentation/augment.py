@@ -18,14 +18,16 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitErr
 from torchtransient.geometry.pinhole import camera_matrices, transforms
 
 Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
+# Light with rows of histograms before time.
+_ROWS = ("rates", "beats")
 KINDS: dict[str, Kind] = {
-    **dict.fromkeys(("transient", "steady", "phasor", "gated"), "light"),
+    **dict.fromkeys(("transient", "steady", "phasor", "gated", *_ROWS), "light"),
     # Counts are no light that could be interpolated: neighbours' noise would no longer be that of a detector.
     "measurement": "label",
-    **dict.fromkeys(("depth", "z_depth", "uv", "albedo", "first_return"), "label"),
+    **dict.fromkeys(("depth", "z_depth", "uv", "albedo", "first_return", "radial_velocity"), "label"),
     **dict.fromkeys(("shape", "primitive", "material"), "number"),
     "position": "point",
-    "normals": "direction",
+    **dict.fromkeys(("normals", "velocity"), "direction"),
 }
 # What a sample has besides images, by names that `fields` cannot give another meaning.
 _NAMED = ("intrinsics", "to_world", "values", "outside")
@@ -39,17 +41,17 @@ class Augment:
     are; leading dimensions of a batch get the same map. It returns a new one; what is given stays as it is, and what no
     map changes is passed on, not copied. Arrays of numpy that are images come back as tensors.
 
-    - ``transient``, ``steady``, ``phasor``, ``gated``: interpolated between pixels, bin by bin, where pixels do not
-      come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter. UnitError for whole
-      numbers that would have to be interpolated.
-    - ``depth``, ``z_depth``, ``uv``, ``albedo``, ``first_return``: the nearest pixel, since between two depths there is
-      no surface; NaN beyond the rim. Distances stay what they are: the camera is turned about its axis, mirrored, or
-      has another matrix. ``measurement``: the nearest pixel; 0 beyond the rim.
+    - ``transient``, ``steady``, ``phasor``, ``gated``, ``rates``, ``beats``: interpolated between pixels, bin by bin,
+      where pixels do not come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter.
+      UnitError for whole numbers that would have to be interpolated.
+    - ``depth``, ``z_depth``, ``uv``, ``albedo``, ``first_return``, ``radial_velocity``: the nearest pixel, since
+      between two depths there is no surface; NaN beyond the rim. Distances stay what they are: the camera is turned
+      about its axis, mirrored, or has another matrix. ``measurement``: the nearest pixel; 0 beyond the rim.
     - ``shape``, ``primitive``, ``material``: the nearest pixel; -1 beyond the rim.
     - Beyond the rim truth values are False. UnitError for a type that cannot hold what stands there (NaN: whole
       numbers; -1: unsigned ones), of maps that may have a rim: kornia's. Flips, turns and crops take every type.
-    - ``position``, ``normals``: the nearest pixel. Of a mirrored image the world is mirrored in the camera's frame, for
-      which ``to_world`` of the camera is needed.
+    - ``position``, ``normals``, ``velocity``: the nearest pixel. Of a mirrored image the world is mirrored in the
+      camera's frame, for which ``to_world`` of the camera is needed.
     - ``intrinsics``, ``to_world``: those of the camera that has taken the new image (:mod:`torchtransient.geometry`).
     - ``values``: stay. SceneError where the map makes one of them false, a place in a mirror or an angle of view in a
       crop, or where a key is not known not to be; read the data set without (``fields=``).
@@ -172,7 +174,7 @@ class Augment:
         return -1 if self._kind(name) == "number" else torch.nan
 
     def _stokes(self, name: str, light: Tensor, drawn: PixelMap, sample: Mapping[str, Any]) -> Tensor:
-        dim = -4 if name == "steady" else -5
+        dim = {"steady": -4, **dict.fromkeys(_ROWS, -6)}.get(name, -5)
         if light.ndim < -dim or light.shape[dim] != 4:
             raise ShapeError(
                 f"Augment: expected the 4 Stokes components of {name!r} in dimension {dim}, got {tuple(light.shape)}."

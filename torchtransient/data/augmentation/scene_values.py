@@ -33,7 +33,8 @@ _THROWN = frozenset(("intensity", "irradiance", "energy"))
 # Of the world, and of no camera: false in a mirror, true for another camera.
 OF_THE_WORLD = frozenset(
     (
-        "position", "positions", "direction", "center", "p0", "p1", "control_points", "data", "grid", "extent",
+        "position", "positions", "direction", "center", "linear", "angular", "p0", "p1", "control_points", "data",
+        "grid", "extent",
         "opacities", "value", "values", "sun_direction", "theta", "left_handed", "normalmap", "nested_texture",
         "texture", "S", "to_uv", "filename", "bsdf", "scale_tilt", "volume", "color0", "color1", "latitude",
         "longitude", "timezone", "year", "month", "day", "hour", "minute", "second", *VERTEX_COLUMNS, *_THROWN,
@@ -54,7 +55,8 @@ OF_DEVICES = frozenset(
         "black_level_dn", "shot_noise", "signed", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins",
         "f_number", "filter_bandwidth_m", "spectral_irradiance_w_m2_nm",
         "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
-        "spads", "coincidence", "window_s", "exponent", "longest_s", "counted_from", "background",
+        "spads", "coincidence", "photons_per_unit", "looks", "window_s", "exponent", "longest_s", "counted_from",
+        "background", "bandwidth_hz", "duration_s",
     )
 )  # fmt: skip
 # Those among them that may be maps of pixels.

@@ -51,6 +51,8 @@ def summary(folder: str | Path) -> str:
     lines += [f"  stored: {header.get('store')}, {header.get('compression')}"]
     lines += [f"  {_axis(about['axis'])}"] if about.get("axis") else []
     lines += [f"  light outside of the window: {OutsideLight.of(missed).shares()}"] if about.get("axis") else []
+    lines += [f"  {_rates(about['rates'])}"] if about.get("rates") else []
+    lines += [f"  chirps: {_entries(about['chirps'])}"] if about.get("chirps") else []
     lines += [f"  {_frequencies(about['frequencies'])}"] if about.get("frequencies") else []
     spp, error = about.get("spp"), header.get("standard_error")
     lines += [f"  {spp} samples per pixel" + (f", standard error {error:.3g}" if error else "")] if spp else []
@@ -97,6 +99,15 @@ def _plan(plan: Any) -> list[str]:
 def _frequencies(told: dict[str, Any]) -> str:
     numbers = told["per_metre"]
     return f"{len(numbers)} frequencies, {min(numbers):g} to {max(numbers):g} cycles per metre"
+
+
+def _rates(told: dict[str, Any]) -> str:
+    start, width, bins = (told[name] for name in ("start", "bin_width", "num_bins"))
+    return f"{bins} bins of {width:g} m/s of rate, from {start:g} to {start + bins * width:g} m/s"
+
+
+def _entries(told: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in told.items())
 
 
 def _axis(axis: dict[str, Any]) -> str:

@@ -20,7 +20,9 @@ from torchtransient.vis.tone_mapping import tone_map
 
 # Drawn values that a title has room for, and letters of each.
 _MOST_VALUES, _MOST_LETTERS = 3, 24
-_MEASURED = ("transient", "phasor", "gated")
+_MEASURED = ("transient", "phasor", "gated", "rates", "beats")
+# Histograms by rows, which are added up.
+_ROWS = ("rates", "beats")
 
 
 def contact_sheet(
@@ -90,7 +92,7 @@ def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
         name = next((name for name in (*_MEASURED, "measurement") if name in arrays), None)
         if name is None:
             return np.zeros((1, 1, 3))
-        light = np.abs(_last(arrays[name], 2 + behind)).sum(1)
+        light = np.abs(_over_time(arrays, name, behind)).sum(1)
         # Of pairs of points a table of all of them, of a list of points a row.
         while light.ndim > 3:
             light = light.reshape(light.shape[0], light.shape[1] * light.shape[2], -1)
@@ -100,12 +102,23 @@ def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
     return np.asarray(shown)
 
 
+def _over_time(arrays: Mapping[str, NDArray[Any]], name: str, behind: int) -> NDArray[Any]:
+    """Light of the first sensor over time (C, T, ...), or over what the film has in place of time."""
+    if name not in _ROWS:
+        return _last(arrays[name], 2 + behind)
+    total: NDArray[Any] = _last(arrays[name], 3 + behind).sum(1)
+    return total
+
+
 def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
     if name in (*_MEASURED, "steady", "measurement"):
         return None
     if name == "normals":
         directions: NDArray[Any] = np.clip((np.moveaxis(_last(array, 3), 0, -1) + 1) / 2, 0, 1)
         return directions
+    if name == "velocity":
+        speeds: NDArray[Any] = np.linalg.norm(_last(array, 3), axis=0)
+        return speeds
     if name == "albedo":
         colour = np.moveaxis(_last(array, 3), 0, -1)
         if colour.shape[-1] != 3:
@@ -119,10 +132,10 @@ def _label(name: str, array: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _curve(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any] | None:
-    least = 2 + behind
-    name = next((name for name in ("transient", "measurement") if name in arrays and arrays[name].ndim >= least), None)
+    timed = ("transient", "measurement", *_ROWS)
+    name = next((name for name in timed if name in arrays and arrays[name].ndim >= 2 + behind), None)
     if name is None:
         return None
-    light = _last(arrays[name], least)
+    light = _over_time(arrays, name, behind)
     curve: NDArray[Any] = light.sum((0, *range(2, light.ndim)), dtype=np.float64)
     return curve

@@ -60,6 +60,8 @@ class Measures:
     axis: Any
     frequencies: Any
     gates: Any
+    rates: Any
+    chirps: Any
     channels: tuple[str, ...]
     spp: int
 
@@ -104,7 +106,8 @@ class Kept:
             "physics": settings.physics, "sampler": settings.sampler,
         }  # fmt: skip
         if self.scan is None:
-            own = {"gates": settings.gates, "max_depth": settings.max_depth, "sensors": settings.sensors}
+            own: dict[str, Any] = {"gates": settings.gates, "rates": settings.rates, "chirps": settings.chirps}
+            own |= {"max_depth": settings.max_depth, "sensors": settings.sensors}
             own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
             with self._keys_told(lambda: given):
                 return TransientRenderer(given, parameters=self.keys, **common, **own)
@@ -174,7 +177,7 @@ class Kept:
         renderer = self.renderer
         return Measures(
             renderer.film.measures, renderer._cube_shape[:-1], renderer.axis, renderer.frequencies, renderer.gates,
-            renderer._channels, renderer.spp or renderer._scene_spp,
+            renderer.rates, renderer.chirps, renderer._channels, renderer.spp or renderer._scene_spp,
         )  # fmt: skip
 
     def check_labels(self) -> None:
@@ -327,6 +330,8 @@ class Kept:
             "axis": None if renderer.axis is None else asdict(renderer.axis),
             "frequencies": written_frequencies(renderer.frequencies),
             "gates": None if renderer.gates is None else [written_shape(gate) for gate in renderer.gates],
+            "rates": None if renderer.rates is None else asdict(renderer.rates),
+            "chirps": None if renderer.chirps is None else asdict(renderer.chirps),
             "channels": list(renderer._channels),
             "behind_time": 2 if self.scan is None else len(self.scan.shape),
             "spp": renderer.spp or renderer._scene_spp,

@@ -33,13 +33,13 @@ class Recipe(Specification):
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
-    ``labels``: names of :func:`torchtransient.data.scene_labels` and ``first_return``, of the same scene
-    and camera. ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``), ``steady``, labels and
-    ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
+    ``labels``: names of :func:`torchtransient.data.scene_labels` and ``first_return``, of the same scene and camera.
+    ``keep``: names of what samples keep, of ``transient`` (``phasor``, ``gated``, ``rates``, ``beats``), ``steady``,
+    labels and ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
 
-    ``time_axis``, ``frequencies``, ``gates``, ``max_depth``, ``spp``, ``sensors``, ``pulse``, ``irf``: as in
-    :class:`~torchtransient.TransientRenderer`. ``temporal_filter``: "auto" is that of the scene's film, whatever
-    varies. ``variant``: None settles it here as :func:`torchtransient.load` does.
+    ``time_axis``, ``frequencies``, ``gates``, ``rates``, ``chirps``, ``max_depth``, ``spp``, ``sensors``, ``pulse``,
+    ``irf``: as in :class:`~torchtransient.TransientRenderer`. ``temporal_filter``: "auto" is that of the scene's film,
+    whatever varies. ``variant``: None settles it here as :func:`torchtransient.load` does.
 
     ``scan``: makes it a capture around a corner: ``scene`` is what is hidden, ``bounces`` and ``energy`` as in
     :class:`~torchtransient.nlos.CaptureRenderer`, and a time axis (or frequencies) has to be given, since what is

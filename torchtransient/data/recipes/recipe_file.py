@@ -14,13 +14,15 @@ import inspect
 import json
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from torchtransient.array_files.part_files import write_text
 from torchtransient.array_files.plain_texts import json_data, text_of_file
-from torchtransient.axes import TimeAxis
+from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.checks import path_of, short_errors, short_message, shown
+from torchtransient.chirps import Chirps
 from torchtransient.data.recipes.places import files_of, without_places
 from torchtransient.data.recipes.specification import Specification
 from torchtransient.data.recipes.structures import OneOf
@@ -40,6 +42,7 @@ from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene
+from torchtransient.scene.motions import BodyMotion
 from torchtransient.scene.samplers import OF_SCENE
 
 FORMAT = "torchtransient recipe 1"
@@ -49,9 +52,10 @@ _PLAIN = (
     "variant", "seed", "n", "plugins",
 )  # fmt: skip
 _ENTRIES = (
-    "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "pulse",
-    "irf", "device", *_PLAIN,
+    "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "rates",
+    "chirps", "pulse", "irf", "device", *_PLAIN,
 )  # fmt: skip
+_MOVING = {"rates": RateAxis, "chirps": Chirps}
 # What a recipe's samples do not depend on.
 _NO_NUMBERS = ("n", "format")
 
@@ -85,6 +89,8 @@ def to_dict(recipe: Specification) -> dict[str, Any]:
         "seed": recipe.seed,
         "n": recipe.n,
     }
+    # Not in the keys of recipes without them, which are older than these settings.
+    found |= {name: asdict(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
     if settings.sampler != OF_SCENE:
         found["sampler"] = settings.sampler
     if recipe.plugins:
@@ -106,10 +112,19 @@ def _written_scenes(recipe: Specification) -> Any:
 
 
 def _written_scene(description: Any) -> dict[str, Any]:
+    motions = {"motions": [asdict(motion) for motion in description.motions]} if description.motions else {}
     if isinstance(description, XmlDescription):
         text = hashlib.sha256(description.text.encode()).hexdigest()
-        return {"xml": description.path, "parameters": dict(description.parameters), "sha256": text}
-    return {"tree": written(description.tree), "folder": description.folder}
+        return {"xml": description.path, "parameters": dict(description.parameters), "sha256": text, **motions}
+    return {"tree": written(description.tree), "folder": description.folder, **motions}
+
+
+def _motions(given: Mapping[str, Any]) -> tuple[BodyMotion, ...]:
+    parts = ("linear", "angular", "center")
+    return tuple(
+        BodyMotion(str(one["of"]), *(tuple(map(float, one[part])) for part in parts))  # type: ignore[arg-type]
+        for one in given.get("motions", ())
+    )
 
 
 def to_yaml(recipe: Specification, path: str | Path | None) -> str:
@@ -168,6 +183,7 @@ def from_dict(data: Mapping[str, Any], folder: str | Path | None) -> tuple[Any, 
     arguments["pulse"], arguments["irf"] = (read_pulse(section.get(name, None)) for name in ("pulse", "irf"))
     gates = section.get("gates", None)
     arguments["gates"] = None if gates is None else [read_gate(gate) for gate in gates]
+    arguments |= {name: kind(**section.get(name)) for name, kind in _MOVING.items() if section.get(name, None)}
     arguments["device"] = _device(section.get("device", None), place)
     if ("hidden" in section) == ("scene" in section):
         raise SceneError("recipe: expected an entry 'scene', or 'hidden' for a capture around a corner; one of them.")
@@ -241,7 +257,7 @@ def _scene(given: Any, folder: Path) -> Any:
 
 def _of_tree(given: Mapping[str, Any]) -> DictDescription:
     tree = describe_dict(read(given["tree"])).tree
-    return DictDescription(tree, str(given.get("folder", os.getcwd())))
+    return DictDescription(tree, str(given.get("folder", os.getcwd())), _motions(given))
 
 
 def _hidden(given: Any) -> Any:
@@ -260,7 +276,8 @@ def _xml(given: Mapping[str, Any], folder: Path) -> Any:
     found = hashlib.sha256(scene._description.text.encode()).hexdigest()  # type: ignore[union-attr]
     if given.get("sha256", found) != found:
         raise SceneError(f"recipe: scene: '{path}' has changed since the recipe was written; it is another recipe now.")
-    return scene
+    motions = _motions(given)
+    return Scene(replace(scene._description, motions=motions), None) if motions else scene  # type: ignore[arg-type]
 
 
 def _builtin(given: Mapping[str, Any]) -> Any:

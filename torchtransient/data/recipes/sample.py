@@ -18,10 +18,11 @@ class Sample:
     """One sample of a recipe, in memory.
 
     ``index``: its number. ``seed``: of the render, 0 to 2^32 - 1. ``arrays``: what is stored, in torch's layout:
-    ``transient`` float32 (C, T, H, W) or ``phasor`` complex64 (C, F, H, W) or ``gated`` (C, G, H, W), ``steady`` (C, H,
-    W), labels, ``measurement``; leading dimensions as in :class:`~torchtransient.RenderOutput`; a capture has its
-    scan's shape behind T. ``values``: what was drawn, by key: numbers as arrays, everything else as a text.
-    ``outside``: shares of the light before and after the window. ``structure``: which of the recipe's scenes.
+    ``transient`` float32 (C, T, H, W) or ``phasor`` complex64 (C, F, H, W), ``gated`` (C, G, H, W), ``rates`` (C, R, T,
+    H, W), ``beats`` (C, 2, T, H, W), ``steady`` (C, H, W), labels, ``measurement``; leading dimensions as in
+    :class:`~torchtransient.RenderOutput`; a capture has its scan's shape behind T. ``values``: what was drawn, by key:
+    numbers as arrays, everything else as a text. ``outside``: shares of the light before and after the window.
+    ``structure``: which of the recipe's scenes.
     """
 
     index: int

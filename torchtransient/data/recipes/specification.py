@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.checks import MOST, Numbers, as_whole, count, is_one_of, mapping, of_class, real_array, shown
+from torchtransient.chirps import Chirps
 from torchtransient.data.recipes.distribution import Distribution, Place
 from torchtransient.data.recipes.distributions import Choice, pick
 from torchtransient.data.recipes.plugin_modules import check_plugins
@@ -45,6 +46,8 @@ class Settings:
     time_axis: TimeAxis | None = None
     frequencies: FrequencyAxis | None = None
     gates: tuple[Gate, ...] | None = None
+    rates: RateAxis | None = None
+    chirps: Chirps | None = None
     temporal_filter: str = "auto"
     spp: int | None = None
     max_depth: int | None = None
@@ -71,6 +74,8 @@ class Specification:
         time_axis: TimeAxis | None = None,
         frequencies: FrequencyAxis | Numbers | None = None,
         gates: Sequence[Gate] | None = None,
+        rates: RateAxis | None = None,
+        chirps: Chirps | None = None,
         temporal_filter: str = "auto",
         spp: int | None = None,
         max_depth: int | None = None,
@@ -100,6 +105,7 @@ class Specification:
             of_class("recipe: scan", scan, Scan)
         for name, given, kind in (
             ("time_axis", time_axis, TimeAxis), ("pulse", pulse, Pulse), ("irf", irf, Pulse), ("vary", vary, Mapping),
+            ("rates", rates, RateAxis), ("chirps", chirps, Chirps),
         ):  # fmt: skip
             if given is not None and not isinstance(given, kind):
                 what = "dictionary {key: distribution}" if name == "vary" else kind.__name__
@@ -118,7 +124,8 @@ class Specification:
         self.variant = resolve_variant(variant)
         self.settings = Settings(
             labels=labels, keep=keep, time_axis=time_axis, frequencies=frequencies,
-            gates=None if gates is None else tuple(gates), temporal_filter=checked_filter(temporal_filter),
+            gates=None if gates is None else tuple(gates), rates=rates, chirps=chirps,
+            temporal_filter=checked_filter(temporal_filter),
             spp=None if spp is None else count("recipe: spp", spp),
             max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
             sensors=_counts("sensors", sensors, 0, "all"), bounces=_counts("bounces", bounces, 1, "all"),

@@ -19,7 +19,7 @@ STORES = ("exact", "rounded", "counts")
 # What sensors make of a transient; of it alone there are counts.
 COUNTED = "measurement"
 # What films measure, where a header does not say it.
-_FILMS = ("transient", "phasor", "gated")
+_FILMS = ("transient", "phasor", "gated", "rates", "beats")
 MANTISSA_BITS = 10
 ENCODINGS = ("exact", "rounded", "counts")  # of one array
 _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)

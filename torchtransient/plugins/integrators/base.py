@@ -7,7 +7,14 @@ import warnings
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.errors import GradientError, GradientWarning, SceneError, VariantError
+from torchtransient.errors import (
+    GradientError,
+    GradientWarning,
+    SceneError,
+    TorchTransientWarning,
+    VariantError,
+    level_of_user,
+)
 from torchtransient.interfaces import BACKWARD, FORWARD, JOBS, RENDER, IntegratorInterface, is_time_resolved
 from torchtransient.plugins.described_scene import note_scene
 from torchtransient.plugins.films.colour import ChannelMatch
@@ -49,7 +56,7 @@ from torchtransient.plugins.transport.derivative import (
 from torchtransient.plugins.transport.record import RecordSink
 from torchtransient.plugins.transport.scene_contents import SceneCache, SceneContents
 from torchtransient.plugins.transport.sinks import FilmSink
-from torchtransient.plugins.transport.velocities import Velocities
+from torchtransient.plugins.transport.velocities import AT_REST, Velocities, movers_of, unmeasured
 from torchtransient.plugins.transport.walk import first_leg, start, walk
 
 UNLIMITED = 0xFFFFFFFF
@@ -93,7 +100,8 @@ class TransientIntegrator(mi.CppADIntegrator):
     aims_lasers = False
     # Every pixel has samples of its own.
     pixels_are_independent = True
-    # Derivatives warn of moving edges that they do not follow; False if the caller warns, by its keys.
+    # Derivatives warn of moving edges that they do not follow, and of velocities without effect; False if the caller
+    # warns, by its keys.
     warns_of_edges = True
 
     def traverse(self, cb):
@@ -129,8 +137,9 @@ class TransientIntegrator(mi.CppADIntegrator):
         film = sensor.film()
         if not is_time_resolved(film):
             raise SceneError(
-                "transient integrators need a film of type transient_hdr_film, gated_hdr_film or phasor_hdr_film, the "
-                f"sensor has {film.class_name()}; change the film's type in the scene."
+                "transient integrators need a film of type transient_hdr_film, gated_hdr_film, phasor_hdr_film, "
+                f"rate_hdr_film or beat_hdr_film, the sensor has {film.class_name()}; change the film's type in the "
+                "scene."
             )
         if film.exhaustive_scan and not self.scans_exhaustively:
             raise SceneError(
@@ -390,6 +399,7 @@ class TransientIntegrator(mi.CppADIntegrator):
                 contents = self.contents(scene, sensor)
             else:
                 contents, wanted = self._wanted(scene, sensor, film)
+            self._warn_of_rest(scene, contents, film)
             with dr.resume_grad():
                 velocities = Velocities.of_job(scene, contents, film)
             context = self.render_context(scene, contents, wanted, film.arrivals(), velocities=velocities)
@@ -517,7 +527,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             effects = tracker.attached()
             tracker.check_black()
         check_stand_ins(effects)
-        check_slope(moving_names(effects), film.has_slope, film.response_name, film.slope_remedy)
+        felt = [one for one in effects if film.knows_rates or one[2].role != "velocity"]
+        check_slope(moving_names(felt), film.has_slope, film.response_name, film.slope_remedy)
         if self.max_depth == UNLIMITED:
             raise GradientError(
                 "Gradients keep one record per bounce and need a bound: max_depth is -1 (no limit). Set max_depth to a "
@@ -531,6 +542,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             )
         if self.warns_of_edges:
             self._warn_of_edges(scene, sensor, effects)
+            self._warn_of_velocities(scene, film, effects)
         return contents, Wanted(effects, sensor, contents, film.knows_rates)
 
     def _warn_of_edges(self, scene, sensor, effects):
@@ -546,6 +558,23 @@ class TransientIntegrator(mi.CppADIntegrator):
                 found.setdefault(gap, []).append(f"{node.id()}.{key}".lstrip("."))
         for gap, keys in found.items():
             warnings.warn(gap.message(keys), GradientWarning, stacklevel=3)
+
+    def _warn_of_velocities(self, scene, film, effects):
+        """Warn once a scene of each attached velocity that the film does not measure."""
+        warned = self._seen_scene(scene).warned_of_velocities
+        found = [(node, key) for node, key, effect in effects if effect.role == "velocity" and not film.knows_rates]
+        new = [(node, key) for node, key in found if (node.ptr, key) not in warned]
+        warned.update((node.ptr, key) for node, key in new)
+        if new:
+            names = [f"{node.id()}.{key}".lstrip(".") for node, key in new]
+            warnings.warn(unmeasured(names), GradientWarning, stacklevel=level_of_user())
+
+    def _warn_of_rest(self, scene, contents, film):
+        """Warn once a scene of films of rates where nothing moves."""
+        seen = self._seen_scene(scene)
+        if film.knows_rates and not seen.warned_of_rest and not movers_of(scene, contents):
+            seen.warned_of_rest = True
+            warnings.warn(AT_REST, TorchTransientWarning, stacklevel=level_of_user())
 
     @no_collection()
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):

@@ -85,10 +85,7 @@ class TransientPathReuse(path.TransientPath):
         if self.max_depth == UNLIMITED:
             return "max_depth is -1 (no limit), and lists of events need one; set it"
         if film.measures not in ("transient", "gated"):
-            return (
-                f"expected a film of histograms or gates, got {film.plugin}, which sums over all times, where noise is "
-                "that of direct light; take a transient_hdr_film"
-            )
+            return f"expected a film of histograms or gates, got {film.plugin}; take a transient_hdr_film"
         if len(film.band_layout()) > 1:
             return f"the film {film.cube_shape()} exceeds one storage band of 2^32 values; crop it, use fewer bins"
         if delays is not None and delays.shifts:

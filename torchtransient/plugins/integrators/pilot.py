@@ -17,6 +17,7 @@ from torchtransient.plugins.films.colour import ChannelMatch, mean_of
 from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.integrators.job import Pass, seed_array
 from torchtransient.plugins.transport.sinks import EventListSink
+from torchtransient.plugins.transport.velocities import Velocities
 from torchtransient.plugins.transport.walk import walk
 
 # Depth of a pilot's paths. Russian roulette ends most of them long before.
@@ -34,6 +35,7 @@ class PilotEvents:
     ``opl`` (N,) float64, metres of optical path. ``energy`` (N,) float64: contribution to the mean over the image of
     the mean over wavelengths or channels. ``depth`` (N,): smallest ``max_depth`` of a render that contains it.
     ``path`` (N,): number of the camera path; ``pixel`` (N,): its pixel on the pilot's film of ``size`` (width, height).
+    ``rate`` (N,) float64: rate of the path, m/s; zero for a sensor whose film measures no rates.
     """
 
     opl: np.ndarray
@@ -41,6 +43,7 @@ class PilotEvents:
     depth: np.ndarray
     path: np.ndarray
     pixel: np.ndarray
+    rate: np.ndarray
     paths: int
     size: tuple[int, int]
 
@@ -53,7 +56,7 @@ class _PilotFilm:
 
     def __init__(self, film, size: tuple[int, int]):
         self._size = mi.ScalarVector2u(*size)
-        self.curves = film.curves
+        self.curves, self.knows_rates = film.curves, film.knows_rates
 
     def crop_size(self):
         return self._size
@@ -99,6 +102,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
         depth=depth[filled],
         path=path,
         pixel=path // spp,
+        rate=np.array(events.rate, dtype=np.float64)[filled],
         paths=size[0] * size[1] * spp,
         size=size,
     )
@@ -125,10 +129,11 @@ def _trace(scene, integrator, sensor, film, size, spp, seed, slots, roulette) ->
         deepest = settings.max_depth if getattr(integrator, "only_bounces", None) is not None else PILOT_DEPTH
         first = min(settings.rr_depth, PILOT_RR_DEPTH) if roulette else PILOT_DEPTH
         settings = replace(settings, max_depth=deepest, rr_depth=first)
-        context = integrator.render_context(scene, contents, settings=settings)
+        velocities = Velocities.of_job(scene, contents, film)
+        context = integrator.render_context(scene, contents, settings=settings, velocities=velocities)
         walk(context, rays.sampler, integrator.primary_path(context, film, rays), sink)
         most = dr.max(sink.used)
-        dr.eval(most, sink.opl, sink.energy, sink.depth)
+        dr.eval(most, sink.opl, sink.energy, sink.depth, sink.rate)
         dr.sync_thread()
     return sink, spp, int(most[0])
 

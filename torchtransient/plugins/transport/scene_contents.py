@@ -317,6 +317,9 @@ class SceneCache:
         self._samplers: dict[tuple[int, str], tuple[Any, Any]] = {}
         # Parameters, by plugin and key, whose gaps at moving edges a warning has named.
         self.warned_of_edges: set[tuple[int, str]] = set()
+        # Likewise those that have no effect, and whether one has said that nothing moves.
+        self.warned_of_velocities: set[tuple[int, str]] = set()
+        self.warned_of_rest = False
 
     def is_of(self, scene: Any) -> bool:
         """Return True if the cache is that of ``scene``."""

@@ -124,6 +124,7 @@ class EventListSink(Sink):
         opl: optical path length, minus the film's start, Float64.
         energy: energy, Float.
         depth: depth of the event, 0 in empty slots.
+        rate: rate of the path, m/s, Float; zero where the context has no velocities.
         used: number of events of each lane, which may exceed ``slots``.
     """
 
@@ -133,6 +134,7 @@ class EventListSink(Sink):
         self.opl = dr.zeros(mi.Float64, slots * lanes)
         self.energy = dr.zeros(mi.Float, slots * lanes)
         self.depth = dr.zeros(mi.UInt32, slots * lanes)
+        self.rate = dr.zeros(mi.Float, slots * lanes)
         self.used = None
 
     def begin(self, context):
@@ -145,6 +147,8 @@ class EventListSink(Sink):
         dr.scatter(self.opl, event.opl, slot, fits)
         dr.scatter(self.energy, energy, slot, fits)
         dr.scatter(self.depth, event.depth, slot, fits)
+        if event.rate is not None:
+            dr.scatter(self.rate, event.rate, slot, fits)
         state["used"] = used + dr.select(found, mi.UInt32(1), 0)
 
     def end(self, state):

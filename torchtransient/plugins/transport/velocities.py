@@ -14,6 +14,7 @@ of the whole image by time, with its weights and outlines: those are poses at se
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -79,6 +80,21 @@ class Movers:
         return bool(self.motions or self.meshes)
 
 
+def unmeasured(keys: Sequence[str]) -> str:
+    """Return the warning of derivatives by velocities, the parameters ``keys``, on a film without rates."""
+    return (
+        f"the derivative by {', '.join(map(repr, keys))} is zero: a velocity changes the rates of paths and nothing "
+        "else, and the film measures none. Render with rates=tt.RateAxis(...) or chirps=tt.Chirps(...), or leave the "
+        "key out."
+    )
+
+
+AT_REST = (
+    "nothing moves: all light is at rate zero. Give bodies velocities with scene.moving({name: tt.Motion(...)}), or "
+    "render with time_axis=tt.TimeAxis(...)."
+)
+
+
 def movers_of(scene: Any, contents: Any) -> Movers:
     """Return the bodies of a scene that move; ``contents``: its :class:`.scene_contents.SceneContents`."""
     found: Movers = contents.memory.get("movers", 0, lambda: Movers(scene))
@@ -96,7 +112,8 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
             if motion.of not in bodies:
                 raise SceneError(
                     f"rigid_motion {motion.id()!r}: expected the name of a shape, an emitter, a sensor or a medium, "
-                    f"one of {some_of(sorted(filter(None, bodies)))}, got {motion.of!r}."
+                    f"one of {some_of(sorted(filter(None, bodies)))}, got {motion.of!r}. Mitsuba "
+                    "merges shapes, which then have no names: load with tt.load, or mi.load_file(..., optimize=False)."
                 )
             pairs += [(body, motion) for body in bodies[motion.of]]
     own = {shape.ptr for shape in scene.shapes()}

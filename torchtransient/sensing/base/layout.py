@@ -18,8 +18,9 @@ from torchtransient.sensing.base.given import check_dense, refuse_cut_off
 
 TIME = -3  # the time dimension of (..., C, T, H, W)
 _OTHER_FILMS = (
-    "Render with time_axis=...; phasors (out.phasor) go to ItofCorrelation, as the first stage of Compose([...]), and "
-    "gated images (out.gated) are no bins: only what follows a gate may take them."
+    "Render with time_axis=...; phasors (out.phasor) go to ItofCorrelation, as the first stage of Compose([...]), "
+    "spectra of beats (out.beats) to Speckle and BeatNoise, the sum of light by rates (out.rates.sum(-4)) is a "
+    "transient, and gated images (out.gated) are no bins: only what follows a gate may take them."
 )
 
 
@@ -111,11 +112,11 @@ def check_bins(x: Tensor, where: str) -> Tensor:
 def not_a_transient(x: object) -> str:
     """What was given instead of a transient, and what to do: the end of a message."""
     if x is None:
-        return f"None, which is the transient of a render with a phasor or gated film. {_OTHER_FILMS}"
+        return f"None, which is the transient of a render with another film. {_OTHER_FILMS}"
     if getattr(x, "transient", None) is not None:
         return f"{type(x).__name__}. Give its tensor, out.transient, or put the sensor into Compose([...])."
     if hasattr(x, "transient"):
-        there = [name for name in ("phasor", "gated", "steady") if getattr(x, name, None) is not None]
+        there = [name for name in ("phasor", "gated", "rates", "beats", "steady") if getattr(x, name, None) is not None]
         there += [name for name, value in getattr(x, "others", {}).items() if isinstance(value, Tensor)]
         held = f"holds {', '.join(there)} and no transient" if there else "holds no transient"
         return f"{type(x).__name__}, which {held}. {_OTHER_FILMS}"

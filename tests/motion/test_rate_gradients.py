@@ -1,0 +1,202 @@
+"""Derivatives of films of rates and of beats against central differences, in both modes."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support.rates import VARIANT, hidden_plate, plate, scene
+from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+
+RATES, AXIS = tt.RateAxis(-12.0, 0.5, 48), tt.TimeAxis(0.0, 0.2, 60)
+CHIRPS = tt.Chirps(1e9, 2e-6, 1550e-9)
+BEATS = CHIRPS.time_axis((0.5, 6.0), (-6.0, 6.0), bins_per_line=2)
+VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
+
+LAMP = {"type": "point", "position": [0.5, 0.3, -0.5], "intensity": 10.0}
+MOTIONS = {
+    "back": tt.Motion(linear=(0.3, 0.2, -1.0), angular=(0.1, 0.3, 0.2), center=(0.1, 0, 2)),
+    "side": tt.Motion(linear=(0.5, 0.2, -0.4), angular=(0.2, 0.1, 0.1)),
+    "lamp": tt.Motion(linear=(0.2, 0.1, 0.3)),
+    "sensor": tt.Motion(linear=(0.1, -0.2, 0.5), angular=(0.1, 0.05, 0.02), center=(0.5, 0.8, 0.1)),
+}
+
+
+def room(depth=3, fov=30, **more):
+    """Two walls with a gap between them, of which the camera sees one."""
+    back = plate((0, 0, 3), (0, 0, 0), half=50)
+    side = plate((-2, 0, -6), (0, 0, -6), half=8.5)
+    return scene(4, fov, depth, **({"back": back, "side": side, "lamp": LAMP} | more))
+
+
+def renderer_of(loaded, keys, beats=False, spp=4096):
+    film = {"chirps": CHIRPS, "time_axis": BEATS} if beats else {"rates": RATES, "time_axis": AXIS}
+    return tt.TransientRenderer(
+        loaded, keys, temporal_filter="tent", grad_seed="same", physics="ignore", spp=spp, **film
+    )
+
+
+def loss_of(out):
+    """Light weighed by waves over rates and lengths, the other channels by less."""
+    light = out.rates if out.beats is None else out.beats
+    light = light.reshape(-1, *light.shape[-4:])
+    n, m = torch.arange(light.shape[1])[:, None, None, None], torch.arange(light.shape[2])[:, None, None]
+    channels = 1 / (1 + torch.arange(light.shape[0]))[:, None, None, None, None]
+    return (light * channels * torch.sin(0.21 * n + 0.1) * torch.cos(0.13 * m)).sum()
+
+
+def direction_of(key, value):
+    """A direction in the entries of a parameter; of a pose a shift, and of a shape's a turn and a growth too."""
+    generator = torch.Generator().manual_seed(zlib.crc32(key.encode()))
+    noise = torch.randn(value.shape, generator=generator)
+    if key.endswith("to_world"):
+        noise[3] = 0
+        if key.startswith("sensor"):
+            noise[:, :3] = 0
+        return 0.3 * noise
+    # Colours and indices grow.
+    return torch.full(value.shape, 0.2) if key.endswith(("eta", "value")) else noise
+
+
+def compare(renderer, directions=None, step=1e-2, seeds=range(4)):
+    """Check the gradient by each key of a renderer with differences of the same samples, and both modes together."""
+    values = {key: value.detach() for key, value in renderer.values.items()}
+    directions = {key: direction_of(key, value) for key, value in values.items()} | (directions or {})
+
+    def loss(along, seed):
+        moved = {key: values[key] + x * directions[key] for key, x in along.items()}
+        return loss_of(renderer(moved, seed=seed))
+
+    reverse = []
+    for seed in seeds:
+        leaves = {key: torch.zeros((), requires_grad=True) for key in values}
+        reverse.append([float(g) for g in torch.autograd.grad(loss(leaves, seed), list(leaves.values()))])
+    reverse = np.array(reverse)
+    for n, key in enumerate(values):
+        with torch.no_grad():
+            pairs = [[float(loss({key: sign * step}, seed)) for sign in (1.0, -1.0)] for seed in seeds]
+        differences = np.array(pairs) @ [1, -1] / (2 * step)
+        gap, size = reverse[:, n] - differences, abs(differences.mean())
+        error = gap.std(ddof=1) / len(gap) ** 0.5
+        # Differences over a step are off by its square, and by the rounding of sums over the film.
+        assert abs(gap.mean()) < 3 * error + 2e-3 * size, (key, reverse[:, n], differences)
+        assert error < 0.1 * size, (key, reverse[:, n], differences)
+
+    def together(*along):
+        return loss(dict(zip(values, along, strict=True)), seeds[0])
+
+    zeros, ones = (tuple(torch.full((), x) for _ in values) for x in (0.0, 1.0))
+    _, forward = torch.func.jvp(together, zeros, ones)
+    assert float(forward) == pytest.approx(reverse[0].sum(), abs=1e-4 * np.abs(reverse[0]).sum())
+
+
+def in_variants(quick):
+    """Variants for a test, of which one is quick."""
+    return [pytest.param(one, marks=() if one == quick else pytest.mark.slow) for one in VARIANTS]
+
+
+ROOM_KEYS = [
+    *(f"{name}.velocity.{part}" for name in MOTIONS for part in ("linear", "angular")),
+    "back.velocity.center", "back.bsdf.reflectance.value", "side.bsdf.reflectance.value", "lamp.position",
+]  # fmt: skip
+POSES = ["back.to_world", "side.to_world", "sensor.to_world"]
+
+
+@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+def test_velocities_colours_and_places_in_a_room(variant):
+    compare(renderer_of(tt.load(room(), variant=variant).moving(MOTIONS), ROOM_KEYS))
+
+
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
+def test_poses_in_a_room(variant):
+    compare(renderer_of(tt.load(room(), variant=variant).moving(MOTIONS), POSES), seeds=range(8))
+
+
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
+def test_beats_of_a_room(variant):
+    keys = ["back.velocity.linear", "side.velocity.angular", "sensor.velocity.linear", "lamp.position", "back.to_world"]
+    compare(renderer_of(tt.load(room(), variant=variant).moving(MOTIONS), keys, beats=True), seeds=range(8))
+
+
+# ------------------------------------------------------------------------------------------------------------ outlines
+
+PLATES = {
+    "in view": plate((0.05, 0.02, 2.0), (0.05, 0.02, 0), half=0.24, bsdf={"type": "diffuse", "reflectance": 0.4}),
+    "its shadow": plate((0.5, 0.2, 1.4), (0.5, 0.2, 0), half=0.28, bsdf={"type": "diffuse", "reflectance": 0.4}),
+}
+SIDEWAYS = torch.zeros(4, 4)
+SIDEWAYS[:2, 3] = torch.tensor([1.0, 0.5])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", list(PLATES))
+@pytest.mark.parametrize("key", ["plate.to_world", "sensor.to_world", "lamp.position"])
+def test_outlines_that_poses_move(where, key):
+    """What they hide and uncover has other rates. No outline comes to the border of a pixel, where differences kink."""
+    moving = MOTIONS | {"plate": MOTIONS["back"]}
+    del moving["back"]
+    loaded = tt.load(room(fov=20, plate=PLATES[where]), variant=VARIANT).moving(moving)
+    directions = {key: SIDEWAYS if key.endswith("to_world") else torch.tensor([1.0, 0.5, 0.0])}
+    compare(renderer_of(loaded, [key], spp=8192), directions, seeds=range(12))
+
+
+# ------------------------------------------------------------------------------------------- glass, meshes, copies, fog
+
+
+@pytest.mark.slow
+def test_velocities_and_index_of_glass():
+    """A tilted pane before a wall, with a lamp that paths find."""
+    pane = {"type": "cube", "to_world": translate([0, 0, 2.0]) @ rotate([1, 0, 0], 10) @ scale([3, 3, 0.1]),
+            "bsdf": {"type": "dielectric", "int_ior": 1.5}}  # fmt: skip
+    lamp = {"type": "rectangle", "to_world": look_at([1.5, 0.3, 0.5], [0, 0, 3]) @ scale(0.6),
+            "emitter": {"type": "area", "radiance": 10.0}}  # fmt: skip
+    moving = {"back": MOTIONS["back"], "pane": tt.Motion(linear=(0, 0.1, 0.5), angular=(0.1, 0, 0))}
+    loaded = tt.load(room(7, pane=pane, lamp=lamp), variant=VARIANT).moving(moving)
+    keys = ["pane.velocity.linear", "pane.velocity.angular", "back.velocity.linear", "pane.bsdf.eta"]
+    compare(renderer_of(loaded, keys, spp=1 << 15), seeds=range(8))
+
+
+@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+def test_velocities_of_vertices(variant):
+    vertices = np.array([[-9, -9, 3.0], [9, -9, 3.2], [9, 9, 3.1], [-9, 9, 2.9]])
+    speeds = np.array([[0.3, -0.4, 1.2], [0.5, 1.0, -0.7], [0.2, 0.1, 2.0], [-1.0, 0.3, 0.4]])
+    sheet = {"type": "mesh_arrays", "vertices": vertices, "faces": np.array([[0, 2, 1], [0, 3, 2]]),
+             "vertex_velocity": speeds}  # fmt: skip
+    loaded = tt.load(room(back=sheet), variant=variant).moving({"side": MOTIONS["side"]})
+    compare(renderer_of(loaded, ["back.vertex_velocity", "side.velocity.linear", "lamp.position"]))
+
+
+def test_velocities_of_copies():
+    group = {"type": "shapegroup", "leaf": plate((0, 0, 0), (0, 0, 1), half=50)}
+    copy = {"type": "instance", "to_world": translate([0, 0, 3]) @ rotate([0, 1, 0], 180),
+            "group": {"type": "ref", "id": "group"}}  # fmt: skip
+    loaded = tt.load(room(group=group, back=copy), variant=VARIANT).moving(MOTIONS)
+    keys = ["back.velocity.linear", "back.velocity.angular", "side.velocity.linear"]
+    compare(renderer_of(loaded, keys))
+
+
+def test_wind_and_the_colour_of_walls_behind_fog():
+    fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.8, "id": "mist"}
+    box = {"type": "cube", "to_world": translate([0, 0, 1.5]) @ scale([5, 5, 0.9]), "bsdf": {"type": "null"},
+           "interior": fog}  # fmt: skip
+    nodes = room(4, box=box)
+    nodes["integrator"]["type"] = "transient_prbvolpath"
+    wind = tt.Motion(linear=(0.5, 0.2, 0.9), angular=(0.1, 0.3, 0.2))
+    loaded = tt.load(nodes, variant=VARIANT).moving({"back": MOTIONS["back"], "mist": wind})
+    keys = ["mist.velocity.linear", "mist.velocity.angular", "back.velocity.linear", "back.bsdf.reflectance.value"]
+    compare(renderer_of(loaded, keys))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["single", "confocal"])
+def test_a_hidden_plate(kind):
+    """Around a corner; its outline hides and uncovers nothing but itself."""
+    nodes, center, _ = hidden_plate(kind)
+    motion = tt.Motion(linear=(0.8, -0.5, -1.6), angular=(0.6, 1.5, 0.4), center=center)
+    loaded = tt.load(nodes, variant=VARIANT).moving({"hidden": motion})
+    keys = ["hidden.velocity.linear", "hidden.velocity.angular", "hidden.bsdf.reflectance.value", "hidden.to_world"]
+    compare(renderer_of(loaded, keys), step=3e-3, seeds=range(8))
