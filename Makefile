@@ -1,4 +1,4 @@
-# `make demo` on a fresh machine: environment, a rendered and fitted Cornell box, pictures in demo_output/.
+# `make demo` on a fresh machine: environment, a rendered and fitted Cornell box, a page and pictures in demo_output/.
 # `make test`: environment, default tests. Both need Python >= 3.11 with the venv module, and pip's access to packages.
 
 VENV ?= .venv
@@ -7,12 +7,13 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
-.PHONY: demo test test-portable test-slow soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
+.PHONY: demo test test-portable test-slow test-browser soak test-lowest release-check audit lint doctor docs sweep mutants environment clean help
 
 help:
-	@echo "make demo       render a scene, fit a parameter, write pictures to demo_output/"
+	@echo "make demo       render a scene, fit a parameter, write a page and pictures to demo_output/"
 	@echo "make test       default tests          make test-slow  the long ones"
 	@echo "make test-portable  sensors, losses and reconstruction with the arithmetic of an older processor"
+	@echo "make test-browser  pages in Chromium (Debian: apt-get install -y chromium)"
 	@echo "make soak       sweeps: ten thousand mutated files for each reader, a thousand kills (up to 3 h)"
 	@echo "make lint       ruff and mypy          make doctor     check the machine"
 	@echo "make test-lowest  smoke tests with the lowest versions that are allowed, in an environment of its own (6 GB)"
@@ -32,7 +33,7 @@ $(READY): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cpu,vis,data,dev,docs]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cpu,vis,view,data,dev,docs]'
 	@touch $@
 
 demo: $(READY)
@@ -60,6 +61,10 @@ test-portable: $(READY)
 
 test-slow: $(READY)
 	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m slow $(PARALLEL)
+
+# One process: pages are timed by a browser that takes several cores.
+test-browser: $(READY)
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -q -m browser
 
 # Each sweep in processes of its own; -s shows what was found.
 soak: $(READY)

@@ -5,7 +5,9 @@ Everything is a render, of a Cornell box or of two balls; nothing is drawn by ha
 
 from __future__ import annotations
 
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +103,29 @@ def gradients() -> None:
         figure.savefig(OUT / file, dpi=80)
 
 
+def page() -> None:
+    """A page with the light of a box, as Chromium shows it."""
+    from playwright.sync_api import sync_playwright
+
+    box = tt.scenes.cornell_box(resolution=128, mirror=True, sampler="multijitter", **AXIS)
+    with torch.no_grad():
+        out = tt.render(tt.load(box, "llvm_ad_rgb"), spp=512, seed=0, errors=True)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
+        file = Path(folder) / "page.html"
+        tt.vis.view(out, file, title="Cornell box with a mirror")
+        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"])
+        shown = browser.new_page(viewport={"width": 1280, "height": 640})
+        shown.goto(file.as_uri())
+        shown.wait_for_function("window.torchtransient && window.torchtransient.ready")
+        shown.evaluate("torchtransient.state.pixels = []")
+        shown.evaluate("torchtransient.tap(84.5, 52.5), torchtransient.tap(40.5, 110.5)")
+        shown.evaluate("torchtransient.go(92)")
+        shown.wait_for_timeout(1000)
+        shown.screenshot(path=OUT / "page.png")
+        browser.close()
+    to_palette(OUT / "page.png")
+
+
 def fit() -> None:
     """The figure of a fit: nine albedos of the Cornell box."""
     keys = [f"{paint}.reflectance.value" for paint in ("white", "red", "green")]
@@ -128,7 +153,7 @@ def fit() -> None:
     to_palette(OUT / "fit.png")
 
 
-PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients, fit)}
+PARTS = {part.__name__: part for part in (surfaces, polarization, phasors, gradients, fit, page)}
 
 if __name__ == "__main__":
     OUT.mkdir(parents=True, exist_ok=True)

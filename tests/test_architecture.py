@@ -52,7 +52,7 @@ WITHOUT_MITSUBA = {*TORCH_PILLAR, "scenes", *(room for room, level in LEVEL.item
 WITHOUT_TORCH = {"plugins", "scenes", "errors", "interfaces", "volume_methods"}
 HEAVY = {
     "matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin",
-    "zstandard", "webdataset", "ray", "tensorboard", "IPython",
+    "zstandard", "webdataset", "ray", "bokeh", "playwright", "tensorboard", "IPython",
 }  # fmt: skip
 # The rooms of `sensing`: each reads those below it, and what `sensing` offers stands in its `__init__`.
 SENSING = {

@@ -308,7 +308,7 @@ def test_samples_of_the_demo(monkeypatch, tmp_path):
 
     monkeypatch.setattr(tt.TransientRenderer, "__call__", called, raising=False)
     monkeypatch.setattr(
-        tt, "render", lambda scene, spp, **more: asked.append(("truth", spp)) or made(scene, spp=1, **more)
+        tt, "render", lambda scene, spp, **more: asked.append(("truth", spp)) or made(scene, spp=2, **more)
     )
     monkeypatch.setattr(tt.vis.FitMonitor, "save", lambda *_: None)
     monkeypatch.setattr("torchtransient.vis.overview.plot_overview", lambda *_, **__: None)
@@ -317,4 +317,4 @@ def test_samples_of_the_demo(monkeypatch, tmp_path):
         result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     assert asked[0] == ("truth", 48)
-    assert [spp for spp in asked[1:] if spp != 1] == [3, 3]
+    assert [spp for spp in asked[1:] if spp != 2] == [3, 3]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchtransient as tt
 from support.sealed_files import as_first_version
 from torchtransient.array_files import array_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
@@ -197,3 +198,18 @@ def test_a_result_that_was_read_is_written_again(tmp_path):
     again = read_result(write_result(tmp_path / "b.npz", first))
     assert torch.equal(again.transient, first.transient) and again.axis == first.axis
     assert again.metadata == first.metadata and again.metadata["name"] == "first"
+
+
+@pytest.mark.parametrize("ending", ["h5", "npz"])
+@pytest.mark.parametrize("kind", ["rates", "beats"])
+def test_rates_and_beats(tmp_path, kind, ending):
+    axis = tt.TimeAxis(3.5, 0.5, 12)
+    film = {
+        "rates": {"rates": tt.RateAxis(-10.0, 4.0, 5)},
+        "beats": {"chirps": tt.Chirps(bandwidth_hz=1e9, duration_s=1e-5, wavelength_m=1.55e-6)},
+    }[kind]
+    scene = tt.load(tt.scenes.cornell_box(resolution=4, num_bins=12, start_opl=3.5, bin_width_opl=0.5))
+    out = tt.TransientRenderer(scene, spp=4, time_axis=axis, **film)(seed=0)
+    read = read_result(write_result(tmp_path / f"moving.{ending}", out))
+    torch.testing.assert_close(getattr(read, kind), getattr(out, kind).detach(), rtol=0, atol=0)
+    assert (read.axis, read.rate_axis, read.chirps) == (out.axis, out.rate_axis, out.chirps)

@@ -341,6 +341,7 @@ def _pictures() -> dict[str, Case]:
         "vis.frames": Case(v.frames, transient, exposure=1.0, scale=1, every=3),
         "vis.side_by_side": Case(v.side_by_side, [frames, frames], gap=3),
         "vis.write_video": Case(v.write_video, video, list(frames), count=8, fps=10.0),
+        "vis.view": Case(v.view, transient, max_megabytes=3.0, samples=2),
         "vis.video": Case(v.video, transient, video, fps=10.0),
         "vis.Frames": Case(v.Frames, make=len, count=3),
         "vis.peak_time_picture": Case(v.peak_time_picture, transient, axis=AXIS, limits=(1.0, 2.0)),

@@ -259,18 +259,20 @@ def test_volumes():
 def test_maps_of_a_surface():
     depth = torch.arange(12.0).reshape(3, 4)
     seen = depth > 4
-    figure = tt.vis.depth_picture(depth, mask=seen, extent=(2.0, 1.5), title="z")
-    assert size(figure) == (4.6, 3.8) and words(figure.axes[0]) == ("z", "x (m)", "y (m)") and len(figure.axes) == 2
-    drawn = np.ma.filled(figure.axes[0].images[0].get_array(), np.nan)
+    volume = torch.rand(2, 3, 4)
+    figure = tt.vis.volume_views(volume, depth=depth, mask=seen, extent=(2.0, 1.5))
+    assert words(figure.axes[3]) == ("depth", "x (m)", "y (m)") and len(figure.axes) == 5
+    drawn = np.ma.filled(figure.axes[3].images[0].get_array(), np.nan)
     np.testing.assert_array_equal(drawn, torch.where(seen, depth, torch.nan))
-    assert len(tt.vis.depth_picture(depth, mask=torch.zeros(3, 4)).axes) == 1  # nothing has no scale
+    assert len(tt.vis.volume_views(volume, depth=depth, mask=torch.zeros(3, 4)).axes) == 4  # nothing has no scale
     normals = torch.stack([depth / 11, -depth / 11, torch.full((3, 4), 3.0)])
     with unittest.TestCase().assertNoLogs("matplotlib"):  # which says so where colours lie outside
-        panel = tt.vis.normals_picture(normals, mask=seen).axes[0]
+        panel = tt.vis.volume_views(volume, normals=normals, mask=seen).axes[3]
     expected = ((normals + 1) / 2).clamp(0, 1).permute(1, 2, 0)
     expected[~seen] = 0.85
     np.testing.assert_allclose(panel.images[0].get_array(), expected, rtol=1e-6)
-    assert panel.images[0].get_extent() == [-2, 2, -1.5, 1.5] and words(panel) == ("", "x (voxels)", "y (voxels)")
+    assert panel.images[0].get_extent() == [-2, 2, -1.5, 1.5]
+    assert words(panel) == ("normals", "x (voxels)", "y (voxels)")
 
 
 @pytest.mark.parametrize("off, even", [(0.9e-3, True), (1.1e-3, False)])

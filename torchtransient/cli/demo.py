@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
 KEY = "red.reflectance.value"
 CHANNELS = ("red", "green", "blue")
+_TITLE = (
+    "Light in flight: a lamp at the ceiling flashes once, and the slider follows its light through the box in steps of "
+    "0.2 ns. Press play, click the walls, and see at their histograms when light reaches them directly and by bounces."
+)
 
 
 @dataclass
@@ -78,7 +82,7 @@ def _averages(transient: torch.Tensor) -> torch.Tensor:
 @click.option("--spp", type=click.IntRange(1), default=32, show_default=True, help="Samples per pixel of a step.")
 @click.option("--steps", type=click.IntRange(1), default=30, show_default=True, help="Steps of Adam.")
 def command(output: Path, resolution: int, spp: int, steps: int) -> None:
-    """Render the Cornell box in time, then find the colour of its red wall from the transient, starting from grey."""
+    """Render light in flight as a page for the browser, then find the colour of a wall from it, from grey."""
     import torch
 
     import torchtransient as tt
@@ -87,7 +91,10 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     from torchtransient.scene.variant import DEFAULT_VARIANT
     from torchtransient.vis.fit_monitor import FitMonitor
     from torchtransient.vis.overview import plot_overview
+    from torchtransient.vis.pages.layout import import_bokeh
+    from torchtransient.vis.view import view
 
+    import_bokeh()  # missing packages before the work
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -97,11 +104,15 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     scene = tt.load(box, variant=DEFAULT_VARIANT)  # it is about colours
     click.echo(f"Rendering the Cornell box: {resolution} x {resolution} pixels, {bins} bins.")
     with torch.no_grad():
-        truth = tt.render(scene, spp=16 * spp, seed=10_000, progress=True)
+        truth = tt.render(scene, spp=16 * spp, seed=10_000, progress=True, errors=True)
     assert truth.transient is not None and truth.axis is not None  # the film of the box is a histogram
     truth_colour = scene.parameters()[KEY].value
     write_result(output / "cornell_box.npz", truth, {"scene": "cornell_box"})
     plot_overview(truth.transient, truth.steady, truth.axis, path=output / "cornell_box.png", title="Cornell box")
+
+    page = output / "light_in_flight.html"
+    view(truth, page, title=_TITLE)
+    click.echo(f"Light in flight, open it in a browser: {page.resolve().as_uri()}")
 
     click.echo("Fitting the colour of the red wall to this transient, from grey.")
     grey = [0.4, 0.4, 0.4]
@@ -118,9 +129,10 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
         click.echo(f"{name:>8}  {grey[n]:7.4f} {fit.found[n]:7.4f} {float(truth_colour[n]):7.4f}")
     click.echo(f"\nWritten to {output.resolve()}:")
     for name, meaning in (
+        ("light_in_flight.html", "light in flight, for the browser"),
         ("cornell_box.png", "overview of the transient"),
         ("fit.png", "the fit"),
         ("fit.html", "the fit step by step, for a browser"),
         ("cornell_box.npz", "the transient itself"),
     ):
-        click.echo(f"  {name:<16} {meaning}")
+        click.echo(f"  {name:<20} {meaning}")

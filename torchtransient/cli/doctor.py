@@ -48,7 +48,8 @@ def versions() -> list[Finding]:
         found.append(
             _judged(name, version) if version else Finding("problem", name, f"missing: pip install {name}")
         )
-    for name, extra, purpose in (("matplotlib", "vis", "pictures"), ("h5py", "data", "HDF5 files")):
+    optional = (("matplotlib", "vis", "pictures"), ("bokeh", "view", "pages"), ("h5py", "data", "HDF5 files"))
+    for name, extra, purpose in optional:
         version = _version(name)
         missing = f"not installed; {purpose} need it: pip install 'torchtransient[{extra}]'"
         found.append(Finding("ok", name, version) if version else Finding("note", name, missing))

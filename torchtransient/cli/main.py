@@ -23,6 +23,7 @@ COMMANDS = {
     "doctor": "Check that this machine can render, and say what to install.",
     "plan": "Say what a render of a scene needs, and why.",
     "render": "Render a scene file to HDF5 or npz, with pictures and video.",
+    "view": "Show results, captures and volumes in a browser.",
     "video": "Write the light in flight of a result as .mp4 or .gif.",
     "picture": "Draw a result: peak time, rainbow, streak, frames, polarization, ...",
     "nlos": "Simulate a capture around a corner, going on where it was stopped.",

@@ -40,6 +40,5 @@ from torchtransient.vis.video import frames as frames
 from torchtransient.vis.video import side_by_side as side_by_side
 from torchtransient.vis.video import video as video
 from torchtransient.vis.video_file import write_video as write_video
-from torchtransient.vis.volumes import depth_picture as depth_picture
-from torchtransient.vis.volumes import normals_picture as normals_picture
+from torchtransient.vis.view import view as view
 from torchtransient.vis.volumes import volume_views as volume_views

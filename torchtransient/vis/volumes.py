@@ -82,56 +82,7 @@ def volume_views(
     return save_figure(figure, path, "volume_views")
 
 
-def depth_picture(
-    depth: Any,
-    path: str | Path | None = None,
-    *,
-    mask: Any = None,
-    extent: Numbers | None = None,
-    title: str = "",
-) -> Figure:
-    """A matplotlib figure of a depth map (Y, X) in metres, where ``mask`` (Y, X) is true, near dark and far light.
-
-    ``extent`` (width, height) in metres scales the axes. Raises ShapeError, UnitError, StorageError.
-    """
-    plain = _map("depth", depth, None)
-    return _one_panel(plain, mask, extent, title, path, "depth_picture")
-
-
-def normals_picture(
-    normals: Any,
-    path: str | Path | None = None,
-    *,
-    mask: Any = None,
-    extent: Numbers | None = None,
-    title: str = "",
-) -> Figure:
-    """A matplotlib figure of unit normals (3, Y, X) as colours, (n + 1) / 2 for red, green and blue, where ``mask``
-    (Y, X) is true.
-
-    ``extent`` (width, height) in metres scales the axes. Raises ShapeError, UnitError, StorageError.
-    """
-    plain = _normals(normals, None)
-    return _one_panel(plain, mask, extent, title, path, "normals_picture")
-
-
 # ------------------------------------------------------------------------------------------------------------- parts
-
-
-def _one_panel(picture: Tensor, mask: Any, extent: Any, title: str, path: str | Path | None, who: str) -> Figure:
-    size = (picture.shape[-2], picture.shape[-1])
-    kept = None if mask is None else _map("mask", mask, size).bool()
-    _, (width, height) = _scales((1, *size), None, extent)
-    figure = figure_type()(figsize=(_PANEL + 1.2, _PANEL + 0.4), layout="constrained")
-    panel = figure.subplots()
-    box = (-width / 2, width / 2, -height / 2, height / 2)
-    if picture.ndim == 2:
-        _depth_panel(figure, panel, picture, kept, box)
-    else:
-        _normals_panel(panel, picture, kept, box)
-    unit = "m" if extent is not None else "voxels"
-    _label(panel, title, f"x ({unit})", f"y ({unit})")
-    return save_figure(figure, path, who)
 
 
 def _light_panel(panel: Any, picture: Tensor, columns: Tensor, rows: Tensor, aspect: str) -> None:
@@ -190,19 +141,17 @@ def _volume(volume: Any) -> Tensor:
     return values.clamp_min(0)
 
 
-def _map(name: str, values: Any, size: tuple[int, ...] | None) -> Tensor:
+def _map(name: str, values: Any, size: tuple[int, ...]) -> Tensor:
     plain = _plain(name, values)
-    if plain.ndim != 2 or plain.numel() == 0 or (size is not None and tuple(plain.shape) != size):
-        expected = "(Y, X)" if size is None else str(size)
-        raise ShapeError(f"{name}: expected {expected}, got {tuple(plain.shape)}; choose an item and a channel.")
+    if tuple(plain.shape) != size:
+        raise ShapeError(f"{name}: expected {size}, got {tuple(plain.shape)}; choose an item and a channel.")
     return plain
 
 
-def _normals(values: Any, size: tuple[int, ...] | None) -> Tensor:
+def _normals(values: Any, size: tuple[int, ...]) -> Tensor:
     plain = _plain("normals", values)
-    if plain.ndim != 3 or plain.shape[0] != 3 or (size is not None and tuple(plain.shape[1:]) != size):
-        expected = "(3, Y, X)" if size is None else str((3, *size))
-        raise ShapeError(f"normals: expected {expected}, got {tuple(plain.shape)}.")
+    if tuple(plain.shape) != (3, *size):
+        raise ShapeError(f"normals: expected {(3, *size)}, got {tuple(plain.shape)}.")
     return plain
 
 

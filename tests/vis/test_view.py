@@ -1,0 +1,193 @@
+"""Pages of `tt.vis.view` without a browser: codes, sizes, files, and what is refused."""
+
+from __future__ import annotations
+
+import builtins
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt
+from support import view_cases as cases
+from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.vis.pages.codes import NOT_FINITE, PHASE, RATIO, table_of
+from torchtransient.vis.pages.layout import PIXEL_COLOURS, colour_maps
+
+# ---------------------------------------------------------------------------------------------------------- codes
+
+
+def decoded(table, x):
+    return torch.from_numpy(table.values[table.encode(x)])
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_light_is_within_its_error(scale):
+    x = scale * torch.logspace(-9, 0, 4001)
+    table = table_of("light", [x])
+    found = decoded(table, x)
+    kept = x >= table.floor * (1 + 1e-3)
+    assert float((found[kept] / x[kept] - 1).abs().max()) <= table.error
+    assert bool((found[x < table.floor * (1 - 2e-3)] == 0).all())
+    # Six powers of ten in 253 steps.
+    assert table.error == pytest.approx(10 ** (3 / 253) - 1, rel=0.05)
+
+
+def test_light_of_few_decades_is_finer():
+    x = torch.linspace(1.0, 2.0, 1001)
+    table = table_of("light", [x])
+    assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < 0.004
+
+
+def test_numbers_of_both_signs():
+    x = torch.cat([torch.logspace(-3.9, 0, 500), -torch.logspace(-3.9, 0, 500)])
+    table = table_of("light", [x])
+    assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < 0.04
+
+
+def test_counts_are_exact():
+    x = torch.arange(255.0)
+    table = table_of("counts", [x])
+    assert table.error == 0
+    assert torch.equal(decoded(table, x), x)
+    assert table_of("counts", [x + 1.5]).error > 0
+
+
+def test_phases_and_ratios():
+    phases = torch.linspace(-math.pi, math.pi, 3001)
+    off = decoded(PHASE, phases) - phases
+    assert float((off - 2 * math.pi * torch.round(off / (2 * math.pi))).abs().max()) <= PHASE.error * (1 + 1e-5)
+    ratios = torch.linspace(-1, 1, 3001)
+    assert float((decoded(RATIO, ratios) - ratios).abs().max()) <= RATIO.error * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("table", [PHASE, RATIO, table_of("light", [torch.ones(3)]), table_of("x", [-torch.ones(3)])])
+def test_what_is_not_finite_has_its_code(table):
+    assert set(table.encode(torch.tensor([math.nan, math.inf])).tolist()) == {NOT_FINITE}
+    assert math.isnan(table.values[NOT_FINITE])
+
+
+# ---------------------------------------------------------------------------------------------------------- pages
+
+
+def test_a_page_needs_nothing_else(tmp_path):
+    path = tmp_path / "light.html"
+    page = tt.vis.view(cases.front(3), path, axis=cases.AXIS, title="a <b> & c")
+    text = path.read_text(encoding="utf-8")
+    assert page.path == path
+    assert text == page.html
+    assert "<title>a &lt;b&gt; &amp; c</title>" in text
+    assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=\"https?:", text)
+    assert page.notes[0].startswith("Stored in 8 bits")
+
+
+def test_pages_have_the_size_that_was_asked_for():
+    noise = cases.noise(3, 100, 120, 120)
+    large, small = (tt.vis.view(noise, max_megabytes=size) for size in (20, 3))
+    assert len(small.html) <= 3e6 < len(large.html) <= 20e6
+    assert any("adds up" in note or "averages" in note for note in small.notes)
+    assert not any("adds up" in note or "averages" in note for note in large.notes)
+
+
+def test_notebooks_show_small_pages():
+    page = tt.vis.view(cases.front(1), axis=cases.AXIS)
+    assert page._repr_html_().startswith("<iframe srcdoc=")
+    large = tt.vis.view(cases.noise(3, 100, 160, 160))
+    assert "too large for a notebook" in large._repr_html_()
+
+
+def test_files(tmp_path):
+    from torchtransient.files.volume_file import write_volume
+
+    capture, volume = cases.capture("confocal"), cases.volume()
+    capture.write(tmp_path / "capture.h5")
+    write_volume(tmp_path / "volume.npz", volume)
+    np.save(tmp_path / "light.npy", cases.front(1).numpy())
+    for name, x in (("capture.h5", capture), ("volume.npz", volume), ("light.npy", cases.front(1))):
+        assert tt.vis.view(tmp_path / name, title="same").html.count("codes-") == tt.vis.view(x).html.count("codes-")
+
+
+def test_samples_that_are_left_out():
+    page = tt.vis.view([cases.front(1, seed=n) for n in range(5)], samples=2, axis=cases.AXIS)
+    assert "The first 2 of 5 samples." in page.notes
+
+
+def test_samples_of_a_loader():
+    samples = [{"transient": cases.front(1, seed=n)} for n in range(3)]
+    loader = torch.utils.data.DataLoader(samples, batch_size=None)
+    of_loader, of_list = (tt.vis.view(x, axis=cases.AXIS) for x in (loader, samples))
+    assert of_loader.html.count('id="codes-') == of_list.html.count('id="codes-') == 3
+
+
+REFUSED = {
+    "a batch": (lambda: tt.vis.view(torch.ones(2, 3, 5, 4, 4)), ShapeError, "expected light"),
+    "nothing": (lambda: tt.vis.view([]), ShapeError, "at least one sample"),
+    "another axis": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), axis=cases.AXIS), ShapeError, "24 bins"),
+    "no axis": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), axis=3), ArgumentError, "TimeAxis"),
+    "rates": (lambda: tt.vis.view(cases.result(rates=cases.rates()[0])), ShapeError, "rate_axis"),
+    "two kinds": (lambda: tt.vis.view((cases.front(1), cases.capture())), ShapeError, "one kind"),
+    "two sizes": (lambda: tt.vis.view((cases.front(1), cases.front(1, 4, 4))), ShapeError, "one kind"),
+    "frequencies": (lambda: tt.vis.view(cases.phasors()[0], frequencies=[1.0]), ShapeError, "5 frequencies"),
+    "a word": (lambda: tt.vis.view({"albedo": 1}), ArgumentError, "expected"),
+    "size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=0), UnitError, "max_megabytes"),
+    "a folder": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), "nowhere/a.html"), StorageError, "nowhere"),
+    "a file": (lambda: tt.vis.view("missing.h5"), StorageError, "missing.h5"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refusals(name):
+    call, error, words = REFUSED[name]
+    with pytest.raises(error, match=words):
+        call()
+
+
+def test_bokeh_is_missing(monkeypatch):
+    found = builtins.__import__
+
+    def without(name, *arguments, **more):
+        if name.split(".")[0] == "bokeh":
+            raise ImportError(name)
+        return found(name, *arguments, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingPackageError, match=r"torchtransient\[view\]"):
+        tt.vis.view(cases.front(1))
+
+
+# -------------------------------------------------------------------------------------------------------- colours
+
+# What eyes without one kind of cones see, in linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
+TOLD_APART = 4 * 2.3
+BLIND = {
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+
+
+def lab(colours, blindness):
+    """CIE L*a*b* of #rrggbb as such eyes see them."""
+    screen = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for c in colours])
+    linear = np.where(screen <= 0.04045, screen / 12.92, ((screen + 0.055) / 1.055) ** 2.4)
+    linear = np.clip(linear @ np.array(BLIND[blindness]).T, 0, 1)
+    xyz = linear @ np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]).T
+    f = np.cbrt(xyz / [0.9505, 1.0, 1.089])
+    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], -1)
+
+
+@pytest.mark.parametrize("blindness", BLIND)
+def test_colours_are_told_apart(blindness):
+    """By four times what an eye just sees (2.3 units of CIELAB, Mahy 1994): curves, and eighths of every map."""
+    curves = lab(PIXEL_COLOURS, blindness)
+    apart = np.linalg.norm(curves[:, None] - curves[None], axis=-1)[~np.eye(len(curves), dtype=bool)]
+    assert apart.min() > TOLD_APART
+    for name, colours in colour_maps().items():
+        seen = lab(colours, blindness)
+        if name == "rainbow":  # the hue of many papers; peak time is the mode without it
+            continue
+        some = seen[:: 256 // 8]
+        steps = np.linalg.norm(some[:, None] - some[None], axis=-1)[~np.eye(len(some), dtype=bool)]
+        assert steps.min() > TOLD_APART, name

@@ -1,0 +1,208 @@
+"""A page in one file: its numbers in eight bits, compressed, beside the models of bokeh and `view.js`."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
+from torchtransient.vis.pages.content import Content, Planes, binned
+from torchtransient.vis.pages.layout import colour_maps, import_bokeh, layout_of, modes_of
+
+_SCRIPT = Path(__file__).with_name("view.js")
+# A notebook keeps what it shows in its own file.
+NOTEBOOK_BYTES = 8_000_000
+# Beyond it the numbers of a page fill a browser's memory.
+_MOST_CODES = 250_000_000
+# Parts of a content that tell how small it becomes.
+_SAMPLED = 24
+
+
+@dataclass(frozen=True)
+class Page:
+    """One HTML page that shows a result in a browser.
+
+    Attributes:
+        html: the page, which needs no other file and no network.
+        notes: sentences about the error of its numbers and about what was left out.
+        path: file that it was written to, None for none.
+    """
+
+    html: str
+    notes: tuple[str, ...]
+    path: Path | None = None
+
+    def __repr__(self) -> str:
+        where = "" if self.path is None else f", {self.path}"
+        return f"Page({len(self.html) / 1e6:.1f} MB{where})"
+
+    def _repr_html_(self) -> str:
+        if len(self.html) > NOTEBOOK_BYTES:
+            return f"<p>{escape(repr(self))}: too large for a notebook, open the file in a browser.</p>"
+        return f'<iframe srcdoc="{escape(self.html)}" width="100%" height="760" style="border:0"></iframe>'
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """Codes of a content: tables by the name of the plane, and compressed codes by entry and plane."""
+
+    tables: dict[str, Table]
+    packed: list[dict[str, bytes]]
+
+    @property
+    def size(self) -> int:
+        """Bytes on the page."""
+        return sum(len(packed) for planes in self.packed for packed in planes.values()) * 4 // 3
+
+
+def page_of(content: Content, title: str, max_bytes: int) -> Page:
+    """Return the page of a content, binned until it has at most ``max_bytes``."""
+    import_bokeh()
+    content, encoded = _fitted(content, max_bytes - 1_800_000)
+    notes = (*_errors_said(content, encoded.tables), *content.notes)
+    maps, modes = colour_maps(), modes_of(content)
+    root = layout_of(content, modes, " ".join(map(escape, notes)), title, maps)
+    chunks = [
+        f'<script type="text/plain" id="codes-{entry}-{name}">{base64.b64encode(packed).decode("ascii")}</script>'
+        for entry, planes in enumerate(encoded.packed)
+        for name, packed in planes.items()
+    ]
+    meta = described(content, encoded.tables, modes, maps)
+    return Page(with_script(html_of(root, title), meta, chunks), notes)
+
+
+def html_of(root: Any, title: str) -> str:
+    """Return the page of bokeh's models, with bokeh in it."""
+    from bokeh.embed import file_html
+    from bokeh.resources import INLINE
+
+    html: str = file_html(root, INLINE, title=title)
+    return html
+
+
+def with_script(html: str, meta: dict[str, Any], chunks: list[str]) -> str:
+    """Return a page of bokeh with the page's own script and numbers before its end."""
+    # Browsers ask servers for an icon.
+    html = html.replace("<head>", '<head><link rel="icon" href="data:,">', 1)
+    head, end, rest = html.rpartition("</body>")
+    said = json.dumps(meta).replace("</", "<\\/")
+    script = _SCRIPT.read_text(encoding="utf-8")
+    data = f'<script type="application/json" id="meta">{said}</script>'
+    return "\n".join([head, data, *chunks, f"<script>\n{script}\n</script>", end + rest])
+
+
+def described(
+    content: Content, tables: dict[str, Table], modes: dict[str, str], maps: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what `view.js` has to know, as plain data."""
+    slider = content.slider
+    return {
+        "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
+        "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
+        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
+        "slider": {
+            "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
+            "secondUnit": slider.second_unit, "factor": slider.factor,
+        },
+        "tables": {name: _plain(table.values) for name, table in tables.items()}, "maps": maps, "modes": list(modes),
+        "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed",
+    }  # fmt: skip
+
+
+def _plain(values: NDArray[np.float32]) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
+    """Codes of a content with as many bins and pixels as there is room for."""
+    times = pixels = 1
+    while True:
+        t, h, w = (n // k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
+        if t * h * w <= 64 or _expected(content, times, pixels) <= 1.1 * max_bytes:
+            shown = content if times == pixels == 1 else binned(content, times, pixels)
+            encoded = _encoded(shown)
+            if encoded.size <= max_bytes or t * h * w <= 64:
+                return shown, encoded
+        # Slices and frequencies are no bins of light.
+        if t > 64 and content.kind not in ("phasors", "gates", "volume") and times <= 4 * pixels:
+            times *= 2
+        else:
+            pixels *= 2
+
+
+def _expected(content: Content, times: int, pixels: int) -> float:
+    """Bytes of a content on the page, from some of its bins."""
+    bins, rows, columns = content.shape
+    some = max(times, bins // _SAMPLED // times * times)
+    parts = []
+    number = min(8, bins // some)
+    for start in ((2 * k + 1) * (bins - some) // (2 * number) for k in range(number)):
+        planes = content.planes[:: max(1, len(content.planes) // _SAMPLED)]
+        parts.append([part.map(lambda x, a=start: x[..., a : a + some, :, :]) for part in planes])  # type: ignore[misc]
+    joined = [Planes.cat([part[n] for part in parts]) for n in range(len(parts[0]))]
+    share = len(parts) * some * len(joined) / (bins * len(content.planes))
+    slider = replace(content.slider, centers=np.arange(float(len(parts) * some)))
+    sample = replace(content, planes=tuple(joined), slider=slider)
+    encoded = _encoded(sample if times == pixels == 1 else binned(sample, times, pixels))
+    codes = len(encoded.packed[0]) * len(content.planes) * bins * rows * columns / (times * pixels**2)
+    return encoded.size / share if codes <= _MOST_CODES else float("inf")
+
+
+def _encoded(content: Content) -> Encoded:
+    tables = _tables(content)
+    packed = []
+    with ThreadPoolExecutor(2) as pool:
+        for planes in content.planes:
+            codes = _codes_of(planes, tables)
+            packed.append(dict(zip(codes, pool.map(_packed, codes.values()), strict=True)))
+    return Encoded(tables, packed)
+
+
+def _packed(codes: NDArray[np.uint8]) -> bytes:
+    # Noise has no strings that repeat: runs of zeros and short codes for frequent numbers are what there is to gain.
+    packer = zlib.compressobj(1, zlib.DEFLATED, 31, 9, zlib.Z_RLE)
+    return packer.compress(codes.data) + packer.flush()
+
+
+def _tables(content: Content) -> dict[str, Table]:
+    planes = content.planes
+    light = table_of(content.quantity, [part.light for part in planes])
+    tables = dict.fromkeys((f"c{k}" for k in range(len(planes[0].light))), light)
+    if planes[0].ratios is not None:
+        tables |= dict.fromkeys(("s1", "s2", "s3"), RATIO)
+    if planes[0].phase is not None:
+        tables["phase"] = PHASE
+    if planes[0].error is not None:
+        tables["error"] = table_of("error", [part.error for part in planes if part.error is not None])
+    return tables
+
+
+def _codes_of(planes: Planes, tables: dict[str, Table]) -> dict[str, NDArray[np.uint8]]:
+    return {name: tables[name].encode(plane) for name, plane in planes.named().items()}
+
+
+def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
+    light = tables["c0"]
+    if light.kind == "whole":
+        said = ["Counts are exact."]
+    else:
+        said = [
+            f"Stored in 8 bits: numbers are within {100 * light.error:.2g} % of those of the file; sizes below "
+            f"{light.floor:.3g} are zero."
+        ]
+    if "s1" in tables:
+        said.append(f"Stokes components over S0 are within {RATIO.error:.2g}.")
+    if "phase" in tables:
+        said.append(f"Phases are within {np.degrees(PHASE.error):.2g} degrees.")
+    if "error" in tables:
+        said.append("Bands: two standard errors.")
+    return said
