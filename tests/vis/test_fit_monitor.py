@@ -179,7 +179,6 @@ def test_a_notebook_shows_one_figure(monkeypatch):
 
 
 def test_tensorboard(tmp_path):
-    pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     monitor = fitted(log_dir=tmp_path / "log")
@@ -225,13 +224,13 @@ def test_lightning(tmp_path):
     assert data["panels"][1]["curves"][0]["label"] == "colour"
 
 
-@pytest.mark.slow
+@pytest.mark.browser
 def test_the_page_in_a_browser(tmp_path):
     """The slider leads through the moments; nothing is loaded from elsewhere."""
-    playwright = pytest.importorskip("playwright.sync_api")
+    from playwright import sync_api as playwright
+
     browser_path = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser_path is None:
-        pytest.skip("needs a chromium")
+    assert browser_path is not None, "tests of pages need Chromium: apt-get install -y chromium"
     fitted().save(tmp_path / "fit.html")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
