@@ -105,7 +105,8 @@ def test_derivatives_behind_an_occluder(key, step):
     assert abs(np.mean(found) - np.mean(differences)) < 4 * error + 1e-3 * abs(np.mean(found))
 
 
-def test_the_wall_rests():
-    moving = capture("single").moving({"wall": tt.Motion(linear=(0, 0, 1))})
+@pytest.mark.parametrize("body", ["wall", "laser"])
+def test_wall_and_laser_rest(body):
+    moving = capture("single").moving({body: tt.Motion(linear=(0, 0, 1))})
     with pytest.raises(SceneError, match="the wall, its sensor and the laser rest"):
         tt.render(moving, rates=RATES, spp=4, seed=0)

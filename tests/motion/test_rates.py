@@ -284,6 +284,27 @@ def test_fog_that_blows():
     assert float(mean_rate(light[:, :80])) == pytest.approx(expected, abs=1e-4)
 
 
+def test_fog_inside_of_glass():
+    """Its velocity of zero changes nothing: the light of all paths stays."""
+    nodes = {
+        "box": {
+            "type": "cube", "to_world": translate([0, 0, 2]) @ scale(0.5), "bsdf": {"type": "thindielectric"},
+            "interior": {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.9, "id": "mist"},
+        },
+        "lamp": {
+            "type": "rectangle", "to_world": look_at([0, 0, 4], [0, 0, 0]) @ scale(2.0), "emitter": {"type": "area"},
+        },
+    }  # fmt: skip
+    described = scene(1, 20, **nodes)
+    described["integrator"] = {"type": "transient_prbvolpath", "max_depth": 6}
+    for body in ("lamp", "mist"):
+        out = tt.render(tt.load(described, variant=VARIANT).moving({body: tt.Motion()}), rates=RATES,
+                        time_axis=tt.TimeAxis(0.0, 0.2, 100), spp=64, seed=0)  # fmt: skip
+        light = float(out.steady.sum())
+        assert light > 0 and float(out.rates.sum()) == pytest.approx(light, rel=1e-5)
+
+
+
 # ------------------------------------------------------------------------------------------------------ around a corner
 
 

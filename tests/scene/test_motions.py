@@ -14,7 +14,7 @@ import torch
 
 import torchtransient as tt
 from support.moving_scenes import LAMP, moving_scene, wall
-from torchtransient.errors import ArgumentError, GradientWarning, SceneError, TorchTransientWarning
+from torchtransient.errors import ArgumentError, GradientError, GradientWarning, SceneError, TorchTransientWarning
 from torchtransient.scenes.transforms import look_at
 
 VARIANT = "llvm_ad_mono"
@@ -375,3 +375,19 @@ def test_variants(name, variant):
             total = light[..., row, :, :, :].sum(-3)
             torch.testing.assert_close(total, out.steady.detach().double(), rtol=5e-3, atol=1e-5)
     assert float(out.steady.abs().max()) > 0
+
+
+def test_names_that_look_like_those_of_motions():
+    """A body called as the motion of another one stays in the scene."""
+    described = two_walls(wall_velocity=wall((0, 0, 1), (0, 0, 0)))
+    assert mean_rate(tt.load(described, variant=VARIANT).moving({"wall": COMES})) == close(0.0)
+    assert mean_rate(tt.load(described, variant=VARIANT).moving({"wall_velocity": COMES})) == close(-2 * SPEED)
+
+
+def test_what_has_no_velocity():
+    still = tt.load(two_walls(), variant=VARIANT)
+    with pytest.raises(SceneError, match=r"expected the name of a body.*got 'integrator'"):
+        still.moving({"integrator": COMES})
+    graph = torch.zeros(3, requires_grad=True)
+    with pytest.raises(GradientError, match=r"expected numbers for 'wall'.*wall\.velocity\.linear"):
+        still.moving({"wall": tt.Motion(linear=graph)})

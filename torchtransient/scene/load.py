@@ -169,6 +169,7 @@ class Scene:
 
         Raises:
             ArgumentError: unless ``motions`` maps names to motions.
+            GradientError: for motions with gradients: velocities are parameters of the scene.
             SceneError: for names that the scene does not have, and for scenes of loaded objects.
         """
         self._description.check_described("scene.moving")

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchtransient.checks import shown, some_of
-from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.errors import ArgumentError, GradientError, SceneError
+from torchtransient.plugins import kind_of
 from torchtransient.plugins.mitsuba_compat import VELOCITY
 from torchtransient.scene.nodes import children, name_children, node_kind
 
 PLUGIN = "rigid_motion"
 # Child of a body that says how it moves, and end of the name of the motion.
 CHILD = "velocity"
-# Kinds of nodes; those of plugins written in Python may be unknown before they are built.
-_BODIES = ("Shape", "Emitter", "Sensor", "Medium", "Unknown")
+_BODIES = ("shape", "emitter", "sensor", "medium")
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,11 @@ def body_motions(motions: Mapping[str, Any]) -> list[BodyMotion]:
     for name, motion in motions.items():
         if not all(hasattr(motion, part) for part in ("linear", "angular", "center")):
             raise ArgumentError(f"scene.moving: expected a tt.Motion for {name!r}, got {shown(motion)}.")
+        if any(getattr(getattr(motion, part), "requires_grad", False) for part in ("linear", "angular", "center")):
+            raise GradientError(
+                f"scene.moving: expected numbers for {name!r}, which become parameters, got a tensor with a gradient. "
+                f"Give that to the renderer: values={{'{name}.{CHILD}.linear': tensor}}, of its parameters=."
+            )
         parts = ([float(x) for x in getattr(motion, part)] for part in ("linear", "angular", "center"))
         found.append(BodyMotion(str(name), *map(tuple, parts)))  # type: ignore[arg-type]
     return found
@@ -61,9 +66,9 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
         del node.props[key]
         props["of"] = name
         props.set_id(f"{name}.{CHILD}")
-        state.root.props[f"{name}_{CHILD}"] = mi.Properties.ResolvedReference(index)
+        state.root.props[_free_key(state, name)] = mi.Properties.ResolvedReference(index)
     described = {state.nodes[index].props.get("of", ""): index for _, index in children(state, state.root)}
-    names = {node.props.id() for node in state.nodes if node_kind(node) in _BODIES}
+    names = {node.props.id() for node in state.nodes if _is_body(node)}
     for motion in motions:
         if motion.of not in names:
             known = some_of(sorted(name for name in names if name and not name.startswith("_")))
@@ -78,9 +83,22 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
             if len(state.node_paths):
                 state.node_paths = [*state.node_paths, f"{motion.of}.{CHILD}"]
             index = len(state.nodes) - 1
-            state.root.props[f"{motion.of}_{CHILD}"] = mi.Properties.ResolvedReference(index)
+            state.root.props[_free_key(state, motion.of)] = mi.Properties.ResolvedReference(index)
         for part in ("linear", "angular", "center"):
             state.nodes[index].props[part] = mi.ScalarVector3f(getattr(motion, part))
+
+
+def _is_body(node: Any) -> bool:
+    kind = node_kind(node).lower()
+    # Mitsuba learns the kind of a plugin written in Python when it builds it.
+    return (kind_of(node.props.plugin_name()) if kind == "unknown" else kind) in _BODIES
+
+
+def _free_key(state: Any, name: str) -> str:
+    key = f"{name}_{CHILD}"
+    while key in state.root.props:
+        key += "_"
+    return key
 
 
 def _motions_of(state: Any, node: Any) -> list[tuple[str, int]]:

@@ -407,9 +407,10 @@ def _choice(props: Any, name: str, shared: str) -> str:
 
 
 def _check_rest(velocities: Any, sensor: Any) -> None:
-    """Raise SceneError for a wall or a sensor with a velocity: spots of the laser would slide over the wall."""
+    """Raise SceneError for a wall, a sensor or a laser with a velocity: spots would slide over the wall."""
     wall = sensor.get_shape()
-    if velocities.sensor_moves or (wall is not None and any(shape.ptr == wall.ptr for shape in velocities.shapes)):
+    moves = velocities.sensor_moves or any(getattr(light, "needs_aim", False) for light in velocities.lights)
+    if moves or (wall is not None and any(shape.ptr == wall.ptr for shape in velocities.shapes)):
         raise SceneError(
             "transient_nlos_path: expected velocities of hidden things; the wall, its sensor and the laser rest."
         )

@@ -147,7 +147,7 @@ class Velocities:
 
     Attributes:
         sensor_moves: the sensor has a velocity.
-        shapes: shapes that have a motion.
+        shapes, lights: shapes and emitters that have a motion.
     """
 
     @staticmethod
@@ -167,6 +167,7 @@ class Velocities:
         if number is not None:
             rows[SENSOR] = rows[number]
         self.sensor_moves, self.shapes = number is not None, [shape for shape, _ in movers.shapes]
+        self.lights = [light for light, _ in movers.emitters]
         self.table = dr.concat([mi.Float(part[k]) for row in rows for part in row for k in range(3)])
         self._shapes, self._emitters, self._media = (
             PointerTable([body for body, _ in found], [number for _, number in found]) if found else None
@@ -184,7 +185,8 @@ class Velocities:
     def _row(self, row: Any, p: Any, active: Any) -> Any:
         active = active & (row > 0)  # not in place: the mask is the caller's
         linear, angular = (dr.gather(mi.Vector3f, self.table, row * 2 + k, active) for k in (0, 1))
-        return linear + dr.cross(angular, mi.Vector3f(p))
+        # Points of other lanes may be infinite.
+        return linear + dr.cross(angular, dr.select(active, mi.Vector3f(p), 0))
 
     def _listed(self, table: PointerTable | None, plugin: Any, p: Any, active: Any) -> Any:
         if table is None:
