@@ -26,7 +26,7 @@ def test_mistakes_of_a_job():
     with pytest.raises(SceneError, match=r"kind of job, one of .*, got 'sideways'"):
         integrator.prepared(scene, spp=1, kind="sideways")
     plain = load(camera(2, 2, transient=False), LAMP)
-    with pytest.raises(SceneError, match="transient_hdr_film, gated_hdr_film or phasor_hdr_film"):
+    with pytest.raises(SceneError, match="a film of type transient_hdr_film, gated_hdr_film, phasor_hdr_film"):
         plain.integrator().render(plain, spp=1)
     pairs = camera(2, 2, bins=3)
     pairs["film"] |= {"exhaustive_scan": True, "laser_scan_width": 2, "laser_scan_height": 3}
