@@ -274,7 +274,7 @@ class TransientNLOSPath(base.TransientIntegrator):
                 division = self.division(scene, contents, wanted, table)
             else:  # what a scan shares knows no rates
                 division = Division(range(0), settings.max_depth)
-                _check_rest(velocities, contents.sensor)
+                _check_rest(scene, velocities, contents.sensor, table)
             # Paths that have nothing to find beyond end before.
             most = settings.max_depth if wanted is not None else max(division.longest, 1)
             settings = replace(settings, division=division, max_depth=most)
@@ -406,11 +406,14 @@ def _choice(props: Any, name: str, shared: str) -> str:
     return value
 
 
-def _check_rest(velocities: Any, sensor: Any) -> None:
+def _check_rest(scene: Any, velocities: Any, sensor: Any, table: ScanTable) -> None:
     """Raise SceneError for a wall, a sensor or a laser with a velocity: spots would slide over the wall."""
-    wall = sensor.get_shape()
+    wall, lit = sensor.get_shape(), [] if table.spots is None else [table.spots.shape]
     moves = velocities.sensor_moves or any(getattr(light, "needs_aim", False) for light in velocities.lights)
-    if moves or (wall is not None and any(shape.ptr == wall.ptr for shape in velocities.shapes)):
+    for shape in filter(velocities.moves, scene.shapes()):
+        moves |= wall is not None and shape.ptr == wall.ptr
+        moves |= any(bool(dr.any(spots == mi.ShapePtr(shape))) for spots in lit)
+    if moves:
         raise SceneError(
             "transient_nlos_path: expected velocities of hidden things; the wall, its sensor and the laser rest."
         )

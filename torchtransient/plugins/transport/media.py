@@ -175,6 +175,7 @@ class Media(Vacuum):
         return dr.all(end.n == 0)
 
     def attached(self, context, v, carry, wanted):
+        start = carry.o
         if wanted.geometry:
             carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
@@ -190,7 +191,7 @@ class Media(Vacuum):
             T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
         if wanted.rate:
-            self.add_rate(context, vertex)
+            self.add_rate(context, vertex, start)
         return vertex
 
     def _surface_or_medium(self, context, v, carry, ray, wanted):

@@ -447,6 +447,8 @@ class Connection(Strategy):
     finds_light = True
     # The first vertex has no event, on any path of the job.
     dark_at_first = False
+    # The segment of a proposal does not count in time.
+    unwarp = False
 
     def events(self, wanted: Any) -> int:
         """Return the largest number of events at a vertex; of terms in a derivative (``wanted`` is not None)."""

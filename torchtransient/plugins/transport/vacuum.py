@@ -189,6 +189,7 @@ class Vacuum(Segment):
         return VertexEnd(si.t, si.n, v.ray.d, si.is_valid() & v.active)
 
     def attached(self, context, v, carry, wanted):
+        start = carry.o
         if wanted.geometry:
             carry = self.from_meter(context, v, carry)
         ray = mi.Ray3f(v.ray)
@@ -197,7 +198,7 @@ class Vacuum(Segment):
         si = self.attached_surface(context, v, carry, ray, wanted, v.active)
         vertex = self.arrived(context, v, carry, ray, si, wanted)
         if wanted.rate:
-            self.add_rate(context, vertex)
+            self.add_rate(context, vertex, start)
         return vertex
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
@@ -249,15 +250,18 @@ class Vacuum(Segment):
         return vertex
 
     @staticmethod
-    def add_rate(context, vertex):
+    def add_rate(context, vertex, start):
         """Add what the end of a segment adds to the rate, and of the first segment its start too.
 
         The vertex that another segment leaves has counted its own part.
+
+        Args:
+            start: attached start of the first segment, without a sideways shift of the ray.
         """
         velocities, v, carry = context.velocities, vertex.v, vertex.carry
         first = v.k == 0
         moves = velocities.of_vertex(vertex, vertex.si, v.active & vertex.sid.is_valid())
-        moves -= dr.select(first, velocities.of_sensor(carry.o), 0)
+        moves -= dr.select(first, velocities.of_sensor(start), 0)
         longer = carry.η * dr.dot(moves, carry.w)
         longer = dr.select(first, 0, longer) if context.camera_unwarp else longer
         vertex.rate_slope = carry.rate + slope_only(longer)

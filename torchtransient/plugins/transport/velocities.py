@@ -23,8 +23,9 @@ import mitsuba as mi
 from torchtransient.checks import some_of
 from torchtransient.errors import SceneError
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_instance
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
+from torchtransient.plugins.sensors.origin import sensors_of
 
 # Rows of the table before those of the bodies: rest, and the sensor.
 REST, SENSOR, FIRST = 0, 1, 2
@@ -59,7 +60,10 @@ class Movers:
 
         self.shapes, self.emitters, self.media = of_kind(mi.Shape), of_kind(mi.Emitter), of_kind(mi.Medium)
         self.sensors = {sensor.ptr: number for sensor, number in of_kind(mi.Sensor)}
-        # What is part of a shape moves with it.
+        # What is part of a shape moves with it, and so does the medium inside.
+        for medium, number in _inside(self.shapes, shapes):
+            if found.setdefault(medium.ptr, number) == number:
+                self.media.append((medium, number))
         for part in (*scene.emitters(), *scene.sensors()):
             shape = part.get_shape()
             if shape is not None and shape.ptr in found:
@@ -106,7 +110,10 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
     bodies: dict[str, list[Any]] = {}
     for body in (*shapes, *scene.emitters(), *scene.sensors(), *_media_of(scene, shapes)):
         bodies.setdefault(body.id(), []).append(body)
-    pairs = [(shape, held) for shape in shapes for _, held in objects_of(shape) if is_motion(held) and not held.of]
+    pairs = [(shape, held) for shape in shapes for _, held in objects_of(shape) if is_motion(held)]
+    for shape, held in pairs:
+        if held.of not in ("", shape.id()):
+            raise SceneError(f"rigid_motion: expected no other 'of' inside of {shape.id()!r}, got {held.of!r}.")
     for _, motion in objects_of(scene):
         if is_motion(motion):
             if motion.of not in bodies:
@@ -120,11 +127,30 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
     for body, _ in pairs:
         if isinstance(body, mi.Shape) and body.ptr not in own:
             raise SceneError(f"{body.id()!r}: expected the motion of its instances; it is inside of a shape group.")
+        part = body.get_shape() if isinstance(body, mi.Emitter | mi.Sensor) else None
+        if part is not None:
+            raise SceneError(f"{body.id()!r}: expected the motion of {part.id()!r}, the shape that it is part of.")
         if isinstance(body, mi.Emitter):
             far = mi.EmitterFlags.Infinite, mi.EmitterFlags.DeltaDirection
             if any(mi.has_flag(body.flags(), flag) for flag in far):
                 raise SceneError(f"{body.id()!r}: expected a near light; light from infinity has no place that moves.")
     return pairs
+
+
+def _inside(moving: list[tuple[Any, int]], shapes: list[Any]) -> list[tuple[Any, int]]:
+    """Return the media inside of shapes that move, with the numbers of their motions, but for those that others bound.
+
+    Args:
+        moving: (shape, number) of those that move.
+        shapes: all shapes.
+    """
+    bounding: dict[int, set[int]] = {}
+    for shape in shapes:
+        if shape.is_medium_transition() and shape.interior_medium() is not None:
+            bounding.setdefault(shape.interior_medium().ptr, set()).add(shape.ptr)
+    inside = [(shape, number) for shape, number in moving if shape.is_medium_transition()]
+    media = [(shape.interior_medium(), number) for shape, number in inside if shape.interior_medium() is not None]
+    return [(medium, number) for medium, number in media if len(bounding[medium.ptr]) == 1]
 
 
 def _media_of(scene: Any, shapes: list[Any]) -> list[Any]:
@@ -147,7 +173,7 @@ class Velocities:
 
     Attributes:
         sensor_moves: the sensor has a velocity.
-        shapes, lights: shapes and emitters that have a motion.
+        lights: emitters that have a motion.
     """
 
     @staticmethod
@@ -163,11 +189,13 @@ class Velocities:
 
     def __init__(self, movers: Movers, sensor: Any) -> None:
         rows = [(mi.Vector3f(0), mi.Vector3f(0))] * FIRST + [motion.rows() for motion in movers.motions]
+        if is_batch(sensor) and any(one.ptr in movers.sensors for one in (sensor, *sensors_of(sensor))):
+            raise SceneError(f"{sensor.id()!r}: expected sensors of a batch at rest; render moving ones by themselves.")
         number = movers.sensors.get(sensor.ptr)
         if number is not None:
             rows[SENSOR] = rows[number]
-        self.sensor_moves, self.shapes = number is not None, [shape for shape, _ in movers.shapes]
-        self.lights = [light for light, _ in movers.emitters]
+        self.sensor_moves, self.lights = number is not None, [light for light, _ in movers.emitters]
+        self._moving = {shape.ptr for shape, _ in movers.shapes} | {mesh.ptr for mesh in movers.meshes}
         self.table = dr.concat([mi.Float(part[k]) for row in rows for part in row for k in range(3)])
         self._shapes, self._emitters, self._media = (
             PointerTable([body for body, _ in found], [number for _, number in found]) if found else None
@@ -179,6 +207,10 @@ class Velocities:
     def tables(self) -> list[Any]:
         """Return the arrays that were computed from parameters."""
         return [self.table]
+
+    def moves(self, shape: Any) -> bool:
+        """Return True for a shape with a velocity, of the whole or of its vertices."""
+        return shape.ptr in self._moving
 
     # ---------------------------------------------------------------------------------------------------- velocities
 
@@ -241,7 +273,7 @@ class Velocities:
 
     def of_event(self, context: Any, connection: Any, vertex: Any, proposal: Any, answer: Any) -> Any:
         """Return the rate of the whole path of an event, Float."""
-        if proposal is None:
+        if proposal is None or connection.unwarp:
             return vertex.rate
         v = connection.end_velocity(context, proposal)
         return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.v, proposal.d)

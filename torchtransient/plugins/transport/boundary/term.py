@@ -34,6 +34,7 @@ from torchtransient.errors import GradientError
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import topology_of
 from torchtransient.plugins.integrators.job import passes_of, seed_array
+from torchtransient.plugins.mitsuba_compat import is_instance
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
 from torchtransient.plugins.transport.boundary.moving_edges import has_delta_lobe
@@ -184,7 +185,10 @@ class BoundaryTerm:
 def _check_chains_rest(context):
     """Raise GradientError where the film measures rates, and mirrors or the sensor have a velocity."""
     velocities = context.velocities
-    if velocities is not None and (velocities.sensor_moves or any(map(has_delta_lobe, velocities.shapes))):
+    if velocities is None:
+        return
+    bends = [shape for shape in context.scene.shapes() if is_instance(shape) or has_delta_lobe(shape)]
+    if velocities.sensor_moves or any(map(velocities.moves, bends)):
         raise GradientError(
             "films of rates: derivatives at edges that are seen in mirrors or through glass are those of mirrors, "
             "glass and sensors without a velocity. Take the velocity away, or leave moving edges out: boundary=False."
