@@ -120,7 +120,7 @@ OF_A_LENS = {"aperture_radius", "focus_distance"}
 REFUSED = (
     "theta.value", "normalmap.data", "nested_texture.data", "texture.data", "irradiance.data", "S.data",
     "vertex_texcoords", "opacities", "extent", "scale_tilt", "latitude", "longitude", "timezone", "year", "month",
-    "day", "hour", "minute", "second", "window_start_time", "window_end_time",
+    "day", "hour", "minute", "second", "window_start_time", "window_end_time", "linear", "angular", "center",
 )  # fmt: skip
 # And textures that stand alone: the name does not tell of what they are one.
 ALONE = ("data", "value", "values", "color0.value", "color1.value", "volume.data", "value.value")
