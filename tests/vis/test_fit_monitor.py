@@ -66,13 +66,27 @@ def test_a_page_has_losses_parameters_and_light(tmp_path):
 
 
 def test_the_noise_of_random_gradients_is_one(tmp_path):
-    """Pairs of independent gradients of a large spread; of 20 pairs of 3, in means of 5 pairs or so."""
+    """Independent gradients of a large spread, 20 pairs of 3 numbers in each point of the curve."""
     curve = saved(fitted(200, noise=1e4), tmp_path)["panels"][1]["curves"][0]
-    # The share of a mean over pairs is 1 with a spread of about sqrt(2 / (3 * 9)) = 0.27.
-    assert np.mean(curve["y"][5:]) == pytest.approx(1, abs=0.5)
+    # 1 less the correlation of successive gradients, of spread 1 / sqrt(60); 7 windows of the 14 points share no step.
+    assert np.mean(curve["y"][5:]) == pytest.approx(1, abs=4 / np.sqrt(60 * 7))
     # Half of the square of a difference is the variance, the mean square is that and one: 1 / (1 + 1).
     curve = saved(fitted(1000, noise=1.0, every=1), tmp_path)["panels"][1]["curves"][0]
     assert np.mean(curve["y"][5:]) == pytest.approx(0.5, abs=0.1)
+
+
+def test_the_noise_is_that_of_recent_gradients(tmp_path):
+    """A constant of 1 and white noise of spread 2, after gradients a thousand times larger: 4 of 5 parts are noise."""
+    generator = torch.Generator().manual_seed(3)
+    x = torch.zeros(100, requires_grad=True)
+    monitor = tt.vis.FitMonitor({"x": x}, live=False)
+    for step in range(101):
+        x.grad = torch.full((100,), 1000.0) if step < 30 else 1 + 2 * torch.randn(100, generator=generator)
+        monitor.step(1.0)
+    curve = saved(monitor, tmp_path)["panels"][1]["curves"][0]
+    assert curve["x"] == list(range(10, 101, 10)) and curve["y"][:2] == [0, 0]
+    # From step 50 on, 20 pairs of 100 numbers: a spread of about 0.8 / sqrt(2000) = 0.02.
+    assert curve["y"][4:] == pytest.approx([0.8] * 6, rel=0.1)
 
 
 def test_every_step_and_steps_of_ones_own(tmp_path):

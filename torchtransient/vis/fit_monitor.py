@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,8 +36,8 @@ MOST_MOMENTS = 60
 MOST_PIXELS = 128
 # Figures of notebooks and TensorBoard take this share of the time of the loop, after the first.
 SHARE = 0.01
-# Weight of the pairs before, in means over pairs of gradients.
-_KEPT = 0.8
+# Pairs of successive gradients of which the noise is a mean: none is of a larger gradient long ago.
+_WINDOW = 20
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22")
 _CHANNELS = ("#d62728", "#2ca02c", "#1f77b4")
 _BLACK, _GREY = "#000000", "#999999"
@@ -53,26 +54,30 @@ class _Light:
     x_label: str
 
 
-@dataclass
 class _Gradient:
-    """Means over pairs of successive gradients: squares of their halved differences, and of the gradients."""
+    """Norms of the last gradients and of the differences of successive ones, on their device until they are asked."""
 
-    before: Tensor | None = None
-    noise: float = 0.0
-    power: float = 0.0
+    def __init__(self) -> None:
+        self._before: Tensor | None = None
+        self._norms: deque[Tensor] = deque(maxlen=_WINDOW + 1)
+        self._changes: deque[Tensor] = deque(maxlen=_WINDOW)
 
     def add(self, now: Tensor) -> None:
-        if self.before is None:
+        self._norms.append(torch.linalg.vector_norm(now))
+        if self._before is None:
+            self._before = now.clone()
             return
-        kept = _KEPT if self.power else 0.0
-        power = float(now.square().sum() + self.before.square().sum()) / 2
-        self.noise = kept * self.noise + (1 - kept) * float((now - self.before).square().sum()) / 2
-        self.power = kept * self.power + (1 - kept) * power
-        self.before = None
+        self._changes.append(torch.dist(now, self._before))
+        self._before.copy_(now)
 
-    @property
-    def share(self) -> float:
-        return self.noise / self.power if self.power > 0 else float("nan")
+    def share(self) -> float | None:
+        """Half of the squared differences over the squares of the gradients; None before there are two."""
+        if not self._changes:
+            return None
+        squares = [number * number for number in torch.stack([*self._norms, *self._changes]).tolist()]
+        norms, changes = squares[: len(self._norms)], squares[len(self._norms) :]
+        power = sum(norms[1:]) + sum(norms[:-1])
+        return sum(changes) / power if power > 0 else float("nan")
 
 
 @dataclass
@@ -96,8 +101,8 @@ class FitMonitor:
     Needs matplotlib and Pillow (extra ``vis``).
 
     The noise of a gradient is the part of its square that changes from one step to the next: half the square of the
-    difference of successive gradients over their mean square, averaged over some pairs. It is 0 for equal gradients, 1
-    for random ones, and up to 2 where steps overshoot.
+    difference of successive gradients over their mean square, both averaged over the last 20 steps. It is 0 for equal
+    gradients, 1 for random ones, and up to 2 where steps overshoot.
 
     Args:
         parameters: a renderer, whose ``values`` are shown; another ``nn.Module``; or ``{name: tensor}``. Up to 12
@@ -146,7 +151,9 @@ class FitMonitor:
         self._losses: dict[str, _Track] = {}
         self._values: dict[str, _Track] = {}
         self._noise: dict[str, _Track] = {}
-        self._gradients: dict[str, _Gradient] = {}
+        # Kept, for the names of a module's parameters take longer than their gradients.
+        self._differentiated = [(name, leaf) for name, leaf in self._leaves() if leaf.is_leaf]
+        self._gradients = {name: _Gradient() for name, _ in self._differentiated}
         self._lights: list[_Light] = []
         self._now: _Light | None = None
         self._between = self._every
@@ -178,19 +185,18 @@ class FitMonitor:
         self._next = number + 1
         losses = loss if isinstance(loss, Mapping) else {"loss": loss}
         self._pending.append((number, {name: _number(name, value) for name, value in losses.items()}))
+        for key, leaf in self._differentiated:
+            if leaf.grad is not None:
+                self._gradients[key].add(leaf.grad)
         if number % self._every == 0:
             self._look(number, output)
-        if (number + 1) % self._every == 0:
-            for name, leaf in self._leaves():
-                if leaf.is_leaf and leaf.grad is not None:
-                    self._gradients.setdefault(name, _Gradient()).before = leaf.grad.clone()
 
     def _look(self, number: int, output: Source | None) -> None:
         self._take_losses()
-        for name, leaf in self._leaves():
-            if name in self._gradients and leaf.grad is not None:
-                self._gradients[name].add(leaf.grad)
-                self._noise.setdefault(name, _Track()).add(number, [self._gradients[name].share])
+        for name, gradient in self._gradients.items():
+            share = gradient.share()
+            if share is not None:
+                self._noise.setdefault(name, _Track()).add(number, [share])
         for name, value in self._shown_values():
             self._values.setdefault(name, _Track()).add(number, _row(value))
         if output is not None:
