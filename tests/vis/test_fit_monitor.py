@@ -269,6 +269,20 @@ def test_the_page_in_a_browser(tmp_path):
     assert all(url.startswith(("file:", "data:")) for url in asked)
 
 
+def test_losses_that_are_not_finite_are_named(tmp_path):
+    """One from a step on, another now and then, beside one that is finite; the axis stays logarithmic."""
+    monitor = tt.vis.FitMonitor({"x": torch.zeros(2)}, target=TARGET, live=False)
+    nan, inf = float("nan"), float("inf")
+    for step in range(11):
+        light = TARGET * (nan if step > 6 else 1.0)
+        monitor.step({"data": nan if step > 6 else 1.0, "edge": inf if step in (3, 5) else 1.0, "prior": 2.0}, light)
+    loss = saved(monitor, tmp_path)["panels"][0]
+    assert loss["title"] == "loss; data not finite from step 7; edge not finite in 2 steps from 3 on" and loss["log"]
+    assert loss["curves"][0]["y"] == [1] * 7 + [None] * 4
+    monitor.save(tmp_path / "fit.png")
+    assert monitor.figure().axes[4].get_title() == loss["title"]
+
+
 def test_names_do_not_end_the_page(tmp_path):
     monitor = tt.vis.FitMonitor({"</script><b>": torch.zeros(2)}, live=False)
     monitor.step(1.0)
@@ -282,7 +296,15 @@ def test_refused(tmp_path):
         tt.vis.FitMonitor({}, target=TARGET, pixels=[(5, 0)])
     with pytest.raises(ShapeError, match="every"):
         tt.vis.FitMonitor({}, every=0)
+    walls = {"wall.distance": torch.zeros(1), "wall.albedo": torch.zeros(1), "lamp": torch.zeros(1)}
+    near = r"got 'wall'. Did you mean 'wall.distance', 'wall.albedo'\? There are: wall.distance, wall.albedo, lamp"
+    with pytest.raises(ArgumentError, match=near):
+        tt.vis.FitMonitor(walls, truth={"wall": 1.0})
+    with pytest.raises(ArgumentError, match=r"got 'lmap'. Did you mean 'lamp'\?"):
+        tt.vis.FitMonitor(walls, truth={"lmap": 1.0})
     monitor = tt.vis.FitMonitor({}, target=TARGET, live=False)
+    with pytest.raises(StorageError, match=r"\.html or \.png, got '.*fit\.foo'"):
+        monitor.save(tmp_path / "fit.foo")
     with pytest.raises(ShapeError, match="target's"):
         monitor.step(1.0, TARGET[..., :4])
     with pytest.raises(ShapeError, match="one number"):

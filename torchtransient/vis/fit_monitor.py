@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import io
+import math
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +20,8 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_number, count, mapping, numbers, path_of, several, shown
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError
+from torchtransient.checks import as_number, count, mapping, numbers, path_of, several, shown, some_of
+from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError
 from torchtransient.vis.colour_maps import symmetric_limit
 from torchtransient.vis.files import figure_type, save_figure, to_bytes
 from torchtransient.vis.fit_page import Curve, Moment, Panel, Picture, write_page
@@ -119,7 +121,7 @@ class FitMonitor:
         live: True shows the figure with IPython; None does so in notebooks.
 
     Raises:
-        ArgumentError: for parameters of another kind.
+        ArgumentError: for parameters of another kind, truth of names that are not shown.
         ShapeError: for a target that is neither a transient nor an image, pixels outside of it, ``every`` < 1.
         MissingPackageError: without matplotlib or tensorboard, where they are needed.
     """
@@ -146,6 +148,7 @@ class FitMonitor:
         self._target = None if target is None else self._light(0, target)
         aims = mapping("FitMonitor: truth", truth or {}, "{name: numbers}")
         self._truth = {name: numbers(f"FitMonitor: truth of {name!r}", v).ravel().tolist() for name, v in aims.items()}
+        self._check_names(self._truth)
         self._next = 0
         self._pending: list[tuple[int, dict[str, Any]]] = []
         self._losses: dict[str, _Track] = {}
@@ -229,6 +232,17 @@ class FitMonitor:
         else:
             yield from self._leaves()
 
+    def _check_names(self, names: Iterable[str]) -> None:
+        known = [key for key, _ in self._shown_values()]
+        for name in names:
+            if name not in known:
+                parts = [key for key in known if f".{name}." in f".{key}."]
+                near = some_of(map(repr, parts or difflib.get_close_matches(str(name), known, 3, 0.5)))
+                raise ArgumentError(
+                    f"FitMonitor: expected names of parameters in truth, got {name!r}. "
+                    f"{f'Did you mean {near}? ' if near else ''}There are: {some_of(known) or 'none'}."
+                )
+
     def _is_many(self, name: str) -> bool:
         return any(value.numel() > MOST_CURVES for key, value in self._shown_values() if key == name)
 
@@ -305,10 +319,15 @@ class FitMonitor:
     def save(self, path: str | Path) -> None:
         """Write the fit: ``.html`` is a page with a slider over its moments, any other ending a picture of its state.
 
-        The page is one file that needs no network. Raises StorageError when it cannot be written.
+        The page is one file that needs no network. Losses that are not finite are named with their first step. Raises
+        StorageError when it cannot be written.
         """
-        if path_of(path, "FitMonitor.save: path").suffix.lower() not in (".html", ".htm"):
-            save_figure(self.figure(), path, "FitMonitor.save")
+        ending = path_of(path, "FitMonitor.save: path").suffix.lower()
+        if ending not in (".html", ".htm"):
+            figure = self.figure()
+            if ending and ending[1:] not in figure.canvas.get_supported_filetypes():
+                raise StorageError(f"FitMonitor.save: expected a name that ends in .html or .png, got '{path}'.")
+            save_figure(figure, path, "FitMonitor.save")
             return
         self._take_losses()
         lights = list(self._lights)
@@ -364,8 +383,9 @@ class FitMonitor:
     def _panels(self) -> list[Panel]:
         """Losses, gradient noise, and each parameter over the steps."""
         lines, noise = _curves(self._losses), _curves(self._noise)
-        log = all(value > 0 for curve in lines for value in curve.y)
-        panels = [Panel("loss", "step", lines, log)] if lines else []
+        log = all(value > 0 for curve in lines for value in curve.y if math.isfinite(value))
+        title = "; ".join(["loss", *(f"{curve.label} {said}" for curve in lines if (said := _not_finite(curve)))])
+        panels = [Panel(title, "step", lines, log)] if lines else []
         if noise:
             panels.append(Panel("noise of the gradient (1: random)", "step", noise))
         return panels + [self._values_panel(name, track) for name, track in self._values.items()]
@@ -437,6 +457,16 @@ def _curves(tracks: Mapping[str, _Track]) -> list[Curve]:
         Curve(name, _COLOURS[n % len(_COLOURS)], track.steps, [row[0] for row in track.rows])
         for n, (name, track) in enumerate(tracks.items())
     ]
+
+
+def _not_finite(curve: Curve) -> str:
+    """From which step on a curve is not finite, or how often; empty where it is."""
+    wrong = [step for step, value in zip(curve.x, curve.y, strict=True) if not math.isfinite(value)]
+    if not wrong:
+        return ""
+    if len(wrong) == sum(step >= wrong[0] for step in curve.x):
+        return f"not finite from step {wrong[0]}"
+    return f"not finite in {len(wrong)} steps from {wrong[0]} on"
 
 
 def _row(value: Tensor) -> list[float]:
