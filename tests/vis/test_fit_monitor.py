@@ -277,10 +277,11 @@ def test_losses_that_are_not_finite_are_named(tmp_path):
         light = TARGET * (nan if step > 6 else 1.0)
         monitor.step({"data": nan if step > 6 else 1.0, "edge": inf if step in (3, 5) else 1.0, "prior": 2.0}, light)
     loss = saved(monitor, tmp_path)["panels"][0]
-    assert loss["title"] == "loss; data not finite from step 7; edge not finite in 2 steps from 3 on" and loss["log"]
+    labels = ["data, not finite from step 7", "edge, not finite in 2 steps from 3 on", "prior"]
+    assert [curve["label"] for curve in loss["curves"]] == labels and loss["log"]
     assert loss["curves"][0]["y"] == [1] * 7 + [None] * 4
     monitor.save(tmp_path / "fit.png")
-    assert monitor.figure().axes[4].get_title() == loss["title"]
+    assert [text.get_text() for text in monitor.figure().axes[4].get_legend().get_texts()] == labels
 
 
 def test_names_do_not_end_the_page(tmp_path):

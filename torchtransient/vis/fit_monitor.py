@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -384,8 +384,8 @@ class FitMonitor:
         """Losses, gradient noise, and each parameter over the steps."""
         lines, noise = _curves(self._losses), _curves(self._noise)
         log = all(value > 0 for curve in lines for value in curve.y if math.isfinite(value))
-        title = "; ".join(["loss", *(f"{curve.label} {said}" for curve in lines if (said := _not_finite(curve)))])
-        panels = [Panel(title, "step", lines, log)] if lines else []
+        lines = [replace(curve, label=curve.label + _not_finite(curve)) for curve in lines]
+        panels = [Panel("loss", "step", lines, log)] if lines else []
         if noise:
             panels.append(Panel("noise of the gradient (1: random)", "step", noise))
         return panels + [self._values_panel(name, track) for name, track in self._values.items()]
@@ -465,8 +465,8 @@ def _not_finite(curve: Curve) -> str:
     if not wrong:
         return ""
     if len(wrong) == sum(step >= wrong[0] for step in curve.x):
-        return f"not finite from step {wrong[0]}"
-    return f"not finite in {len(wrong)} steps from {wrong[0]} on"
+        return f", not finite from step {wrong[0]}"
+    return f", not finite in {len(wrong)} steps from {wrong[0]} on"
 
 
 def _row(value: Tensor) -> list[float]:
@@ -492,7 +492,7 @@ def _draw(axes: Any, panel: Panel) -> None:
             axes.fill_between(curve.x, *curve.band, color=curve.colour, alpha=0.2, linewidth=0)
     if panel.log:
         axes.set_yscale("log")
-    if any(curve.label for curve in panel.curves) and len(panel.curves) > 1:
+    if any(curve.label not in ("", panel.title) for curve in panel.curves):
         axes.legend(fontsize=7, frameon=False)
     axes.set_title(panel.title, fontsize=9)
     axes.set_xlabel(panel.x_label, fontsize=8)
