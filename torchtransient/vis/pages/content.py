@@ -101,7 +101,8 @@ class Content:
         unit: "m", or "pixels".
         marks: points on the picture, such as the laser's.
         notes: sentences about what was left out.
-        stride: rows and columns from one pixel of the picture to the next.
+        stride: rows and columns of the result from one pixel of the picture to the next.
+        block: rows and columns of the result that a pixel is the mean of.
     """
 
     kind: str
@@ -118,6 +119,7 @@ class Content:
     marks: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = field(default_factory=tuple)
     stride: int = 1
+    block: int = 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -402,5 +404,6 @@ def binned(content: Content, times: int, pixels: int) -> Content:
     parts = [f"adds up {times} bins"] * (times > 1) + [f"averages {pixels} x {pixels} pixels"] * (pixels > 1)
     note = f"To be small, the page {' and '.join(parts)}."
     return replace(
-        content, slider=slider, planes=tuple(map(reduced, content.planes)), extent=extent, notes=(*content.notes, note)
-    )
+        content, slider=slider, planes=tuple(map(reduced, content.planes)), extent=extent, notes=(*content.notes, note),
+        stride=pixels, block=pixels,
+    )  # fmt: skip

@@ -67,8 +67,11 @@ class Encoded:
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
     """Return the page of a content, binned until it has at most ``max_bytes``."""
     import_bokeh()
-    content, encoded = _fitted(content, max_bytes - 1_800_000)
+    room = max_bytes - 1_800_000
+    content, encoded = _fitted(content, room)
     notes = (*_errors_said(content, encoded.tables), *content.notes)
+    if encoded.size > room:
+        notes += (f"The page is larger than max_megabytes={max_bytes / 1e6:g}: it cannot be binned further.",)
     maps, modes = colour_maps(), modes_of(content)
     root = layout_of(content, modes, " ".join(map(escape, notes)), title, maps)
     chunks = [
@@ -109,6 +112,7 @@ def described(
         "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
         "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
         "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
+        "block": content.block,
         "slider": {
             "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
             "secondUnit": slider.second_unit, "factor": slider.factor,
@@ -199,6 +203,8 @@ def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
             f"Stored in 8 bits: numbers are within {100 * light.error:.2g} % of those of the file; sizes below "
             f"{light.floor:.3g} are zero."
         ]
+        if content.items == ("A", "B"):
+            said.append(f"A − B is within {100 * light.error:.2g} % of |A| + |B|.")
     if "s1" in tables:
         said.append(f"Stokes components over S0 are within {RATIO.error:.2g}.")
     if "phase" in tables:
