@@ -343,6 +343,31 @@ def test_what_is_not_finite_is_magenta(show):
     shown = show(cube, axis=cases.AXIS)
     assert shown.picture()[2 * cases.W + 3] == [255, 0, 255]
     assert shown.picture().count([255, 0, 255]) == 1
+    assert "in 1 of 140 pixels" in shown.notes
+    place, other = pick(shown, 2, 3), pick(shown, 7, 9)
+    assert math.isnan(shown.rows()[place][4])
+    assert not math.isnan(shown.rows()[other][4])
+
+
+def test_what_is_infinite_once_has_no_peak(show):
+    cube = cases.front(1)
+    cube[0, 9, 2, 3] = math.inf
+    shown = show(cube, axis=cases.AXIS)
+    place = pick(shown, 2, 3)
+    assert math.isnan(shown.rows()[place][4])
+    shown.select("show", "peak time")
+    assert math.isnan(shown.rows()[place][1])
+
+
+def test_gates_are_named_by_start_and_end(show):
+    gates = tuple(tt.Gate.rectangular(5.0 + n, 6.25 + n) for n in range(3))
+    cube = cases.front(1)[:, 6:9]
+    shown = show(cases.result(gated=cube, gates=gates))
+    shown.go(1)
+    assert shown.page.get_by_text("of 0 to 2: gate 6 to 7.25 m").count() == 1
+    place = pick(shown, 4, 5)
+    start = 5.0 + int(cube[0, :, 4, 5].argmax())
+    assert shown.page.locator("td.at").nth(place).inner_text() == f"{start:.4g} to {start + 1.25:.4g} m"
 
 
 # ------------------------------------------------------------------------------------------------------ controls

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
@@ -67,9 +68,10 @@ class Encoded:
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
     """Return the page of a content, binned until it has at most ``max_bytes``."""
     import_bokeh()
+    not_finite = _not_finite_said(content)
     room = max_bytes - 1_800_000
     content, encoded = _fitted(content, room)
-    notes = (*_errors_said(content, encoded.tables), *content.notes)
+    notes = (*_errors_said(content, encoded.tables), *not_finite, *content.notes)
     if encoded.size > room:
         notes += (f"The page is larger than max_megabytes={max_bytes / 1e6:g}: it cannot be binned further.",)
     maps, modes = colour_maps(), modes_of(content)
@@ -115,7 +117,7 @@ def described(
         "block": content.block,
         "slider": {
             "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
-            "secondUnit": slider.second_unit, "factor": slider.factor,
+            "secondUnit": slider.second_unit, "factor": slider.factor, "labels": slider.labels,
         },
         "tables": {name: _plain(table.values) for name, table in tables.items()}, "maps": maps, "modes": list(modes),
         "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed",
@@ -192,6 +194,15 @@ def _tables(content: Content) -> dict[str, Table]:
 
 def _codes_of(planes: Planes, tables: dict[str, Table]) -> dict[str, NDArray[np.uint8]]:
     return {name: tables[name].encode(plane) for name, plane in planes.named().items()}
+
+
+def _not_finite_said(content: Content) -> list[str]:
+    found = torch.zeros(content.shape[1:], dtype=torch.bool)
+    for planes in content.planes:
+        for plane in (*planes.light, *(() if planes.ratios is None else planes.ratios)):
+            found |= ~torch.isfinite(plane).all(0)
+    number = int(found.sum())
+    return [f"NaN or infinity in {number} of {found.numel()} pixels."] if number else []
 
 
 def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:

@@ -172,6 +172,7 @@
         total[i] += v;
       }
     }
+    for (let i = 0; i < N; i++) if (!Number.isFinite(total[i])) peak[i] = NaN;
     return { peak, total };
   });
 
@@ -380,8 +381,9 @@
 
   function placeText(t) {
     const { name, unit, second, secondUnit, factor } = meta.slider;
-    const along = unit || second ? `${name} ${number(centers[t])} ${unit}` : "";
-    return `<b>${t}</b> of ${T}: ${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
+    const label = meta.slider.labels[t];
+    const along = label ? `${name} ${label}` : unit || second ? `${name} ${number(centers[t])} ${unit}` : "";
+    return `<b>${t}</b> of 0 to ${T - 1}: ${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
   }
 
   // ------------------------------------------------------------------------------------------------ curves
@@ -457,6 +459,8 @@
     return perPixel[state.mode](summed, 0);
   }
 
+  const positionText = (t) => meta.slider.labels[t] ?? `${number(centers[t])} ${meta.slider.unit}`;
+
   // Rows and columns of the result.
   function placeOf({ row, column }) {
     const named = (name, first) => (meta.block === 1 ? `${name} ${first}` : `${name}s ${first}-${first + meta.block - 1}`);
@@ -472,7 +476,7 @@
       const error = curve.errors && !state.accumulate && ["light", "colour"].includes(state.mode) ? ` ± ${number(curve.errors[state.t])}` : "";
       return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} ${placeOf(curve.pixel)}</td>`
         + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${number(total)}</td>`
-        + `<td class="at">${number(centers[top])} ${meta.slider.unit}</td></tr>`;
+        + `<td class="at">${curve.y.every(Number.isFinite) ? positionText(top) : "none"}</td></tr>`;
     });
     write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor${curves.some((curve) => curve.errors) ? " (± one standard error)" : ""}</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
       + `<div style="color:#555;margin-top:4px">Click: a pixel more, or one less. Drag a ring to move it. Space: play. Arrows: one step (shift: ten). Home, End. Click the histogram to go there.</div>`);
