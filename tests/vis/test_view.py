@@ -99,6 +99,13 @@ def test_a_size_that_cannot_be_reached_is_said():
     assert not any("larger" in note for note in tt.vis.view(rates[:, :4, 0], max_megabytes=2).notes)
 
 
+def test_a_line_of_pixels_is_binned_over_time():
+    page = tt.vis.view(cases.noise(1, 1024, 1, 4000), max_megabytes=2)
+    assert len(page.html) <= 2e6
+    assert any("adds up" in note for note in page.notes)
+    assert not any("averages" in note for note in page.notes)
+
+
 def test_notebooks_show_small_pages():
     page = tt.vis.view(cases.front(1), axis=cases.AXIS)
     assert page._repr_html_().startswith("<iframe srcdoc=")

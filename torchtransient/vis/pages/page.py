@@ -133,13 +133,15 @@ def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
     times = pixels = 1
     while True:
         t, h, w = (n // k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
-        if t * h * w <= 64 or _expected(content, times, pixels) <= 1.1 * max_bytes:
+        # Slices and frequencies are no bins of light.
+        adds_up = t > 1 and content.kind not in ("phasors", "gates", "volume")
+        least = t * h * w <= 64 or (min(h, w) == 1 and not adds_up)
+        if least or _expected(content, times, pixels) <= 1.1 * max_bytes:
             shown = content if times == pixels == 1 else binned(content, times, pixels)
             encoded = _encoded(shown)
-            if encoded.size <= max_bytes or t * h * w <= 64:
+            if encoded.size <= max_bytes or least:
                 return shown, encoded
-        # Slices and frequencies are no bins of light.
-        if t > 64 and content.kind not in ("phasors", "gates", "volume") and times <= 4 * pixels:
+        if adds_up and (min(h, w) == 1 or (t > 64 and times <= 4 * pixels)):
             times *= 2
         else:
             pixels *= 2
