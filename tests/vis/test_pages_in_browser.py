@@ -454,6 +454,8 @@ def test_a_page_that_was_binned(show):
     place = names.index(f"rows {ends[0]}, columns {ends[1]}")
     shown.go(4)
     near(shown, shown.rows()[place][1], float(mean[4, 11, 13]))
+    assert times > 1
+    assert shown.page.get_by_text(f"of 0 to {128 // times - 1}: bin {4 * times + (times - 1) / 2:g}").count() == 1
 
 
 # -------------------------------------------------------------------------------------------------------- server

@@ -382,8 +382,9 @@
   function placeText(t) {
     const { name, unit, second, secondUnit, factor } = meta.slider;
     const label = meta.slider.labels[t];
-    const along = label ? `${name} ${label}` : unit || second ? `${name} ${number(centers[t])} ${unit}` : "";
-    return `<b>${t}</b> of 0 to ${T - 1}: ${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
+    const along = label ? `${name} ${label}` : unit || second ? `${name} ${number(centers[t])} ${unit}`
+      : centers[t] === t ? "" : `${name} ${centers[t]}`;
+    return `<b>${t}</b> of 0 to ${T - 1}${along && ": "}${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
   }
 
   // ------------------------------------------------------------------------------------------------ curves
