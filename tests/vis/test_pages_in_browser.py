@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 
 import h5py
@@ -135,6 +136,7 @@ def test_error_bands(show, tmp_path):
     _, value, error, _, _ = shown.rows()[place]
     near(shown, value, float(out.transient.mean(0)[t, row, column]))
     near(shown, error, float(out.error_map()[t, row, column]))
+    assert shown.page.get_by_text("± one standard error").count() == 1
     low, high = shown.page.evaluate(
         "(n) => { const data = Bokeh.documents[0].get_model_by_name(`curve_${n}`).data;"
         " return [data.low, data.high].map((v) => Array.from(v)); }",
@@ -164,6 +166,20 @@ def test_polarization(show):
     off = (shown.rows()[place][1] - angle + 90) % 180 - 90
     linear = float((s1[at] ** 2 + s2[at] ** 2).sqrt() / s0[at])
     assert abs(off) < 0.5 * math.degrees(0.004 * math.sqrt(2) / linear) + 0.05
+
+
+def test_light_without_linear_polarization_has_no_angle(show):
+    cube = cases.stokes()
+    cube[1:3, :, :, :, :7] = 0
+    shown = show(cube, axis=cases.AXIS)
+    shown.select("show", "angle of linear polarization")
+    t, row, column = brightest(cube[0, 0, :, :, :7])
+    place = pick(shown, row, column)
+    shown.go(t)
+    assert math.isnan(shown.rows()[place][1])
+    grey = np.all(np.array(shown.picture()) == 0x88, axis=-1).reshape(cases.H, cases.W)
+    assert grey[:, :7].all()
+    assert not grey[:, 7:].any()
 
 
 def test_phasors(show):
@@ -287,7 +303,8 @@ def test_two_results(show):
     shown.select("result", "A − B")
     values = {name: value for name, value, *_ in shown.rows()}
     at = (t, row, column)
-    spare = (shown.stated_error + PRINTED) * float(mean_a[at] + mean_b[at])
+    stated = float(re.search(r"A − B is within ([\d.]+) % of \|A\| \+ \|B\|", shown.notes).group(1)) / 100
+    spare = (stated + PRINTED) * float(mean_a[at] + mean_b[at])
     assert values[f"A − B row {row}, column {column}"] == pytest.approx(float(mean_a[at] - mean_b[at]), abs=spare)
 
 
@@ -326,6 +343,31 @@ def test_what_is_not_finite_is_magenta(show):
     shown = show(cube, axis=cases.AXIS)
     assert shown.picture()[2 * cases.W + 3] == [255, 0, 255]
     assert shown.picture().count([255, 0, 255]) == 1
+    assert "in 1 of 140 pixels" in shown.notes
+    place, other = pick(shown, 2, 3), pick(shown, 7, 9)
+    assert math.isnan(shown.rows()[place][4])
+    assert not math.isnan(shown.rows()[other][4])
+
+
+def test_what_is_infinite_once_has_no_peak(show):
+    cube = cases.front(1)
+    cube[0, 9, 2, 3] = math.inf
+    shown = show(cube, axis=cases.AXIS)
+    place = pick(shown, 2, 3)
+    assert math.isnan(shown.rows()[place][4])
+    shown.select("show", "peak time")
+    assert math.isnan(shown.rows()[place][1])
+
+
+def test_gates_are_named_by_start_and_end(show):
+    gates = tuple(tt.Gate.rectangular(5.0 + n, 6.25 + n) for n in range(3))
+    cube = cases.front(1)[:, 6:9]
+    shown = show(cases.result(gated=cube, gates=gates))
+    shown.go(1)
+    assert shown.page.get_by_text("of 0 to 2: gate 6 to 7.25 m").count() == 1
+    place = pick(shown, 4, 5)
+    start = 5.0 + int(cube[0, :, 4, 5].argmax())
+    assert shown.page.locator("td.at").nth(place).inner_text() == f"{start:.4g} to {start + 1.25:.4g} m"
 
 
 # ------------------------------------------------------------------------------------------------------ controls
@@ -405,9 +447,15 @@ def test_a_page_that_was_binned(show):
     side = pixels[0] if pixels else 1
     sums = cube[0].unflatten(0, (-1, times)).sum(1)
     mean = torch.nn.functional.avg_pool2d(sums, side)
-    place = pick(shown, 11, 13)
+    assert side > 1
+    shown.click("picture", (13 + 0.5) * side, (11 + 0.5) * side)
+    names = [name for name, *_ in shown.rows()]
+    ends = [f"{first * side}-{(first + 1) * side - 1}" for first in (11, 13)]
+    place = names.index(f"rows {ends[0]}, columns {ends[1]}")
     shown.go(4)
     near(shown, shown.rows()[place][1], float(mean[4, 11, 13]))
+    assert times > 1
+    assert shown.page.get_by_text(f"of 0 to {128 // times - 1}: bin {4 * times + (times - 1) / 2:g}").count() == 1
 
 
 # -------------------------------------------------------------------------------------------------------- server

@@ -91,6 +91,21 @@ def test_pages_have_the_size_that_was_asked_for():
     assert not any("adds up" in note or "averages" in note for note in large.notes)
 
 
+def test_a_size_that_cannot_be_reached_is_said():
+    rates = cases.noise(1, 3000, 1, 8, 8)
+    page = tt.vis.view(rates, rate_axis=tt.RateAxis(-20.0, 0.01, 3000), max_megabytes=2)
+    assert len(page.html) > 2e6
+    assert any("larger than max_megabytes=2" in note for note in page.notes)
+    assert not any("larger" in note for note in tt.vis.view(rates[:, :4, 0], max_megabytes=2).notes)
+
+
+def test_a_line_of_pixels_is_binned_over_time():
+    page = tt.vis.view(cases.noise(1, 1024, 1, 4000), max_megabytes=2)
+    assert len(page.html) <= 2e6
+    assert any("adds up" in note for note in page.notes)
+    assert not any("averages" in note for note in page.notes)
+
+
 def test_notebooks_show_small_pages():
     page = tt.vis.view(cases.front(1), axis=cases.AXIS)
     assert page._repr_html_().startswith("<iframe srcdoc=")
@@ -130,8 +145,12 @@ REFUSED = {
     "two kinds": (lambda: tt.vis.view((cases.front(1), cases.capture())), ShapeError, "one kind"),
     "two sizes": (lambda: tt.vis.view((cases.front(1), cases.front(1, 4, 4))), ShapeError, "one kind"),
     "frequencies": (lambda: tt.vis.view(cases.phasors()[0], frequencies=[1.0]), ShapeError, "5 frequencies"),
+    "rates as a tensor": (lambda: tt.vis.view(cases.rates()[0]), ShapeError, "rate_axis"),
+    "a steady picture": (lambda: tt.vis.view(torch.ones(3, 4, 4)), ShapeError, "steady"),
+    "real phasors": (lambda: tt.vis.view(torch.ones(1, 2, 4, 4), frequencies=[1, 2]), ArgumentError, "complex"),
     "a word": (lambda: tt.vis.view({"albedo": 1}), ArgumentError, "expected"),
     "size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=0), UnitError, "max_megabytes"),
+    "a small size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=1.9), UnitError, "least 2"),
     "a folder": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), "nowhere/a.html"), StorageError, "nowhere"),
     "a file": (lambda: tt.vis.view("missing.h5"), StorageError, "missing.h5"),
 }  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 from torchtransient.array_files.part_files import replacing
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.checks import Numbers, check_folder, count, positive
+from torchtransient.errors import UnitError
 from torchtransient.vis.pages.content import content_of
 from torchtransient.vis.pages.page import Page, page_of
 
@@ -35,8 +36,8 @@ def view(
         axis, rate_axis, frequencies: axes of tensors that do not know their own. Rates (C, R, T, H, W) need
             ``rate_axis``.
         title: heading of the page.
-        max_megabytes: size of the page in 10^6 bytes. What is larger is binned over time and pixels, and the page says
-            so.
+        max_megabytes: size of the page in 10^6 bytes, at least 2. What is larger is binned over time and pixels, and
+            the page says so.
         samples: number of samples of a sequence that the page holds.
 
     Returns:
@@ -45,10 +46,13 @@ def view(
     Raises:
         ShapeError: for other shapes, and results that do not fit each other.
         ArgumentError: for what is no result.
+        UnitError: for ``max_megabytes`` below 2, of which the page's own scripts take most.
         StorageError: when a file cannot be read or the page not be written.
         MissingPackageError: without bokeh, the extra ``view``.
     """
     megabytes, samples = positive("view: max_megabytes", max_megabytes), count("view: samples", samples)
+    if megabytes < 2:
+        raise UnitError(f"view: expected max_megabytes of at least 2, as an empty page takes, got {max_megabytes!r}.")
     target = None if path is None else check_folder(path, "view")
     heading = title or (Path(x).name if isinstance(x, str | Path) else "torchtransient")
     content = content_of(x, "view", axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)

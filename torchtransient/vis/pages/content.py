@@ -17,6 +17,7 @@ from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.gates import Gate
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis.sources import as_tensor, frequencies_of, read_any
 
@@ -34,6 +35,7 @@ class Slider:
         name, unit: quantity along it.
         centers: (T,) float64.
         second, second_unit, factor: another quantity, ``factor`` times the first; empty for none.
+        labels: what each position is, such as a gate from its start to its end; empty for centers alone.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Slider:
     second: str = ""
     second_unit: str = ""
     factor: float = 1.0
+    labels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,8 @@ class Content:
         unit: "m", or "pixels".
         marks: points on the picture, such as the laser's.
         notes: sentences about what was left out.
-        stride: rows and columns from one pixel of the picture to the next.
+        stride: rows and columns of the result from one pixel of the picture to the next.
+        block: rows and columns of the result that a pixel is the mean of.
     """
 
     kind: str
@@ -118,6 +122,7 @@ class Content:
     marks: tuple[tuple[float, float], ...] = ()
     notes: tuple[str, ...] = field(default_factory=tuple)
     stride: int = 1
+    block: int = 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -189,18 +194,28 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
         known = getattr(x, "frequencies", None) if frequencies is None else frequencies
         return _phasors(as_tensor(x.phasor, who), known, who)
     if getattr(x, "gated", None) is not None:
-        gates = getattr(x, "gates", None)
-        return light_content(as_tensor(x.gated, who), _gates(x.gated.shape[-3], gates), "gates", _errors(x), who)
+        slider = gate_slider(x.gated.shape[-3], getattr(x, "gates", None))
+        return light_content(as_tensor(x.gated, who), slider, "gates", _errors(x), who)
     if getattr(x, "transient", None) is not None:
         cube = as_tensor(x.transient, who)
         return light_content(
             cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who
         )
-    cube = as_tensor(x, who)
+    return _plain(as_tensor(x, who), who, axis, rate_axis, frequencies)
+
+
+def _plain(cube: Tensor, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
     if cube.is_complex():
         return _phasors(cube, frequencies, who)
+    if frequencies is not None:
+        raise ArgumentError(f"{who}: frequencies are those of complex phasors (C, F, H, W), got {cube.dtype}.")
     if rate_axis is not None:
         return _rates(cube, axis, rate_axis, who)
+    if cube.ndim == 3 and len(cube) == 3 and axis is None:
+        raise ShapeError(
+            f"{who}: {tuple(cube.shape)} is a steady picture in colour, or three bins of time. Give light as "
+            "(C, T, H, W): steady[:, None] of a picture, cube[None] of bins."
+        )
     if cube.ndim == 3:
         cube = cube[None]
     return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
@@ -233,8 +248,10 @@ def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
     return Slider(_METRES, "m", axis.centers_opl.numpy(), "time", "ns", _NS_PER_METRE)
 
 
-def _gates(count: int, gates: Any) -> Slider:
-    return Slider("gate", "", np.arange(count, dtype=np.float64))
+def gate_slider(count: int, gates: Sequence[Gate] | None) -> Slider:
+    """Return the slider of gates, which count where they are not known."""
+    labels = tuple(f"{gate.start_opl:.4g} to {gate.end_opl:.4g} m" for gate in gates or ())
+    return Slider("gate", "", np.arange(count, dtype=np.float64), labels=labels)
 
 
 def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
@@ -258,7 +275,7 @@ def light_content(
     if cube.ndim != 4 or not cube.numel():
         raise ShapeError(
             f"{who}: expected light (C, T, H, W), polarized (4, C, T, H, W) or a result that has some, got "
-            f"{tuple(cube.shape)}; of a batch, choose one entry."
+            f"{tuple(cube.shape)}; of a batch, choose one entry. Rates (C, R, T, H, W) need rate_axis=tt.RateAxis(...)."
         )
     light, notes = _grey(cube)
     quantity = "radiance through a gate" if kind == "gates" else "radiance in a bin"
@@ -402,5 +419,6 @@ def binned(content: Content, times: int, pixels: int) -> Content:
     parts = [f"adds up {times} bins"] * (times > 1) + [f"averages {pixels} x {pixels} pixels"] * (pixels > 1)
     note = f"To be small, the page {' and '.join(parts)}."
     return replace(
-        content, slider=slider, planes=tuple(map(reduced, content.planes)), extent=extent, notes=(*content.notes, note)
-    )
+        content, slider=slider, planes=tuple(map(reduced, content.planes)), extent=extent, notes=(*content.notes, note),
+        stride=pixels, block=pixels,
+    )  # fmt: skip

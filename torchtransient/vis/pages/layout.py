@@ -15,6 +15,8 @@ from torchtransient.vis.pages.content import Content
 PIXEL_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
 _PICTURE = 440
+# Gates that have their start and end along the axis; more would cover each other.
+_GATE_TICKS = 6
 _OWN = "<div class='own'></div>"
 _MODES = {
     "colour": "colour", "light": "intensity", "peak": "peak time", "rainbow": "rainbow",
@@ -227,6 +229,9 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
     step = float(np.abs(np.diff(centers)).min()) if len(centers) > 1 else 1.0
     figure.x_range = m.Range1d(float(centers.min()) - step / 2, float(centers.max()) + step / 2)
     figure.y_range = m.Range1d(0 if not log else 1e-6, 1)
+    if slider.labels:
+        figure.xaxis.ticker = list(range(0, len(centers), -(-len(centers) // _GATE_TICKS)))
+        figure.xaxis.major_label_overrides = dict(enumerate(slider.labels))
     if slider.second:
         figure.extra_x_ranges = {
             "second": m.Range1d(figure.x_range.start * slider.factor, figure.x_range.end * slider.factor)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
@@ -67,8 +68,12 @@ class Encoded:
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
     """Return the page of a content, binned until it has at most ``max_bytes``."""
     import_bokeh()
-    content, encoded = _fitted(content, max_bytes - 1_800_000)
-    notes = (*_errors_said(content, encoded.tables), *content.notes)
+    not_finite = _not_finite_said(content)
+    room = max_bytes - 1_800_000
+    content, encoded = _fitted(content, room)
+    notes = (*_errors_said(content, encoded.tables), *not_finite, *content.notes)
+    if encoded.size > room:
+        notes += (f"The page is larger than max_megabytes={max_bytes / 1e6:g}: it cannot be binned further.",)
     maps, modes = colour_maps(), modes_of(content)
     root = layout_of(content, modes, " ".join(map(escape, notes)), title, maps)
     chunks = [
@@ -109,9 +114,10 @@ def described(
         "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
         "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
         "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
+        "block": content.block,
         "slider": {
             "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
-            "secondUnit": slider.second_unit, "factor": slider.factor,
+            "secondUnit": slider.second_unit, "factor": slider.factor, "labels": slider.labels,
         },
         "tables": {name: _plain(table.values) for name, table in tables.items()}, "maps": maps, "modes": list(modes),
         "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed",
@@ -127,13 +133,15 @@ def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
     times = pixels = 1
     while True:
         t, h, w = (n // k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
-        if t * h * w <= 64 or _expected(content, times, pixels) <= 1.1 * max_bytes:
+        # Slices and frequencies are no bins of light.
+        adds_up = t > 1 and content.kind not in ("phasors", "gates", "volume")
+        least = t * h * w <= 64 or (min(h, w) == 1 and not adds_up)
+        if least or _expected(content, times, pixels) <= 1.1 * max_bytes:
             shown = content if times == pixels == 1 else binned(content, times, pixels)
             encoded = _encoded(shown)
-            if encoded.size <= max_bytes or t * h * w <= 64:
+            if encoded.size <= max_bytes or least:
                 return shown, encoded
-        # Slices and frequencies are no bins of light.
-        if t > 64 and content.kind not in ("phasors", "gates", "volume") and times <= 4 * pixels:
+        if adds_up and (min(h, w) == 1 or (t > 64 and times <= 4 * pixels)):
             times *= 2
         else:
             pixels *= 2
@@ -190,6 +198,15 @@ def _codes_of(planes: Planes, tables: dict[str, Table]) -> dict[str, NDArray[np.
     return {name: tables[name].encode(plane) for name, plane in planes.named().items()}
 
 
+def _not_finite_said(content: Content) -> list[str]:
+    found = torch.zeros(content.shape[1:], dtype=torch.bool)
+    for planes in content.planes:
+        for plane in (*planes.light, *(() if planes.ratios is None else planes.ratios)):
+            found |= ~torch.isfinite(plane).all(0)
+    number = int(found.sum())
+    return [f"NaN or infinity in {number} of {found.numel()} pixels."] if number else []
+
+
 def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
     light = tables["c0"]
     if light.kind == "whole":
@@ -199,6 +216,8 @@ def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
             f"Stored in 8 bits: numbers are within {100 * light.error:.2g} % of those of the file; sizes below "
             f"{light.floor:.3g} are zero."
         ]
+        if content.items == ("A", "B"):
+            said.append(f"A − B is within {100 * light.error:.2g} % of |A| + |B|.")
     if "s1" in tables:
         said.append(f"Stokes components over S0 are within {RATIO.error:.2g}.")
     if "phase" in tables:

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from torchtransient.array_files.hdf5_writing import hdf5_package
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError
+from torchtransient.gates import gates_from_text
 from torchtransient.vis.pages.codes import light_table
-from torchtransient.vis.pages.content import Content, light_content, slider_of
+from torchtransient.vis.pages.content import Content, gate_slider, light_content, slider_of
 from torchtransient.vis.pages.layout import colour_maps, layout_of, modes_of
 from torchtransient.vis.pages.page import described, html_of, with_script
 
@@ -62,7 +63,11 @@ class LargeResult:
         channels, bins, rows, columns = self.cube.shape
         stride = -(-max(rows, columns) // _MOST_PIXELS)
         light = torch.zeros(channels, 1, 1, 1).expand(channels, bins, -(-rows // stride), -(-columns // stride))
-        self.content: Content = replace(light_content(light, slider_of(bins, axis, "view")), stride=stride)
+        if name == "gated":
+            shown = light_content(light, gate_slider(bins, gates_from_text(str(known.get("gates", "")))), "gates")
+        else:
+            shown = light_content(light, slider_of(bins, axis, "view"))
+        self.content: Content = replace(shown, stride=stride)
 
     def frame(self, channel: int, t: int) -> NDArray[np.uint16]:
         """Return the upper halves of the pixels that the picture shows of a bin."""

@@ -134,7 +134,8 @@
   const perPixel = {
     light,
     dop: (p, i) => (p[0][i] > 0 ? Math.min(1, Math.hypot(p[1][i], p[2][i], p[3][i]) / p[0][i]) : NaN),
-    aolp: (p, i) => (p[0][i] > 0 ? 0.5 * DEGREES * Math.atan2(p[2][i], p[1][i]) : NaN),
+    // Below the error of the ratios light may be without linear polarization, which has no angle.
+    aolp: (p, i) => (Math.hypot(p[1][i], p[2][i]) > (tables.s1[128] / Math.SQRT2) * p[0][i] ? 0.5 * DEGREES * Math.atan2(p[2][i], p[1][i]) : NaN),
     real: (p, i) => p[0][i],
     phase: (p, i) => (p[0][i] || p[1][i] ? DEGREES * Math.atan2(p[1][i], p[0][i]) : NaN),
   };
@@ -171,6 +172,7 @@
         total[i] += v;
       }
     }
+    for (let i = 0; i < N; i++) if (!Number.isFinite(total[i])) peak[i] = NaN;
     return { peak, total };
   });
 
@@ -379,8 +381,10 @@
 
   function placeText(t) {
     const { name, unit, second, secondUnit, factor } = meta.slider;
-    const along = unit || second ? `${name} ${number(centers[t])} ${unit}` : "";
-    return `<b>${t}</b> of ${T}: ${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
+    const label = meta.slider.labels[t];
+    const along = label ? `${name} ${label}` : unit || second ? `${name} ${number(centers[t])} ${unit}`
+      : centers[t] === t ? "" : `${name} ${centers[t]}`;
+    return `<b>${t}</b> of 0 to ${T - 1}${along && ": "}${along}${second ? ` = ${number(centers[t] * factor)} ${secondUnit}` : ""}`;
   }
 
   // ------------------------------------------------------------------------------------------------ curves
@@ -456,6 +460,14 @@
     return perPixel[state.mode](summed, 0);
   }
 
+  const positionText = (t) => meta.slider.labels[t] ?? `${number(centers[t])} ${meta.slider.unit}`;
+
+  // Rows and columns of the result.
+  function placeOf({ row, column }) {
+    const named = (name, first) => (meta.block === 1 ? `${name} ${first}` : `${name}s ${first}-${first + meta.block - 1}`);
+    return `${named("row", row * stride)}, ${named("column", column * stride)}`;
+  }
+
   function drawReadout() {
     const units = { dop: "", aolp: " °", phase: " °", peak: ` ${meta.slider.unit}`, rainbow: ` ${meta.slider.unit}`, speed: " m/s" };
     const unit = units[state.mode] ?? "";
@@ -463,11 +475,11 @@
       const total = curve.y.reduce((a, b) => a + b, 0);
       const top = curve.y.reduce((best, v, t) => (v > curve.y[best] ? t : best), 0);
       const error = curve.errors && !state.accumulate && ["light", "colour"].includes(state.mode) ? ` ± ${number(curve.errors[state.t])}` : "";
-      return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} row ${curve.pixel.row * stride}, column ${curve.pixel.column * stride}</td>`
+      return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} ${placeOf(curve.pixel)}</td>`
         + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${number(total)}</td>`
-        + `<td class="at">${number(centers[top])} ${meta.slider.unit}</td></tr>`;
+        + `<td class="at">${curve.y.every(Number.isFinite) ? positionText(top) : "none"}</td></tr>`;
     });
-    write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
+    write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor${curves.some((curve) => curve.errors) ? " (± one standard error)" : ""}</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
       + `<div style="color:#555;margin-top:4px">Click: a pixel more, or one less. Drag a ring to move it. Space: play. Arrows: one step (shift: ten). Home, End. Click the histogram to go there.</div>`);
   }
 
