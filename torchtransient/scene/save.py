@@ -447,7 +447,7 @@ class XmlWriter:
         self.state, self.folder = state, folder
         self._direct = {index for _, index in children(state, state.root)}
         self._names = [node.props.id() for node in state.nodes]
-        self._moving = {node.props["of"] for node in state.nodes if node.props.plugin_name() == MOTION}
+        self._moving = {node.props.get("of", "") for node in state.nodes if node.props.plugin_name() == MOTION}
         self._written: dict[int, ElementTree.Element] = {}
         self._kinds: dict[int, str] = {}
         self._count = 0

@@ -72,9 +72,8 @@ def first_photon_probabilities(rate: Tensor) -> tuple[Tensor, Tensor]:
 class CoatesEstimate(NamedTuple):
     """Estimate of the light behind a histogram.
 
-    Attributes:
-        rate: detections per cycle and bin of a detector that is never dead, (..., C, T, H, W).
-        valid: mask of bins where cycles were still armed and not all of them fired.
+    ``rate``: detections per cycle and bin of a detector that is never dead, (..., C, T, H, W). ``valid``: mask of bins
+    where cycles were still armed and not all of them fired.
     """
 
     rate: Tensor
