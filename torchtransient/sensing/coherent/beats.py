@@ -22,6 +22,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.checks import of_class
 from torchtransient.chirps import Chirps
 from torchtransient.errors import UnitError
+from torchtransient.floating import product
 from torchtransient.sensing.base.layout import check_count, check_number, check_time_axis, check_transient
 from torchtransient.sensing.base.policies import GradPolicy, standard_normal
 from torchtransient.sensing.base.sensor import RandomSensor
@@ -222,7 +223,7 @@ class CoherentReceiver(RandomSensor):
 
 
 def _over_bins(matrix: Tensor, x: Tensor) -> Tensor:
-    return torch.einsum("jt,...thw->...jhw", matrix.to(x), x)
+    return product(matrix.to(x), x.flatten(-2)).reshape(*x.shape[:-3], len(matrix), *x.shape[-2:])
 
 
 def _root(photons: Tensor) -> Tensor:
