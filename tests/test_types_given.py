@@ -31,10 +31,6 @@ ANYTHING = {
 # What hands a value on to a function of the user's, whose errors are its own.
 HANDED_ON = {
     "losses.measurement_consistency(volume)": "an operator of the case", "training.accumulate(loss_of)": "a function",
-    # options that a module hands to its function
-    **dict.fromkeys(("losses.FirstPhotonNLL(cycles)", "losses.FreeRunningNLL(periods)",
-      "losses.FreeRunningNLL(dead_bins)", "losses.ReadNoiseNLL(read_noise)",
-      "losses.MeasurementConsistency(operator)"), "a function"),
 }  # fmt: skip
 # Without a case, and why.
 LEFT = {
@@ -90,12 +86,11 @@ def test_what_is_of_a_wrong_type(entry):
     name, argument = entry
     case, place = TYPE_CASES[name], f"{name}({argument})"
     names = list(inspect.signature(case.call).parameters)
-    base = {**dict(zip(names, case.places, strict=False)), **case.base}
     wrong = []
     for value in [] if place in HANDED_ON else WRONG:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            taken, said_wrong = complaint(partial(case.call, **{**base, argument: value}), case.errors, value)
+            taken, said_wrong = complaint(partial(case.by_name, {argument: value}, names), case.errors, value)
         if taken and value is NOTHING and place not in ANYTHING:
             wrong.append("object() is taken")
         wrong += [said_wrong] if said_wrong else []

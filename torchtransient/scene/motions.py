@@ -53,9 +53,9 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
     """
     import mitsuba as mi
 
-    moving = [(node, key, index) for node in state.nodes for key, index in _motions_of(state, node)]
-    if not moving and not motions:
+    if not motions and all(node.props.plugin_name() != PLUGIN for node in state.nodes):
         return
+    moving = [(node, key, index) for node in state.nodes for key, index in _motions_of(state, node)]
     name_children(state)
     for node, key, index in moving:
         name, props = node.props.id(), state.nodes[index].props

@@ -17,9 +17,10 @@ class RigidMotion(mi.Texture):
 
     ``linear`` (m/s), ``angular`` (rad/s, right-handed), ``center`` (m): three numbers each, in the world; zero.
     ``of`` (string): name of the body, for a motion that is a child of the scene: a shape, an instance, an emitter, a
-    sensor or a medium. A shape may hold its motion itself, as its child ``velocity``.
+    sensor or a medium. A shape may hold its motion itself, as its child ``velocity``: it is a texture since shapes take
+    textures of any name as children.
 
-    Nothing moves: poses are those of one instant. Films of rates measure how fast the lengths of paths change there.
+    Poses stay those of one instant. Films of rates measure how fast the lengths of paths change there.
     """
 
     def __init__(self, props):
@@ -40,13 +41,6 @@ class RigidMotion(mi.Texture):
     def rows(self):
         """Return (velocity of the body's point at the origin of the world, angular velocity), Vector3f."""
         return self.linear - dr.cross(self.angular, self.center), self.angular
-
-    def is_spatially_varying(self):
-        return True
-
-    def eval_3(self, si, active=True):
-        """Return the velocity at ``si`` (m/s), for whoever asks a shape for its attribute."""
-        return mi.Color3f(self.linear + dr.cross(self.angular, mi.Vector3f(si.p) - self.center))
 
     def to_string(self):
         values = ", ".join(f"{name} = {getattr(self, name)}" for name in PARAMETERS)
