@@ -36,6 +36,30 @@ def test_a_wall_head_on_has_the_doppler_shift_of_lidars(variant):
     assert float(light.sum()) == pytest.approx(float(still.transient.reshape(-1, AXIS.num_bins)[0].sum()), rel=1e-4)
 
 
+@pytest.mark.parametrize("speed", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("distance", [1e-2, 1e5])
+def test_near_and_far_walls_that_creep_and_fly(distance, speed):
+    """Mean rate, its derivative by the velocity in both modes, relative to the speed."""
+    nodes = scene(wall=plate((0, 0, distance), (0, 0, 0), half=distance))
+    nodes["sensor"] |= {"near_clip": 1e-3 * distance, "far_clip": 1e3 * distance}
+    rates, axis = tt.RateAxis(-4 * speed, 0.1 * speed, 80), tt.TimeAxis(0.0, distance, 3)
+    moving = tt.load(nodes, variant=VARIANT).moving({"wall": tt.Motion(linear=(0, 0, -speed))})
+    key = "wall.velocity.linear"
+    renderer = tt.TransientRenderer(moving, [key], rates=rates, time_axis=axis, spp=64, physics="ignore")
+    centers = rates.centers.float()[:, None, None, None]
+
+    def mean(value):
+        light = renderer({key: value}, seed=0).rates
+        return (light * centers).sum() / light.sum()
+
+    base, along = torch.tensor([0.0, 0.0, -speed], requires_grad=True), torch.tensor([0.0, 0.0, 1.0])
+    found = mean(base)
+    found.backward()
+    _, tangent = torch.func.jvp(mean, (base.detach(),), (along,))
+    assert float(found.detach()) / speed == pytest.approx(-2.0, abs=1e-4)
+    assert float(base.grad[2]) == pytest.approx(2.0, rel=1e-3) and float(tangent) == pytest.approx(2.0, rel=1e-3)
+
+
 def test_described_velocities_are_those_of_motions(tmp_path):
     """In a dictionary as a child of the wall, and in XML."""
     child = {"type": "rigid_motion", "linear": [0, 0, -SPEED], "angular": [0.2, 0.1, 0.0], "center": [0.1, 0.0, 2.0]}

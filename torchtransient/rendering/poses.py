@@ -1,4 +1,4 @@
-"""What functions beside the renderer need of it: the values of one pose, the size of its film and of its scene."""
+"""Values of one pose of a renderer, and the sizes of its film and scene, for functions beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page shows: light over a slider, a picture for each of its positions, for one thing or several of a kind."""
+"""Content of a page: light over a slider, a picture for each of its positions, of one thing or several of a kind."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Planes:
 
 @dataclass(frozen=True)
 class Content:
-    """What a page shows.
+    """Content of a page.
 
     Attributes:
         kind: "transient", "gates", "counts", "polarized", "phasors", "rates", "beats", "capture" or "volume".
