@@ -121,8 +121,8 @@ class EmitterFound(Connection):
         if context.velocities is not None:
             term.rate = following.rate
         if wanted.rate:
-            moves = context.velocities.of_vertex(vertex, vertex.scattered_si, lit)
-            term.rate_slope = vertex.rate_slope - slope_only(dr.select(lit, step.carry.η * dr.dot(moves, d), 0))
+            rate = step.carry.η * dr.dot(vertex.velocity, d)
+            term.rate_slope = vertex.rate_slope - slope_only(dr.select(lit, rate, 0))
         return term
 
 
@@ -275,7 +275,7 @@ class EmitterSampled(Connection):
         term = EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))
         if context.velocities is not None:
             end = context.velocities.of_light(light.ds.emitter, light.p, lit)
-            set_rate(context, vertex, term, end, d, vertex.carry.η * towards.eta, wanted)
+            set_rate(vertex, term, end, d, vertex.carry.η * towards.eta, wanted)
         return [term]
 
     def _light(self, context, si, u, lit, wanted):
@@ -380,7 +380,7 @@ class EmitterSampled(Connection):
         return dr.replace_grad(light.weight, value)
 
 
-def set_rate(context, vertex, term, end, d, η, wanted):
+def set_rate(vertex, term, end, d, η, wanted):
     """Set the rate of a term whose last segment leads from the vertex to a point of a light.
 
     Args:
@@ -388,8 +388,7 @@ def set_rate(context, vertex, term, end, d, η, wanted):
         end: attached velocity of that point.
         d, η: attached direction and index of the segment.
     """
-    rate = η * dr.dot(end - context.velocities.of_vertex(vertex, vertex.scattered_si, term.active), d)
-    rate = dr.select(term.active, rate, 0)
+    rate = dr.select(term.active, η * dr.dot(end - vertex.velocity, d), 0)
     term.rate = vertex.v.rate + dr.detach(rate)
     if wanted.rate:
         term.rate_slope = vertex.rate_slope + slope_only(rate)

@@ -139,7 +139,7 @@ class LaserSpot(Connection):
         value = product(vertex.carry.β, value)
         term = EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=vertex.v.arrival(self.name))
         if context.velocities is not None:  # the spot rests where the beam meets the wall
-            set_rate(context, vertex, term, mi.Vector3f(0), d, vertex.carry.η * towards.eta, wanted)
+            set_rate(vertex, term, mi.Vector3f(0), d, vertex.carry.η * towards.eta, wanted)
         return [term]
 
 

@@ -190,8 +190,7 @@ class Media(Vacuum):
         if wanted.geometry:
             T *= dr.relative_grad(dr.select(v.scatter, stretch, 1))
         vertex.carry = replace(carry, β=attenuated(carry.β, T))
-        if wanted.rate:
-            self.add_rate(context, vertex, start)
+        self.add_rate(context, vertex, start, wanted)
         return vertex
 
     def _surface_or_medium(self, context, v, carry, ray, wanted):

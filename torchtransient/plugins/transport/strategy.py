@@ -67,7 +67,7 @@ class Vertex(Local):
         scattered_si: ``si`` with the wavelengths behind the surface (scattering).
         connectable: mask, a connection can find light from here (scattering).
         scattered_τ: ``τ`` and the delay, where connections start to count (loop).
-        v, rate: velocity, and rate of the path up to the vertex, of films that measure rates (loop).
+        velocity, rate: velocity, and rate of the path up to the vertex, of films that measure rates (loop).
     """
 
 
@@ -188,6 +188,7 @@ class AttachedVertex(Local):
         end: :class:`VertexEnd` (segment).
         carry: :class:`.carry.Carry` with the throughput at the vertex (segment).
         slope: Float, zero with the derivative of the optical path length up to the vertex (segment).
+        velocity: attached velocity, of films that measure rates (segment).
         rate_slope: Float, zero with the derivative of the rate up to the vertex, where ``wanted.rate`` (segment).
         damping_radius: distance below which points are dragged along, with moving geometry (segment).
         bsdf, delay: as of :class:`Vertex` (scattering).

@@ -406,8 +406,7 @@ class Surface(Scattering):
         rate = mi.Float(0)
         if wanted.rate:
             leaving = dr.select(mirrored, d_out, out) if context.contents.delta else out
-            moves = context.velocities.of_vertex(vertex, si, v.goes_on)
-            rate = vertex.rate_slope - slope_only(dr.select(v.goes_on, η * dr.dot(moves, leaving), 0))
+            rate = vertex.rate_slope - slope_only(dr.select(v.goes_on, η * dr.dot(vertex.velocity, leaving), 0))
         p, n = (motion.p, motion.n) if "p" in context.carried else (mi.Point3f(0), mi.Normal3f(0))
         carry = Carry(
             β=product(vertex.carry.β, weight), slope=slope, η=η, o=o, d=d, x=dr.select(v.goes_on, si.p, 0), w=w, p=p,

@@ -197,8 +197,7 @@ class Vacuum(Segment):
             ray.o, ray.d = carry.o, carry.d
         si = self.attached_surface(context, v, carry, ray, wanted, v.active)
         vertex = self.arrived(context, v, carry, ray, si, wanted)
-        if wanted.rate:
-            self.add_rate(context, vertex, start)
+        self.add_rate(context, vertex, start, wanted)
         return vertex
 
     def attached_surface(self, context, v, carry, ray, wanted, active):
@@ -250,19 +249,23 @@ class Vacuum(Segment):
         return vertex
 
     @staticmethod
-    def add_rate(context, vertex, start):
-        """Add what the end of a segment adds to the rate, and of the first segment its start too.
+    def add_rate(context, vertex, start, wanted):
+        """Set velocity and slope of the rate of an attached vertex, for films that measure rates.
 
-        The vertex that another segment leaves has counted its own part.
+        The end of the segment counts here, of the first one its start too; of others the vertex that they leave has
+        counted it.
 
         Args:
             start: attached start of the first segment, without a sideways shift of the ray.
         """
         velocities, v, carry = context.velocities, vertex.v, vertex.carry
+        if velocities is None:
+            return
+        vertex.velocity = velocities.of_vertex(vertex, vertex.si, v.active & vertex.sid.is_valid())
+        if not wanted.rate:
+            return
         first = v.k == 0
-        moves = velocities.of_vertex(vertex, vertex.si, v.active & vertex.sid.is_valid())
-        moves -= dr.select(first, velocities.of_sensor(start), 0)
-        longer = carry.η * dr.dot(moves, carry.w)
+        longer = carry.η * dr.dot(vertex.velocity - dr.select(first, velocities.of_sensor(start), 0), carry.w)
         longer = dr.select(first, 0, longer) if context.camera_unwarp else longer
         vertex.rate_slope = carry.rate + slope_only(longer)
 

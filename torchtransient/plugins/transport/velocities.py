@@ -266,9 +266,9 @@ class Velocities:
     # --------------------------------------------------------------------------------------------------------- primal
 
     def arrive(self, context: Any, path: Any, vertex: Any) -> None:
-        """Set the velocity ``v`` of a vertex, and the ``rate`` of the path up to it."""
-        vertex.v = self.of_vertex(vertex, vertex.si, vertex.valid)
-        longer = path.η * dr.dot(vertex.v - path.prev_v, path.ray.d)
+        """Set the ``velocity`` of a vertex, and the ``rate`` of the path up to it."""
+        vertex.velocity = self.of_vertex(vertex, vertex.si, vertex.valid)
+        longer = path.η * dr.dot(vertex.velocity - path.prev_v, path.ray.d)
         vertex.rate = path.rate + (dr.select(path.depth == 0, 0, longer) if context.camera_unwarp else longer)
 
     def of_event(self, context: Any, connection: Any, vertex: Any, proposal: Any, answer: Any) -> Any:
@@ -276,4 +276,4 @@ class Velocities:
         if proposal is None or connection.unwarp:
             return vertex.rate
         v = connection.end_velocity(context, proposal)
-        return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.v, proposal.d)
+        return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)

@@ -193,7 +193,7 @@ def bounce(context, path, state, sampler, sink, *, dark=False, last=False):
     path.prev_pdf, path.prev_unconnected = step.pdf, step.unconnected
     path.β, path.η, path.τ = β, path.η * step.eta, vertex.scattered_τ
     if context.velocities is not None:
-        path.rate, path.prev_v = vertex.rate, vertex.v
+        path.rate, path.prev_v = vertex.rate, vertex.velocity
     path.leg = leg if leg is not None else context.segment.depart(context, ray, vertex, β, sampler, goes_on)
 
 

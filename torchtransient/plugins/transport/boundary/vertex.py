@@ -105,7 +105,7 @@ class VertexPass(BoundaryPass):
         }  # fmt: skip
         if context.velocities is not None:
             context.velocities.arrive(context, path, vertex)
-            first |= {"rate": vertex.rate, "prev_v": vertex.v}
+            first |= {"rate": vertex.rate, "prev_v": vertex.velocity}
         lit = None
         if context.finds_light:  # Elsewhere a density of zero leaves out emission.
             dragged_along = b.dist < radius
