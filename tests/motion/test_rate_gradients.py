@@ -144,6 +144,41 @@ def test_outlines_that_poses_move(where, key):
     compare(renderer_of(loaded, [key], spp=8192), directions, seeds=range(12))
 
 
+def behind(bender):
+    """A body before a wall, seen in a mirror or through a tilted pane; all move."""
+    dark = {"type": "diffuse", "reflectance": 0.4}
+    if bender == "mirror":
+        lamp, depth = [0.6, 0.5, -0.3], 3
+        nodes = {"bender": plate((0, 0, 2), (0.1, 0.05, 0), half=2, bsdf={"type": "conductor"}),
+                 "body": plate((0.33, 0.22, -1), (0.33, 0.22, 1), half=0.4, bsdf=dark, up=(0.5, 1, 0)),
+                 "wall": plate((0, 0, -2.5), (0, 0, 0), half=9)}  # fmt: skip
+    else:
+        lamp, depth = [0.6, 0.5, 1.7], 6
+        nodes = {"bender": {"type": "cube", "bsdf": {"type": "dielectric", "int_ior": 1.5},
+                            "to_world": translate([0, 0, 1.2]) @ rotate([1, 0, 0], 20) @ scale([3, 3, 0.1])},
+                 "body": plate((0.05, 0.02, 2.4), (0.05, 0.02, 0), half=0.24, bsdf=dark),
+                 "wall": plate((0, 0, 3.2), (0, 0, 0), half=9)}  # fmt: skip
+    motions = {"bender": MOTIONS["back"], "body": MOTIONS["side"], "wall": tt.Motion(linear=(0, 0.3, -2.0))}
+    nodes = scene(4, 24, depth, **nodes, lamp=LAMP | {"position": lamp})
+    return tt.load(nodes, variant=VARIANT).moving(motions | {name: MOTIONS[name] for name in ("sensor", "lamp")})
+
+
+AWAY = torch.zeros(4, 4)
+AWAY[2, 3] = 1.0
+SEEN = [("mirror", "body.to_world"), ("mirror", "lamp.position"), ("mirror", "sensor.to_world"),
+        ("mirror", "bender.to_world"), ("pane", "body.to_world"), ("pane", "lamp.position"),
+        ("pane", "sensor.to_world")]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("bender", "key"), [pytest.param(*one, marks=() if one == SEEN[0] else pytest.mark.slow) for one in SEEN]
+)
+def test_outlines_and_shadows_behind_a_mirror_or_a_pane_that_moves(bender, key):
+    """The light that they hide and uncover has the rate of the whole way. Of poses of a mirror, what moves it away."""
+    direction = SIDEWAYS if key.endswith("to_world") else torch.tensor([1.0, 0.5, 0.0])
+    compare(renderer_of(behind(bender), [key]), {key: AWAY if key.startswith("bender") else direction}, seeds=range(6))
+
+
 # ------------------------------------------------------------------------------------------- glass, meshes, copies, fog
 
 

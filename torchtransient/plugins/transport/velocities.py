@@ -276,4 +276,5 @@ class Velocities:
         if proposal is None or connection.unwarp:
             return vertex.rate
         v = connection.end_velocity(context, proposal)
-        return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)
+        longer = vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)
+        return vertex.rate + longer + connection.rate_beyond(proposal)
