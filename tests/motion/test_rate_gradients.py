@@ -226,6 +226,19 @@ def test_wind_and_the_colour_of_walls_behind_fog():
     compare(renderer_of(loaded, keys))
 
 
+def test_wind_on_a_grid():
+    """Its numbers, and what moves the places at which it blows."""
+    data = np.random.default_rng(3).normal(size=(2, 3, 3, 3)).astype(np.float32)
+    wind = {"type": "gridvolume", "data": data, "to_world": translate([-5, -5, 0]) @ scale([10, 10, 3])}
+    fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.8, "id": "mist", "velocity": wind}
+    box = {"type": "cube", "to_world": translate([0, 0, 1.5]) @ scale([5, 5, 0.9]), "bsdf": {"type": "null"},
+           "interior": fog}  # fmt: skip
+    nodes = room(4, box=box)
+    nodes["integrator"]["type"] = "transient_prbvolpath"
+    loaded = tt.load(nodes, variant=VARIANT).moving({"back": MOTIONS["back"], "sensor": MOTIONS["sensor"]})
+    compare(renderer_of(loaded, ["mist.velocity.data", "back.velocity.linear", "lamp.position", "back.to_world"]))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["single", "confocal"])
 def test_a_hidden_plate(kind):

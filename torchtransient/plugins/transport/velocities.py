@@ -23,7 +23,7 @@ import mitsuba as mi
 from torchtransient.checks import some_of
 from torchtransient.errors import SceneError
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance, moved_by
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
 
@@ -39,6 +39,7 @@ class Movers:
         shapes, emitters, media: bodies of that kind and the numbers of their motions.
         sensors: number of the motion by the sensor's pointer.
         meshes: meshes with velocities at their vertices.
+        winds: (medium, volume of its velocities).
 
     Raises:
         SceneError: for motions of what is not there, of several at once, or that has none.
@@ -46,7 +47,7 @@ class Movers:
 
     def __init__(self, scene: Any) -> None:
         shapes = shapes_of_scene(scene)
-        pairs = _motions(scene, shapes)
+        pairs, self.winds = _motions(scene, shapes), _winds(scene, shapes)
         self.motions = list({motion.ptr: motion for _, motion in pairs}.values())
         numbers = {motion.ptr: FIRST + n for n, motion in enumerate(self.motions)}
         found: dict[int, int] = {}
@@ -60,6 +61,9 @@ class Movers:
 
         self.shapes, self.emitters, self.media = of_kind(mi.Shape), of_kind(mi.Emitter), of_kind(mi.Medium)
         self.sensors = {sensor.ptr: number for sensor, number in of_kind(mi.Sensor)}
+        for medium, _ in self.winds:
+            if found.setdefault(medium.ptr, REST) != REST:
+                raise SceneError(f"{medium.id()!r}: expected one velocity, got a rigid_motion and a volume.")
         # What is part of a shape moves with it, and so does the medium inside.
         for medium, number in _inside(self.shapes, shapes):
             if found.setdefault(medium.ptr, number) == number:
@@ -81,7 +85,7 @@ class Movers:
             )
 
     def __bool__(self) -> bool:
-        return bool(self.motions or self.meshes)
+        return bool(self.motions or self.meshes or self.winds)
 
 
 def unmeasured(keys: Sequence[str]) -> str:
@@ -135,6 +139,23 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
             if any(mi.has_flag(body.flags(), flag) for flag in far):
                 raise SceneError(f"{body.id()!r}: expected a near light; light from infinity has no place that moves.")
     return pairs
+
+
+def _winds(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
+    """Return (medium, volume) of the media whose velocities are volumes. Raises SceneError for others."""
+    media = {medium.id(): medium for medium in _media_of(scene, shapes)}
+    winds = [(moved_by(held), held) for _, held in objects_of(scene)]
+    for name, volume in winds:
+        if name is None:
+            continue
+        if name not in media:
+            raise SceneError(f"{volume.id()!r}: expected the name of a medium, got {name!r}; other bodies are rigid.")
+        if volume.channel_count() != 3:
+            raise SceneError(
+                f"{volume.id()!r}: expected velocities in three channels, m/s, got {volume.channel_count()}. A "
+                "gridvolume of them has raw=true and data (Z, Y, X, 3)."
+            )
+    return [(media[name], volume) for name, volume in winds if name is not None]
 
 
 def _inside(moving: list[tuple[Any, int]], shapes: list[Any]) -> list[tuple[Any, int]]:
@@ -201,6 +222,9 @@ class Velocities:
             PointerTable([body for body, _ in found], [number for _, number in found]) if found else None
             for found in (movers.shapes, movers.emitters, movers.media)
         )
+        self._winds = [volume for _, volume in movers.winds]
+        numbers = range(1, 1 + len(self._winds))
+        self._wind_of = PointerTable([body for body, _ in movers.winds], list(numbers)) if self._winds else None
         self._instances = any(is_instance(shape) for shape, _ in movers.shapes)
         self._meshes = PointerTable.marking(movers.meshes)
 
@@ -237,7 +261,16 @@ class Velocities:
 
     def of_medium(self, medium: Any, p: Any, active: Any) -> Any:
         """Return the velocity of a medium at the point ``p``."""
-        return self._listed(self._media, medium, p, active)
+        v = self._listed(self._media, medium, p, active)
+        if self._wind_of is None:
+            return v
+        with dr.suspend_grad():
+            number = self._wind_of.look_up(medium, active)
+        for n, wind in enumerate(self._winds, 1):
+            on, at = active & (number == n), dr.zeros(mi.Interaction3f)
+            at.p = dr.select(on, mi.Point3f(p), 0)
+            v += dr.select(on, mi.Vector3f(wind.eval_3(at, on)), 0)
+        return v
 
     def of_surface(self, si: Any, active: Any) -> Any:
         """Return the velocity of the material point at a SurfaceInteraction3f."""
