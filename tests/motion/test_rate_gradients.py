@@ -205,6 +205,26 @@ def test_velocities_of_vertices(variant):
     compare(renderer_of(loaded, ["back.vertex_velocity", "side.velocity.linear", "lamp.position"]))
 
 
+def bent_lamp(**more):
+    corners = np.array([[0.5, -0.3, 0.5], [1.3, -0.3, 0.5], [1.3, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    lamp = {"type": "mesh_arrays", "vertices": corners, "faces": np.array([[0, 1, 2], [0, 2, 3]]),
+            "vertex_velocity": np.random.default_rng(1).normal(size=(4, 3)) * 1.5,
+            "emitter": {"type": "area", "radiance": 5.0}}  # fmt: skip
+    return tt.load(room(lamp=lamp, **more), variant=VARIANT).moving({name: MOTIONS[name] for name in ("back", "side")})
+
+
+def test_velocities_of_lamps_whose_vertices_move():
+    compare(renderer_of(bent_lamp(), ["lamp.vertex_velocity", "back.velocity.linear"], spp=2048))
+
+
+@pytest.mark.slow
+def test_places_and_shadows_of_lamps_whose_vertices_move():
+    grows = {"lamp.vertex_positions": torch.tensor([[0.5, 0, 1], [1, 0.3, 0.5], [0.2, 0.5, 0.8], [0.5, -0.4, 1.2]])}
+    compare(renderer_of(bent_lamp(), list(grows)), grows)
+    hider = plate((0.5, 0.1, 1.6), (0.9, 0.1, 0.5), half=0.3, up=(0.4, 1, 0))
+    compare(renderer_of(bent_lamp(plate=hider), ["plate.to_world"]), {"plate.to_world": SIDEWAYS}, seeds=range(6))
+
+
 def test_velocities_of_copies():
     group = {"type": "shapegroup", "leaf": plate((0, 0, 0), (0, 0, 1), half=50)}
     copy = {"type": "instance", "to_world": translate([0, 0, 3]) @ rotate([0, 1, 0], 180),

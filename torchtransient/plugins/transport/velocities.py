@@ -14,7 +14,8 @@ of the whole image by time, with its weights and outlines: those are poses at se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -26,6 +27,7 @@ from torchtransient.plugins.kernel_arrays import PointerTable
 from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance, moved_by
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
+from torchtransient.plugins.transport.geometry_terms import point_of_light
 
 # Rows of the table before those of the bodies: rest, and the sensor.
 REST, SENSOR, FIRST = 0, 1, 2
@@ -77,11 +79,10 @@ class Movers:
                     self.emitters.append((part, found[shape.ptr]))
         self.meshes = [shape for shape in shapes if has_velocities(shape)]
         own = {shape.ptr for shape in scene.shapes()}
-        wrong = [mesh.id() for mesh in self.meshes if mesh.is_emitter() or mesh.ptr not in own]
-        if wrong:
+        if wrong := [mesh.id() for mesh in self.meshes if mesh.ptr not in own]:
             raise SceneError(
-                f"{some_of(wrong)}: {VELOCITY} of a light, or inside of a shape group, is not supported; expected a "
-                "mesh of the scene that does not shine. Lights and instances take a 'velocity' of type 'rigid_motion'."
+                f"{some_of(wrong)}: {VELOCITY} inside of a shape group is not supported; expected a mesh of the scene. "
+                "Instances take a 'velocity' of type 'rigid_motion'."
             )
 
     def __bool__(self) -> bool:
@@ -227,6 +228,7 @@ class Velocities:
         self._wind_of = PointerTable([body for body, _ in movers.winds], list(numbers)) if self._winds else None
         self._instances = any(is_instance(shape) for shape, _ in movers.shapes)
         self._meshes = PointerTable.marking(movers.meshes)
+        self._mesh_lights = PointerTable.marking([mesh.emitter() for mesh in movers.meshes if mesh.is_emitter()])
 
     def tables(self) -> list[Any]:
         """Return the arrays that were computed from parameters."""
@@ -255,9 +257,32 @@ class Velocities:
         """Return the velocity of the sensor's point ``p``."""
         return self._row(mi.UInt32(SENSOR), p, mi.Bool(True)) if self.sensor_moves else mi.Vector3f(0)
 
-    def of_light(self, emitter: Any, p: Any, active: Any) -> Any:
-        """Return the velocity of the point ``p`` of a light; ``emitter`` is None for one outside of the scene."""
-        return mi.Vector3f(0) if emitter is None else self._listed(self._emitters, emitter, p, active)
+    def of_light(self, emitter: Any, p: Any, active: Any, found: Callable[[], Any]) -> Any:
+        """Return the velocity of the point ``p`` of a light.
+
+        Args:
+            found: function that returns :func:`.geometry_terms.point_of_light`, called where vertices of lights move.
+        """
+        v = self._listed(self._emitters, emitter, p, active)
+        if self._mesh_lights is None:
+            return v
+        with dr.suspend_grad():
+            ray, pi, there, _ = found()
+            there = active & there & self._mesh_lights.lists(emitter)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+        si.p = mi.Point3f(p)
+        return v + dr.select(there, mi.Vector3f(si.shape.eval_attribute_3(VELOCITY, si, there)), 0)
+
+    def of_sampled_light(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
+        """Return the velocity of a sampled point of a light, zero for one outside of the scene.
+
+        Args:
+            ref: Interaction3f that the light is seen from.
+            ds: the point, with ``p`` and ``emitter``, None outside of the scene.
+        """
+        if ds.emitter is None:
+            return mi.Vector3f(0)
+        return self.of_light(ds.emitter, ds.p, active, partial(point_of_light, context, ref, ds, active))
 
     def of_medium(self, medium: Any, p: Any, active: Any) -> Any:
         """Return the velocity of a medium at the point ``p``."""
@@ -308,6 +333,6 @@ class Velocities:
         """Return the rate of the whole path of an event, Float."""
         if proposal is None or connection.unwarp:
             return vertex.rate
-        v = connection.end_velocity(context, proposal)
+        v = connection.end_velocity(context, vertex, proposal)
         longer = vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)
         return vertex.rate + longer + connection.rate_beyond(proposal)

@@ -467,7 +467,7 @@ class SensorThroughChain(Connection):
         return Proposal(d=-seen.d, active=active, ds=ds, seen=seen, through=through, depth=depth, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
-    def end_velocity(self, context, proposal):
+    def end_velocity(self, context, vertex, proposal):
         return proposal.through.prev_v
 
     def rate_beyond(self, proposal):
