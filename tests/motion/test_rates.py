@@ -395,6 +395,8 @@ def test_range_and_speed_of_a_wall_from_two_beats(variant):
         found, approach = tt.sensing.range_and_speed(beats, CHIRPS, axis)
         assert float(found) == pytest.approx(distance, abs=1e-4)
         assert float(approach) == pytest.approx(speed, abs=1e-4)
+        for whole, one in zip(tt.sensing.range_and_speed(out), (found, approach), strict=True):
+            assert float(whole.reshape(-1, 1, 1)[0]) == float(one)
 
 
 def test_beats_are_the_rates_of_a_film_of_rates():
