@@ -256,8 +256,8 @@ def plan(
 
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
-        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for what the
-            settings of a film that are given call for, or else "transient".
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for what
+            the settings of a film that are given call for, or else "transient".
         parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
