@@ -59,6 +59,7 @@ from torchtransient.sensing.estimation.linear_part import adjoint as adjoint
 from torchtransient.sensing.estimation.linear_part import linearity_error as linearity_error
 from torchtransient.sensing.estimation.physics import deepinv_physics as deepinv_physics
 from torchtransient.sensing.estimation.position_likelihood import ml_position as ml_position
+from torchtransient.sensing.itof.heterodyne import heterodyne_speed as heterodyne_speed
 from torchtransient.sensing.itof.itof import ItofCorrelation as ItofCorrelation
 from torchtransient.sensing.itof.itof import correlate as correlate
 from torchtransient.sensing.itof.itof import tap_weights as tap_weights
