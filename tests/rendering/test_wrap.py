@@ -1,4 +1,4 @@
-"""``tt.wrap``: the bridge's promises for functions of a user's own."""
+"""``tt.wrap``: the bridge's promises for functions of a user's own; the list is that of test_dr_wrap.py."""
 
 from __future__ import annotations
 
