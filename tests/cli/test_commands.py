@@ -191,7 +191,7 @@ def test_plan_of_rates_and_beats(moving):
     result = run("plan", "moving.xml", "--outputs", "rates", "--json")
     told = json.loads(result.stdout)
     assert told["film"] == "rates" and told["rates"]["rates_num_bins"] == 64
-    result = run("plan", "moving.xml", "--outputs", "beats", "--chirps", "1e9:1e-5:1550e-9")
+    result = run("plan", "moving.xml", "--chirps", "1e9:1e-5:1550e-9")
     assert result.exit_code == 0 and "a bin for each line of the chirps" in result.stdout
     result = run("plan", "moving.xml", "--outputs", "beats")
     assert result.exit_code == 2 and "Give --chirps" in result.output
