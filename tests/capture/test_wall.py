@@ -9,7 +9,7 @@ import torch
 
 from support.sweeps import together
 from torchtransient.capture import Wall
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.scenes.transforms import rotate, scale, translate
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from torchtransient.capture import Wall
-from torchtransient.capture.triangles import first_hits, triangle_normals
-from torchtransient.capture.wall import _EDGE, ON_WALL, checked_mesh, grid_size
+from torchtransient.capture.wall import _EDGE, ON_WALL, checked_mesh, first_hits, grid_size, triangle_normals
 from torchtransient.errors import SceneError, ShapeError, UnitError
 
 # A parallelogram: half sides (3, 0, 0) and (1, 2, 0), diagonals of (8, 4) and (4, -4).
@@ -225,7 +224,7 @@ def test_of_equally_near_triangles_the_first_counts():
 
 
 def test_pieces_of_rays_do_not_show(monkeypatch):
-    from torchtransient.capture import triangles
+    from torchtransient.capture import wall as triangles
 
     rng = np.random.default_rng(0)
     corners = rng.normal(size=(40, 3, 3))
@@ -240,7 +239,7 @@ def test_pieces_of_rays_do_not_show(monkeypatch):
 
 
 def test_lists_of_triangles_stay_short():
-    from torchtransient.capture.triangles import _Cells
+    from torchtransient.capture.wall import _Cells
 
     rng = np.random.default_rng(1)
     large = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]) + np.arange(100.0)[:, None, None] * [0, 0, 1]

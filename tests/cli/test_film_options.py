@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 import torchtransient as tt
-from torchtransient.cli.films import film_of_options, write_film_video
+from torchtransient.cli.options import film_of_options, write_film_video
 from torchtransient.errors import ArgumentError, TorchTransientError
 from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates
 

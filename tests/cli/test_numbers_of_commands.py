@@ -19,8 +19,7 @@ from torchtransient.cli.cost import Counts
 from torchtransient.cli.dataset import _share
 from torchtransient.cli.doctor import Finding
 from torchtransient.cli.main import main
-from torchtransient.cli.options import assignments, scene_values
-from torchtransient.cli.pictures import write_pictures
+from torchtransient.cli.options import assignments, scene_values, write_pictures
 from torchtransient.cli.reconstruct import Numbers, _as_words, _check_together, _draw, _grid, _wall_size
 from torchtransient.scene.variant import active_variant
 

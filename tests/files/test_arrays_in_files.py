@@ -13,13 +13,12 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import grids, made
-from torchtransient.array_files import array_file, hdf5_limits, part_files
+from torchtransient.array_files import array_file, hdf5, part_files
 from torchtransient.capture import Capture, Scan
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
 from torchtransient.files.captures.contents import MatContents
-from torchtransient.files.plain_data import plain, restored
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import plain, restored, scan_data, scan_from_data
 
 # ----------------------------------------------------------------------------------------------------- sizes and memory
 
@@ -27,23 +26,23 @@ from torchtransient.files.scan_data import scan_data, scan_from_data
 def test_arrays_are_no_larger_than_what_is_stored_of_them():
     # Two thousand and sixty-four times as large, or a mebibyte.
     for stored, most in ((0, 2**20), (508, 2**20), (509, 2 * 1032 * 509), (10_000, 2 * 1032 * 10_000)):
-        hdf5_limits.check_size(most, stored, "file: 'a'")
+        hdf5.check_size(most, stored, "file: 'a'")
         with pytest.raises(StorageError, match=f"file: 'a' declares {most + 1:,} bytes .* and stores {stored:,}"):
-            hdf5_limits.check_size(most + 1, stored, "file: 'a'")
+            hdf5.check_size(most + 1, stored, "file: 'a'")
 
 
 def test_large_arrays_fit_into_the_memory_that_is_left(monkeypatch):
     asked = []
-    monkeypatch.setattr(hdf5_limits, "available_memory", lambda: asked.append(1) or 3 * 2**26)
-    hdf5_limits.check_memory(2**26 - 1, "a")
+    monkeypatch.setattr(hdf5, "available_memory", lambda: asked.append(1) or 3 * 2**26)
+    hdf5.check_memory(2**26 - 1, "a")
     assert not asked
-    hdf5_limits.check_memory(2**26, "a")
-    hdf5_limits.check_memory(3 * 2**26, "a")
+    hdf5.check_memory(2**26, "a")
+    hdf5.check_memory(3 * 2**26, "a")
     assert len(asked) == 2
     with pytest.raises(StorageError, match=r"a takes 0\.201 GB, and 0\.201 GB of memory are left"):
-        hdf5_limits.check_memory(3 * 2**26 + 1, "a")
-    monkeypatch.setattr(hdf5_limits, "available_memory", lambda: None)
-    hdf5_limits.check_memory(2**60, "a")
+        hdf5.check_memory(3 * 2**26 + 1, "a")
+    monkeypatch.setattr(hdf5, "available_memory", lambda: None)
+    hdf5.check_memory(2**60, "a")
 
 
 @pytest.mark.parametrize(("kind", "taken"), [
@@ -51,7 +50,7 @@ def test_large_arrays_fit_into_the_memory_that_is_left(monkeypatch):
     ("f16", False), ("c32", False),
 ])  # fmt: skip
 def test_numbers_of_up_to_64_bits(kind, taken):
-    assert hdf5_limits.is_number(np.dtype(kind)) is taken
+    assert hdf5.is_number(np.dtype(kind)) is taken
 
 
 def npy(version, head):
@@ -97,12 +96,12 @@ def test_attributes_are_numbers_or_texts(tmp_path):
         file.attrs["reference"] = file.ref
         file.attrs["texts"] = np.array(["a", "b"], dtype=h5py.string_dtype())
     with h5py.File(tmp_path / "a.h5") as file:
-        found = hdf5_limits.read_attributes(file, "file", ["number", "text", "bytes", "none"])
+        found = hdf5.read_attributes(file, "file", ["number", "text", "bytes", "none"])
         assert found == {"number": 2.5, "text": "straße", "bytes": "abc"}
         with pytest.raises(StorageError, match="the attribute 'reference' holds object; expected numbers or a"):
-            hdf5_limits.read_attributes(file, "file", ["reference"])
+            hdf5.read_attributes(file, "file", ["reference"])
         with pytest.raises(StorageError, match="the attribute 'texts' is a text that is stored in an unknown"):
-            hdf5_limits.read_attributes(file, "file", ["texts"])
+            hdf5.read_attributes(file, "file", ["texts"])
 
 
 def test_parts_of_datasets(tmp_path):
@@ -116,7 +115,7 @@ def test_parts_of_datasets(tmp_path):
     with h5py.File(tmp_path / "a.h5") as file:
 
         def read(name, *part):
-            return hdf5_limits.read_dataset(file, name, "file", *part)
+            return hdf5.read_dataset(file, name, "file", *part)
 
         np.testing.assert_array_equal(read("a"), array)
         np.testing.assert_array_equal(read("a", (slice(None), 1)), array[:, 1])

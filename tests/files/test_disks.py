@@ -22,7 +22,7 @@ import torch
 import torchtransient as tt
 from support.capture_files import grids, holdable, made
 from support.killed_writers import output
-from torchtransient.array_files import hdf5_limits
+from torchtransient.array_files import hdf5
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.files.captures.formats import LAYOUTS
 from torchtransient.files.result_file import write_result
@@ -174,8 +174,8 @@ def test_zip_files_of_other_programs(tmp_path, name):
 def test_the_memory_that_is_left(tmp_path, monkeypatch, ending, name):
     write, read = WRITTEN[name]
     path = write(tmp_path / f"a.{ending}")
-    monkeypatch.setattr(hdf5_limits, "_LARGE_BYTES", 100)
-    monkeypatch.setattr(hdf5_limits, "available_memory", lambda *_: 300)
+    monkeypatch.setattr(hdf5, "_LARGE_BYTES", 100)
+    monkeypatch.setattr(hdf5, "available_memory", lambda *_: 300)
     with pytest.raises(StorageError, match="of memory are left"):
         read(path)
 

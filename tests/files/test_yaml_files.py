@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchtransient.errors import MissingPackageError, SceneError, StorageError
-from torchtransient.files import entries
+from torchtransient.files import plain_data as entries
 from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
 

@@ -8,7 +8,7 @@ import pytest
 
 from support.hidden_shapes import ball
 from torchtransient import plugins
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits
 
 VARIANT = "llvm_ad_mono"
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}

@@ -11,8 +11,7 @@ from torchtransient import scenes
 from torchtransient.errors import SceneError, UnitError
 from torchtransient.scenes import meshes
 from torchtransient.scenes.bottle import _smooth, lathe, write_ply
-from torchtransient.scenes.letters import OUTLINES, outline
-from torchtransient.scenes.nlos import _BODY, mannequin
+from torchtransient.scenes.nlos import _BODY, OUTLINES, mannequin, outline
 from torchtransient.scenes.transforms import rotate, scale, translate
 
 

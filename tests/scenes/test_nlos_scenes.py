@@ -9,10 +9,10 @@ import pytest
 import torchtransient as tt
 from torchtransient import scenes
 from torchtransient.capture import Wall
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.scenes import meshes
-from torchtransient.scenes.letters import OUTLINES, outline
+from torchtransient.scenes.nlos import OUTLINES, outline
 from torchtransient.scenes.transforms import rotate, scale, translate
 
 ALL = {

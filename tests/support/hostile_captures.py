@@ -12,7 +12,7 @@ import numpy as np
 
 from support.capture_files import chip_frames, holdable, read_only, zone_frame
 from torchtransient.files.captures.formats import LAYOUTS
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.checks import check_special, path_of, short_message
-from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 
 MOST_LEVELS = 100
 # Most nodes of a text with fewer characters, once aliases are expanded.
 _NODES = 2**16
+# Ground truth of 1024 x 1024 points with normals takes 43 MB as text.
+_CHARACTERS = 2**27
 _WITHOUT_POINT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 # Errors of PyYAML's constructors and Python's parsers for texts in another format.
 _WRONG = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, MemoryError)
@@ -72,6 +74,51 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
         raise StorageError(f"{what}: expected YAML, got what cannot be read{_place(error)}.") from error
     except _WRONG as error:
         raise StorageError(f"{what}: expected YAML, got what cannot be read: {short_message(error)}.") from error
+
+
+def read_plain_yaml(text: str, what: str) -> Any:
+    """The data of a YAML text. Raises StorageError for what is no YAML, for more than 2^16 nodes once aliases are
+    written out, for more than 100 levels, and for a missing PyYAML.
+    """
+    yaml = yaml_package(what)
+    if len(text) > _CHARACTERS:
+        raise StorageError(f"{what}: expected a YAML text below {_CHARACTERS:,} characters, got {len(text):,}.")
+    return yaml_data(text, what, yaml, _lenient_loader(yaml), _NODES)
+
+
+def write_plain_yaml(data: Any, what: str) -> str:
+    """Plain data as YAML text that y-tal's own loader reads as well."""
+    text: str = yaml_package(what).safe_dump(data, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def _lenient_loader(yaml: Any) -> Any:
+    class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
+        """Plain data only."""
+
+    def plain(loader: Any, _suffix: str, node: Any) -> Any:
+        if isinstance(node, yaml.MappingNode):
+            return loader.construct_mapping(node, deep=True)
+        if isinstance(node, yaml.SequenceNode):
+            return loader.construct_sequence(node, deep=True)
+        return loader.construct_scalar(node)
+
+    for tag in ("timestamp", "binary"):  # JSON has neither dates nor bytes
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
+    for tag in ("set", "omap", "pairs"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
+    Loader.add_multi_constructor("", plain)
+    return Loader
+
+
+def yaml_package(what: str) -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
+        ) from error
+    return yaml
 
 
 def safe_loader(yaml: Any) -> Any:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,15 +14,16 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.capture.arithmetic import summed
-from torchtransient.capture.files import reader, writer
-from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.checks import arguments_of, finite, flag, of_class, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.tensor_record import TensorRecord
 
 _CHANNEL_AND_TIME = 2
+# `tt.nlos.read_capture` and `tt.nlos.write_capture`, which stand above.
+ReadsCaptures = Callable[..., Any]
+WritesCaptures = Callable[..., Path]
+_files: list[tuple[ReadsCaptures, WritesCaptures]] = []
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,14 +125,15 @@ class Capture(TensorRecord):
     @classmethod
     def read(cls, path: str | Path, format: str | None = None, **said: Any) -> Capture:
         """Read a capture of any known layout: `tt.nlos.read_capture`, with its arguments and errors."""
-        read = reader()
+        read, _ = _registered()
         with arguments_of("Capture.read", read, ("path", "format")):
             capture: Capture = read(path, format, **said)
         return capture
 
     def write(self, path: str | Path, format: str = "torchtransient") -> Path:
         """Write it in a layout, the library's own or another: `tt.nlos.write_capture`, with its errors."""
-        return writer()(path, self, format=format)
+        _, write = _registered()
+        return write(path, self, format=format)
 
     # -------------------------------------------------------------------------------------------------- measurements
 
@@ -234,3 +237,70 @@ def _measured(name: str, values: Any) -> Tensor | None:
         return torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ShapeError(f"Capture: expected {name} as a tensor of numbers, got {shown(values)}: {error}.") from None
+
+
+# ----------------------------------------------------------------------------------------------------------- arithmetic
+
+
+def precision_of(tensor: Tensor) -> torch.dtype:
+    """float64 of captures in double precision, else float32: what operators compute in."""
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def computed(tensor: Tensor) -> Tensor:
+    """Measured numbers of any kind as those that arithmetic is done with, by :func:`precision_of`."""
+    return tensor.to(precision_of(tensor))
+
+
+def summed(tensor: Tensor, dim: int) -> Tensor:
+    """The sum over a dimension. Counts stay whole (int64; those of uint64, which int64 cannot hold, are float64), other
+    numbers are :func:`computed`.
+    """
+    if tensor.is_floating_point():
+        return computed(tensor).sum(dim)
+    wide = torch.float64 if tensor.dtype == torch.uint64 else torch.int64
+    return tensor.to(wide).sum(dim)
+
+
+# ------------------------------------------------------------------------------------------------------------- metadata
+
+
+def metadata_text(metadata: Any, who: str) -> str:
+    """Metadata as JSON. Raises StorageError for what is no mapping, for data that JSON cannot hold, and for names that
+    are no texts, which JSON would make texts of: 1 and "1" would be one name. Tuples come back as lists.
+    """
+    if not isinstance(metadata, Mapping):
+        raise StorageError(f"{who}: expected metadata as names and values, got {shown(metadata)}.")
+    try:
+        found = json.dumps(dict(metadata), default=_refuse)
+        _check_names(metadata)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise StorageError(f"{who}: expected metadata of plain data that JSON can hold: {error}.") from None
+    return found
+
+
+def _check_names(data: Any) -> None:
+    if isinstance(data, Mapping):
+        for name in data:
+            if not isinstance(name, str):
+                raise TypeError(f"the name {shown(name)} is a {type(name).__name__} and no text")
+    for part in data.values() if isinstance(data, Mapping) else data if isinstance(data, list | tuple) else ():
+        _check_names(part)
+
+
+def _refuse(value: object) -> Any:
+    raise TypeError(f"{type(value).__name__} is not plain data")
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def register_files(read: ReadsCaptures, write: WritesCaptures) -> None:
+    """Say who reads and writes; a later call replaces an earlier one."""
+    _files[:] = [(read, write)]
+
+
+def _registered() -> tuple[ReadsCaptures, WritesCaptures]:
+    if not _files:
+        raise StorageError("Capture: no layout of files is loaded. Import torchtransient.nlos first.")
+    return _files[0]

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options
-from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.cli.options import film_of_options, load_scene, scene_options
 
 NOT_REACHED = 1
 

@@ -90,7 +90,7 @@ class Commands(click.Group):
 
 def _in_options(message: Any) -> str:
     # Where the library could not be imported, its films are not known, and its message is as it is.
-    from torchtransient.cli.words import in_options
+    from torchtransient.cli.options import in_options
 
     return in_options(str(message))
 

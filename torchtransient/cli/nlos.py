@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import assignments
-from torchtransient.cli.pictures import video_options
+from torchtransient.cli.options import assignments, video_options
 
 # Pictures of a capture: option, function of `tt.vis`, what it shows.
 PICTURES = {

@@ -9,8 +9,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options
-from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.cli.options import film_of_options, load_scene, scene_options
 from torchtransient.rendering.films import layout_of_plugin
 from torchtransient.rendering.plan import Plan, known_outputs
 from torchtransient.scene.inventory import scene_inventory

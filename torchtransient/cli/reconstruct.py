@@ -110,7 +110,7 @@ def command(capture: Path, **options: Any) -> None:
     bp, fbp: any points. Which loses what: docs/nlos_reconstruction.md. The volume's file holds values (C, Z, Y, X),
     depths and axes; tt.nlos.read_volume reads it.
     """
-    from torchtransient.cli.words import arguments_as_options
+    from torchtransient.cli.options import arguments_as_options
     from torchtransient.errors import TorchTransientError
 
     _check_together(options)

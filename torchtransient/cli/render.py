@@ -9,9 +9,17 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options, summary
-from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
-from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
+from torchtransient.cli.options import (
+    assignments,
+    check_pictures,
+    film_of_options,
+    load_scene,
+    picture_options,
+    scene_options,
+    scene_values,
+    summary,
+    write_pictures,
+)
 from torchtransient.cli.plan import error_option, plan_of_options
 from torchtransient.errors import PhysicsWarning
 from torchtransient.rendering.films import layout_of_output

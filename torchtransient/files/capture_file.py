@@ -25,10 +25,9 @@ from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
-from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.plain_data import flag_of, names_of, notes_of, number_of, plain, restored, text_of, whole_of
 
 FORMAT = "torchtransient capture 2"
 # Those of the first version have no checksums.

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.array_files.array_file import array_of
+from torchtransient.array_files.array_file import array_of, damage_said
+from torchtransient.capture import Scan
 from torchtransient.errors import StorageError
 
 _WHAT = "capture file"
@@ -73,3 +77,75 @@ def _number_type(name: Any) -> np.dtype[Any]:
     if dtype.kind not in "biufc":
         raise StorageError(f"capture file: expected a type of numbers, got {name!r}.")
     return dtype
+
+
+
+
+def scan_data(scan: Scan) -> dict[str, Any]:
+    """A scan as plain data that JSON can hold, Gradients are not kept."""
+    found: dict[str, Any] = plain({f.name: getattr(scan, f.name) for f in fields(scan)}, None, "scan")
+    return found
+
+
+def scan_from_data(data: Mapping[str, Any]) -> Scan:
+    """The scan that :func:`scan_data` made plain data of. Raises StorageError for other data."""
+    with damage_said(Path("scan"), "scan", "the plain data of a scan"):
+        found = restored(dict(data), {})
+        unknown = set(found) - {f.name for f in fields(Scan)}
+        if unknown:
+            raise StorageError(f"scan: expected the data of a scan, got {sorted(unknown)} beside it.")
+        entries: dict[str, Any] = {
+            name: torch.from_numpy(value) if isinstance(value, np.ndarray) else value for name, value in found.items()
+        }
+        return Scan(**entries)
+
+
+# ----------------------------------------------------------------------------------------------------- entries of files
+
+
+def text_of(values: Mapping[str, Any], name: str) -> str:
+    """A text. Raises ValueError."""
+    array = np.asarray(values[name])
+    if array.dtype.kind != "U" or array.size != 1:
+        raise ValueError(f"expected {name} as a text, got {array.dtype} of {array.shape}")
+    return str(array.reshape(-1)[0])
+
+
+def number_of(values: Mapping[str, Any], name: str) -> float:
+    """One finite number. Raises ValueError."""
+    array = np.asarray(values[name])
+    if array.dtype.kind not in "iuf" or array.size != 1 or not np.isfinite(array).all():
+        raise ValueError(f"expected {name} as one finite number, got {array.dtype} {array.reshape(-1)[:4].tolist()}")
+    return float(array.reshape(-1)[0])
+
+
+def whole_of(values: Mapping[str, Any], name: str) -> int:
+    """One whole number. Raises ValueError."""
+    number = number_of(values, name)
+    if number != int(number):
+        raise ValueError(f"expected {name} as a whole number, got {number!r}")
+    return int(number)
+
+
+def flag_of(values: Mapping[str, Any], name: str) -> bool:
+    """A truth value, or 0 or 1. Raises ValueError."""
+    array = np.asarray(values[name])
+    if array.dtype.kind not in "biuf" or array.size != 1 or array.reshape(-1)[0] not in (0, 1):
+        raise ValueError(f"expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}")
+    return bool(array.reshape(-1)[0])
+
+
+def names_of(values: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    """Names in a list of JSON. Raises ValueError."""
+    found = json.loads(text_of(values, name))
+    if not isinstance(found, list) or not all(isinstance(one, str) for one in found):
+        raise ValueError(f"expected {name} as a list of names, got {type(found).__name__}")
+    return tuple(found)
+
+
+def notes_of(values: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Names and values in JSON. Raises ValueError."""
+    found = json.loads(text_of(values, name))
+    if not isinstance(found, dict):
+        raise ValueError(f"expected {name} as names and values, got {type(found).__name__}")
+    return found

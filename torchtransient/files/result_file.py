@@ -9,7 +9,7 @@ C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_
 `chirps_wavelength_m`, `chirps_window`); or `slow_phasor` complex64 (..., C, S, F, H, W) with `slow_times` float64 (S,),
 seconds, and `frequencies_per_metre`. Polarized variants have the four Stokes components before C. The numbers of the
 axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`), `channels` (JSON: the names of
-the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`) are attributes of the HDF5 file
+the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `array_file.py`) are attributes of the HDF5 file
 and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
@@ -27,10 +27,10 @@ import torch
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
+from torchtransient.files.plain_data import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
 from torchtransient.rendering.films import FILMS, layout_of_entries, layout_of_output

@@ -15,9 +15,9 @@ import numpy as np
 
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files.entries import notes_of, text_of
+from torchtransient.files.plain_data import notes_of, text_of
 from torchtransient.reconstruction.hidden_volume import HiddenVolume
 from torchtransient.reconstruction.voxels import VoxelGrid
 

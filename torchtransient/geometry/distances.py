@@ -174,3 +174,32 @@ def _triangle(image: Tensor, camera_matrix: Any, to_world: Any, light: Any, wher
         raise ShapeError(f"{where}: expected light as points (..., 3) of the world, got {tuple(place.shape)}.")
     origin = camera_to_world(to_world).to(matrix)[..., :3, 3]
     return _rays(matrix, size, to_world), (place - origin)[..., None, None]
+
+
+@without_autocast
+def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = None) -> Tensor:
+    """Unit normals (..., 3, H, W), turned to the camera, of distances along the rays (..., H, W), the label `depth`: in
+    kornia's camera, or in the world of a sensor's `to_world`.
+
+    The cross product of Sobel's derivatives of the points, as `kornia.geometry.depth_to_normals`, whose normals point
+    away from the camera. A pixel takes part in those of its eight neighbours: at edges they lie between those of both
+    sides, on the rim of the image they are one-sided, and where one of the nine is NaN so are they. The label `normals`
+    is that of the shading, on the side of the surface's front: it has the other sign where a surface is seen from
+    behind. For depth along the axis: `normals_from_distance(distance_from_z_depth(z, K), K)`. Raises ShapeError.
+    """
+    from kornia.filters import spatial_gradient
+
+    if min(image_of(distance, "normals_from_distance")) < 2:
+        raise ShapeError(f"normals_from_distance: expected two rows and columns at least, got {tuple(distance.shape)}.")
+    known, filled = without_nan(distance)
+    points = points_from_distance(filled, camera_matrix)
+    size = points.shape[-2:]
+    along = spatial_gradient(points.reshape(-1, 3, *size))
+    normals = -torch.nn.functional.normalize(torch.linalg.cross(along[:, :, 0], along[:, :, 1], dim=1), dim=1)
+    normals = normals.reshape(points.shape)
+    if to_world is not None:
+        turn = camera_to_world(to_world).to(normals)[..., :3, :3]
+        normals = (turn @ normals.flatten(-2)).reshape(normals.shape)
+    unknown = (~known).to(normals).reshape(-1, 1, *size)
+    near = torch.nn.functional.max_pool2d(unknown, 3, stride=1, padding=1).reshape(*known.shape[:-2], 1, *size) > 0
+    return torch.where(near, torch.nan, normals).to(distance.dtype)

@@ -10,7 +10,7 @@ from support.capture_files import holdable, read_only
 from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.formats import LAYOUTS
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 FILES = [(layout, f"{layout}-{name}", capture) for layout, name, capture in holdable() if layout != "torchtransient"]
 FILES += [(layout, f"{layout}-{number}", arrays) for number, (layout, arrays) in enumerate(read_only())]

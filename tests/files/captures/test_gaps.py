@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +10,11 @@ import pytest
 import torch
 
 from support.capture_files import LIST, grids, listed, made
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
-from torchtransient.files.captures import formats, gaps, tal_scene_info
-from torchtransient.files.captures.mat_file import write_mat, write_parts
-from torchtransient.plugins.films.transform_bins import transform_bins
+from torchtransient.files.captures import formats, gaps
+from torchtransient.files.captures.matlab import write_mat
 
 assert "tal" in formats.FORMATS  # what reads and writes is registered
 
@@ -157,91 +155,6 @@ def test_sizes_of_scans_by_spacing(tmp_path):
     assert plain.scan.kind == "confocal" and plain.scan.sensor_shape == (2, 3)
     assert plain.metadata["not_read"] == ["more"]
     assert plain.axis == TimeAxis.from_seconds(0.0, 4e-12, 9)
-
-
-def test_parts_of_a_dataset(tmp_path):
-    class Kept:
-        def __init__(self):
-            self.parts = []
-
-        def __setitem__(self, part, values):
-            self.parts.append((part, np.array(values)))
-
-    array = np.arange(24.0).reshape(6, 4)
-    for part_bytes, steps in ((1, 6), (64, 3), (80, 3), (96, 2), (10**6, 1)):
-        kept = Kept()
-        write_parts(kept, array, part_bytes)
-        assert len(kept.parts) == steps
-        np.testing.assert_array_equal(np.concatenate([values for _, values in kept.parts]), array)
-        np.testing.assert_array_equal(np.concatenate([array[part] for part, _ in kept.parts]), array)
-    for whole in (np.array(2.5), np.zeros((0, 3))):
-        kept = Kept()
-        write_parts(kept, whole)
-        assert [part for part, _ in kept.parts] == [...]
-
-
-# -------------------------------------------------------------------------------------------------- scene_info of y-tal
-
-CONFIG = {"histogram_mode": "frequency", "wl_mean": 0.1, "wl_sigma": 0.2, "num_bins": 64, "bin_width_opl": 0.02}
-LINES = transform_bins(0.1, 0.2, 64, 0.02)
-
-
-@pytest.mark.parametrize(("change", "known"), [
-    ({}, True), ({"num_bins": 64.0}, True), ({"histogram_mode": "time"}, False), ({"wl_mean": None}, False),
-    ({"wl_sigma": "0.2"}, False), ({"num_bins": True}, False), ({"num_bins": 0}, False), ({"num_bins": -64}, False),
-    ({"num_bins": 2**31 + 1}, False), ({"wl_sigma": 1e-9}, False), ({"num_bins": 32}, False),
-])  # fmt: skip
-def test_frequencies_of_a_render_of_tal(change, known):
-    info = {"config": {**CONFIG, **change}}
-    found = tal_scene_info.frequencies(info, None, len(LINES), 0.7)
-    assert found == (FrequencyAxis(tuple(LINES.tolist()), 0.7) if known else None)
-    if known:
-        assert tal_scene_info.frequencies(info, None, len(LINES), None).start_opl == 0.0
-        assert tal_scene_info.frequencies(info, None, len(LINES) + 1, 0.7) is None
-    for nothing in (None, [], {"config": 3}, {}):
-        assert tal_scene_info.frequencies(nothing, None, 3, 0.7) is None
-    own = {"frequencies_per_metre": [1.0, 2.0], "phasor_start_opl": 0.25}
-    assert tal_scene_info.frequencies(info, own, 2, 0.7) == FrequencyAxis((1.0, 2.0), 0.25)
-
-
-def test_spectra_of_many_more_lines_than_rows_are_not_made(monkeypatch):
-    asked = []
-    monkeypatch.setattr(tal_scene_info, "transform_bins", lambda *given: asked.append(given) or np.zeros(99))
-    # Bins times width over sigma, against a thousand lines for each row and ten more.
-    for bins, count in ((20479, 10), (20480, 10), (20480, 11), (10240, 0), (10239, 0)):
-        config = {**CONFIG, "wl_mean": 3, "wl_sigma": 0.5, "bin_width_opl": 0.48828125, "num_bins": bins}
-        assert tal_scene_info.frequencies({"config": config}, None, count, 0.0) is None
-    assert asked == [(3.0, 0.5, bins, 0.48828125) for bins in (20479, 20480, 10239)]
-
-
-def test_own_parts_of_scene_info():
-    own = {"wall": None, "steady": None, "channels": ["a"]}
-    assert tal_scene_info.own_part({"torchtransient": json.dumps(own)}) == own
-    for info in (None, [], {}, {"torchtransient": 3}):
-        assert tal_scene_info.own_part(info) is None
-    numbers = '{"wall": {"__numbers__": 3, "dtype": "f4", "shape": []}, "steady": 1}'
-    for text in ("{", "[]", "3", '{"wall": null}', numbers):
-        with pytest.raises(StorageError, match=r"scene_info\.torchtransient is damaged"):
-            tal_scene_info.own_part({"torchtransient": text})
-
-
-def test_what_metadata_keep_of_a_file():
-    def kept(tal):
-        return tal_scene_info.kept_of(made(grids()["confocal"], metadata={"tal": tal}))
-
-    dtypes = {"H": "<f4", "a": "|b1", "b": ">i2", "c": "<c16", "d": "O", "e": "|S3", "f": 3, "g": "<f4x", "h": "=u8"}
-    assert kept({"dtypes": dtypes})["dtypes"] == {"H": "<f4", "a": "|b1", "b": ">i2", "c": "<c16", "h": "=u8"}
-    whole = {"scene_info_text": "a: 1", "volume_format": 2, "delta_t": 0.5}
-    assert kept({**whole, "more": 1}) == {"dtypes": {}, **whole}
-    assert kept({"scene_info_text": None}) == {"dtypes": {}, "scene_info_text": None}
-    for tal in (None, 3, [], {"dtypes": 3}, {"scene_info_text": 3, "volume_format": "2", "delta_t": 1}):
-        assert kept(tal) == {"dtypes": {}}
-
-
-def test_plain_data_of_scene_info():
-    parsed = tal_scene_info.parsed("a: !!set {x: null}\n1: [2, null]\n2020-01-01: true\nb: {c: 1.5}\n", "x")
-    assert parsed == {"a": {"x": None}, "1": [2, None], "2020-01-01": True, "b": {"c": 1.5}}
-    assert tal_scene_info._as_json({1: (2, {3}), "a": b"\x01\xff", None: 1}) == {"1": [2, [3]], "a": "01ff", "null": 1}
 
 
 def test_scene_infos_that_were_read_are_written_again(tmp_path):

@@ -16,7 +16,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
 from torchtransient.files.captures.contents import MatContents
 from torchtransient.files.captures.formats import FORMATS, LAYOUTS
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 WRITTEN = ["torchtransient", *(layout.name for layout in LAYOUTS if layout.write is not None)]
@@ -309,15 +309,15 @@ def test_counts_of_few_photons(tmp_path):
 def test_structures_count_for_memory_too(tmp_path, monkeypatch):
     import scipy.io
 
-    from torchtransient.array_files import hdf5_limits
+    from torchtransient.array_files import hdf5
 
     for compressed in (False, True):
         scipy.io.savemat(tmp_path / "a.mat", {"dataset": {"data": np.ones((50, 50))}}, do_compression=compressed)
         contents = MatContents(tmp_path / "a.mat")
         assert contents.array("dataset/data").shape == (50, 50)
         with monkeypatch.context() as patched:
-            patched.setattr(hdf5_limits, "_LARGE_BYTES", 100)
-            patched.setattr(hdf5_limits, "available_memory", lambda *_: 10_000)
+            patched.setattr(hdf5, "_LARGE_BYTES", 100)
+            patched.setattr(hdf5, "available_memory", lambda *_: 10_000)
             with pytest.raises(StorageError, match="of memory are left"):
                 MatContents(tmp_path / "a.mat").array("dataset/data")
 

@@ -12,10 +12,11 @@ import torch
 import torchtransient as tt
 from support.capture_files import AXIS, FROM_ZERO, SQUARE, WALL, grids, holdable, listed, made
 from support.sweeps import together
-from torchtransient.capture import Capture, files
+from torchtransient.capture import Capture
+from torchtransient.capture import capture as files
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.captures.formats import FORMATS, LAYOUTS, read_capture, write_capture
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 ENDINGS = {"torchtransient": "h5"} | {layout.name: layout.endings[0][1:] for layout in LAYOUTS}
 HOLDABLE = {f"{layout}-{name}": (layout, capture) for layout, name, capture in holdable()}

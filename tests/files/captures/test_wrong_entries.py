@@ -13,11 +13,12 @@ import torch
 
 from support.capture_files import FROM_ZERO, SQUARE, grids, listed, made
 from support.sweeps import together
+from torchtransient.array_files import plain_texts
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import MissingPackageError, StorageError
-from torchtransient.files.captures import formats, plain_yaml
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures import formats
+from torchtransient.files.captures.matlab import write_mat
 
 LEGS, PLAIN = grids(), grids(legs=False)
 SQUARES = grids(legs=False, wall=SQUARE, size=(4, 4))
@@ -308,14 +309,14 @@ def test_spots_are_sensor_points_to_a_thousandth(tmp_path):
 
 
 def test_texts_of_yaml_have_a_length(monkeypatch):
-    monkeypatch.setattr(plain_yaml, "MOST_CHARACTERS", 6)
-    assert plain_yaml.read_plain_yaml("a: 123", "scene_info") == {"a": 123}
+    monkeypatch.setattr(plain_texts, "_CHARACTERS", 6)
+    assert plain_texts.read_plain_yaml("a: 123", "scene_info") == {"a": 123}
     with pytest.raises(StorageError, match="scene_info: expected a YAML text below 6 characters, got 7"):
-        plain_yaml.read_plain_yaml("a: 1234", "scene_info")
+        plain_texts.read_plain_yaml("a: 1234", "scene_info")
 
 
 def test_yaml_needs_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "yaml", None)
-    for call in (lambda: plain_yaml.read_plain_yaml("a: 1", "x"), lambda: plain_yaml.write_plain_yaml({}, "x")):
+    for call in (lambda: plain_texts.read_plain_yaml("a: 1", "x"), lambda: plain_texts.write_plain_yaml({}, "x")):
         with pytest.raises(MissingPackageError, match=r"x: YAML needs PyYAML.*torchtransient\[yaml\]"):
             call()

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said, npz_shapes, read_npz
-from torchtransient.array_files.hdf5_limits import check_memory, read_attributes, read_dataset
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import check_memory, hdf5_package, read_attributes, read_dataset
 from torchtransient.array_files.plain_texts import json_data, text_of_file
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File, Other
 
 WHAT = "capture file"
 _BLOCK = 64

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import new_hdf5
+from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import Gaps, cannot, hidden_side, only_transient, scan_of, tensor_of, time_axis
-from torchtransient.files.captures.mat_file import write_parts
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}

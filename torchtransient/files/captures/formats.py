@@ -10,11 +10,10 @@ from types import ModuleType
 from typing import Any
 
 from torchtransient.array_files.array_file import HDF5, check_folder, damage_said, path_of
-from torchtransient.array_files.hdf5_limits import read_attributes
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import hdf5_package, read_attributes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.files import register_files
+from torchtransient.capture.capture import register_files
 from torchtransient.checks import is_one_of, shown, some_of
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file

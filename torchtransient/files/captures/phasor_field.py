@@ -27,7 +27,7 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 NAME = "phasor_field"
 _VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}

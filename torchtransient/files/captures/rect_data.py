@@ -30,7 +30,7 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"

@@ -8,7 +8,9 @@ which y-tal executes and this reader does not. What is missing is HDF5's empty d
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,10 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.hdf5 import hdf5_package, new_hdf5, write_parts
+from torchtransient.array_files.plain_texts import read_plain_yaml, write_plain_yaml
+from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
-from torchtransient.files.captures import tal_scene_info
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
     Gaps,
@@ -35,7 +38,8 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.plain_data import plain, restored
+from torchtransient.plugins.films.transform_bins import transform_bins
 
 NAME = "tal"
 _STOKES = 4
@@ -45,6 +49,12 @@ _KNOWN = frozenset(
 ) | {"H", "H_format", "volume_format", "delta_t", "t_start", _LEGS, "scene_info"}
 _GRIDS = {"UNKNOWN": 0, "N_3": 1, "X_Y_3": 2}
 _VOLUMES = {"UNKNOWN": 0, "N_3": 1, "X_Y_Z_3": 2, "X_Y_3": 3}
+# Our part of the information: a JSON text, in which numbers keep every digit.
+_OWN = "torchtransient"
+# What metadata hold after reading; other entries were added since.
+_READ = {"format", "assumed", "scene_info", "tal", "not_read"}
+# Kinds of numbers as NumPy writes them.
+_DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
 @dataclass(frozen=True)
@@ -91,8 +101,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
     kept: dict[str, Any] = {"dtypes": {}}
     text = contents.text("scene_info")
-    info = None if text is None else tal_scene_info.parsed(text, WHAT)
-    own = tal_scene_info.own_part(info)
+    info = None if text is None else _scene_info(text)
+    own = _own_part(info)
     legs = gaps.fill(_LEGS, _flag(contents, _LEGS, kept), False)
     scan = _scan(contents, gaps, form, legs, kept)
     measured = _measured(contents, gaps, form, kept)
@@ -101,7 +111,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
     tensor = _from_tal(measured, form, polarized)
     if form.frequencies:
-        found = tal_scene_info.frequencies(info, own, len(measured), start)
+        found = _frequencies(info, own, len(measured), start)
         axis = frequency_axis(gaps, found)
         if start is not None and axis.start_opl != start:
             raise gaps.error(
@@ -275,9 +285,9 @@ def write(target: Path, capture: Capture) -> None:
     """
     form_name, h = _h(capture)
     form = _FORMATS[form_name]
-    kept = tal_scene_info.kept_of(capture)
+    kept = _kept(capture)
     arrays = _arrays(capture, kept, form)
-    text = tal_scene_info.written(capture, kept, WHAT)
+    text = _scene_info_text(capture, kept)
     formats = {"H_format": (_NUMBERS, form.number)}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
@@ -362,3 +372,106 @@ def _holds(array: NDArray[Any], dtype: np.dtype[Any]) -> bool:
         return False
     with np.errstate(all="ignore"):
         return math.prod(array.shape) == 0 or bool(np.array_equal(array.astype(dtype).astype(array.dtype), array))
+
+
+# ----------------------------------------------------------------------------------------------------------- scene_info
+
+
+def _scene_info(text: str) -> Any:
+    """``scene_info`` as plain data. Raises StorageError."""
+    return _as_json(read_plain_yaml(text, WHAT))
+
+
+def _own_part(info: Any) -> dict[str, Any] | None:
+    """What this library has written into it: ``channels``, ``metadata``, ``wall``, ``steady``,
+    ``frequencies_per_metre``, ``phasor_start_opl``. None where another program has written it. Raises StorageError for
+    what is damaged.
+    """
+    text = info.get(_OWN) if isinstance(info, Mapping) else None
+    if not isinstance(text, str):
+        return None
+    try:
+        own = json.loads(text)
+        return dict(own) | {name: restored(own[name], {}) for name in ("wall", "steady")}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise StorageError(f"capture file: scene_info.{_OWN} is damaged: {error}.") from None
+
+
+def _frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl: float | None) -> FrequencyAxis | None:
+    """The frequencies of ``count`` phasors: as this library wrote them, or those that a render of y-tal with these
+    settings keeps; None where neither is there.
+    """
+    if own is not None and own.get("frequencies_per_metre") is not None:
+        return FrequencyAxis(tuple(own["frequencies_per_metre"]), own["phasor_start_opl"])
+    config = info.get("config") if isinstance(info, Mapping) else None
+    if not isinstance(config, Mapping) or config.get("histogram_mode") != "frequency":
+        return None
+    numbers = [config.get(name) for name in ("wl_mean", "wl_sigma", "num_bins", "bin_width_opl")]
+    if any(isinstance(n, bool) or not isinstance(n, int | float) for n in numbers):
+        return None
+    mean, sigma, bins, width = (float(n) for n in numbers if n is not None)
+    # A spectrum has as many lines as H has rows, whatever a damaged text says of bins.
+    if not (0 < bins <= 2**31 and bins * width / max(sigma, 1e-300) < 1e3 * (count + 10)):
+        return None
+    found = transform_bins(mean, sigma, int(bins), width)
+    return FrequencyAxis(tuple(found.tolist()), start_opl or 0.0) if len(found) == count else None
+
+
+def _kept(capture: Capture) -> dict[str, Any]:
+    """What the metadata of a capture that was read keeps for writing it again: ``dtypes`` by name, and where they are
+    there ``scene_info_text``, ``volume_format``, ``delta_t``. Whatever else stands there is left out:
+    metadata are anyone's.
+    """
+    given = capture.metadata.get("tal")
+    given = given if isinstance(given, Mapping) else {}
+    dtypes = given.get("dtypes")
+    names = dtypes.items() if isinstance(dtypes, Mapping) else ()
+    kept: dict[str, Any] = {"dtypes": {name: kind for name, kind in names if _DTYPE.fullmatch(str(kind))}}
+    kinds = {"scene_info_text": str | None, "volume_format": int, "delta_t": float}
+    return kept | {name: given[name] for name, kind in kinds.items() if name in given and isinstance(given[name], kind)}
+
+
+def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
+    """The text for a capture: as it was read where nothing about it has changed, None where there was none."""
+    text = kept.get("scene_info_text")
+    added = bool(capture.channels or set(capture.metadata) - _READ)
+    added = added or capture.scan.wall is not None or capture.steady is not None
+    if "scene_info_text" in kept and not added and capture.frequencies == _kept_frequencies(capture, kept):
+        before = None if text is None else _scene_info(text)
+        if capture.metadata.get("scene_info") == before:
+            return None if text is None else str(text)
+    info: dict[str, Any] = {"original_format": str(capture.metadata.get("format", _OWN))}
+    given = capture.metadata.get("scene_info")
+    own = {
+        "channels": capture.channels, "metadata": dict(capture.metadata),
+        "wall": plain(capture.scan.wall, None, "wall"), "steady": plain(capture.steady, None, "steady"),
+    }  # fmt: skip
+    if capture.frequencies is not None:
+        own |= {
+            "frequencies_per_metre": capture.frequencies.frequencies, "phasor_start_opl": capture.frequencies.start_opl,
+        }  # fmt: skip
+    if capture.polarized:
+        # Not the variant, which 0.21 looks at: its `read_capture` raises for polarized ones.
+        info["is_polarized"] = True
+    info |= given if isinstance(given, Mapping) else {}
+    return write_plain_yaml(_as_json(info) | {_OWN: json.dumps(own)}, WHAT)
+
+
+def _kept_frequencies(capture: Capture, kept: Mapping[str, Any]) -> FrequencyAxis | None:
+    if capture.frequencies is None:
+        return None
+    text = kept.get("scene_info_text")
+    info = None if text is None else _scene_info(text)
+    count, start = capture.frequencies.num_frequencies, capture.frequencies.start_opl
+    return _frequencies(info, _own_part(info), count, start)
+
+
+def _as_json(data: Any) -> Any:
+    """Plain data as JSON has it: names are texts, sequences lists."""
+    if isinstance(data, Mapping):
+        return {name if isinstance(name, str) else json.dumps(_as_json(name)): _as_json(v) for name, v in data.items()}
+    if isinstance(data, list | tuple | set | frozenset):
+        return [_as_json(value) for value in data]
+    if isinstance(data, bytes):
+        return data.hex()
+    return data if data is None or isinstance(data, bool | int | float | str) else str(data)

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import new_hdf5
+from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.checks import shown
 from torchtransient.errors import StorageError
@@ -31,7 +31,6 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_parts
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}

@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 import mmap
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.free_memory import available_memory
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError, StorageError
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032
@@ -33,6 +35,21 @@ _KIND_HEAD = 2 + 8 + 1
 _HEAP_HEADER = 16
 # An attribute's parts may be filled up to eight bytes; then a shape of version 1 or 2, and the length.
 _NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{16})", re.DOTALL)
+
+
+def hdf5_package(what: str) -> Any:
+    """The module h5py. Raises MissingPackageError where it is not installed."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what}: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
+            "or choose a name that ends in .npz."
+        ) from error
+    return h5py
+
+
+# -------------------------------------------------------------------------------------------------------------- reading
 
 
 def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
@@ -210,3 +227,91 @@ def _check_heap(data: mmap.mmap, reference: bytes, what: str) -> None:
         if step < _HEAP_HEADER or place + step > end:
             raise StorageError(f"{what} lies in a heap that is damaged.")
         place += step
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+@contextmanager
+def new_hdf5(path: Path, what: str, **settings: Any) -> Iterator[Any]:
+    """A new HDF5 file, open for writing. Raises StorageError without h5py, OSError where not all of it was written."""
+    h5py = hdf5_package(what)
+    with path.open("w+b", buffering=0) as raw:
+        sink = _Sink(raw)
+        try:
+            with h5py.File(sink, "w", **settings) as file:
+                yield file
+        finally:
+            # What HDF5 says of bytes that it does not find again tells less.
+            if sink.error is not None:
+                raise sink.error
+
+
+def write_parts(dataset: Any, array: NDArray[Any], part_bytes: int = 2**26) -> None:
+    """Fill a dataset some first indices at a time, so that an array whose axes were moved is not copied as a whole."""
+    if array.ndim == 0 or array.size == 0:
+        dataset[...] = array
+        return
+    step = max(1, part_bytes * len(array) // max(1, array.nbytes))
+    for first in range(0, len(array), step):
+        dataset[first : first + step] = array[first : first + step]
+
+
+class _Sink:
+    """A file that fails no more than once: what comes after is dropped, and read as zeros."""
+
+    def __init__(self, raw: Any) -> None:
+        self._raw, self._at, self._end = raw, 0, 0
+        self.error: OSError | None = None
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """The new place."""
+        self._at = offset + (0, self._at, self._end)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """The place."""
+        return self._at
+
+    def write(self, data: Any) -> int:
+        """All of the data, written or dropped."""
+        left = memoryview(data).cast("B")
+        size = len(left)
+        if self.error is None:
+            try:
+                self._raw.seek(self._at)
+                while left:
+                    left = left[self._raw.write(left) :]
+            except OSError as error:
+                self.error = error
+        self._at += size
+        self._end = max(self._end, self._at)
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """What was written, zeros for what was not."""
+        view = memoryview(buffer).cast("B")
+        self._raw.seek(self._at)
+        found = self._raw.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)
+        self._at += len(view)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """As :meth:`readinto`."""
+        found = bytearray(size)
+        self.readinto(found)
+        return bytes(found)
+
+    def truncate(self, size: int) -> int:
+        """Cut or lengthened."""
+        self._end = size
+        if self.error is None:
+            try:
+                self._raw.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size
+
+    def flush(self) -> None:
+        """Nothing is kept back."""

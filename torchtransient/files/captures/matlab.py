@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.array_files.hdf5_limits import check_memory, check_size
+from torchtransient.array_files.array_file import replacing
+from torchtransient.array_files.hdf5 import check_memory, check_size, new_hdf5, write_parts
+
+# Version 7.3 is HDF5 behind a header.
+_HEADER = b"MATLAB 7.3 MAT-file, Platform: torchtransient, HDF5 schema 1.00 ."
+_USER_BLOCK = 512
+_CLASSES = {"float64": "double", "float32": "single", "bool": "logical"}
 
 HEADER_BYTES = 128
 # How numbers are stored, by the types of elements; texts have their letters in some of these.
@@ -58,6 +64,9 @@ class Variable:
     stored: int
     unpacked: int
     compressed: bool
+
+
+# ------------------------------------------------------------------------------------------------------ versions 5 to 7
 
 
 class Mat5File:
@@ -182,3 +191,33 @@ def _numbers(elements: _Elements, kind: int, shape: tuple[int, ...]) -> NDArray[
         raise ValueError(f"expected {math.prod(shape)} numbers {shape}, got {len(stored)}")
     with np.errstate(all="ignore"):  # a damaged file may store what its class does not hold
         return np.require(stored.astype(_NUMBERS[kind], copy=False), requirements="W").reshape(shape)
+
+
+# ---------------------------------------------------------------------------------------------------------- version 7.3
+
+
+def write_mat(target: Path, variables: Mapping[str, Any], what: str = "capture file") -> None:
+    """Write arrays and structures (mappings of arrays) by name. Arrays are in the order of HDF5, the reverse of
+    MATLAB's. Raises StorageError for a full disk.
+    """
+    with replacing(target, what) as unfinished:
+        with new_hdf5(unfinished, what, userblock_size=_USER_BLOCK) as file:
+            for name, value in variables.items():
+                if isinstance(value, Mapping):
+                    group = file.create_group(name)
+                    group.attrs["MATLAB_class"] = np.bytes_("struct")
+                    for field, array in value.items():
+                        _write(group, field, np.asarray(array))
+                else:
+                    _write(file, name, np.asarray(value))
+        with unfinished.open("r+b") as raw:
+            raw.write(_HEADER.ljust(116) + bytes(8) + b"\x00\x02IM")
+
+
+def _write(group: Any, name: str, array: NDArray[Any]) -> None:
+    # MATLAB has no arrays of fewer than two dimensions.
+    array = array.reshape(*(1,) * (2 - array.ndim), *array.shape)
+    kind = _CLASSES.get(array.dtype.name, array.dtype.name)
+    dataset = group.create_dataset(name, shape=array.shape, dtype=np.uint8 if kind == "logical" else array.dtype)
+    dataset.attrs["MATLAB_class"] = np.bytes_(kind)
+    write_parts(dataset, array)
