@@ -43,7 +43,15 @@ def text_of_file(path: Any, what: str) -> str:
 
 
 def json_data(text: str | bytes, what: str) -> Any:
-    """Return the data of a JSON text. Raises StorageError; ``what``: subject of its message."""
+    """Return the data of a JSON text.
+
+    Args:
+        text: the text.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for other texts.
+    """
     try:
         return json.loads(text)
     except _WRONG as error:
@@ -77,8 +85,19 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
 
 
 def read_plain_yaml(text: str, what: str) -> Any:
-    """The data of a YAML text. Raises StorageError for what is no YAML, for more than 2^16 nodes once aliases are
-    written out, for more than 100 levels, and for a missing PyYAML.
+    """Return the data of a YAML text with any tags, which are left out.
+
+    Args:
+        text: the text.
+        what: subject of messages.
+
+    Returns:
+        Mappings, lists, texts and numbers as they stand under tags such as ``!!python/object``; nothing is executed.
+
+    Raises:
+        StorageError: for texts in another format, of more than 2^27 characters, more than 2^16 nodes with aliases
+            expanded, or more than 100 levels.
+        MissingPackageError: without PyYAML.
     """
     yaml = yaml_package(what)
     if len(text) > _CHARACTERS:
@@ -87,12 +106,21 @@ def read_plain_yaml(text: str, what: str) -> Any:
 
 
 def write_plain_yaml(data: Any, what: str) -> str:
-    """Plain data as YAML text that y-tal's own loader reads as well."""
+    """Return plain data as YAML text that y-tal's loader reads as well.
+
+    Args:
+        data: mappings, lists, texts and numbers.
+        what: subject of messages.
+
+    Raises:
+        MissingPackageError: without PyYAML.
+    """
     text: str = yaml_package(what).safe_dump(data, sort_keys=False, allow_unicode=True)
     return text
 
 
 def _lenient_loader(yaml: Any) -> Any:
+    """Return a loader that reads all tags as the plain data under them."""
     class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
         """Plain data only."""
 
@@ -112,6 +140,14 @@ def _lenient_loader(yaml: Any) -> Any:
 
 
 def yaml_package(what: str) -> Any:
+    """Return the module yaml.
+
+    Args:
+        what: subject of messages.
+
+    Raises:
+        MissingPackageError: if PyYAML is not installed.
+    """
     try:
         import yaml
     except ImportError as error:
@@ -122,12 +158,19 @@ def yaml_package(what: str) -> Any:
 
 
 def safe_loader(yaml: Any) -> Any:
-    """Return the loader of PyYAML that makes plain data only, the one in C if it is installed."""
+    """Return the loader of PyYAML that makes plain data only, the one in C if it is installed.
+
+    Args:
+        yaml: the package PyYAML.
+    """
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def reads_exponents(loader: Any) -> Any:
     """Return a loader class of PyYAML after changing it to read plain 1e-10 as a number, as JSON and YAML 1.2 do.
+
+    Args:
+        loader: class of PyYAML.
 
     Quoted 1e-10 stays a text. PyYAML follows YAML 1.1, where a number needs a point.
     """

@@ -1,4 +1,4 @@
-"""Dictionaries with arrays in them as what JSON can hold, and back."""
+"""Plain data in files: dictionaries and scans as JSON, and entries that are checked for their kind."""
 
 from __future__ import annotations
 
@@ -23,8 +23,16 @@ _ARRAY, _TUPLE, _NUMBERS = "__array__", "__tuple__", "__numbers__"
 
 
 def plain(value: Any, parts: list[NDArray[Any]] | None, where: str) -> Any:
-    """What JSON can hold. Arrays are put into `parts` and named ``where_0``, ``where_1``, ...; without parts they stand
-    there as their bytes in base64, little-endian. Raises StorageError for what is no data.
+    """Return data that JSON can hold.
+
+    Args:
+        value: numbers, texts, lists, tuples, dictionaries, arrays and tensors, nested.
+        parts: list that arrays are appended to, which are then named ``where_0``, ``where_1``, ...; None writes them as
+            their bytes in base64, little-endian.
+        where: name of the value, in messages and of parts.
+
+    Raises:
+        StorageError: for anything else.
     """
     return _plain(value, parts, where, where)
 
@@ -58,7 +66,15 @@ def _plain(value: Any, parts: list[NDArray[Any]] | None, where: str, stem: str) 
 
 
 def restored(value: Any, arrays: Mapping[str, Any]) -> Any:
-    """What `plain` made JSON of; ``arrays``: its parts by name."""
+    """Return the data that :func:`plain` has made JSON of.
+
+    Args:
+        value: plain data.
+        arrays: parts by name.
+
+    Raises:
+        StorageError: for arrays of other dtypes than numbers.
+    """
     if isinstance(value, dict):
         if set(value) == {_ARRAY}:
             return np.asarray(arrays[value[_ARRAY]])
@@ -82,13 +98,24 @@ def _number_type(name: Any) -> np.dtype[Any]:
 
 
 def scan_data(scan: Scan) -> dict[str, Any]:
-    """A scan as plain data that JSON can hold, Gradients are not kept."""
+    """Return a scan as plain data that JSON can hold, without gradients.
+
+    Args:
+        scan: with its wall.
+    """
     found: dict[str, Any] = plain({f.name: getattr(scan, f.name) for f in fields(scan)}, None, "scan")
     return found
 
 
 def scan_from_data(data: Mapping[str, Any]) -> Scan:
-    """The scan that :func:`scan_data` made plain data of. Raises StorageError for other data."""
+    """Return the scan of :func:`scan_data`.
+
+    Args:
+        data: plain data.
+
+    Raises:
+        StorageError: for other data.
+    """
     with damage_said(Path("scan"), "scan", "the plain data of a scan"):
         found = restored(dict(data), {})
         unknown = set(found) - {f.name for f in fields(Scan)}
@@ -104,7 +131,15 @@ def scan_from_data(data: Mapping[str, Any]) -> Scan:
 
 
 def text_of(values: Mapping[str, Any], name: str) -> str:
-    """A text. Raises ValueError."""
+    """Return an entry that is a text.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else, which readers report as damage.
+    """
     array = np.asarray(values[name])
     if array.dtype.kind != "U" or array.size != 1:
         raise ValueError(f"expected {name} as a text, got {array.dtype} of {array.shape}")
@@ -112,7 +147,15 @@ def text_of(values: Mapping[str, Any], name: str) -> str:
 
 
 def number_of(values: Mapping[str, Any], name: str) -> float:
-    """One finite number. Raises ValueError."""
+    """Return an entry that is one finite number.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else.
+    """
     array = np.asarray(values[name])
     if array.dtype.kind not in "iuf" or array.size != 1 or not np.isfinite(array).all():
         raise ValueError(f"expected {name} as one finite number, got {array.dtype} {array.reshape(-1)[:4].tolist()}")
@@ -120,7 +163,15 @@ def number_of(values: Mapping[str, Any], name: str) -> float:
 
 
 def whole_of(values: Mapping[str, Any], name: str) -> int:
-    """One whole number. Raises ValueError."""
+    """Return an entry that is one whole number.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else.
+    """
     number = number_of(values, name)
     if number != int(number):
         raise ValueError(f"expected {name} as a whole number, got {number!r}")
@@ -128,7 +179,15 @@ def whole_of(values: Mapping[str, Any], name: str) -> int:
 
 
 def flag_of(values: Mapping[str, Any], name: str) -> bool:
-    """A truth value, or 0 or 1. Raises ValueError."""
+    """Return an entry that is a truth value, or 0 or 1; the text "False" is none.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else.
+    """
     array = np.asarray(values[name])
     if array.dtype.kind not in "biuf" or array.size != 1 or array.reshape(-1)[0] not in (0, 1):
         raise ValueError(f"expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}")
@@ -136,7 +195,15 @@ def flag_of(values: Mapping[str, Any], name: str) -> bool:
 
 
 def names_of(values: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    """Names in a list of JSON. Raises ValueError."""
+    """Return an entry that is a list of names in JSON.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else.
+    """
     found = json.loads(text_of(values, name))
     if not isinstance(found, list) or not all(isinstance(one, str) for one in found):
         raise ValueError(f"expected {name} as a list of names, got {type(found).__name__}")
@@ -144,7 +211,15 @@ def names_of(values: Mapping[str, Any], name: str) -> tuple[str, ...]:
 
 
 def notes_of(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Names and values in JSON. Raises ValueError."""
+    """Return an entry that is an object in JSON.
+
+    Args:
+        values: entries by name.
+        name: of the entry.
+
+    Raises:
+        ValueError: for anything else.
+    """
     found = json.loads(text_of(values, name))
     if not isinstance(found, dict):
         raise ValueError(f"expected {name} as names and values, got {type(found).__name__}")
