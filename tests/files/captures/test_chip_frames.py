@@ -110,7 +110,7 @@ WRONG = {
     "depths of others": (frame(dist_to_plane=None, distances=[{"depths_1": [240] * 4}]), "each of 9 zones"),
     "ragged": (frame(hists=[[1, 2], [3]]), "one shape in 'hists'"),
     "texts": (frame(hists="many"), "one shape in 'hists'"),
-    "flat": (frame(hists=[1, 2, 3]), "hists with 2 dimensions"),
+    "flat": (frame(hists=[1, 2, 3]), "expected hists"),
     "huge": (frame(hists=[[10**400]]), "one shape"),
     "a pose that stretches": (frame(pose=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "a turn and a"),
     "a pose that mirrors": (frame(pose=np.diag([1, 1, -1, 1]).tolist()), "a turn and a shift"),
@@ -155,7 +155,7 @@ def test_a_frame_of_zones(tmp_path):
 
 def test_wrong_zones(tmp_path):
     for changes, words in (
-        ({"pt_cloud": np.zeros((4, 3))}, r"pt_cloud \(16, 3\)"), ({"hists": np.zeros(16)}, r"hists \(zones, T\)"),
+        ({"pt_cloud": np.zeros((4, 3))}, "expected pt_cloud"), ({"hists": np.zeros(16)}, "expected hists"),
         ({"cam_z": np.zeros(3)}, "one number as cam_z"), ({"hists": np.full((16, 8), "a")}, "got a text"),
         ({"pt_cloud": np.full((16, 3), np.nan)}, "finite"), ({"hists": np.zeros((16, 8), object)}, "No pickle is read"),
     ):  # fmt: skip

@@ -1,5 +1,8 @@
-"""MATLAB files of versions 5 to 7 ("MAT-File Format", The MathWorks, level 5): arrays of numbers, texts and structures
-of them. Others' readers trust the types that a damaged file names, and may end the process.
+"""MATLAB files: a reader of versions 5 to 7 ("MAT-File Format", The MathWorks, level 5) and a writer of version 7.3.
+
+Numbers, texts and structures of them are read, and sizes compared with the file's. Other readers trust the types that
+a damaged file names, and may end the process. Version 7.3 is HDF5 with a header in front and the class of each array
+beside it.
 """
 
 from __future__ import annotations
@@ -47,15 +50,22 @@ Value = NDArray[Any] | str | dict[str, Any] | None
 
 @dataclass(frozen=True)
 class Other:
-    """What is neither numbers nor a text nor one structure; ``kind`` in words."""
+    """Value other than numbers, a text or one structure; ``kind`` in words."""
 
     kind: str
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable whose values have not been read: where it lies, ``stored`` and ``unpacked`` bytes; ``shape`` in the
-    order of HDF5, the reverse of MATLAB's, None for structures.
+    """Variable whose values have not been read.
+
+    Attributes:
+        name: its name.
+        shape: in the order of HDF5, the reverse of MATLAB's; None for structures.
+        place: offset in the file.
+        stored: bytes in the file.
+        unpacked: bytes of the values.
+        compressed: packed by zlib.
     """
 
     name: str
@@ -70,7 +80,7 @@ class Variable:
 
 
 class Mat5File:
-    """A file of version 5 to 7. Raises ValueError, StorageError and zlib.error for damage."""
+    """File of version 5 to 7. Raises ValueError, StorageError and zlib.error for damage."""
 
     def __init__(self, source: Path) -> None:
         self._source = source
@@ -79,7 +89,7 @@ class Mat5File:
             self.variables = {variable.name: variable for variable in self._listed(file)}
 
     def read(self, name: str, what: str) -> Value | Other:
-        """Numbers in the order of HDF5, a text, a structure by its fields; None for what is empty."""
+        """Return numbers in the order of HDF5, a text, a structure by its fields; None for an empty value."""
         variable = self.variables[name]
         what = f"{what}: '{name}' {variable.shape or ''}".rstrip()
         check_size(variable.unpacked, variable.stored, what)
@@ -114,13 +124,13 @@ class Mat5File:
 
 
 class _Elements:
-    """The elements of a matrix, one behind another."""
+    """Elements of a matrix, one behind another."""
 
     def __init__(self, data: memoryview, order: str) -> None:
         self._data, self.order, self._at = data, order, 0
 
     def next(self) -> tuple[int, memoryview]:
-        """Type and bytes of the next one. Raises ValueError where it does not end."""
+        """Return type and bytes of the next element. Raises ValueError for one that does not end."""
         if len(self._data) < self._at + 8:
             raise ValueError("a variable ends too early")
         kind, size = struct.unpack_from(f"{self.order}II", self._data, self._at)
@@ -133,7 +143,7 @@ class _Elements:
         return kind, self._data[first : first + size]
 
     def numbers(self, *kinds: int) -> NDArray[Any]:
-        """The next one as numbers, of one of the types that are given, or any."""
+        """Return the next element as numbers, of one of the given types, or any."""
         kind, data = self.next()
         if kind not in (kinds or _STORED):
             raise ValueError(f"expected numbers, got an element of type {kind}")
@@ -141,7 +151,7 @@ class _Elements:
 
 
 def _head(elements: _Elements) -> tuple[int, tuple[int, ...], str]:
-    """Flags, dimensions in the order of HDF5, and name of a matrix."""
+    """Return flags, dimensions in the order of HDF5, and name of a matrix."""
     flags, dims = elements.numbers(_UINT32), elements.numbers(_INT32)
     if len(flags) < 1 or len(dims) < 2 or bool((dims < 0).any()):
         raise ValueError(f"expected two dimensions or more, got {dims[:8].tolist()}")
@@ -197,8 +207,15 @@ def _numbers(elements: _Elements, kind: int, shape: tuple[int, ...]) -> NDArray[
 
 
 def write_mat(target: Path, variables: Mapping[str, Any], what: str = "capture file") -> None:
-    """Write arrays and structures (mappings of arrays) by name. Arrays are in the order of HDF5, the reverse of
-    MATLAB's. Raises StorageError for a full disk.
+    """Write arrays and structures by name, as MATLAB 7.3.
+
+    Args:
+        target: checked path.
+        variables: arrays, and mappings of arrays, in the order of HDF5, the reverse of MATLAB's.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for a full disk.
     """
     with replacing(target, what) as unfinished:
         with new_hdf5(unfinished, what, userblock_size=_USER_BLOCK) as file:

@@ -59,7 +59,7 @@ _DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 @dataclass(frozen=True)
 class HFormat:
-    """What the dimensions of ``H`` are: ``grids`` of points or lists, with those of the laser or without."""
+    """Dimensions of ``H``: times or frequencies, ``grids`` of points or lists, with those of the laser or without."""
 
     number: int
     frequencies: bool
@@ -81,7 +81,11 @@ _NUMBERS = {"UNKNOWN": 0} | {name: form.number for name, form in _FORMATS.items(
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of y-tal's."""
+    """Return True for a file of y-tal.
+
+    Args:
+        contents: the file.
+    """
     return {"H", "H_format", "sensor_grid_xyz"} <= set(contents.shapes)
 
 
@@ -89,11 +93,19 @@ def recognises(contents: Contents) -> bool:
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """The capture of a file of y-tal. ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` what makes a
-    file that is written of it the same again.
+    """Return the capture of a file of y-tal.
 
-    Origins that are missing are assumed where their distance does not count. Laser points of ``T_Si`` and ``T_Sx_Sy``
-    are one (single), those of the sensor (confocal), or as many elsewhere (pairs). Raises StorageError for others.
+    Args:
+        contents: the file.
+        gaps: arguments of the reader. Missing origins are assumed if their distance does not count.
+
+    Returns:
+        The capture; ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` settings by which a file that is
+        written of it is the same again. Laser points of ``T_Si`` and ``T_Sx_Sy`` are one (single), those of the sensor
+        (confocal), or as many elsewhere (pairs).
+
+    Raises:
+        StorageError: for other files, wrong entries and missing arguments.
     """
     number = _whole(contents, "H_format", gaps)
     form = next((form for form in _FORMATS.values() if form.number == number), None)
@@ -130,8 +142,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], left: list[str]) -> dict[str, Any]:
-    """What this library has written beside, into ``scene_info``; ``assumed`` and ``left`` where another program has
-    taken something out since, or put something in.
+    """Return parts of a capture that this library has written into ``scene_info``.
+
+    ``assumed`` and ``left`` name what another program has taken out, or put in, since.
     """
     metadata, steady = dict(own.get("metadata") or {}), own["steady"]
     if steady is not None and np.shape(steady)[-len(scan.shape) :] != scan.shape:
@@ -160,13 +173,13 @@ def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any
 
 
 def _from_tal(measured: Tensor, form: HFormat, polarized: bool) -> Tensor:
-    """(T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
+    """Return (T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
     tensor = _swapped(measured, form)
     return tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
 
 
 def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
-    """x and y of each grid in the other order, which is its own reverse."""
+    """Exchange x and y of each grid, which is its own inverse."""
     if not form.grids:
         return tensor
     return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
@@ -277,11 +290,15 @@ def _volume(contents: Contents, gaps: Gaps) -> int | None:
 
 
 def write(target: Path, capture: Capture) -> None:
-    """Write a capture as y-tal reads it. A phasor is written where there is no transient.
+    """Write a capture so that y-tal reads it. A phasor is written if there is no transient.
 
-    Channels' names, metadata, the wall and the steady image go into ``scene_info``, unless the capture was read from
-    such a file and has none of them: then ``scene_info`` is written as it was. Raises StorageError for a batch, several
-    channels, and a transient beside a phasor.
+    Args:
+        target: checked path.
+        capture: names of channels, metadata, the wall and the steady image go into ``scene_info``, unless the capture
+            was read from such a file and has none of them: then ``scene_info`` is written as it was.
+
+    Raises:
+        StorageError: for a batch, several channels, and a transient beside a phasor.
     """
     form_name, h = _h(capture)
     form = _FORMATS[form_name]
@@ -306,7 +323,7 @@ def write(target: Path, capture: Capture) -> None:
 
 
 def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
-    """The name of H's format, and H as a view where the tensor lies on the CPU."""
+    """Return the name of H's format, and H as a view if the tensor lies on the CPU."""
     if capture.transient is not None and capture.phasor is not None:
         raise cannot(NAME, "a transient or a phasor", "both; write dataclasses.replace(capture, phasor=None, ...)")
     scan = capture.scan
@@ -355,7 +372,9 @@ def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[st
 
 
 def _as_stored(name: str, value: Any, dtype: str | None) -> NDArray[Any]:
-    """As the file had it that it was read from; else points in single precision, where that loses nothing."""
+    """Return an array in the dtype of the file that it was read from, else points in single precision if that is
+    exact.
+    """
     array = np.ascontiguousarray(array_of(value, WHAT)) if isinstance(value, Tensor) else np.asarray(value)
     if dtype is not None and (
         _holds(array, np.dtype(dtype)) or (name.endswith("normals") and np.dtype(dtype).kind == "f")
@@ -365,7 +384,7 @@ def _as_stored(name: str, value: Any, dtype: str | None) -> NDArray[Any]:
 
 
 def _holds(array: NDArray[Any], dtype: np.dtype[Any]) -> bool:
-    """Whether numbers of another kind are the same."""
+    """Return True if numbers are the same in another dtype."""
     if array.dtype == dtype:
         return True
     if dtype.kind not in "iufc" or (dtype.kind != "c" and array.dtype.kind == "c"):
@@ -378,14 +397,15 @@ def _holds(array: NDArray[Any], dtype: np.dtype[Any]) -> bool:
 
 
 def _scene_info(text: str) -> Any:
-    """``scene_info`` as plain data. Raises StorageError."""
+    """Return ``scene_info`` as plain data. Raises StorageError."""
     return _as_json(read_plain_yaml(text, WHAT))
 
 
 def _own_part(info: Any) -> dict[str, Any] | None:
-    """What this library has written into it: ``channels``, ``metadata``, ``wall``, ``steady``,
-    ``frequencies_per_metre``, ``phasor_start_opl``. None where another program has written it. Raises StorageError for
-    what is damaged.
+    """Return the part of ``scene_info`` that this library writes, None in files of other programs.
+
+    ``channels``, ``metadata``, ``wall``, ``steady``, ``frequencies_per_metre``, ``phasor_start_opl``. Raises
+    StorageError for damage.
     """
     text = info.get(_OWN) if isinstance(info, Mapping) else None
     if not isinstance(text, str):
@@ -398,8 +418,8 @@ def _own_part(info: Any) -> dict[str, Any] | None:
 
 
 def _frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl: float | None) -> FrequencyAxis | None:
-    """The frequencies of ``count`` phasors: as this library wrote them, or those that a render of y-tal with these
-    settings keeps; None where neither is there.
+    """Return the frequencies of ``count`` phasors: as this library wrote them, or those that a render of y-tal with
+    these settings keeps; None without either.
     """
     if own is not None and own.get("frequencies_per_metre") is not None:
         return FrequencyAxis(tuple(own["frequencies_per_metre"]), own["phasor_start_opl"])
@@ -418,9 +438,8 @@ def _frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl
 
 
 def _kept(capture: Capture) -> dict[str, Any]:
-    """What the metadata of a capture that was read keeps for writing it again: ``dtypes`` by name, and where they are
-    there ``scene_info_text``, ``volume_format``, ``delta_t``. Whatever else stands there is left out:
-    metadata are anyone's.
+    """Return settings of a file that was read, from a capture's metadata: ``dtypes`` by name, and if they are there
+    ``scene_info_text``, ``volume_format``, ``delta_t``. Other entries are left out: metadata may be anything.
     """
     given = capture.metadata.get("tal")
     given = given if isinstance(given, Mapping) else {}
@@ -432,7 +451,7 @@ def _kept(capture: Capture) -> dict[str, Any]:
 
 
 def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
-    """The text for a capture: as it was read where nothing about it has changed, None where there was none."""
+    """Return the text for a capture: as it was read if nothing about it has changed, None if there was none."""
     text = kept.get("scene_info_text")
     added = bool(capture.channels or set(capture.metadata) - _READ)
     added = added or capture.scan.wall is not None or capture.steady is not None
@@ -467,7 +486,7 @@ def _kept_frequencies(capture: Capture, kept: Mapping[str, Any]) -> FrequencyAxi
 
 
 def _as_json(data: Any) -> Any:
-    """Plain data as JSON has it: names are texts, sequences lists."""
+    """Return plain data as JSON has it: names are texts, sequences lists."""
     if isinstance(data, Mapping):
         return {name if isinstance(name, str) else json.dumps(_as_json(name)): _as_json(v) for name, v in data.items()}
     if isinstance(data, list | tuple | set | frozenset):
