@@ -1,4 +1,4 @@
-"""The relay wall as a surface that points are laid out on: a parallelogram or a triangle mesh."""
+"""Relay walls as surfaces that points are laid out on: a parallelogram or a triangle mesh."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MOST_POINTS = 2**32 - 1
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
+    """Relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
 
     A flat wall is the parallelogram `center + (2u - 1) half_u + (2v - 1) half_v`. On a curved one a point is found by
     going from that place along `normal` (the mesh's mean normal) to the mesh, from the front. `normal` points into the
@@ -58,10 +58,19 @@ class Wall:
         up: Numbers = (0.0, 1.0, 0.0),
         albedo: float | Numbers = 0.5,
     ) -> Wall:
-        """A diffuse rectangle, metres. u runs along `up x normal`, v along `up` as far as it lies in the wall.
+        """Return a diffuse rectangle. u runs along `up x normal`, v along `up` as far as it lies in the wall.
 
-        `albedo`: one number or a linear sRGB triple. Raises UnitError for sizes that are not positive or albedos
-        outside of [0, 1], SceneError for a normal without a direction or along `up`.
+        Args:
+            width: metres.
+            height: metres.
+            center: (3,), metres.
+            normal: (3,), any length.
+            up: (3,), any length.
+            albedo: one number or a linear sRGB triple.
+
+        Raises:
+            UnitError: for sizes that are not positive or albedos outside of [0, 1].
+            SceneError: for a normal without a direction or along `up`.
         """
         width, height = positive("Wall.plane: width", width), positive("Wall.plane: height", height)
         n, u, v = _frame(triple("Wall.plane normal", normal), triple("Wall.plane up", up), "Wall.plane")
@@ -79,11 +88,19 @@ class Wall:
         up: Numbers = (0.0, 1.0, 0.0),
         albedo: float | Numbers = 0.5,
     ) -> Wall:
-        """A diffuse triangle mesh: `vertices` (V, 3) metres, `faces` (F, 3) whole numbers, wound against the clock as
-        seen from the room.
+        """Return a diffuse triangle mesh. u and v span the smallest rectangle across the mean normal that holds the
+        mesh.
 
-        u and v span the smallest rectangle across the mean normal that holds the mesh. Raises ShapeError for other
-        shapes or indices, UnitError for numbers that are not finite, SceneError for a mesh without a mean normal.
+        Args:
+            vertices: (V, 3), metres.
+            faces: (F, 3) whole numbers, wound against the clock as seen from the room.
+            up: (3,), any length.
+            albedo: one number or a linear sRGB triple.
+
+        Raises:
+            ShapeError: for other shapes or indices.
+            UnitError: for numbers that are not finite.
+            SceneError: for a mesh without a mean normal.
         """
         points, triangles = checked_mesh("Wall.mesh", vertices, faces)
         corners = points[triangles]
@@ -110,9 +127,13 @@ class Wall:
 
     @classmethod
     def of(cls, description: Any) -> Wall:
-        """A wall; a Mitsuba dictionary of a `rectangle` or of `mesh_arrays`; or a pair (vertices, faces).
+        """Return the wall of a description.
 
-        Raises SceneError for anything else; then errors as :meth:`mesh`.
+        Args:
+            description: a wall; a Mitsuba dictionary of a `rectangle` or of `mesh_arrays`; or a pair (vertices, faces).
+
+        Raises:
+            SceneError, ArgumentError: for anything else; then errors as :meth:`mesh`.
         """
         if isinstance(description, Wall):
             return description
@@ -168,13 +189,20 @@ class Wall:
 
     @property
     def is_planar(self) -> bool:
-        """Whether the wall is a parallelogram; a mesh counts as curved, however flat it is."""
+        """True for a parallelogram; a mesh counts as curved, however flat it is."""
         return self.vertices is None
 
     def at(self, u: Any, v: Any) -> tuple[Array, Array]:
-        """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. On the edges they stand a
-        millionth of the wall's size inside, where rays in single precision meet it. Raises SceneError for coordinates
-        outside of [0, 1] and where a curved wall has a hole.
+        """Return points and unit normals (..., 3) at coordinates.
+
+        Args:
+            u: in [0, 1], broadcast with `v`. On the edges points stand a millionth of the wall's size inside, where
+                rays in single precision meet it.
+            v: in [0, 1].
+
+        Raises:
+            SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.
+            ShapeError: for anything but numbers that broadcast.
         """
         places = [real_array(u), real_array(v)]
         if places[0] is None or places[1] is None:
@@ -201,7 +229,7 @@ class Wall:
         return points.reshape(flat.shape), normals.reshape(flat.shape)
 
     def _inside(self, share: Array, half: Array) -> Array:
-        """Coordinates that are not nearer to the edges than single precision can tell."""
+        """Return coordinates as far from the edges as single precision needs."""
         margin = _EDGE * (self.diagonal + np.abs(self.center).max()) / (2 * np.linalg.norm(half))
         return np.clip(share, margin, 1 - margin)
 
@@ -273,7 +301,15 @@ class Wall:
 
 
 def triple(what: str, values: Any) -> Array:
-    """Three finite numbers as float64 (3,). Raises ShapeError and UnitError."""
+    """Return three finite numbers as float64 (3,).
+
+    Args:
+        what: subject of messages.
+        values: numbers of any library.
+
+    Raises:
+        ShapeError, UnitError: for anything else.
+    """
     array = real_array(values)
     if array is None:
         raise ShapeError(f"{what}: expected three numbers [x, y, z], got {shown(values)}.")
@@ -285,7 +321,15 @@ def triple(what: str, values: Any) -> Array:
 
 
 def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
-    """(nx, ny) of one number or a pair. Raises ShapeError unless both are whole and at least 1."""
+    """Return (nx, ny).
+
+    Args:
+        size: one whole number or a pair, at least 1.
+        who: subject of messages.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     given: Any = size
     several = isinstance(given, Sequence) or getattr(given, "ndim", 0) == 1
     pair = [as_whole(n) for n in (given if several else (given, given))]
@@ -336,10 +380,17 @@ def _places(count: int, low: float, high: float, centers: bool) -> Array:
 
 
 def first_hits(origins: Array, direction: Array, corners: Array) -> tuple[Array, Indices]:
-    """Distance (N,) to the first triangle that each ray meets, and its index (N,); infinity and -1 where none is met.
+    """Find the first triangle that each of some parallel rays meets, from either side.
 
-    `origins` (N, 3), one unit `direction` (3,) for all, `corners` (F, 3, 3). Both sides of a triangle count. The method
-    of Moeller and Trumbore (1997), for the triangles alone that share a cell with a ray on a grid across the rays.
+    Args:
+        origins: (N, 3).
+        direction: unit vector (3,), the same for all rays.
+        corners: corners of triangles (F, 3, 3).
+
+    Returns:
+        Distance (N,) and index (N,) of the triangle; infinity and -1 for rays that meet none.
+
+    Source: Moeller and Trumbore (1997), for the triangles alone that share a cell with a ray on a grid across the rays.
     """
     cells = _Cells(corners, direction)
     distances, indices = np.full(len(origins), np.inf), np.full(len(origins), -1, dtype=np.int64)
@@ -366,7 +417,7 @@ def first_hits(origins: Array, direction: Array, corners: Array) -> tuple[Array,
 
 
 def _distances(origins: Array, direction: Array, corners: Array) -> Array:
-    """Along each ray (N, 3) to a triangle (N, 3, 3) of its own; infinity where it passes."""
+    """Return distances along rays (N, 3) to a triangle (N, 3, 3) of each; infinity for a ray that passes it."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)
     determinant = (first * across).sum(1)
@@ -384,7 +435,7 @@ def _distances(origins: Array, direction: Array, corners: Array) -> Array:
 
 
 class _Cells:
-    """Which triangles reach into which cell of a grid across a direction."""
+    """Lists of triangles that reach into each cell of a grid across a direction."""
 
     def __init__(self, corners: Array, direction: Array):
         helper = np.eye(3)[np.abs(direction).argmin()]
@@ -409,7 +460,7 @@ class _Cells:
         self._starts = np.searchsorted(cell[order], np.arange(self._count**2 + 1))
 
     def candidates(self, origins: Array) -> tuple[Indices, Indices]:
-        """Where in `triangles` the list of each ray begins, and its length; 0 beside the grid."""
+        """Return the start in `triangles` and the length of each ray's list; length 0 beside the grid."""
         place = origins @ self._frame
         slack = 1e-9 * self._size
         inside = ((place >= self._low - slack) & (place <= self._low + self._size + slack)).all(1)
@@ -432,7 +483,11 @@ class _Cells:
 
 
 def triangle_normals(corners: Array) -> Array:
-    """Unit normals (F, 3) by the winding of the corners (F, 3, 3); zero for triangles without an area."""
+    """Return unit normals (F, 3) of triangles by the winding of their corners; zero for triangles without an area.
+
+    Args:
+        corners: (F, 3, 3).
+    """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.where(length > 0, length, 1.0))

@@ -1,8 +1,8 @@
 """Hidden scenes of captures around a corner: shapes without light or camera. Lengths in metres.
 
-The relay wall lies in the plane z = 0 and looks along +z (`relay_wall`); hidden things are at positive z and face it. A
-dictionary of each function holds shapes by name, for `tt.nlos.simulate` or as parts of a scene. Seen in pictures of a
-scan, x runs to the right and y up, which is how letters read.
+The relay wall lies in the plane z = 0 and looks along +z (`relay_wall`); hidden things are at positive z and face it.
+Each function returns a dictionary of shapes by name, for `tt.nlos.simulate` or as parts of a scene. Seen in pictures of
+a scan, x runs to the right and y up, so that letters read as usual.
 """
 
 from __future__ import annotations
@@ -55,13 +55,26 @@ COLOURS = {"walls": 0.7, "floor": 0.4, "ceiling": 0.8, "desk": 0.5, "shelf": 0.4
 
 
 def relay_wall(width: float = 2.0, height: float = 2.0, albedo: Albedo = 0.5) -> SceneDict:
-    """The wall that light goes around the corner by: a diffuse rectangle around the origin that faces +z."""
+    """Return the relay wall: a diffuse rectangle around the origin that faces +z.
+
+    Args:
+        width: metres.
+        height: metres.
+        albedo: one number or a linear sRGB triple.
+    """
     half = [positive("width", width) / 2, positive("height", height) / 2, 1.0]
     return {"type": "rectangle", "to_world": scale(half), "bsdf": diffuse(albedo)}
 
 
 def nlos_z(*, size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9, thickness: float = 0.0) -> SceneDict:
-    """The letter Z, `size` high and wide, `depth` before the wall: `nlos_letter("Z")`."""
+    """Return the letter Z: `nlos_letter("Z")`.
+
+    Args:
+        size: height and width, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
+        thickness: metres, 0 for a sheet.
+    """
     return nlos_letter("Z", size=size, depth=depth, albedo=albedo, thickness=thickness)
 
 
@@ -74,11 +87,19 @@ def nlos_letter(
     thickness: float = 0.0,
     subdivide: int = 0,
 ) -> SceneDict:
-    """A block letter, `size` high and wide, as the mesh `letter`, the side that faces the wall at z = `depth`.
+    """Return a block letter as the mesh `letter`, the side that faces the wall at z = `depth`.
 
-    `thickness` 0 is a sheet, whose back is black; more is a closed body, which reaches to `depth + thickness`.
-    `subdivide`: every triangle as 4^subdivide, for fits of its vertices. Letters: `scenes.letters.OUTLINES`. Raises
-    SceneError for others and UnitError for lengths that are not positive.
+    Args:
+        letter: one of `scenes.nlos.OUTLINES`.
+        size: height and width, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
+        thickness: 0 is a sheet, whose back is black; more is a closed body, which reaches to `depth + thickness`.
+        subdivide: splits of every triangle in four, for fits of its vertices.
+
+    Raises:
+        ArgumentError: for other letters.
+        UnitError: for lengths that are not positive.
     """
     corners = outline(letter, positive("size", size))
     z = positive("depth", depth)
@@ -87,9 +108,17 @@ def nlos_letter(
 
 
 def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
-    """Corners (N, 2) of a letter of height and width `size` around the origin, metres, against the clock.
+    """Return the corners of a letter around the origin, against the clock.
 
-    Raises ArgumentError for a letter that is not there (those with holes are not).
+    Args:
+        letter: one of `OUTLINES`, which have no holes.
+        size: height and width, metres.
+
+    Returns:
+        (N, 2), metres.
+
+    Raises:
+        ArgumentError: for other letters.
     """
     if not isinstance(letter, str) or letter not in OUTLINES:
         raise ArgumentError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
@@ -100,7 +129,15 @@ def nlos_plates(
     *,
     size: float = 0.8, depth: float = 0.8, gap: float = 0.5, albedo: Albedo = 0.9, second_size: float | None = None
 ) -> SceneDict:
-    """A square plate `front` before the wall and another one, `back`, `gap` behind it. `second_size` None: as large."""
+    """Return a square plate `front` before the wall and another one, `back`, behind it.
+
+    Args:
+        size: side of the front plate, metres.
+        depth: its distance from the wall, metres.
+        gap: distance of the back plate from it, metres.
+        albedo: one number or a linear sRGB triple.
+        second_size: side of the back plate, None for the same.
+    """
     z = positive("depth", depth)
     far = positive("second_size", size if second_size is None else second_size)
     return {
@@ -110,10 +147,16 @@ def nlos_plates(
 
 
 def nlos_corner(size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9) -> SceneDict:
-    """Two plates that meet at a right angle and light each other, open towards the wall, and a small one before them.
+    """Return two plates that meet at a right angle and light each other, open towards the wall, and a small one before
+    them.
 
     `left` and `right` start at z = `depth` at x = -size / 2 and size / 2 and meet at x = 0, `size / 2` deeper. `small`
     hides a part of `right`.
+
+    Args:
+        size: width and height, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
     """
     s, z = positive("size", size), positive("depth", depth)
     y = np.array([-s / 2, s / 2])
@@ -144,9 +187,12 @@ _BODY = (
 
 
 def mannequin(height: float = 1.45, level: int = 3) -> Mesh:
-    """A body of six closed ellipsoids that overlap and hide each other, around the origin; one arm reaches towards -z.
+    """Return a body of six closed ellipsoids that overlap and hide each other, around the origin; one arm reaches
+    towards -z.
 
-    `height` in metres from the soles to the top of the head; 120 4^level triangles.
+    Args:
+        height: from the soles to the top of the head, metres.
+        level: fineness; 120 4^level triangles.
     """
     factor = positive("height", height) / 1.41
     parts = [ellipsoid(factor * np.array(center), factor * np.array(radii), level) for center, radii in _BODY]
@@ -157,9 +203,17 @@ def nlos_mannequin(
     *,
     depth: float = 1.2, height: float = 1.45, albedo: Albedo = 0.7, level: int = 3, x: float = 0.0
 ) -> SceneDict:
-    """A standing `mannequin` as the mesh `body`, its axis `depth` before the wall and `x` beside its middle.
+    """Return a standing `mannequin` as the mesh `body`.
 
-    Raises SceneError when the outstretched arm would reach through the wall.
+    Args:
+        depth: distance of its axis from the wall, metres.
+        height: metres.
+        albedo: one number or a linear sRGB triple.
+        level: fineness of the mesh.
+        x: distance of its axis from the middle, metres.
+
+    Raises:
+        SceneError: if the outstretched arm would reach through the wall.
     """
     vertices, faces = mannequin(height, level)
     vertices = vertices + np.array([finite("x", x), 0.0, positive("depth", depth)])
@@ -170,10 +224,13 @@ def nlos_mannequin(
 
 
 def bounds(shapes: SceneDict) -> NDArray[np.float64]:
-    """The box (2, 3) around the shapes of a dictionary: lowest and highest coordinates, metres.
+    """Return the box (2, 3) around the shapes of a dictionary: lowest and highest coordinates, metres.
 
-    For shapes of this room: rectangles, disks, cubes, spheres and meshes as arrays. Raises SceneError for others, and
-    for a dictionary without any.
+    Args:
+        shapes: rectangles, disks, cubes, spheres and meshes as arrays, by name.
+
+    Raises:
+        SceneError: for other shapes, and for a dictionary without any.
     """
     if not isinstance(shapes, dict):
         raise SceneError(f"bounds: expected a dictionary of shapes, got {shown(shapes)}")
@@ -222,12 +279,22 @@ def nlos_room(
     person: bool = True,
     level: int = 3,
 ) -> SceneDict:
-    """A room before `relay_wall(width, height)`: floor, ceiling, three walls, desk, shelf, chair and a person.
+    """Return an office of which `relay_wall(width, height)` is one wall: floor, ceiling, walls, desk, shelf, chair,
+    person.
 
-    The room fills |x| <= width / 2, |y| <= height / 2 and 0 <= z <= depth. `albedo` None takes those of `COLOURS`.
-    `person=False` leaves the room empty of people, as a background to subtract. `level`: fineness of the person's mesh.
-    Furniture is placed from the walls and keeps its size: widths and depths below 2.4 m and heights below 2.2 m raise
-    UnitError.
+    The room fills |x| <= width / 2, |y| <= height / 2 and 0 <= z <= depth. Furniture is placed from the walls and keeps
+    its size.
+
+    Args:
+        width: metres, at least 2.4.
+        height: metres, at least 2.2.
+        depth: metres, at least 2.4.
+        albedo: of everything, None for those of `COLOURS`.
+        person: False leaves the room empty, as a background to subtract.
+        level: fineness of the person's mesh.
+
+    Raises:
+        UnitError: for smaller rooms.
     """
     for name, size, least in (("width", width, 2.4), ("height", height, 2.2), ("depth", depth, 2.4)):
         positive(f"{name} beyond the {least} m of the furniture", positive(name, size) - least + 1e-9)
@@ -266,7 +333,7 @@ def nlos_room(
 
 
 def _add_shelf(shapes: SceneDict, foot: Sequence[float], wood: float, books: float) -> None:
-    """A shelf of five boards between two sides before the back wall, with books on three of them."""
+    """Add a shelf of five boards between two sides before the back wall, with books on three of them."""
     x, y, z = foot
     wide, deep, high = 1.0, 0.3, 1.8
     for number, side in enumerate((-1, 1)):
