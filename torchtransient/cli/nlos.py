@@ -116,7 +116,7 @@ def _summary(capture: Any) -> str:
 
 
 def _drawable(hidden: Any) -> tuple[dict[str, Any], list[str]]:
-    """The shapes that a layout can show, and the names of the others."""
+    """Return the shapes that a layout can show, and the names of the others."""
     if not isinstance(hidden, dict):
         return {}, ["the shapes of the scene"]
     from torchtransient.vis.hidden_shapes import DRAWN

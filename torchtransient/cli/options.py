@@ -60,7 +60,11 @@ _RECONSTRUCTION = {
 
 
 def scene_options(command: Command) -> Command:
-    """The scene file and what changes how it is read and rendered, the settings of every film included."""
+    """Add the scene file, and the options of how it is read and rendered, those of every film included.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.argument("scene", type=click.Path(path_type=Path)),
         click.option("--variant", help="Mitsuba variant, such as llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb."),
@@ -75,7 +79,15 @@ def scene_options(command: Command) -> Command:
 
 
 def assignments(given: Sequence[str], option: str) -> dict[str, str]:
-    """`("a=1", "b=x")` as a dictionary. A usage error names the option when there is no `=`, or a name comes twice."""
+    """Return `("a=1", "b=x")` as a dictionary.
+
+    Args:
+        given: texts NAME=VALUE.
+        option: name of the option, for messages.
+
+    Raises:
+        BadParameter: for a text without `=`, and a name that comes twice.
+    """
     found: dict[str, str] = {}
     for text in given:
         name, sign, value = text.partition("=")
@@ -88,7 +100,15 @@ def assignments(given: Sequence[str], option: str) -> dict[str, str]:
 
 
 def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
-    """`("red.reflectance.value=0.5,0.1,0.1",)` as tensors. Nested lists as in Python give more dimensions."""
+    """Return `("red.reflectance.value=0.5,0.1,0.1",)` as tensors. Nested lists as in Python give more dimensions.
+
+    Args:
+        given: texts KEY=VALUE.
+        option: name of the option, for messages.
+
+    Raises:
+        BadParameter: for values that are no numbers.
+    """
     import torch
 
     values = {}
@@ -103,7 +123,13 @@ def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
 
 
 def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene:
-    """The scene of a command line."""
+    """Return the scene of a command line.
+
+    Args:
+        scene: its file.
+        variant: Mitsuba variant, None for the default.
+        params: texts NAME=VALUE that fill $NAME of the file.
+    """
     import torchtransient as tt
 
     values: dict[str, Any] = dict(assignments(params, "--param"))
@@ -115,7 +141,11 @@ def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene
 
 
 def film_options(command: Command) -> Command:
-    """Add the options of all films to a command."""
+    """Add the options of all films to a command.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.option("--start-opl", type=float, help="Start of the time axis, metres of optical path."),
         click.option("--bin-width-opl", type=float, help="Width of a bin, metres of optical path."),
@@ -145,6 +175,9 @@ def film_options(command: Command) -> Command:
 
 def film_of_options(options: Mapping[str, Any]) -> FilmLayout | None:
     """Return the film that the options of a command ask for, None without one.
+
+    Args:
+        options: values by name.
 
     Raises:
         ArgumentError: for options of two films, and for a part of an axis.
@@ -213,7 +246,12 @@ def _chirps(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | N
 
 
 def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
-    """Return the contents of a written file in words, and how they were made."""
+    """Return the contents of a written file in words, and how they were made.
+
+    Args:
+        film: of the render.
+        output: the render.
+    """
     tensor = film.tensor(output)
     sizes = " x ".join(map(str, () if tensor is None else tensor.shape))
     shape = f"{sizes} ({'Stokes x ' if output.polarized else ''}C x {film.letter} x H x W)"
@@ -223,7 +261,11 @@ def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
 
 
 def pictures_of(film: FilmLayout) -> tuple[str, ...]:
-    """Return the pictures of ``torchtransient render`` that show a film."""
+    """Return the pictures of ``torchtransient render`` that show a film.
+
+    Args:
+        film: of the render.
+    """
     if isinstance(film, Histogram | Rates):
         return ("overview", "peak_time", "rainbow", "video")
     return ("video",) if isinstance(film, Phasors | Gates) else ()
@@ -231,6 +273,12 @@ def pictures_of(film: FilmLayout) -> tuple[str, ...]:
 
 def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
     """Write a video of a render and return its contents in words.
+
+    Args:
+        film: of the render.
+        output: the render.
+        path: place of the video.
+        progress: show a progress bar.
 
     Raises:
         ArgumentError: for films without a video.
@@ -251,7 +299,11 @@ def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -
 
 
 def video_options(command: Command) -> Command:
-    """How the frames of a video look."""
+    """Add the options of a video's frames.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.option("--fps", type=click.FloatRange(min=0, min_open=True), default=25.0, show_default=True),
         click.option("--exposure", type=click.FloatRange(min=0, min_open=True), help="Factor.  [default: measured]"),
@@ -268,7 +320,11 @@ def video_options(command: Command) -> Command:
 
 
 def picture_options(command: Command) -> Command:
-    """Which pictures `render` writes beside the result."""
+    """Add the options of pictures that `render` writes beside the result.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png)."),
         click.option("--video", type=click.Path(path_type=Path), help="Write the light in flight (.mp4 or .gif)."),
@@ -281,8 +337,15 @@ def picture_options(command: Command) -> Command:
 
 
 def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
-    """Raise StorageError when one of the pictures of `picture_options` could not be written, UsageError when it does
-    not show what the film measures. None: it is not known yet.
+    """Check that the pictures of `picture_options` can be written and show the film.
+
+    Args:
+        options: values by name.
+        film: of the render, None before it is known.
+
+    Raises:
+        StorageError: for a place that cannot be written.
+        UsageError: for a picture that does not show what the film measures.
     """
     from torchtransient.vis.overview import check_picture
     from torchtransient.vis.video_file import check_video
@@ -300,7 +363,14 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
 
 
 def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title: str) -> None:
-    """Write the pictures of `picture_options` that are asked for, and say so."""
+    """Write the pictures of `picture_options` that are asked for, and print their names.
+
+    Args:
+        output: the render.
+        film: its film.
+        options: values by name.
+        title: of the pictures.
+    """
     import torchtransient as tt
 
     if options["overview"]:
@@ -328,7 +398,11 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
 
 
 def in_options(message: str) -> str:
-    """The message without Python in it."""
+    """Return a message of the library with options in the place of Python.
+
+    Args:
+        message: of an error or a warning.
+    """
     for kind, flags in OPTIONS.items():
         message = message.replace(f"Give {kind.example}", f"Give {', '.join(flags)}")
     for python, option in _WORDS.items():
@@ -337,7 +411,12 @@ def in_options(message: str) -> str:
 
 
 def arguments_as_options(message: str, names: Sequence[str]) -> str:
-    """The message with ``name=`` as ``--name`` for these arguments, and without calls of reconstruction."""
+    """Return a message with ``name=`` as ``--name``, and without calls of reconstruction.
+
+    Args:
+        message: of an error.
+        names: arguments that are options.
+    """
     for name in names:
         option = f"--{name.replace('_', '-')}"
         # With a value behind it, or as a name alone.

@@ -21,7 +21,7 @@ class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer 
     name = "NAME,NAME,..."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """The words of a text."""
+        """Return the words of a text."""
         return value if isinstance(value, tuple) else tuple(part.strip() for part in value.split(",") if part.strip())
 
 

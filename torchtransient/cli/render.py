@@ -157,12 +157,12 @@ def _render_to_tolerance(
 
 
 def _power(output: Any) -> tuple[Any, Any]:
-    """Transient and steady image without the components that describe the polarization."""
+    """Return transient and steady image without the components that describe the polarization."""
     return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
 
 
 def _report_energy(output: Any) -> None:
-    """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
+    """Print the light outside of the time axis, which is easily overlooked in a picture."""
     before, after = output.outside
     if before + after > 0.001:
         axis = output.axis

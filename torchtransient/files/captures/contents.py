@@ -120,6 +120,7 @@ class Hdf5Contents:
         return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
+        """Return a text, None if it is missing or empty."""
         value = self._read(name)
         if value is not None and not isinstance(value, str):
             raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
