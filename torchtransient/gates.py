@@ -257,12 +257,20 @@ class Gate:
 
 
 def jump_in(gates: Sequence[Gate]) -> str:
-    """Return a name for the first gate that opens or closes at once, for messages; empty if all have a slope."""
+    """Return a name for the first gate that opens or closes at once, for messages; empty if all have a slope.
+
+    Args:
+        gates: of a film.
+    """
     return next((f"{gate.kind} gate" for gate in gates if not gate.is_continuous), "")
 
 
 def gates_to_text(gates: Sequence[Gate]) -> str:
-    """Return gates in the notation of scene files."""
+    """Return gates in the notation of scene files.
+
+    Args:
+        gates: of a film.
+    """
     return "; ".join(map(str, gates))
 
 

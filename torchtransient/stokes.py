@@ -276,10 +276,10 @@ def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
 
 
 def circular_polarizer(left_handed: bool = False) -> Tensor:
-    """Return the Mueller matrix (4, 4) of an ideal polarizer for right (or left) circular light.
+    """Return the Mueller matrix (4, 4) of an ideal polarizer for circular light.
 
     Args:
-        left_handed: pass left circular light.
+        left_handed: pass left circular light, otherwise right circular light.
     """
     sign = -0.5 if left_handed else 0.5
     matrix = torch.zeros(4, 4)

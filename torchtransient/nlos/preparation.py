@@ -9,7 +9,7 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.arithmetic import precision_of, summed
+from torchtransient.capture.capture import precision_of, summed
 from torchtransient.checks import count, shown
 from torchtransient.errors import DeviceError, ShapeError
 from torchtransient.nlos.measured_light import checked_light

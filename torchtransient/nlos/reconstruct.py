@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.arithmetic import precision_of
+from torchtransient.capture.capture import precision_of
 from torchtransient.checks import Numbers, count, finite, positive, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.nlos.measured_light import checked_light

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchtransient.capture.arithmetic import summed
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text, summed
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.reconstruction.voxels import VoxelGrid

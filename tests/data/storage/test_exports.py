@@ -25,7 +25,7 @@ from torchtransient.data.storage.shard_writing import ShardWriter
 from torchtransient.data.storage.tal_export import export_tal
 from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.tensor_record import same
 
 

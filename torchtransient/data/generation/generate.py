@@ -328,7 +328,7 @@ def _check_recipe(recipe: Any, folder: Any) -> None:
 
 
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
-    from torchtransient.array_files.hdf5_writing import hdf5_package
+    from torchtransient.array_files.hdf5 import hdf5_package
     from torchtransient.data.storage.chunks import check_compression
     from torchtransient.data.storage.encodings import check_store
 

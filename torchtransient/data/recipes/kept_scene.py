@@ -24,7 +24,7 @@ from torchtransient.data.recipes.streams import Draw, Stream
 from torchtransient.data.recipes.structures import Structure
 from torchtransient.data.recipes.written import written_frequencies, written_shape
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError
-from torchtransient.files.scan_data import scan_data
+from torchtransient.files.plain_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer

@@ -23,7 +23,7 @@ from torchtransient.data.recipes.specification import (
 from torchtransient.data.recipes.streams import Stream
 from torchtransient.data.recipes.structures import SCAN, Structure
 from torchtransient.errors import UnitError
-from torchtransient.files.scan_data import scan_data
+from torchtransient.files.plain_data import scan_data
 
 # Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
 # Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.

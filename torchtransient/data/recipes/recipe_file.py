@@ -38,7 +38,7 @@ from torchtransient.data.recipes.written import (
     written_shape,
 )
 from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.scene.description import DictDescription, XmlDescription, describe_dict
 from torchtransient.scene.load import Scene

@@ -22,8 +22,7 @@ from torchtransient.data.recipes import distributions as distributions
 from torchtransient.data.recipes import poses as poses
 from torchtransient.data.recipes.distribution import Distribution
 from torchtransient.errors import SceneError
-from torchtransient.files.plain_data import plain, restored
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import plain, restored, scan_data, scan_from_data
 from torchtransient.gates import Gate
 from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse

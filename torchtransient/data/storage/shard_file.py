@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said
-from torchtransient.array_files.hdf5_limits import check_memory, dataset_of, is_number, read_dataset
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import check_memory, dataset_of, hdf5_package, is_number, read_dataset
 from torchtransient.checks import as_whole, shown
 from torchtransient.data.storage.chunks import check_chunks, time_axis
 from torchtransient.data.storage.encodings import ENCODINGS, decoded

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_folder, path_of
-from torchtransient.array_files.hdf5_writing import new_hdf5
+from torchtransient.array_files.hdf5 import new_hdf5
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.checks import count, mapping, shown
 from torchtransient.data.storage.chunks import LIBVER, Compressor, check_compression

@@ -13,7 +13,7 @@ from torchtransient.data.reading.transient_dataset import TransientDataset
 from torchtransient.data.recipes.written import read_frequencies
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files.captures import tal
-from torchtransient.files.scan_data import scan_from_data
+from torchtransient.files.plain_data import scan_from_data
 from torchtransient.rendering.progress import with_bar
 
 _WHAT = "TAL export"

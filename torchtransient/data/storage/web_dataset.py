@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said, path_of
-from torchtransient.array_files.hdf5_limits import check_memory
+from torchtransient.array_files.hdf5 import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.checks import positive
 from torchtransient.data.reading.sample_draws import outside_tensor

@@ -1,7 +1,9 @@
-"""Datasets of HDF5 files that anyone may have written: numbers and texts of the file itself, no more than it can hold.
+"""HDF5 of any origin: datasets and attributes read within bounds, and files written to disks that may be full.
 
-A file may declare terabytes that nobody stored, point to other files of the machine, or be damaged where the library
-that reads it does not look. What is declared is compared with what is stored before memory is asked for.
+A file may declare terabytes that nothing stores, point to other files of the machine, or be damaged where the HDF5
+library does not look. Declared sizes are compared with stored ones before memory is asked for. When a file is closed
+and cannot be written to the end, the library ends the process; here it writes into an object that accepts everything
+and keeps the disk's error.
 """
 
 from __future__ import annotations
@@ -9,14 +11,16 @@ from __future__ import annotations
 import math
 import mmap
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.free_memory import available_memory
-from torchtransient.errors import StorageError
+from torchtransient.errors import MissingPackageError, StorageError
 
 # Deflate, the filter that all of these files use, makes at most 1032 bytes of one.
 MOST_BYTES_OF_ONE = 1032
@@ -35,11 +39,43 @@ _HEAP_HEADER = 16
 _NO_SHAPE_AND_LENGTH = re.compile(rb"\x00{0,7}(?:\x01\x00{7}|\x02\x00{3})(.{16})", re.DOTALL)
 
 
-def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
-    """A dataset of an open file or group, or ``part`` of it; None for one that is missing or empty. Texts are `str`.
+def hdf5_package(what: str) -> Any:
+    """Return the module h5py.
 
-    Raises StorageError for links to other files, for objects and records, and for more numbers than the file, or the
-    memory that is left, can hold.
+    Args:
+        what: subject of messages.
+
+    Raises:
+        MissingPackageError: if it is not installed.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what}: HDF5 needs the package h5py. Install it with pip install 'torchtransient[data]', "
+            "or choose a name that ends in .npz."
+        ) from error
+    return h5py
+
+
+# -------------------------------------------------------------------------------------------------------------- reading
+
+
+def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
+    """Read a dataset of an open file or group.
+
+    Args:
+        parent: file or group of h5py.
+        name: path of the dataset.
+        what: subject of messages.
+        part: index of the part that is read, () for all of it.
+
+    Returns:
+        Numbers, or a text as `str`; None for a dataset that is missing or empty.
+
+    Raises:
+        StorageError: for links to other files, objects and records, filters that are no part of HDF5, and more numbers
+            than the file or the free memory can hold.
     """
     dataset = dataset_of(parent, name, what)
     # MATLAB writes the size of an empty array in its place.
@@ -63,8 +99,15 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
 
 
 def dataset_of(parent: Any, name: str, what: str) -> Any:
-    """The dataset at a path of the file itself, None where there is nothing. Raises StorageError for groups, and for
-    links to elsewhere, which are not looked at.
+    """Return the dataset at a path of the file itself, None if there is nothing.
+
+    Args:
+        parent: file or group of h5py.
+        name: path of the dataset.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for groups, and for links to elsewhere, which are not followed.
     """
     import h5py
 
@@ -84,7 +127,7 @@ def dataset_of(parent: Any, name: str, what: str) -> Any:
 
 
 def _check_filters(dataset: Any, name: str, what: str) -> None:
-    """Filters that are no part of HDF5 would be looked for and loaded as code, wherever HDF5_PLUGIN_PATH leads."""
+    """Refuse filters that are no part of HDF5, which would be loaded as code from where HDF5_PLUGIN_PATH leads."""
     settings = dataset.id.get_create_plist()
     for number in range(settings.get_nfilters()):
         code = settings.get_filter(number)[0]
@@ -96,26 +139,51 @@ def _check_filters(dataset: Any, name: str, what: str) -> None:
 
 
 def is_number(dtype: np.dtype[Any]) -> bool:
-    """Whether an array is of numbers that tensors can have, complex ones of two of them."""
+    """Return True for dtypes that tensors can have, complex ones of two such numbers.
+
+    Args:
+        dtype: of an array.
+    """
     return dtype.kind in "biufc" and dtype.itemsize <= (16 if dtype.kind == "c" else 8)
 
 
 def is_text(dataset: Any) -> bool:
-    """Whether a dataset holds one text."""
+    """Return True for a dataset of one text.
+
+    Args:
+        dataset: of h5py.
+    """
     import h5py
 
     return h5py.check_string_dtype(dataset.dtype) is not None and math.prod(dataset.shape or ()) == 1
 
 
 def check_size(declared: int, stored: int, what: str) -> None:
-    """Raise StorageError where an array of ``declared`` bytes cannot come from ``stored`` ones, or does not fit."""
+    """Check that an array can come from the bytes that are stored of it, and fits into memory.
+
+    Args:
+        declared: bytes of the array.
+        stored: bytes in the file.
+        what: subject of messages.
+
+    Raises:
+        StorageError: if it does not.
+    """
     if declared > max(_FREE_BYTES, _SLACK * MOST_BYTES_OF_ONE * stored):
         raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: the file is damaged.")
     check_memory(declared, what)
 
 
 def check_memory(declared: int, what: str) -> None:
-    """Raise StorageError where an array of ``declared`` bytes does not fit into memory."""
+    """Check that an array fits into memory.
+
+    Args:
+        declared: bytes of the array.
+        what: subject of messages.
+
+    Raises:
+        StorageError: if it does not.
+    """
     if declared < _LARGE_BYTES:
         return
     available = available_memory()
@@ -141,9 +209,18 @@ def _text(dataset: Any, what: str) -> str:
 
 
 def read_attributes(file: Any, what: str, names: Iterable[str] | None = None) -> dict[str, Any]:
-    """The attributes of an open file, or those of ``names`` that are there: numbers, and texts as `str`.
+    """Read attributes of an open file.
 
-    Raises StorageError for others, and for texts that say they are longer than the file.
+    Args:
+        file: of h5py.
+        what: subject of messages.
+        names: names that are read if they are there, None for all.
+
+    Returns:
+        Numbers, and texts as `str`, by name.
+
+    Raises:
+        StorageError: for other kinds, and texts that claim to be longer than the file.
     """
     import h5py
 
@@ -161,7 +238,7 @@ def read_attributes(file: Any, what: str, names: Iterable[str] | None = None) ->
 
 
 def _check_attribute(attribute: Any, path: str, what: str) -> None:
-    """Find the lengths of texts in the raw file by what stands before them: the kind of text, and no shape."""
+    """Check the lengths of an attribute's texts, found in the raw file behind their type and an empty shape."""
     # The letters' type behind its version, as HDF5 writes it in all of them: one byte, 8 bits.
     letters = attribute.get_type().encode()[_KIND_HEAD:]
     found = False
@@ -179,7 +256,7 @@ def _check_attribute(attribute: Any, path: str, what: str) -> None:
 
 
 def _check_length(dataset: Any, what: str) -> None:
-    """As :func:`_check_attribute`, of a dataset, which says where it lies."""
+    """Check the length of a dataset's text, whose place the dataset knows."""
     offset = dataset.id.get_offset()
     if offset is None or dataset.file.userblock_size:
         raise StorageError(
@@ -210,3 +287,107 @@ def _check_heap(data: mmap.mmap, reference: bytes, what: str) -> None:
         if step < _HEAP_HEADER or place + step > end:
             raise StorageError(f"{what} lies in a heap that is damaged.")
         place += step
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+@contextmanager
+def new_hdf5(path: Path, what: str, **settings: Any) -> Iterator[Any]:
+    """Open a new HDF5 file for writing.
+
+    Args:
+        path: place of the file.
+        what: subject of messages.
+        settings: other arguments of ``h5py.File``.
+
+    Raises:
+        MissingPackageError: without h5py.
+        OSError: if not all of it could be written.
+    """
+    h5py = hdf5_package(what)
+    with path.open("w+b", buffering=0) as raw:
+        sink = _Sink(raw)
+        try:
+            with h5py.File(sink, "w", **settings) as file:
+                yield file
+        finally:
+            # What HDF5 says of bytes that it does not find again tells less.
+            if sink.error is not None:
+                raise sink.error
+
+
+def write_parts(dataset: Any, array: NDArray[Any], part_bytes: int = 2**26) -> None:
+    """Fill a dataset some first indices at a time, so that an array whose axes were moved is not copied as a whole.
+
+    Args:
+        dataset: object with ``__setitem__`` by slices of the first axis.
+        array: numbers in the dataset's shape.
+        part_bytes: size of a part.
+    """
+    if array.ndim == 0 or array.size == 0:
+        dataset[...] = array
+        return
+    step = max(1, part_bytes * len(array) // max(1, array.nbytes))
+    for first in range(0, len(array), step):
+        dataset[first : first + step] = array[first : first + step]
+
+
+class _Sink:
+    """File that fails at most once: later writes are dropped, and read as zeros."""
+
+    def __init__(self, raw: Any) -> None:
+        self._raw, self._at, self._end = raw, 0, 0
+        self.error: OSError | None = None
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Move, and return the new place."""
+        self._at = offset + (0, self._at, self._end)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Return the place."""
+        return self._at
+
+    def write(self, data: Any) -> int:
+        """Write or drop all of the data, and return its size."""
+        left = memoryview(data).cast("B")
+        size = len(left)
+        if self.error is None:
+            try:
+                self._raw.seek(self._at)
+                while left:
+                    left = left[self._raw.write(left) :]
+            except OSError as error:
+                self.error = error
+        self._at += size
+        self._end = max(self._end, self._at)
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        """Read into a buffer, zeros for what was dropped."""
+        view = memoryview(buffer).cast("B")
+        self._raw.seek(self._at)
+        found = self._raw.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)
+        self._at += len(view)
+        return len(view)
+
+    def read(self, size: int) -> bytes:
+        """Read ``size`` bytes, as :meth:`readinto`."""
+        found = bytearray(size)
+        self.readinto(found)
+        return bytes(found)
+
+    def truncate(self, size: int) -> int:
+        """Cut or lengthen the file."""
+        self._end = size
+        if self.error is None:
+            try:
+                self._raw.truncate(size)
+            except OSError as error:
+                self.error = error
+        return size
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered."""

@@ -1,5 +1,8 @@
-"""MATLAB files of versions 5 to 7 ("MAT-File Format", The MathWorks, level 5): arrays of numbers, texts and structures
-of them. Others' readers trust the types that a damaged file names, and may end the process.
+"""MATLAB files: a reader of versions 5 to 7 ("MAT-File Format", The MathWorks, level 5) and a writer of version 7.3.
+
+Numbers, texts and structures of them are read, and sizes compared with the file's. Other readers trust the types that
+a damaged file names, and may end the process. Version 7.3 is HDF5 with a header in front and the class of each array
+beside it.
 """
 
 from __future__ import annotations
@@ -7,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.array_files.hdf5_limits import check_memory, check_size
+from torchtransient.array_files.array_file import replacing
+from torchtransient.array_files.hdf5 import check_memory, check_size, new_hdf5, write_parts
+
+# Version 7.3 is HDF5 behind a header.
+_HEADER = b"MATLAB 7.3 MAT-file, Platform: torchtransient, HDF5 schema 1.00 ."
+_USER_BLOCK = 512
+_CLASSES = {"float64": "double", "float32": "single", "bool": "logical"}
 
 HEADER_BYTES = 128
 # How numbers are stored, by the types of elements; texts have their letters in some of these.
@@ -41,15 +50,22 @@ Value = NDArray[Any] | str | dict[str, Any] | None
 
 @dataclass(frozen=True)
 class Other:
-    """What is neither numbers nor a text nor one structure; ``kind`` in words."""
+    """Value other than numbers, a text or one structure; ``kind`` in words."""
 
     kind: str
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable whose values have not been read: where it lies, ``stored`` and ``unpacked`` bytes; ``shape`` in the
-    order of HDF5, the reverse of MATLAB's, None for structures.
+    """Variable whose values have not been read.
+
+    Attributes:
+        name: its name.
+        shape: in the order of HDF5, the reverse of MATLAB's; None for structures.
+        place: offset in the file.
+        stored: bytes in the file.
+        unpacked: bytes of the values.
+        compressed: packed by zlib.
     """
 
     name: str
@@ -60,8 +76,11 @@ class Variable:
     compressed: bool
 
 
+# ------------------------------------------------------------------------------------------------------ versions 5 to 7
+
+
 class Mat5File:
-    """A file of version 5 to 7. Raises ValueError, StorageError and zlib.error for damage."""
+    """File of version 5 to 7. Raises ValueError, StorageError and zlib.error for damage."""
 
     def __init__(self, source: Path) -> None:
         self._source = source
@@ -70,7 +89,7 @@ class Mat5File:
             self.variables = {variable.name: variable for variable in self._listed(file)}
 
     def read(self, name: str, what: str) -> Value | Other:
-        """Numbers in the order of HDF5, a text, a structure by its fields; None for what is empty."""
+        """Return numbers in the order of HDF5, a text, a structure by its fields; None for an empty value."""
         variable = self.variables[name]
         what = f"{what}: '{name}' {variable.shape or ''}".rstrip()
         check_size(variable.unpacked, variable.stored, what)
@@ -105,13 +124,13 @@ class Mat5File:
 
 
 class _Elements:
-    """The elements of a matrix, one behind another."""
+    """Elements of a matrix, one behind another."""
 
     def __init__(self, data: memoryview, order: str) -> None:
         self._data, self.order, self._at = data, order, 0
 
     def next(self) -> tuple[int, memoryview]:
-        """Type and bytes of the next one. Raises ValueError where it does not end."""
+        """Return type and bytes of the next element. Raises ValueError for one that does not end."""
         if len(self._data) < self._at + 8:
             raise ValueError("a variable ends too early")
         kind, size = struct.unpack_from(f"{self.order}II", self._data, self._at)
@@ -124,7 +143,7 @@ class _Elements:
         return kind, self._data[first : first + size]
 
     def numbers(self, *kinds: int) -> NDArray[Any]:
-        """The next one as numbers, of one of the types that are given, or any."""
+        """Return the next element as numbers, of one of the given types, or any."""
         kind, data = self.next()
         if kind not in (kinds or _STORED):
             raise ValueError(f"expected numbers, got an element of type {kind}")
@@ -132,7 +151,7 @@ class _Elements:
 
 
 def _head(elements: _Elements) -> tuple[int, tuple[int, ...], str]:
-    """Flags, dimensions in the order of HDF5, and name of a matrix."""
+    """Return flags, dimensions in the order of HDF5, and name of a matrix."""
     flags, dims = elements.numbers(_UINT32), elements.numbers(_INT32)
     if len(flags) < 1 or len(dims) < 2 or bool((dims < 0).any()):
         raise ValueError(f"expected two dimensions or more, got {dims[:8].tolist()}")
@@ -182,3 +201,40 @@ def _numbers(elements: _Elements, kind: int, shape: tuple[int, ...]) -> NDArray[
         raise ValueError(f"expected {math.prod(shape)} numbers {shape}, got {len(stored)}")
     with np.errstate(all="ignore"):  # a damaged file may store what its class does not hold
         return np.require(stored.astype(_NUMBERS[kind], copy=False), requirements="W").reshape(shape)
+
+
+# ---------------------------------------------------------------------------------------------------------- version 7.3
+
+
+def write_mat(target: Path, variables: Mapping[str, Any], what: str = "capture file") -> None:
+    """Write arrays and structures by name, as MATLAB 7.3.
+
+    Args:
+        target: checked path.
+        variables: arrays, and mappings of arrays, in the order of HDF5, the reverse of MATLAB's.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for a full disk.
+    """
+    with replacing(target, what) as unfinished:
+        with new_hdf5(unfinished, what, userblock_size=_USER_BLOCK) as file:
+            for name, value in variables.items():
+                if isinstance(value, Mapping):
+                    group = file.create_group(name)
+                    group.attrs["MATLAB_class"] = np.bytes_("struct")
+                    for field, array in value.items():
+                        _write(group, field, np.asarray(array))
+                else:
+                    _write(file, name, np.asarray(value))
+        with unfinished.open("r+b") as raw:
+            raw.write(_HEADER.ljust(116) + bytes(8) + b"\x00\x02IM")
+
+
+def _write(group: Any, name: str, array: NDArray[Any]) -> None:
+    # MATLAB has no arrays of fewer than two dimensions.
+    array = array.reshape(*(1,) * (2 - array.ndim), *array.shape)
+    kind = _CLASSES.get(array.dtype.name, array.dtype.name)
+    dataset = group.create_dataset(name, shape=array.shape, dtype=np.uint8 if kind == "logical" else array.dtype)
+    dataset.attrs["MATLAB_class"] = np.bytes_(kind)
+    write_parts(dataset, array)
