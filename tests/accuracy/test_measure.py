@@ -6,8 +6,8 @@ import time
 import numpy as np
 import pytest
 
+from torchtransient.accuracy.cost import Estimates, Task, measure
 from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference
-from torchtransient.accuracy.measure import Estimates, Task, measure
 from torchtransient.accuracy.report import Choice
 from torchtransient.errors import ShapeError, StorageError, UnitError
 

@@ -10,8 +10,7 @@ import torch
 
 from torchtransient import losses
 from torchtransient.errors import ShapeError
-from torchtransient.reconstruction.hidden_volume import HiddenVolume
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
 
 
 def box(n=16, low=4, high=10, height=3.0):

@@ -25,8 +25,6 @@ from torchtransient.errors import (
     TorchTransientError,
     UnitError,
 )
-from torchtransient.nlos import answers, defaults, work
-from torchtransient.nlos.renderer import LASER_ORIGIN, ORIGIN, POINTS, SPOTS
 from torchtransient.rendering.renderer import TransientRenderer
 
 VARIANT = "llvm_ad_mono"
@@ -34,6 +32,9 @@ AXIS = tt.TimeAxis(1.5, 0.05, 40)
 WALL = tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7)
 HIDDEN = tt.scenes.nlos_z()
 VERTICES = "letter.vertex_positions"
+# Keys of the points of a scan in its scene.
+POINTS, SPOTS = "wall.sensor.points", "wall.sensor.laser_points"
+ORIGIN, LASER_ORIGIN = "wall.sensor.sensor_origin", "wall.sensor.laser_origin"
 POINT_TENSORS = {POINTS: "sensor_points", SPOTS: "laser_points", ORIGIN: "sensor_origin", LASER_ORIGIN: "laser_origin"}
 # A square whose normals point away from the wall.
 SQUARE = [[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.5, 0.5, 1.0], [-0.5, 0.5, 1.0]]
@@ -67,7 +68,7 @@ def physics_of(act):
 def test_bins_that_nobody_gave(parameters):
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""
     made = renderer(parameters, time_axis=None)(seed=0)
-    assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), defaults.BIN_WIDTH_OPL)
+    assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), tt.units.seconds_to_opl(16e-12))
     assert made.axis == simulated(time_axis=None).axis
     torch.testing.assert_close(made.total().detach(), made.steady.detach(), rtol=1e-2 if parameters else 1e-5, atol=0)
     phasors = renderer(frequencies=[1.0], time_axis=None)(seed=0)
@@ -197,40 +198,6 @@ def test_sensors_without_a_generator(kind):
     torch.testing.assert_close(layer(seed=0, generator=generator).transient, doubled.transient, rtol=1e-5, atol=1e-9)
 
 
-class Open(torch.nn.Module):
-    """A module that takes any settings."""
-
-    def forward(self, transient, **settings):
-        self.settings = settings
-        return transient
-
-
-class Asked(sensing.Sensor):
-    """Remembers what it was given."""
-
-    def expected(self, x):
-        self.asked = tuple(x.shape), x.device.type
-        return x
-
-
-def test_generators_go_to_who_takes_them():
-    light, generator = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(0)), torch.Generator()
-    sensor = Open()
-    assert torch.equal(answers.measured(light, scan(), sensor, generator), light)
-    assert sensor.settings == {"generator": generator}
-    assert torch.equal(answers.measured(light, scan(), Plain(), generator), 2 * light)
-
-
-def test_sensors_are_tried_where_they_are():
-    """On the device of their tensors, or on the processor where they have none."""
-    for buffers in ({}, {"weight": torch.ones(40, 1, 1, device="meta")}):
-        sensor = Asked()
-        for name, tensor in buffers.items():
-            sensor.register_buffer(name, tensor)
-        assert answers.checked_module(sensor, AXIS) is sensor
-        assert sensor.asked == ((1, 40, 1, 1), "meta" if buffers else "cpu")
-
-
 def response(axis):
     return sensing.ImpulseResponse(sensing.GaussianResponse(200e-12), axis)
 
@@ -251,8 +218,6 @@ def correlation(axis):
     ],
 )  # fmt: skip
 def test_sensors_that_do_not_fit_are_said_before_the_render(monkeypatch, sensor, error, message):
-    for kind in (work.HiddenWork, work.SceneWork):
-        monkeypatch.setattr(kind, "render", None)
     monkeypatch.setattr(TransientRenderer, "forward", None)
     with pytest.raises(error, match=message):
         simulated(sensor=sensor)

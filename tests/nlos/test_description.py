@@ -12,9 +12,8 @@ from torchtransient import scenes
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
-from torchtransient.nlos.described_shapes import SCENES
-from torchtransient.nlos.description import _SCAN as SCAN_ENTRIES
-from torchtransient.nlos.description import ENTRIES, read_description
+from torchtransient.nlos.setup_files import _SCAN_ENTRIES as SCAN_ENTRIES
+from torchtransient.nlos.setup_files import ENTRIES, SCENES, read_description
 from torchtransient.scenes.transforms import rotate, scale, translate
 from torchtransient.sensing import Device
 from torchtransient.units import SPEED_OF_LIGHT
@@ -43,7 +42,7 @@ def test_the_shortest_description():
 
 
 def test_the_example_of_the_documentation():
-    import torchtransient.nlos.description as module
+    import torchtransient.nlos.setup_files as module
 
     example = module.__doc__.split("\n\n")[1].replace("    sensor: device.yaml", "    # sensor: device.yaml")
     found = read_description(example + "\n")

@@ -73,13 +73,6 @@ def test_batches(kind):
         N.HiddenVolume.stack([parts[0], moved])
 
 
-def test_films_of_other_times_are_no_batch():
-    a, b = volume(times=torch.tensor([0.1, 0.2])), volume(times=torch.tensor([0.1, 0.3]))
-    assert a != b
-    with pytest.raises(ShapeError, match="same times"):
-        N.HiddenVolume.stack([a, b])
-
-
 @each_kind
 def test_trees_see_the_tensors(kind):
     one = volume(**KINDS[kind])

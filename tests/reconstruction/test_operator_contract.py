@@ -17,7 +17,7 @@ from support.marks import long
 from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, ShapeError, UnitError
 from torchtransient.reconstruction import (
     FK,
     LCT,
@@ -30,7 +30,7 @@ from torchtransient.reconstruction import (
     PhasorFilter,
     PlanarScan,
     VoxelGrid,
-    confocal_operator,
+    transient_operator,
 )
 
 ON_GRIDS, ANYWHERE = grid_operators.operators(), scan_operators.operators()
@@ -161,7 +161,7 @@ def test_pieces_do_not_show(name, monkeypatch):
     x, y = volume_of(operator), data_of(operator)
     whole = operator(x), operator.adjoint(y)
     for elements in (1, 400, 1 << 30):
-        monkeypatch.setattr(confocal_operator, "CPU_CHUNK", elements)
+        monkeypatch.setattr(transient_operator, "CPU_CHUNK", elements)
         for found, expected in zip((operator(x), operator.adjoint(y)), whole, strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12 * float(expected.abs().max()))
 
@@ -296,17 +296,6 @@ def test_operands_of_other_kinds_are_converted(name, kind):
         assert found.dtype in (torch.float32, torch.complex64)
 
 
-@every
-@pytest.mark.filterwarnings("ignore:Complex modules")
-def test_complex_tables_are_refused(name):
-    operator = copy.deepcopy(OPERATORS[name])
-    expected = operator.adjoint(data_of(operator))
-    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
-        operator.to(torch.complex64)
-    assert operator.dtype == torch.float64
-    torch.testing.assert_close(operator.adjoint(data_of(operator)), expected, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("name", [name for name in OPERATORS if name.startswith("inverse")])
 def test_inverses_are_operators_of_their_own(name):
     operator = copy.deepcopy(OPERATORS[name].operator)
@@ -412,17 +401,6 @@ def test_function_twins_take_a_capture_first(twin):
         })  # fmt: skip
 
 
-def test_grids_of_the_same_wall_are_told_from_others():
-    scan = grid_operators.SCAN
-    wall = PlanarScan.of_scan(scan, "test")
-    assert wall.matches(PlanarScan.of_scan(copy.deepcopy(scan), "test"))
-    assert wall.matches(PlanarScan.of(scan.sensor_points.float(), scan.sensor_normals, who="test"))
-    assert not wall.matches(PlanarScan.of(1.01 * scan.sensor_points, scan.sensor_normals, who="test"))
-    assert not wall.matches(PlanarScan.of(scan.sensor_points, -scan.sensor_normals, who="test"))
-    assert not wall.matches(PlanarScan.of(scan.sensor_points[:, 1:], scan.sensor_normals[:, 1:], who="test"))
-    assert not isinstance(wall, Scan) and "5 x 6 points" in repr(wall)
-
-
 MADE = {
     "fk": lambda scan, points, of: FK(scan["confocal"], **of),
     "fk of a grid": lambda scan, points, of: FK(PlanarScan.of(scan["confocal"].sensor_points, who="test"), **of),
@@ -459,18 +437,6 @@ def test_what_the_caller_does_to_its_points_later_does_not_matter(name):
     torch.testing.assert_close(again.adjoint(y), expected, rtol=0, atol=0)
     torch.testing.assert_close(again.points, places, rtol=0, atol=0)
     torch.testing.assert_close(operator.points, places, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("value", [{}, ["fk"], None, True, torch.tensor([1, 2]), 2.5])
-def test_choices_that_are_none(value):
-    of = {"time_axis": grid_operators.AXIS}
-    for kind in (FK, LCT, DirectionalLCT):
-        with pytest.raises(ArgumentError, match="target"):
-            kind(grid_operators.SCAN, target=value, **of)
-    with pytest.raises(ArgumentError, match="taps"):
-        FK(grid_operators.SCAN, taps=value, **of)
-    with pytest.raises(UnitError, match="passes"):
-        DiffusionDeconvolution(grid_operators.SCAN, passes=value, **of)
 
 
 @pytest.mark.parametrize("kind", [LCT, DirectionalLCT, DiffusionDeconvolution])

@@ -11,7 +11,7 @@ from scipy import integrate
 from support.marks import long
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.testing import closed_forms as cf
-from torchtransient.testing import flight_lengths as fl
+from torchtransient.testing import closed_forms as fl
 
 
 def masses(law, edges, count, start=0.0):

@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import of_class
-from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
-from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import black_message, checked_module, is_readable, measured
-from torchtransient.nlos.arguments import check_seeds, check_sensor, keys_and_values
-from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
-from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
-from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
+from torchtransient.checks import as_whole, of_class, shown
+from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError, TorchTransientError
+from torchtransient.nlos.scene import (
+    DEFAULT_BIN_WIDTH_OPL,
+    DEFAULT_BOUNCES,
+    DEFAULT_ENERGY,
+    SENSOR,
+    WALL,
+    capture_scene,
+    film_size,
+    hidden_bounds,
+    laser_size,
+)
+from torchtransient.nlos.scene_scan import check_scan_is_seen, reaches_before, tolerance_of
 from torchtransient.rendering.arguments import checked_samples
+from torchtransient.rendering.job import SEED_RANGE, draw_seed
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import BuildOptions
@@ -26,7 +38,200 @@ from torchtransient.scene.load import Scene, load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.variant import active_variant
-from torchtransient.sensing import Device
+from torchtransient.sensing import Compose, Device, GradPolicy, Sensor
+from torchtransient.sensing.chain.compose import check_axis
+
+
+def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy = "expected") -> nn.Module:
+    """A sensor as the module that takes transients on ``axis``; ``grad``: what becomes of a device's noise. Raises
+    UnitError for one that was made for another axis, SceneError for one whose answer has other bins.
+    """
+    module = sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
+    check_axis(module, axis)
+    if isinstance(module, Sensor | Compose):
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            given = next((tensor for tensor in (*module.parameters(), *module.buffers())), None)
+            dark = torch.zeros(1, axis.num_bins, 1, 1, device=None if given is None else given.device)
+            bins = module(dark).shape[-3]
+        if bins != axis.num_bins:
+            raise SceneError(
+                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of "
+                f"{sensor!r}. Apply a sensor with bins of its own to capture.transient."
+            )
+    return module
+
+
+def is_readable(tensor: torch.Tensor) -> bool:
+    """False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that)."""
+    try:
+        bool(tensor.any())
+    except RuntimeError:
+        return False
+    return True
+
+
+def black_message(who: str, within: str = "") -> str:
+    """What is said of a capture without light. ``within``: where there is none, of what is known of a part alone."""
+    return (
+        f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
+        "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
+        "'twosided' bsdf. Black albedos, energy 0, things behind the wall and bounces= that no light takes give none "
+        "either."
+    )
+
+
+def say_black(who: str, capture: Capture) -> None:
+    """Warn of a capture without light."""
+    found = (capture.steady, capture.transient, capture.phasor)
+    light = next(tensor for tensor in found if tensor is not None)
+    if not bool(light.any()):
+        within = " within the bins" if light is capture.transient else ""
+        warnings.warn(black_message(who, within), PhysicsWarning, stacklevel=3)
+
+
+def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
+    """What ``sensor`` makes of (..., T, [Lh, Lw,] H, W): each pair is a pixel of its own."""
+    if scan.kind == "exhaustive":
+        (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)
+        flat = transient.reshape(*transient.shape[:-4], laser_rows * laser_columns, rows * columns)
+        seen = _answer(sensor, flat, generator)
+        return seen.reshape(*seen.shape[:-2], *transient.shape[-4:])
+    result: torch.Tensor = _answer(sensor, transient, generator)
+    return result
+
+
+def _answer(sensor: nn.Module, transient: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
+    """Of a module of ``tt.sensing``, or of any other, which may know nothing of generators."""
+    known = inspect.signature(sensor.forward).parameters.values()
+    if any(one.name == "generator" or one.kind is one.VAR_KEYWORD for one in known):
+        answer: torch.Tensor = sensor(transient, generator=generator)
+    else:
+        answer = sensor(transient)
+    return answer
+
+
+def checked_seed(who: str, value: Any) -> int:
+    """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises ArgumentError."""
+    number = as_whole(value)
+    if number is None or not 0 <= number < SEED_RANGE:
+        raise ArgumentError(
+            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
+            "modulo 2^32, and be the same as one of these."
+        )
+    return number
+
+
+def check_seeds(who: str, value: Any) -> None:
+    """Likewise for what a layer takes: None, one seed, one for each entry of a batch, or what ``vmap`` has given to its
+    entries, of which nothing can be said here.
+    """
+    if value is None:
+        return
+    if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 1:
+        for one in value:
+            check_seeds(who, one)
+        return
+    _, of_each_entry = draw_seed(value)
+    if of_each_entry is None:
+        checked_seed(who, value)
+
+
+def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
+    """Raise ArgumentError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
+    if not isinstance(sensor, nn.Module | Device | None):
+        raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
+    if not isinstance(generator, torch.Generator | None):
+        raise ArgumentError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
+
+
+def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
+    """Parameters by key, of a mapping or a list of keys. Raises SceneError for what is neither."""
+    listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
+    keys = list(given) if listed else [given]
+    if not listed or not all(isinstance(key, str) for key in keys):
+        raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
+    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
+
+
+# What findings are about.
+SENSOR_RAYS, LASER_RAYS, HIDDEN = "sensor of a scan", "laser of a scan", "hidden things of a scan"
+
+
+@dataclass(frozen=True, eq=False)
+class ScanWatch:
+    """Says what is wrong with a scene of a capture as it is, in one pass of rays to scan points and laser spots.
+
+    ``tolerance``: in metres, how far from its point a ray may end. ``normals``: those of the wall at the scan points
+    (N, 3), None where they may change. It is asked in every render, so it does not look up which shapes are met: every
+    end in the wrong place counts.
+    """
+
+    tolerance: float
+    normals: NDArray[np.float64] | None
+
+    def __call__(self, scene: Any, number: int) -> dict[str, str]:
+        """Findings about sensor ``number`` of a scene that holds the values of a call, by what they are about."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from torchtransient.interfaces import CaptureType
+        from torchtransient.plugins.around_corner.scan_table import aims_of, origin_of, scanned_points
+
+        sensor, capture = scene.sensors()[number], scene.integrator().capture
+        with dr.suspend_grad():
+            points, origin = scanned_points(scene, sensor), mi.Point3f(sensor.origin)
+            laser = origin_of(scene, sensor)
+            rays = {"sensor": _rays(origin, points - origin)}
+            if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
+                rays["laser"] = _rays(laser, aims_of(scene, sensor, capture, None))
+            tolerance = dr.opaque(mi.Float, self.tolerance)
+            off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])
+            dr.eval(points, normals, off)
+        found = {}
+        for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
+            if wrong.any():
+                found[SENSOR_RAYS if who == "sensor" else LASER_RAYS] = (
+                    f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
+                    f"values of a call: something stands between the wall and {who}_origin, or points and wall have "
+                    "parted. What the rays meet is what is rendered there."
+                )
+        wall = sensor.get_shape()
+        hidden = [shape for shape in scene.shapes() if shape.ptr != wall.ptr]
+        upright = self.normals if self.normals is not None else np.array(normals).T
+        if not reaches_before(hidden, np.array(points).T, upright):
+            found[HIDDEN] = (
+                "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and "
+                "has no gradient that would bring it back."
+            )
+        return found
+
+
+def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
+    """Rays (Ray3f) along ways, and their lengths."""
+    import drjit as dr
+    import mitsuba as mi
+
+    length = dr.norm(way)
+    return mi.Ray3f(origin, way / length), length
+
+
+def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
+    """Which rays meet something before their length, or nothing there (Bool); NaN is elsewhere, too."""
+    import drjit as dr
+
+    met = scene.ray_intersect_preliminary(ray, coherent=True)
+    return ~(dr.abs(met.t - length) <= tolerance)
+
+
+def _normals(scene: Any, ray: Any) -> Any:
+    """Normals where rays end, on the side that they come from."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(ray, +mi.RayFlags.Minimal, coherent=True)
+    return dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
@@ -72,8 +277,8 @@ class CaptureRenderer(nn.Module):
         scan: Scan,
         parameters: Sequence[str] | Mapping[str, Any] = (),
         *,
-        bounces: Sequence[int] | str = defaults.BOUNCES,
-        energy: Any = defaults.ENERGY,
+        bounces: Sequence[int] | str = DEFAULT_BOUNCES,
+        energy: Any = DEFAULT_ENERGY,
         sensor: nn.Module | Device | None = None,
         variant: str | None = None,
         **settings: Any,
@@ -88,7 +293,7 @@ class CaptureRenderer(nn.Module):
         scene = load(capture_scene(hidden, scan, bounces=bounces, energy=energy), variant=variant)
         if not _WHAT_IS_MEASURED & {name for name, value in settings.items() if value is not None}:
             bounds = hidden_bounds(hidden, scene.variant)
-            settings["time_axis"] = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
+            settings["time_axis"] = scan.default_axis(bounds, DEFAULT_BIN_WIDTH_OPL)
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
         _check_once(wanted, followed)

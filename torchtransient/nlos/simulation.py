@@ -11,9 +11,10 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +25,155 @@ from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers, count, of_class
-from torchtransient.errors import ArgumentError
-from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import checked_module, measured, say_black
-from torchtransient.nlos.arguments import check_sensor, checked_seed
-from torchtransient.nlos.forecast import Forecast, forecast_of
-from torchtransient.nlos.part_file import PartFile
-from torchtransient.nlos.point_rows import RowLayout, Rows
-from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
-from torchtransient.nlos.scene import capture_scene, hidden_bounds
-from torchtransient.nlos.variant_choice import choose_variant
-from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
+from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
+from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
+from torchtransient.nlos.renderer import (
+    check_sensor,
+    checked_module,
+    checked_seed,
+    in_film_shape,
+    in_scan_shape,
+    light_of,
+    measured,
+    say_black,
+)
+from torchtransient.nlos.scene import (
+    DEFAULT_BIN_WIDTH_OPL,
+    DEFAULT_BOUNCES,
+    DEFAULT_ENERGY,
+    DEFAULT_SEED,
+    DEFAULT_SPP,
+    capture_scene,
+    hidden_bounds,
+)
+from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, choose_variant, seed_of
 from torchtransient.rendering.arguments import checked_samples
+from torchtransient.rendering.memory import available_bytes
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
+
+# Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
+# all laser spots anew: 16 of them take three times as long as one, 4 a quarter more (256 x 256 pairs).
+PARTS, EXHAUSTIVE_PARTS = 16, 4
+# Shares of the samples that the time is estimated by, and the fewest that tell something.
+FEW, SOME, LEAST = 512, 128, 16
+_NUMBER_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """``scan`` in words, ``shape`` of the measured tensor, ``bytes`` that it takes, ``seconds`` (None: not estimated),
+    ``spp``, ``parts`` that it is rendered in, ``variant`` and why, ``light``: how which light is found. Printing it
+    gives a few lines.
+    """
+
+    scan: str
+    shape: tuple[int, ...]
+    bytes: int
+    seconds: float | None
+    spp: int
+    parts: int
+    variant: str
+    light: str
+
+    def __str__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        parts = f", in {self.parts} parts" if self.parts > 1 else ""
+        taken = "" if self.seconds is None else f", about {duration_in_words(self.seconds)}"
+        lines = [
+            self.scan,
+            f"{shape}: {size_in_words(self.bytes)}{taken}, {self.spp} samples a point{parts}",
+            f"variant: {self.variant}",
+            f"light: {self.light}",
+        ]
+        return "\n".join(lines)
+
+
+def forecast_of(work: Work, *, timed: bool) -> Forecast:
+    """Of what is about to start. ``timed``: with the time, from a small share of the samples.
+
+    Raises StorageError for a capture that does not fit into memory.
+    """
+    shape = _measured_shape(work)
+    taken = math.prod(shape) * _NUMBER_BYTES * (1 if work.film.frequencies is None else 2)
+    _check_fits(taken, shape, work)
+    with active_variant(work.variant.name):
+        light = light_of(work.renderer(0))
+        seconds = _seconds(work) if timed else None
+    return Forecast(
+        scan=repr(work.scan), shape=shape, bytes=taken, seconds=seconds, spp=work.film.spp, parts=work.count,
+        variant=f"{work.variant.name}, {work.variant.why}", light=light,
+    )  # fmt: skip
+
+
+def _measured_shape(work: Work) -> tuple[int, ...]:
+    """That of the measured tensor."""
+    renderer = work.renderer(0)
+    stokes = (4,) if renderer.scene.variant.endswith("_polarized") else ()
+    cube = renderer._cube_shape
+    times, channels = cube[-2:]
+    channels = channels // 2 if renderer.frequencies is not None else channels
+    # The components of polarization are channels of the film.
+    channels = channels // 4 if stokes else channels
+    return (*stokes, channels, times, *work.scan.shape)
+
+
+def _seconds(work: Work) -> float:
+    """Of all parts, from runs of the first with few samples: what starts it, and what a sample costs."""
+    # Of few samples in all, those of a part: a render that has next to nothing to do says nothing of others.
+    of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
+    few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
+    few, some = (few, some) if some > few else (of_part, of_part)
+    times = {}
+    told = work.renderer(0).scene.warned
+    before = set(told)
+    with torch.no_grad(), warnings.catch_warnings():
+        # What few samples see of a window is no warning yet.
+        warnings.simplefilter("ignore", PhysicsWarning)
+        for spp in (few, some, few, some) if some > few else (few, few):  # compiled, then timed
+            began = time.perf_counter()
+            work.render(0, 0, spp=spp)
+            times[spp] = time.perf_counter() - began
+    told &= before
+    slope = max(0.0, (times[some] - times[few]) / (some - few)) if some > few else 0.0
+    of_one = times[some] + slope * (of_part - some)
+    if work.sums:
+        return work.count * of_one
+    return of_one / _share(work)
+
+
+def _share(work: Work) -> float:
+    """The sensor points of the first part, of all."""
+    return work.run(0)[1] / math.prod(work.scan.sensor_shape)
+
+
+def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
+    # The whole on the host, and what is being rendered: a part of it, or as much again.
+    share = _share(work) if work.count > 1 else 0.0
+    available = available_bytes("llvm")
+    if available is not None and taken * (1 + share) > available:
+        numbers = " x ".join(map(str, shape))
+        raise StorageError(
+            f"simulate: the capture would take {size_in_words(int(taken * (1 + share)))} ({numbers} numbers), and "
+            f"{size_in_words(available)} are available. Use fewer bins, sensor points or laser spots, or simulate "
+            "parts of the scan (Scan.single, Scan.points)."
+        )
+
+
+def size_in_words(count: int) -> str:
+    """Bytes in words."""
+    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
+        if count >= scale:
+            return f"{count / scale:.4g} {unit}"
+    return f"{count / 2**10:.4g} KiB"
+
+
+def duration_in_words(seconds: float) -> str:
+    """Seconds in words."""
+    if seconds < 100:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def simulate(
@@ -51,7 +186,7 @@ def simulate(
     bounces: Sequence[int] | str | None = None,
     energy: Any = None,
     sensor: torch.nn.Module | Device | None = None,
-    seed: int = defaults.SEED,
+    seed: int = DEFAULT_SEED,
     variant: str | None = None,
     part: str | Path | None = None,
     tiles: int | None = None,
@@ -120,7 +255,7 @@ def forecast(
     """What :func:`simulate` would take with the same arguments: memory, time, variant, how light is found. Errors as
     there.
     """
-    checked_seed("forecast", settings.get("seed", defaults.SEED))
+    checked_seed("forecast", settings.get("seed", DEFAULT_SEED))
     time_axis, frequencies, spp, *of_light = (
         settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")
     )
@@ -155,15 +290,15 @@ def _work(
         )
     bounces, energy = of_light
     settings: dict[str, Any] = {
-        "bounces": defaults.BOUNCES if bounces is None else bounces,
-        "energy": defaults.ENERGY if energy is None else energy,
+        "bounces": DEFAULT_BOUNCES if bounces is None else bounces,
+        "energy": DEFAULT_ENERGY if energy is None else energy,
     }
     chosen = choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
-        time_axis = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
-    film = Film(time_axis, frequencies, defaults.SPP if spp is None else spp)
+        time_axis = scan.default_axis(bounds, DEFAULT_BIN_WIDTH_OPL)
+    film = Film(time_axis, frequencies, DEFAULT_SPP if spp is None else spp)
     return HiddenWork(hidden, scan, settings, film, chosen, parts)
 
 
@@ -207,7 +342,7 @@ def _part_path(part: Any) -> Path | None:
 
 def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
     if tiles is None:
-        many = defaults.EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else defaults.PARTS
+        many = EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else PARTS
         return 1 if part is None else many
     return count("simulate: tiles", tiles, 1, ArgumentError)
 

@@ -1,10 +1,11 @@
-"""What a simulation has to render, as a whole or in parts: a scan of hidden things, or a complete scene."""
+"""Renders of a simulation, whole or in parts: a scan of hidden things, or a complete scene."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
@@ -12,15 +13,70 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers
-from torchtransient.files.content_key import content_key
+from torchtransient.errors import SceneError
+from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.nlos.renderer import POINTS, SPOTS, CaptureRenderer, as_capture, check_scan
 from torchtransient.nlos.scene import capture_scene
-from torchtransient.nlos.scene_files import files_of
 from torchtransient.nlos.scene_scan import scan_of_scene
-from torchtransient.nlos.variant_choice import VariantChoice
 from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import Scene, load
-from torchtransient.scene.variant import active_variant
+from torchtransient.scene.objects import LoadedScene
+from torchtransient.scene.plan import text_of
+from torchtransient.scene.variant import active_variant, is_differentiable, resolve_variant
+
+
+@dataclass(frozen=True)
+class VariantChoice:
+    """``name``: of the variant; ``why`` it was chosen."""
+
+    name: str
+    why: str
+
+
+def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
+    """``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is
+    grey, on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
+
+    Raises VariantError for a variant that cannot be used, SceneError for a scene that cannot be read.
+    """
+    import mitsuba as mi
+
+    if requested is not None:
+        return VariantChoice(resolve_variant(requested), "as asked for")
+    active, name = mi.variant(), resolve_variant(None)
+    if name.endswith("_polarized"):
+        return VariantChoice(name, "the active one, which is polarized")
+    # In the variant that is active, or becomes so: a switch takes time.
+    found = scene_inventory(load(scene, variant=name if is_differentiable(active) else f"{name.split('_')[0]}_ad_mono"))
+    coloured = [*found.colours, *found.measured, *found.bands]
+    if not coloured:
+        device = name.split("_")[0]
+        return VariantChoice(f"{device}_ad_mono", "every spectrum is grey, so that one channel carries all of it")
+    # One channel may have been chosen for the scene before.
+    return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {text_of(coloured)}")
+
+
+def files_of(scene: Scene) -> dict[str, str]:
+    """What is in the files that a scene names anywhere, by the name that it has there: included files, defaults and
+    values of ``$parameters`` count. Raises SceneError for a description that Mitsuba cannot read.
+    """
+    import mitsuba as mi
+
+    description, found = scene._description, {}
+    description.check_described("tt.nlos: a simulation that is kept in files")
+    assert not isinstance(description, LoadedScene)  # refused above
+    with active_variant(scene.variant), description.resolved_files():
+        try:
+            nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes
+        except RuntimeError as error:
+            raise SceneError(f"{description.name}: {error}") from error
+        for props in (node.props for node in nodes):
+            for name in list(props):
+                if props.type(name) == mi.Properties.Type.String:
+                    value = str(props[name])
+                    found[value] = contents_of(Path(str(mi.file_resolver().resolve(value))))
+    return {name: contents for name, contents in found.items() if contents}
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,10 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import as_whole, finite, positive, shown
 from torchtransient.errors import UnitError
-from torchtransient.reconstruction.capture_checks import SNR, within
-from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.capture_checks import SNR, check_thickness, within
 from torchtransient.reconstruction.linear import each
-from torchtransient.reconstruction.planar_scan import PlanarScan
-from torchtransient.reconstruction.proportions import check_thickness
+from torchtransient.reconstruction.transient_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.volume_methods import SLAB_SNR
 
 IMAGES = 20

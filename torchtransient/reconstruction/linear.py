@@ -1,21 +1,25 @@
 """Linear maps between hidden volumes and captures, with exact adjoints and derivatives that save nothing.
 
-A map is two plain functions that run without autograd, a piece at a time. What torch differentiates is one node: its
-backward pass is the adjoint, that of the adjoint the map again, and forward mode the map of the tangent. No tensor is
-kept for it, so that memory does not grow with what lies between.
+A map is two plain functions that run without autograd, a piece at a time. Torch differentiates one node: its backward
+pass is the adjoint, the backward pass of the adjoint is the map again, and forward mode is the map of the tangent. No
+tensor is kept for it, so that memory does not grow with the steps inside. States of operators are their settings, which
+are compared when they are loaded.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields, is_dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, GradientError, ShapeError, StorageError, UnitError
 
 PRECISIONS = (torch.float32, torch.float64)
 
@@ -178,3 +182,67 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
 
 def _words(shape: tuple[int, ...]) -> str:
     return ", ".join(map(str, shape))
+
+
+# Shares by which numbers may differ: those of another machine, or that a file rounds to single precision.
+SLACK = 1e-6
+# Sums of a tensor that tell it from others.
+SUMS = 4
+
+
+def packed(described: dict[str, Any]) -> Tensor:
+    """Plain data as JSON in bytes (N,), uint8 on the CPU: files that hold tensors alone take it too."""
+    return torch.tensor(list(json.dumps(described).encode()), dtype=torch.uint8, device="cpu")
+
+
+def unpacked(state: Any, who: str) -> Any:
+    """The plain data of :func:`packed`. Raises StorageError."""
+    try:
+        return json.loads(bytes(state.cpu().tolist()).decode())
+    except (AttributeError, TypeError, ValueError) as error:
+        raise StorageError(f"{who}: expected the state of an operator, as state_dict() gives it: {error}.") from None
+
+
+def plain(value: Any) -> Any:
+    """A setting as plain data: records by their fields, tensors by their shape, size and some sums."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Tensor):
+        flat = value.detach().to("cpu", torch.float64).reshape(-1)
+        k = torch.arange(1, SUMS + 1, dtype=torch.float64, device="cpu")[:, None]
+        places = torch.arange(1, len(flat) + 1, dtype=torch.float64, device="cpu")
+        size = float(flat.abs().max()) if len(flat) else 0.0
+        return {"shape": list(value.shape), "size": size, "sums": (torch.cos(k * places) @ flat).tolist()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    record = {"type": type(value).__name__}
+    if is_dataclass(value):
+        record |= {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    return record
+
+
+def check_same(mine: Any, theirs: Any, who: str, what: str = "settings") -> None:
+    """Raises ShapeError where the state that is loaded is that of another operator, ``what`` says in which respect."""
+    if isinstance(mine, dict) and isinstance(theirs, dict) and mine.keys() == theirs.keys():
+        if "sums" in mine and mine["shape"] == theirs["shape"]:
+            slack = SLACK * max(mine["size"], theirs["size"]) * math.sqrt(max(1, math.prod(mine["shape"])))
+            if all(abs(a - b) <= slack for a, b in zip(mine["sums"], theirs["sums"], strict=True)):
+                return
+            raise ShapeError(_difference(who, what, "the same values", "others"))
+        for key in mine:
+            check_same(mine[key], theirs[key], who, key if what == "settings" else f"{what}.{key}")
+        return
+    if isinstance(mine, list) and isinstance(theirs, list) and len(mine) == len(theirs):
+        for a, b in zip(mine, theirs, strict=True):
+            check_same(a, b, who, what)
+        return
+    numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (mine, theirs))
+    if not (math.isclose(mine, theirs, rel_tol=SLACK, abs_tol=1e-3 * SLACK) if numbers else mine == theirs):
+        raise ShapeError(_difference(who, what, mine, theirs))
+
+
+def _difference(who: str, what: str, mine: Any, theirs: Any) -> str:
+    return (
+        f"{who}: expected the state of an operator like this one, with {what} {mine!r}, got one with {theirs!r}. Make "
+        "the operator as the one that was saved."
+    )

@@ -5,23 +5,113 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import finite, shown, with_article
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
-from torchtransient.reconstruction.capture_checks import check_falloff, refuse_pairs
+from torchtransient.checks import finite, real_array, shown, with_article
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.reconstruction.capture_checks import check_falloff, check_wavelength, refuse_pairs
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
-from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
-from torchtransient.reconstruction.plane_waves import phase_pairs, waves
-from torchtransient.reconstruction.proportions import check_wavelength
-from torchtransient.reconstruction.scan_operator import ScanOperator
-from torchtransient.reconstruction.transient_operator import reconstructed
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.reconstruction.transient_operator import ScanOperator, reconstructed
+from torchtransient.reconstruction.voxels import OFF_GRID, PlanarScan, VoxelGrid
+
+
+@dataclass(frozen=True)
+class DirectLight:
+    """The image of light that met one voxel and nothing else: laser and sensor are focused on the voxel itself, and the
+    picture is taken at the moment of focus. Volumes are (..., Z, Y, X).
+    """
+
+    @property
+    def times(self) -> None:
+        """No video."""
+        return None
+
+    @property
+    def focuses_laser(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class ConfocalCamera:
+    """A video of voxels that laser and sensor are both focused on, ``times`` (N,) metres of optical path after the
+    focus: at zero it is :class:`DirectLight`, later what else of the light came back. Volumes are (..., N, Z, Y, X).
+    """
+
+    times: Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", _times(self.times, "ConfocalCamera"))
+
+    @property
+    def focuses_laser(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class TransientCamera:
+    """A video of the pulse that leaves the laser's spot and passes through the hidden scene: ``times`` (N,) are lengths
+    of optical path from the spot, so that a voxel lights up at its distance from it. Volumes are (..., N, Z, Y, X).
+    Needs a scan with one spot.
+    """
+
+    times: Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", _times(self.times, "TransientCamera"))
+
+    @property
+    def focuses_laser(self) -> bool:
+        return False
+
+
+Camera = DirectLight | ConfocalCamera | TransientCamera
+
+
+def _times(values: Any, who: str) -> Tensor:
+    plain = real_array(values)
+    if plain is None or plain.ndim != 1 or len(plain) == 0:
+        raise ShapeError(f"{who}: expected times (N,) in metres of optical path, got {shown(values)}.")
+    times = torch.from_numpy(plain)
+    if not bool(torch.isfinite(times).all()):
+        raise UnitError(f"{who}: expected finite times, got {shown(plain.tolist())}.")
+    return times
+
+
+def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype, nearest: float = 0.0) -> Tensor:
+    """``exp(2 pi i f r) / r^falloff``, (F, ...), of ``distances`` r (...) in metres and evenly spaced ``frequencies``
+    (F,) in cycles per metre, both float64; ``dtype``: a complex one. Distances below ``nearest`` fall off as it does.
+
+    Phases are those of double precision: single precision has none left for r of many wavelengths. A sine of each
+    frequency would be most of the work of a plane, so waves follow from each other by products, which lose F ulp.
+    """
+    count = len(frequencies)
+    wave = _turned(distances * frequencies[0])
+    if falloff:
+        wave = wave * distances.clamp_min(nearest).pow(-falloff)
+    out = torch.empty(count, *distances.shape, dtype=dtype, device=distances.device)
+    out[0] = wave
+    if count > 1:
+        step = _turned(distances * ((frequencies[-1] - frequencies[0]) / (count - 1)))
+        for k in range(1, count):
+            wave = wave.mul_(step)
+            out[k] = wave
+    return out
+
+
+def _turned(turns: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(turns), (turns - turns.round()) * (2 * math.pi))
+
+
+def phase_pairs(turns: Tensor) -> Tensor:
+    """(..., 2): real and imaginary part of ``exp(2 pi i turns)``, float64."""
+    return torch.view_as_real(_turned(turns))
+
 
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25

@@ -1,20 +1,133 @@
-"""Regular grids of hidden points: where the voxels of a reconstructed volume stand."""
+"""Grids and what stands on them: points of a flat wall, voxels before it, hidden volumes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
+from torchtransient.capture.arithmetic import summed
+from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import bounds_of
 from torchtransient.checks import Numbers, count, of_class, positive, real_array, shown
-from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.tensor_record import TensorRecord
+
+# Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
+OFF_GRID = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlanarScan:
+    """``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
+    ``first``; ``normal`` points to the hidden side. Vectors are (3,) float64 on the CPU.
+    """
+
+    size: tuple[int, int]
+    pitch: tuple[float, float]
+    first: Tensor
+    _: KW_ONLY
+    along_x: Tensor
+    along_y: Tensor
+    normal: Tensor
+
+    @staticmethod
+    def of(points: Tensor, normals: Tensor | None = None, *, who: str, what: str = "sensor points") -> PlanarScan:
+        """Of points (Y, X, 3), two along each side at least. ``normals`` (Y, X, 3): of the wall, which say where the
+        hidden side is; without them it is that of ``along_x`` times ``along_y``. Raises ShapeError for a list of
+        points, and for grids that are not regular, not at right angles, or not flat: ``who`` cannot take them.
+        """
+        check_real(points, f"{who}: {what}")
+        p = points.detach().to("cpu", torch.float64, copy=True)
+        if p.ndim != 3 or p.shape[-1] != 3 or min(p.shape[:2]) < 2:
+            raise ShapeError(f"{who}: expected {what} as a grid (Y, X, 3) of 2 x 2 at least, got {tuple(p.shape)}.")
+        rows, columns = p.shape[:2]
+        x, y = (p[0, -1] - p[0, 0]) / (columns - 1), (p[-1, 0] - p[0, 0]) / (rows - 1)
+        dx, dy = float(x.norm()), float(y.norm())
+        i, k = (torch.arange(n, dtype=torch.float64, device="cpu")[:, None] for n in (columns, rows))
+        expected = p[0, 0] + (k * y)[:, None] + (i * x)[None]
+        slack = OFF_GRID * min(dx, dy)
+        off = float((p - expected).norm(dim=-1).max())
+        if not (slack > 0 and off <= slack and abs(float(x @ y)) <= OFF_GRID * dx * dy):
+            raise ShapeError(
+                f"{who}: expected {what} on a regular, rectangular grid of a flat wall, got some {off:.3g} m off it "
+                f"(pitch {dy:.3g} x {dx:.3g} m, angle {_angle(x, y)}). Use Backprojection, which takes any points."
+            )
+        along_x = x / dx
+        # At right angles to rounding, where the points are to a share of their pitch.
+        along_y = y - (y @ along_x) * along_x
+        along_y = along_y / along_y.norm()
+        normal = torch.linalg.cross(along_x, along_y)
+        if normals is not None:
+            normal = _with_normals(normal, normals)
+        return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x=along_x, along_y=along_y, normal=normal)
+
+    @staticmethod
+    def of_scan(scan: Scan, who: str) -> PlanarScan:
+        """The sensor points of a scan, and its :func:`hidden_side`. Raises ShapeError."""
+        of_class(f"{who}: scan", scan, Scan, error=ShapeError)
+        wall = PlanarScan.of(scan.sensor_points, who=who)
+        return replace(wall, normal=hidden_side(scan, wall.normal))
+
+    @property
+    def points(self) -> Tensor:
+        """(Y, X, 3) float64 on the CPU: its points in world coordinates, metres."""
+        rows, columns = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
+        wall = self.first + (rows[:, None, None] * self.pitch[0]) * self.along_y
+        return wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
+
+    def matches(self, other: PlanarScan) -> bool:
+        """Whether it is the same grid with the same hidden side, to what points of a grid may be off it."""
+        if self.size != other.size or float(self.normal @ other.normal) <= 0:
+            return False
+        off = float((self.points - other.points).norm(dim=-1).max())
+        return off <= OFF_GRID * min(*self.pitch, *other.pitch)
+
+    def __repr__(self) -> str:
+        (rows, columns), (dy, dx) = self.size, self.pitch
+        return f"PlanarScan({columns} x {rows} points, {dx:.4g} x {dy:.4g} m apart)"
+
+    def local(self, points: Tensor) -> Tensor:
+        """Coordinates (..., 3) along x, y and the normal, from the first point, metres, float64."""
+        off = points.detach().to("cpu", torch.float64) - self.first
+        return torch.stack([off @ self.along_x, off @ self.along_y, off @ self.normal], -1)
+
+
+def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
+    """``normal`` (3,) of a scan's wall or its opposite, whichever points to the hidden side: that of the scan's
+    normals; without them, that on which its sensor and its laser stand. Where they stand in the wall or on both sides
+    of it nothing says which it is: ``normal`` as given.
+    """
+    if scan.sensor_normals is not None:
+        return _with_normals(normal, scan.sensor_normals)
+    points = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
+    middle, extent = points.mean(0), float((points.amax(0) - points.amin(0)).norm())
+    origins = (origin.detach().to("cpu", torch.float64) for origin in (scan.sensor_origin, scan.laser_origin))
+    heights = [float((origin - middle) @ normal) for origin in origins]
+    return -normal if max(heights) < -1e-6 * extent else normal
+
+
+def check_real(points: Tensor, what: str) -> None:
+    """Raises ShapeError for complex tensors and truth values, which a conversion would make real numbers of."""
+    if points.is_complex() or points.dtype == torch.bool:
+        raise ShapeError(f"{what}: expected real numbers, got {points.dtype}.")
+
+
+def _with_normals(normal: Tensor, normals: Tensor) -> Tensor:
+    mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+    return normal if float(mean @ normal) >= 0 else -normal
+
+
+def _angle(x: Tensor, y: Tensor) -> str:
+    cos = float(x @ y) / max(float(x.norm() * y.norm()), 1e-300)
+    return f"{math.degrees(math.acos(max(-1.0, min(1.0, cos)))):.2f} degrees"
+
 
 # How far points are off one line at most, as a share of its length.
 ON_ONE_LINE = 1e-6
@@ -248,3 +361,94 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     along_y = y / y.norm()
     normal = torch.linalg.cross(along_x, along_y)
     return along_x, along_y, hidden_side(scan, normal)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HiddenVolume(TensorRecord):
+    """What a method found behind a corner.
+
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
+    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
+    data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
+
+    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
+    values and directions; grid and times stay on the CPU, and are the same in a batch. Raises ShapeError where tensors
+    and grid do not fit, UnitError for times that are not finite, StorageError for metadata that is not plain.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    values: Tensor
+    grid: VoxelGrid
+    method: str
+    _: KW_ONLY
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    times: Tensor | None = None
+    directions: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check_volume(self)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Values and directions."""
+        return {name: tensor for name, tensor in super().tensors().items() if name != "times"}
+
+    def _settings(self) -> dict[str, Any]:
+        # One by one: torch 2.6 makes no list inside of `torch.func.grad`.
+        times = None if self.times is None else tuple(time.item() for time in self.times.unbind())
+        return {**super()._settings(), "times": times}
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[HiddenVolume]) -> dict[str, Any]:
+        return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
+
+    def _shown(self) -> dict[str, str]:
+        frames = {} if self.times is None else {"times": f"{len(self.times)} of them"}
+        return {**{name: text for name, text in super()._shown().items() if name != "times"}, **frames}
+
+    def picture(self) -> Tensor:
+        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
+        per_item = 4 if self.times is None else 5
+        values = self.values.detach()
+        while values.ndim > per_item:
+            values = values[0]
+        together = summed(values, 0)
+        return together if self.times is None else together.amax(0)
+
+
+def _check_volume(volume: HiddenVolume) -> None:
+    """Raise ShapeError unless values, times and directions are real and fit the grid and each other."""
+    if not isinstance(volume.grid, VoxelGrid):
+        raise ArgumentError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(volume.grid)}.")
+    frames = () if volume.times is None else _frames(volume.times)
+    _check_values("values", volume.values, (*frames, *volume.grid.shape))
+    if volume.directions is not None:
+        _check_values("directions", volume.directions, (3, *volume.grid.shape))
+        items = tuple(volume.values.shape[: -3 - len(frames)])
+        if tuple(volume.directions.shape[:-4]) != items:
+            sizes = ", ".join(map(str, (*items, 3, *volume.grid.shape)))
+            raise ShapeError(
+                f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
+                f"{tuple(volume.directions.shape)}."
+            )
+    if not isinstance(volume.method, str) or "\0" in volume.method:
+        raise ArgumentError(f"HiddenVolume: expected method as a name, got {shown(volume.method)}.")
+    metadata_text(volume.metadata, "HiddenVolume")
+
+
+def _frames(times: Any) -> tuple[int]:
+    if not isinstance(times, Tensor) or times.ndim != 1 or times.is_complex():
+        got = f"{tuple(times.shape)} {times.dtype}" if isinstance(times, Tensor) else shown(times)
+        raise ShapeError(f"HiddenVolume: expected times as a tensor (N,) of real numbers, got {got}.")
+    if not bool(torch.isfinite(times).all()):
+        raise UnitError("HiddenVolume: expected finite times in metres of optical path, got some that are not.")
+    return (len(times),)
+
+
+def _check_values(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+    fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
+    if not fits or tensor.is_complex() or tensor.dtype == torch.bool or tensor.numel() == 0:
+        got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
+        sizes = ", ".join(map(str, shape))
+        raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import pickle
+import random
 import warnings
 import zipfile
+from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
@@ -13,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import nn
@@ -28,9 +31,190 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
-from torchtransient.training.optimizer_states import check_optimizer, kind_of, put_back_optimizer
-from torchtransient.training.plain_state import plain
-from torchtransient.training.random_states import check_random_state, random_state, set_random_state
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, torch.Size, torch.dtype, torch.device)
+
+# Kinds of numbers that torch has, in any order of their bytes.
+_ARRAYS = [np.dtype(kind) for kind in ("?", "i1", "u1")]
+_ARRAYS += [np.dtype(order + kind + size) for order in "<>" for kind in "iu" for size in "248"]
+_ARRAYS += [np.dtype(order + kind) for order in "<>" for kind in ("f2", "f4", "f8", "c8", "c16")]
+
+
+def plain(value: Any, where: str) -> Any:
+    """``value`` with mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch, and tensors
+    detached. Raises StorageError, which names the place, for anything that is no data.
+    """
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, torch.Tensor) and is_lazy(value):
+        raise StorageError(f"save_checkpoint: {where} has no shape yet: run the lazy module once before.")
+    if isinstance(value, torch.Tensor):
+        return value.detach()
+    if isinstance(value, np.generic) and type(value.item()) in _PLAIN:
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype in _ARRAYS:
+        return torch.from_numpy(value.astype(value.dtype.newbyteorder("="), copy=True))
+    if isinstance(value, Mapping):
+        items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
+        return _ordered(value, items, where) if isinstance(value, OrderedDict) else items
+    if type(value) in (list, tuple, set, frozenset):
+        entries = [plain(entry, f"{where}[{n}]") for n, entry in enumerate(value)]
+        return entries if type(value) is list else set(entries) if type(value) in (set, frozenset) else tuple(entries)
+    raise StorageError(
+        f"save_checkpoint: {where} is a {type(value).__name__}, expected data: numbers, texts, tensors, lists, "
+        "dictionaries. Anything else would have to be executed when it is read."
+    )
+
+
+def _ordered(value: OrderedDict[Any, Any], items: dict[Any, Any], where: str) -> OrderedDict[Any, Any]:
+    """With the versions of modules, by which they convert what older ones have written."""
+    made = OrderedDict(items)
+    if hasattr(value, "_metadata"):
+        made._metadata = plain(value._metadata, f"{where}._metadata")  # type: ignore[attr-defined]
+    return made
+
+
+def _key(key: Any, where: str) -> Any:
+    if type(key) in (str, int, bool, float, bytes, type(None)):
+        return key
+    if isinstance(key, tuple):
+        return tuple(_key(entry, where) for entry in key)
+    raise StorageError(f"save_checkpoint: a key of {where} is a {type(key).__name__}, expected a text or a number.")
+
+
+def random_state() -> dict[str, Any]:
+    """Where the generators of Python, NumPy (the legacy one of the process), torch and its CUDA devices stand."""
+    numpy = np.random.get_state(legacy=False)  # noqa: NPY002 (others draw from it)
+    assert isinstance(numpy, dict)
+    version, words, gauss = random.getstate()
+    found = {
+        "python": {"version": version, "words": list(words), "gauss": gauss},
+        "numpy": {
+            "bit_generator": numpy["bit_generator"],
+            "key": torch.from_numpy(numpy["state"]["key"].astype(np.int64)),
+            "pos": int(numpy["state"]["pos"]),
+            "has_gauss": int(numpy["has_gauss"]),
+            "gauss": float(numpy["gauss"]),
+        },
+        "torch": torch.get_rng_state(),
+    }
+    if torch.cuda.is_available():
+        found["cuda"] = torch.cuda.get_rng_state_all()
+    return found
+
+
+def check_random_state(state: Any) -> None:
+    """Raises StorageError where a state is of another number of CUDA devices, or none. Changes nothing."""
+    lacking = [name for name in ("python", "numpy", "torch") if not isinstance(state, dict) or name not in state]
+    if lacking:
+        raise StorageError(f"load_checkpoint: its random numbers lack those of {', '.join(lacking)}.")
+    devices = len(state.get("cuda", ()))
+    here = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if devices != here:
+        raise StorageError(
+            f"load_checkpoint: its random numbers are of {devices} CUDA devices, here are {here}. Use as many, or "
+            "leave them alone with random=False."
+        )
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Put all of them back. Raises StorageError as `check_random_state`, and for what is no such state."""
+    check_random_state(state)
+    devices = len(state.get("cuda", ()))
+    try:
+        python, numpy = state["python"], state["numpy"]
+        words = tuple(python["words"])
+        key = numpy["key"].numpy().astype(np.uint32)
+        random.setstate((python["version"], words, python["gauss"]))
+        legacy = (numpy["bit_generator"], key, numpy["pos"], numpy["has_gauss"], numpy["gauss"])
+        np.random.set_state(legacy)  # noqa: NPY002
+        torch.set_rng_state(state["torch"])
+        if devices:
+            torch.cuda.set_rng_state_all(state["cuda"])
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise StorageError(f"load_checkpoint: its random numbers cannot be used: {error}") from error
+
+
+# Entries of torch's optimisers that have the shape of their parameter.
+_OF_SHAPE = (
+    "exp_avg", "exp_avg_sq", "max_exp_avg_sq", "exp_inf", "momentum_buffer", "square_avg", "grad_avg", "sum",
+    "acc_delta", "ax", "prev",
+)  # fmt: skip
+
+
+def kind_of(optimizer: torch.optim.Optimizer) -> str:
+    """The name of its class, with the module."""
+    return f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
+
+
+def put_back_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Load a state that was checked. What schedules and callers keep in groups, and the state lacks, stays as it is
+    here: torch would delete it, and some schedules fail without it at their next step.
+    """
+    groups = [
+        {**{key: value for key, value in own.items() if key not in group and _is_added(optimizer, key)}, **group}
+        for own, group in zip(optimizer.param_groups, state["param_groups"], strict=True)
+    ]
+    optimizer.load_state_dict({**state, "param_groups": groups})
+
+
+def check_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, state: Any, kind: Any, is_same_torch: bool
+) -> None:  # fmt: skip
+    """Raise StorageError or ShapeError for a state of another kind, or of other groups, settings or shapes. Changes
+    nothing.
+
+    ``kind``: :func:`kind_of` the optimiser that has written it, None for what is not known. ``is_same_torch``: whether
+    the state is of the same torch; others may have other settings.
+    """
+    groups = state.get("param_groups") if isinstance(state, dict) else None
+    entries = state.get("state") if isinstance(state, dict) else None
+    if not isinstance(groups, list) or not isinstance(entries, dict):
+        raise StorageError(f"load_checkpoint: the part {name!r} is no state of an optimiser.")
+    if kind is not None and not _is_same_kind(kind, kind_of(optimizer)):
+        raise StorageError(
+            f"load_checkpoint: the state of {name!r} is of another kind of optimiser, {shown(kind)}; here is "
+            f"{kind_of(optimizer)!r}."
+        )
+    here = [len(group["params"]) for group in optimizer.param_groups]
+    there = [len(group["params"]) for group in groups]
+    if here != there:
+        raise StorageError(
+            f"load_checkpoint: {name!r} has groups of {there} parameters in the file, here of {here}: make the "
+            "optimiser of the same parameters, in the same order."
+        )
+    for own, group in zip(optimizer.param_groups, groups, strict=True):
+        lacks = sorted(key for key in own.keys() - group.keys() if not _is_added(optimizer, key))
+        if is_same_torch and lacks:
+            raise StorageError(
+                f"load_checkpoint: the state of {name!r} is of another kind of optimiser, it lacks {', '.join(lacks)}; "
+                f"here is {type(optimizer).__name__}."
+            )
+        for parameter, number in zip(own["params"], group["params"], strict=True):
+            for entry, value in entries.get(number, {}).items():
+                wrong = isinstance(value, torch.Tensor) and entry in _OF_SHAPE and value.shape != parameter.shape
+                # Of what torch keeps of complex numbers as pairs, and of lazy parameters, nothing is known yet.
+                if wrong and not parameter.is_complex() and not torch.nn.parameter.is_lazy(parameter):
+                    raise ShapeError(
+                        f"load_checkpoint: {entry!r} of parameter {number} of {name!r}: expected shape "
+                        f"{tuple(parameter.shape)}, the file has {tuple(value.shape)}."
+                    )
+
+
+def _is_same_kind(there: Any, here: str) -> bool:
+    """Modules count by their package: within it they move from version to version. A script's own class is of the
+    module `__main__` when it is run, and of another one when it is imported.
+    """
+    if not isinstance(there, str):
+        return False
+    packages = {kind.partition(".")[0] for kind in (there, here)}
+    return there.rpartition(".")[2] == here.rpartition(".")[2] and (len(packages) == 1 or "__main__" in packages)
+
+
+def _is_added(optimizer: torch.optim.Optimizer, key: str) -> bool:
+    """Whether an entry of groups is none of the optimiser's own settings: a schedule's ``initial_lr`` is not."""
+    return key != "params" and key not in optimizer.defaults
+
 
 _FORMAT, _VERSION = "torchtransient checkpoint", 1
 _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries")
