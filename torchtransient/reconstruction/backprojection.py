@@ -50,11 +50,18 @@ Rows = Callable[[Group], Tensor]
 
 
 class EllipsoidOperator(ScanOperator):
-    """Linear interpolation in time of what each pair of a scan measures of each voxel, and its transpose.
+    """Linear interpolation in time of the light that each pair of a scan measures of each voxel, and its transpose.
 
-    ``falloff``: p of the factor (r_laser r_sensor)^-p, distances in metres, which no distance below half a bin makes
-    larger. ``samples``: how many values of a row stand in a bin (:func:`sample_places`). Otherwise as
-    :class:`ScanOperator`. Raises UnitError for a falloff that is not finite or beyond what the precision holds.
+    Args:
+        scan: of any kind.
+        points: as of :class:`ScanOperator`.
+        time_axis: of the transients.
+        falloff: p of the factor (r_laser r_sensor)^-p, distances in metres, none of them below half a bin.
+        dtype: float32 or float64.
+        samples: values of a row in each bin, see :func:`sample_places`.
+
+    Raises:
+        UnitError: for a falloff that is not finite or beyond the range of the precision.
     """
 
     def __init__(
@@ -121,9 +128,14 @@ class EllipsoidOperator(ScanOperator):
     # ------------------------------------------------------------------------------------------------------- the sums
 
     def gather(self, rows_of: Rows, items: int) -> Tensor:
-        """(items, V): the sum over all rows of their values at the lengths of each voxel.
+        """Sum over all rows of their values at the lengths of each voxel.
 
-        ``rows_of(group)``: real rows (items, R, row_length) of a group.
+        Args:
+            rows_of: real rows (items, R, row_length) of a group.
+            items: number of items.
+
+        Returns:
+            (items, V).
         """
         out = self.voxels.new_zeros(items, self.voxels.shape[1])
         for group in self.groups():
@@ -139,8 +151,9 @@ class EllipsoidOperator(ScanOperator):
         return out
 
     def splat(self, volume: Tensor) -> Iterator[tuple[Group, Tensor]]:
-        """The transpose of :meth:`gather`: for each group its rows (items, R, row_length) of a real volume
-        (items, V)."""
+        """Yield each group with its rows (items, R, row_length) of a real volume (items, V), the transpose of
+        :meth:`gather`.
+        """
         items, length = len(volume), self.row_length + _PAD
         for group in self.groups():
             rows = volume.new_zeros(items, math.prod(group.size) * length)
@@ -161,7 +174,7 @@ class EllipsoidOperator(ScanOperator):
         return out
 
     def _blocks(self, group: Group) -> Iterator[tuple[slice, Tensor, Tensor, Tensor | None]]:
-        """Of each piece of a group: the voxels of a tile, and (rows, voxels) indices into the padded rows of the group,
+        """Yield the pieces of a group: the voxels of a tile, (rows, voxels) indices into the padded rows of the group,
         fractions of a bin, and weights unless all are one.
         """
         length, (spots, points) = self.row_length + _PAD, group.size
@@ -220,26 +233,34 @@ class EllipsoidOperator(ScanOperator):
 
     @property
     def _spots(self) -> int:
-        """How many spots vary against the sensor points."""
+        """Number of spots that vary against the sensor points."""
         return self.lasers.shape[1] if self.scan.kind == "exhaustive" else 1
 
     def split(self, data: Tensor) -> Tensor:
-        """(items, T, spots, sensors) of real data (..., T, *scan.shape)."""
+        """Return real data (..., T, *scan.shape) as (items, T, spots, sensors)."""
         return data.reshape(-1, self.axis.num_bins, self._spots, self.sensors.shape[1])
 
     def rows_of(self, split: Tensor, group: Group) -> Tensor:
-        """(items, R, T): the rows of a group, a view where it can be."""
+        """Return the rows (items, R, T) of a group, a view where possible."""
         part = split[:, :, group.lasers, group.sensors]
         return part.flatten(2).transpose(1, 2)
 
     def put_rows(self, split: Tensor, group: Group, rows: Tensor) -> None:
-        """Write rows (items, R, T) to where :meth:`rows_of` has them from."""
+        """Write rows (items, R, T) to the place that :meth:`rows_of` reads."""
         part = split[:, :, group.lasers, group.sensors]
         part.copy_(rows.transpose(1, 2).reshape(part.shape))
 
 
 def apart(a: Tensor, b: Tensor) -> float:
-    """What no distance between points (N, 3) and (M, 3) falls short of: that of the boxes around them."""
+    """Return a lower bound of the distances between two sets of points: the distance of the boxes around them.
+
+    Args:
+        a: points (N, 3).
+        b: points (M, 3), in the same unit.
+
+    Returns:
+        Distance in that unit, zero where the boxes overlap.
+    """
     gaps = torch.maximum(a.amin(0) - b.amax(0), b.amin(0) - a.amax(0)).clamp_min(0)
     return float(gaps.norm())
 
@@ -254,8 +275,18 @@ def _distances(points: Tensor, voxels: Tensor) -> Tensor:
 
 
 def backproject(capture: Capture, points: VoxelGrid | Tensor, *, falloff: float = 0.0) -> Tensor:
-    """:meth:`Backprojection.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the device of its
-    transient. Raises as the class.
+    """Backproject a capture: :meth:`Backprojection.reconstruct` by its own scan and axis.
+
+    Args:
+        capture: with a transient.
+        points: grid, or points (..., 3) in world coordinates, metres.
+        falloff: power of 1 / (r_laser r_sensor), see :class:`Backprojection`.
+
+    Returns:
+        (..., C, *volume), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, Backprojection, points, who="backproject", falloff=falloff)
 
@@ -265,17 +296,24 @@ class Backprojection(EllipsoidOperator):
 
     ``forward`` puts the value of a voxel at the length laser spot - voxel - sensor point of every pair, shared linearly
     between the two bins whose centres are next to it, so that their sum is the value: the transient of isotropic points
-    that hide nothing. ``adjoint`` reads the transients there by linear interpolation and adds up. What falls outside of
-    the record counts as zero. Scans of any kind are taken: confocal, single, exhaustive and pairs, grids and lists of
-    points, flat and curved walls, with or without first and last legs, in single and double precision.
+    that hide nothing. ``adjoint`` reads the transients there by linear interpolation and adds up. Light outside of the
+    record counts as zero. Takes scans of any kind (confocal, single, exhaustive, pairs), grids and lists of points,
+    flat and curved walls, with or without first and last legs.
 
-    ``points``: a :class:`VoxelGrid` or any points (..., 3). ``falloff``: p of a factor (r_laser r_sensor)^-p in both: 0
-    leaves distances alone, 2 is the falloff of small diffuse patches, 1 that of retroreflectors in confocal scans; -2
-    makes ``adjoint`` compensate for it. Distances below half a bin count as half a bin there. Cosines of wall and
-    surface are not part of it.
+    Args:
+        scan: of any kind.
+        points: grid, or points (..., 3) in world coordinates, metres.
+        time_axis: of the transients, counted as the scan's ``first_and_last_leg`` says.
+        falloff: p of a factor (r_laser r_sensor)^-p in both maps. 0 leaves distances alone, 2 is the falloff of small
+            diffuse patches, 1 that of retroreflectors in confocal scans; -2 makes ``adjoint`` compensate for it.
+            Distances below half a bin count as half a bin. Cosines of wall and surface are not part of it.
+        dtype: float32 or float64.
 
-    Time grows with pairs times voxels (some 4 ns each on a core); memory beyond operands with neither. Raises
-    ShapeError and UnitError.
+    Raises:
+        ShapeError: for other scans, axes and points.
+        UnitError: for points that are not finite or far beyond the record, and for a falloff out of range.
+
+    Time grows with pairs times voxels (some 4 ns each on a core); memory beyond operands with neither.
     """
 
     def __init__(
@@ -290,7 +328,17 @@ class Backprojection(EllipsoidOperator):
         super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """``adjoint`` of a transient (..., T, *scan.shape) or a capture: (..., *volume). Raises ShapeError."""
+        """Return ``adjoint`` of a transient.
+
+        Args:
+            transient: (..., T, *scan.shape), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., *volume).
+
+        Raises:
+            ShapeError: for another shape, or a capture of another scan or axis.
+        """
         return self.adjoint(self.transients(transient))
 
     def map_(self, x: Tensor) -> Tensor:
@@ -316,8 +364,19 @@ class Backprojection(EllipsoidOperator):
 def filtered_backproject(
     capture: Capture, points: VoxelGrid | Tensor, *, filter: ReconstructionFilter, falloff: float = 0.0
 ) -> Tensor:
-    """:meth:`FilteredBackprojection.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the
-    device of its transient. Raises as the class.
+    """Backproject a capture behind a filter: :meth:`FilteredBackprojection.reconstruct` by its own scan and axis.
+
+    Args:
+        capture: with a transient.
+        points: grid, or points (..., 3) in world coordinates, metres.
+        filter: :class:`PhasorFilter` or :class:`LaplacianFilter`.
+        falloff: power of 1 / (r_laser r_sensor), see :class:`Backprojection`.
+
+    Returns:
+        (..., C, *volume), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     options = {"filter": filter, "falloff": falloff}
     return reconstructed(capture, FilteredBackprojection, points, who="filtered_backproject", **options)
@@ -329,13 +388,20 @@ class FilteredBackprojection(EllipsoidOperator):
     ``adjoint`` is L B^H F, from transients (..., T, *scan.shape) to volumes (..., *points), complex ones with a
     :class:`PhasorFilter`; ``forward`` is F^H B L^H, its exact adjoint. ``reconstruct`` makes the filter's picture.
 
-    ``filter``: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019), or
-    ``LaplacianFilter(sigma)`` (Velten et al. 2012), or what has the methods of :class:`ReconstructionFilter`. The other
-    arguments, what scans are taken, time and memory are those of :class:`Backprojection`; rows are filtered a group at
-    a time, those of wavelengths below 16 bins at more than one sample a bin. Lines between samples are within 1.7 % of
-    the pulse's own value at every length, at wavelengths of two bins as at long ones (1 % but for their common scale).
-    On planes before a flat, regular grid :class:`PhasorField` has the same result to that for less. Raises ShapeError
-    and UnitError.
+    Args:
+        scan, points, time_axis, falloff, dtype: as of :class:`Backprojection`.
+        filter: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019),
+            ``LaplacianFilter(sigma)`` (Velten et al. 2012), or an object with the methods of
+            :class:`ReconstructionFilter`.
+
+    Raises:
+        ArgumentError: for other filters.
+        ShapeError, UnitError: as :class:`Backprojection` and the filter.
+
+    Rows are filtered a group at a time, at wavelengths below 16 bins with more than one sample a bin. Lines between
+    samples are within 1.7 % of the pulse's own value at every length, at wavelengths of two bins as at long ones (1 %
+    but for their common scale). On planes before a flat, regular grid :class:`PhasorField` has the same result to that
+    for less.
     """
 
     def __init__(
@@ -362,8 +428,16 @@ class FilteredBackprojection(EllipsoidOperator):
         self.real_volume = not filter.complex_volume
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The picture (..., *volume) of a transient (..., T, *scan.shape) or a capture: the squared modulus with a
-        :class:`PhasorFilter`, ``adjoint`` itself with a :class:`LaplacianFilter`. Raises ShapeError.
+        """Return the picture of a transient: the squared modulus with a :class:`PhasorFilter`, else ``adjoint`` itself.
+
+        Args:
+            transient: (..., T, *scan.shape), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., *volume), real.
+
+        Raises:
+            ShapeError: for another shape, or a capture of another scan or axis.
         """
         return self.filter.image(self.adjoint(self.transients(transient)))
 

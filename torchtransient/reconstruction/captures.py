@@ -17,16 +17,22 @@ from torchtransient.reconstruction.capture_checks import checked_capture
 
 
 def subtract_legs(capture: Capture) -> Capture:
-    """The capture with lengths from the spot to the sensor point: each histogram moved back by its legs.
+    """Move each histogram of a capture back by its legs, to lengths from the spot to the sensor point.
 
     Values are interpolated linearly between the middles of bins, so pulses get up to half a bin wider. The new axis has
     bins of the same width and starts where the light of the pair with the shortest legs started, or at zero; its bins
-    begin where that pair's bins did. Light before its start is lost, and what would come from after the old end is
-    zero. ``steady`` stays; a capture without legs is returned as it is. Differentiable by the transient, not by points.
-    Captures in double precision stay so, all others, counts too, become float32.
+    begin where that pair's bins did. Light before its start is lost, and light from after the old end is zero.
+    Differentiable by the transient, not by points.
 
-    Raises ShapeError for a capture without a transient or with phasors, whose phases would have to turn, and UnitError
-    where nothing is left.
+    Args:
+        capture: with a transient; returned as it is where its scan counts no legs.
+
+    Returns:
+        Capture without legs, ``steady`` kept, in double precision where the capture is, else in float32, counts too.
+
+    Raises:
+        ShapeError: for a capture without a transient, or with phasors, whose phases would have to turn.
+        UnitError: where no bin is left.
     """
     transient, axis = checked_capture(capture, "subtract_legs")
     if not capture.scan.first_and_last_leg:
@@ -71,13 +77,22 @@ COUNTS_FLOOR = 0.25
 
 
 def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
-    """``H / sqrt(|H| + floor)`` of every value, odd in H: what background leaves below zero keeps its sign.
+    """Take the root of light, ``H / sqrt(|H| + floor)`` of every value, with a bounded slope at empty bins.
 
-    ``floor``: in the unit of the transient, 1/4 for photon counts; a small part of the brightest bin for radiance. With
-    0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero there.
-    Differentiable any number of times, in both modes. Whole numbers become float32. Values must be finite. Raises
-    UnitError for a floor below zero and for one that the transient's precision takes for zero, ShapeError for what is
-    no tensor of real numbers.
+    Odd in H: background below zero keeps its sign. Differentiable any number of times, in both modes.
+
+    Args:
+        transient: finite real numbers, any shape; whole numbers become float32.
+        floor: in the unit of the transient, 1/4 for photon counts, a small part of the brightest bin for radiance. With
+            0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero
+            there.
+
+    Returns:
+        Tensor of the same shape.
+
+    Raises:
+        UnitError: for a floor below zero or below the smallest number of the precision.
+        ShapeError: for other objects than tensors of real numbers.
     """
     if not isinstance(transient, Tensor) or transient.is_complex():
         got = transient.dtype if isinstance(transient, Tensor) else shown(transient)
@@ -93,7 +108,11 @@ def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
 
 
 class StabilizedRoot(nn.Module):
-    """:func:`stabilized_root` as a layer."""
+    """:func:`stabilized_root` as a layer.
+
+    Args:
+        floor: in the unit of the transient.
+    """
 
     def __init__(self, floor: float = COUNTS_FLOOR) -> None:
         super().__init__()
@@ -107,7 +126,15 @@ class StabilizedRoot(nn.Module):
 
 
 def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
-    """A floor of :func:`stabilized_root` in a precision. Raises UnitError."""
+    """Return a floor of :func:`stabilized_root`.
+
+    Args:
+        value: number, zero or more.
+        dtype: precision of the transient.
+
+    Raises:
+        UnitError: for numbers below zero or below the smallest number of ``dtype``.
+    """
     floor = finite("stabilized_root: floor", value)
     if floor < 0:
         raise UnitError(f"stabilized_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")

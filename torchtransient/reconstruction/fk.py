@@ -61,17 +61,24 @@ class FK(ConfocalOperator):
     and nearly inverses: migration of the model is J / 2 times the field, J being the cosine of each wave's direction.
     ``operator.reconstruct(transient)``: from measured light to the squared field.
 
-    ``target``: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
-    with the second and psi = sqrt(H), where z is half the optical path length. ``floor``: of the root, see
-    :func:`stabilized_root`, in the unit of the transient; 0, the default, is the root itself, with no derivative at
-    empty bins. Take 1/4 for photon counts and wherever gradients go through. ``taps``: 4 interpolate to 3e-4 of the
-    field, 2 linearly to some percent.
+    Args:
+        scan: confocal, on a regular grid of a flat wall, without legs.
+        time_axis: of the transients, from zero on.
+        target: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
+            with the second and psi = sqrt(H), where z is half the optical path length.
+        floor: of the root, see :func:`stabilized_root`, in the unit of the transient; 0 is the root itself, with no
+            derivative at empty bins. Take 1/4 for photon counts and wherever gradients go through.
+        taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
+        dtype: float32 or float64.
+
+    Raises:
+        ShapeError: for other scans.
+        ArgumentError: for an unknown target and other taps.
+        UnitError: for a negative floor and for time axes that begin before zero.
 
     Wall, time and depth are padded to twice their length. Memory: two complex cubes of the wavefield for each call, and
     tables of 4 + 8 taps bytes (float32) for each quarter of a voxel of the padded spectrum. Not supported: scans that
-    are not confocal (:class:`MidpointFK`), curved walls, cosines of wall and hidden surfaces. Raises ShapeError for
-    scans that it cannot take, SceneError for an unknown target and other taps, UnitError for a negative floor and
-    for time axes that begin before zero.
+    are not confocal (:class:`MidpointFK`), curved walls, cosines of wall and hidden surfaces.
     """
 
     real_volume = False
@@ -131,18 +138,39 @@ class FK(ConfocalOperator):
         return each(self._model, x, 3)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The squared modulus of the migrated field, (..., Z, Y, X) of (..., T, Y, X) or of a capture's (C, T, Y, X).
+        """Return the squared modulus of the migrated field. With ``floor=0`` empty bins get no gradient.
 
-        Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
+        Args:
+            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., Z, Y, X), of a capture (C, Z, Y, X).
+
+        Raises:
+            ShapeError, DeviceError: for other transients and captures.
         """
         return self.picture(stabilized_root(self.transients(transient), self.floor))
 
     def wavefield(self, transient: Tensor | Capture) -> Tensor:
-        """psi (..., T, Y, X) of a transient: z sqrt(H) of a diffuse target, sqrt(H) of a retroreflective one."""
+        """Return psi of a transient: z sqrt(H) of a diffuse target, sqrt(H) of a retroreflective one.
+
+        Args:
+            transient: (..., T, Y, X), or a capture.
+
+        Returns:
+            (..., T, Y, X).
+        """
         return self._falling(stabilized_root(self.transients(transient), self.floor))
 
     def picture(self, root: Tensor) -> Tensor:
-        """The squared modulus of the field that the root of a transient (..., T, Y, X) migrates to."""
+        """Return the squared modulus of the field that a root migrates to.
+
+        Args:
+            root: of a transient, (..., T, Y, X).
+
+        Returns:
+            (..., Z, Y, X).
+        """
         field = self.adjoint(self._falling(root))
         return field.real.square() + field.imag.square()
 
@@ -225,9 +253,17 @@ class FK(ConfocalOperator):
 
 
 def fk(capture: Capture, **options: Any) -> Tensor:
-    """:meth:`FK.reconstruct` of a capture: the volume (C, Z, Y, X), on the device of its transient.
+    """Migrate a confocal capture: :meth:`FK.reconstruct` by its own scan and axis.
 
-    ``options``: of :class:`FK`. Raises as it does.
+    Args:
+        capture: confocal, of a flat wall.
+        options: of :class:`FK`.
+
+    Returns:
+        Squared field (C, Z, Y, X), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, FK, who="fk", **options)
 
@@ -260,15 +296,21 @@ def _beta(taps: int, oversampling: float = 2.0) -> float:
 
 
 class Midpoints(TransientOperator):
-    """Confocal light at midpoints, and what pairs of spot and sensor point measure of it.
+    """Confocal light at midpoints, and the light that pairs of spot and sensor point measure of it.
 
-    ``operator(confocal)``: (..., T, 2 Y, 2 X) on a grid of half the sensors' pitch (:attr:`wall`) to the scan's
-    (..., T, *scan.shape); ``operator.adjoint``: its adjoint, the mean over the pairs of each midpoint, moved to the
-    time of a confocal pair by linear interpolation between bins, zero before and behind the record. Midpoints are
-    rounded to the grid; those of one spot stand on it. Midpoints that no pair has are dark.
+    ``operator(confocal)``: (..., T, 2 Y, 2 X) on a grid of half the sensors' pitch (:attr:`wall`) to the scan's (...,
+    T, *scan.shape); ``operator.adjoint``: its adjoint, the mean over the pairs of each midpoint, moved to the time of a
+    confocal pair by linear interpolation between bins, zero before and behind the record. Midpoints are rounded to the
+    grid; with one spot they stand on it. Midpoints without a pair are dark.
 
-    Raises ShapeError for confocal scans, grids that are not regular or not flat, spots off their plane or beside the
-    sensors' rectangle, and scans that count legs; UnitError for times before zero.
+    Args:
+        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
+        time_axis: of the transients, from zero on.
+        dtype: float32 or float64.
+
+    Raises:
+        ShapeError: for other scans, and spots off the sensors' plane or beside their rectangle.
+        UnitError: for times before zero.
     """
 
     place: Tensor
@@ -309,8 +351,8 @@ class Midpoints(TransientOperator):
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
-        """Of each pair its ``place`` on the grid and ``distance_squared``, m^2; the ``share`` of a pair in the light of
-        each place; ``times`` (T,) of the bins.
+        """Return ``place`` on the grid and ``distance_squared``, m^2, of each pair; the ``share`` of a pair in the
+        light of each place; ``times`` (T,) of the bins.
         """
         pairs = torch.bincount(self._place, minlength=math.prod(self.wall.size)).to(torch.float64)
         return {
@@ -368,11 +410,18 @@ class MidpointFK(TransientOperator):
 
     ``operator(field)``: complex (..., Z, 2 Y, 2 X) on a grid of half the sensors' pitch to the wavefield of each pair,
     (..., T, *scan.shape); ``operator.adjoint``: the migration; ``operator.reconstruct(transient)``: from measured light
-    to the squared field. Settings as of :class:`FK`. An approximation: a letter that faces the wall comes out of a
-    capture by one laser with a correlation of 0.8, of 4 x 4 lasers 0.9, and tilted ones worse. One laser sees half of
-    the wall's width. Filtered backprojection and phasor fields are better, and take longer.
+    to the squared field.
 
-    Raises as :class:`Midpoints` and :class:`FK`.
+    Args:
+        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
+        time_axis, target, floor, taps, dtype: as of :class:`FK`.
+
+    Raises:
+        ShapeError, UnitError, ArgumentError: as :class:`Midpoints` and :class:`FK`.
+
+    An approximation: a letter that faces the wall comes out of a capture by one laser with a correlation of 0.8, of 4 x
+    4 lasers 0.9, and tilted ones worse. One laser sees half of the wall's width. Filtered backprojection and phasor
+    fields are better, and take longer.
     """
 
     real_volume = False
@@ -406,18 +455,33 @@ class MidpointFK(TransientOperator):
         return self.fk.adjoint_(self.midpoints.adjoint_(y))
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The squared modulus of the migrated field, (..., Z, 2 Y, 2 X) of (..., T, *scan.shape) or of a capture's.
+        """Return the squared modulus of the migrated field. With ``floor=0`` empty bins get no gradient.
 
-        Differentiable; with ``floor=0`` empty bins get no gradient. Raises ShapeError, DeviceError.
+        Args:
+            transient: (..., T, *scan.shape), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., Z, 2 Y, 2 X).
+
+        Raises:
+            ShapeError, DeviceError: for other transients and captures.
         """
         data = self.transients(transient)
         return self.fk.picture(self.midpoints.adjoint(stabilized_root(data, self.fk.floor)))
 
 
 def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
-    """:meth:`MidpointFK.reconstruct` of a capture: the volume (C, Z, 2 Y, 2 X), on the device of its transient.
+    """Migrate a single or exhaustive capture: :meth:`MidpointFK.reconstruct` by its own scan and axis.
 
-    ``options``: of :class:`MidpointFK`. Raises as it does.
+    Args:
+        capture: single or exhaustive, of a flat wall.
+        options: of :class:`MidpointFK`.
+
+    Returns:
+        Squared field (C, Z, 2 Y, 2 X), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, MidpointFK, who="midpoint_fk", **options)
 

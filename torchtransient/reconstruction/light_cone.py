@@ -50,8 +50,10 @@ LONGEST = 8
 
 @dataclass(frozen=True)
 class ConeGrid:
-    """Equal bins of v between the ends of a time axis. ``edges`` (V + 1,) of v, ``radii`` (T + 1,) half the edges of
-    the time axis, metres; ``padded``: length of the transforms along v, so that no cone comes round.
+    """Equal bins of v between the ends of a time axis.
+
+    ``edges`` (V + 1,) of v, m^2; ``radii`` (T + 1,) half the edges of the time axis, metres; ``padded``: length of the
+    transforms along v, so that no cone comes round.
     """
 
     edges: Tensor
@@ -60,7 +62,17 @@ class ConeGrid:
 
     @staticmethod
     def of(axis: TimeAxis, grid: PlanarScan, v_bins: int, who: str) -> ConeGrid:
-        """Of an axis from zero on. Raises ShapeError where the cone is far longer than the record."""
+        """Make the bins of a time axis.
+
+        Args:
+            axis: from zero on.
+            grid: points of the wall.
+            v_bins: number of bins.
+            who: begins the message.
+
+        Raises:
+            ShapeError: where the cone is far longer than the record.
+        """
         radii = axis.edges_opl / 2
         near, far = float(radii[0]) ** 2, float(radii[-1]) ** 2
         edges = torch.linspace(near, far, v_bins + 1, dtype=torch.float64, device="cpu")
@@ -81,7 +93,11 @@ class ConeGrid:
         return float(self.edges[-1] - self.edges[0]) / (len(self.edges) - 1)
 
     def overlaps(self, of_depth: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """(index of v, index of time, overlap) of all bins that overlap; lengths in v, m^2, or in r, metres."""
+        """Return (index of v, index of time, overlap) of all bins that overlap.
+
+        Args:
+            of_depth: lengths of overlaps in r, metres, instead of v, m^2.
+        """
         squares = self.radii**2
         # Both partitions together cut the axis into intervals, each of which lies in one bin of either.
         cuts = torch.cat([squares, self.edges[1:-1]]).sort().values
@@ -93,7 +109,7 @@ class ConeGrid:
         return v[kept], t[kept], size[kept]
 
     def window(self) -> Tensor:
-        """What the frequencies of v are multiplied by, (V' / 2 + 1,): a mean of neighbours, (1, 4, 6, 4, 1) / 16.
+        """Return the factors (V' / 2 + 1,) of the frequencies of v, a mean of neighbours, (1, 4, 6, 4, 1) / 16.
 
         A cone that is band-limited alone rings as far as the record is long, and the r^-4 of early bins makes more of
         that than there is light.
@@ -102,8 +118,16 @@ class ConeGrid:
         return ((1 + turn.cos()) / 2) ** 2
 
     def kernel_tables(self, count: int, pitch: float, moment: int = 0, *, windowed: bool = False) -> Tensor:
-        """Transform (V' / 2 + 1, 2 count, 2) along one side of the wall of q^moment exp(-i w q^2) for every frequency
-        w of v, real and imaginary; ``windowed``: times :meth:`window`.
+        """Return the transform along one side of the wall of q^moment exp(-i w q^2) for every frequency w of v.
+
+        Args:
+            count: points along the side.
+            pitch: between them, metres.
+            moment: power of the offset.
+            windowed: times :meth:`window`.
+
+        Returns:
+            (V' / 2 + 1, 2 count, 2), real and imaginary.
         """
         w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
         w = w * (2 * math.pi / (self.padded * self.width))
@@ -113,8 +137,15 @@ class ConeGrid:
 
 
 def offset_powers(count: int, pitch: float, moment: int) -> Tensor:
-    """q^moment (2 count,) float64 of the offsets q along one side of the wall, in the order of transforms. The farthest
-    one stands for both signs: its odd powers are zero.
+    """Return powers of the offsets along one side of the wall, in the order of transforms.
+
+    Args:
+        count: points along the side.
+        pitch: between them, metres.
+        moment: the power.
+
+    Returns:
+        (2 count,) float64. The farthest offset stands for both signs: its odd powers are zero.
     """
     q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
     powers: Tensor = q**moment
@@ -132,7 +163,16 @@ class Resampling:
     values: Tensor
 
     def apply(self, x: Tensor, count: int, *, transposed: bool = False) -> Tensor:
-        """The matrix, or its transpose, times x (T, N): (count, N)."""
+        """Multiply a tensor by the matrix.
+
+        Args:
+            x: (T, N).
+            count: rows of the result.
+            transposed: by the transpose instead.
+
+        Returns:
+            (count, N).
+        """
         rows, columns = (self.columns, self.rows) if transposed else (self.rows, self.columns)
         out = x.new_zeros(count, x.shape[1])
         # In pieces of N, so that the products stay small.
@@ -149,11 +189,11 @@ DEFAULT_SNR = 10.0
 
 
 class ConeOperator(ConfocalOperator):
-    """What the light-cone transforms share: resampling in depth and time, and a sum of convolutions over components.
+    """Base of light-cone transforms: resampling in depth and time, and a sum of convolutions over components.
 
-    ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall
-    that its kernel holds; ``scales``: the factors of the kernels.
-    Classes say with :meth:`components` and :meth:`volume_of` what their volumes are made of.
+    ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall in
+    its kernel; ``scales``: the factors of the kernels. Classes say with :meth:`components` and :meth:`volume_of` how
+    volumes are made of components. Arguments as of :class:`LCT`.
     """
 
     moments: tuple[tuple[int, int], ...]
@@ -177,12 +217,12 @@ class ConeOperator(ConfocalOperator):
         self._set_tables()
 
     def fall(self) -> int:
-        """The power of the distance with which light falls."""
+        """Return the power of the distance with which light falls."""
         return FALL[self.target]
 
     def tables(self) -> dict[str, Tensor]:
-        """Entries of the resampling matrices (places ``*_v``, ``*_t``; values ``volume``, ``data`` and inverses),
-        and the tables of the kernels along y and x.
+        """Return entries of the resampling matrices (places ``*_v``, ``*_t``; values ``volume``, ``data`` and
+        inverses), and the tables of the kernels along y and x.
         """
         cone, (rows, columns) = self.cone, self.grid.size
         area = self.grid.pitch[0] * self.grid.pitch[1]
@@ -210,7 +250,7 @@ class ConeOperator(ConfocalOperator):
         return tables
 
     def kernels(self, first: int, last: int) -> list[tuple[Tensor, Tensor]]:
-        """Tables (w, 2 Y, 1) and (w, 1, 2 X) of every component for frequencies ``first`` to ``last``."""
+        """Return tables (w, 2 Y, 1) and (w, 1, 2 X) of every component for frequencies ``first`` to ``last``."""
         found = []
         for (y, x), scale in zip(self.moments, self.scales, strict=True):
             along_y = torch.view_as_complex(cast(Tensor, getattr(self, f"along_y{y}"))[first:last])
@@ -220,11 +260,11 @@ class ConeOperator(ConfocalOperator):
 
     @abstractmethod
     def components(self, volume: Tensor, matrix: str) -> list[Tensor]:
-        """The components (V, Y, X) of a volume, resampled by the matrix "volume" or "volume_inverse"."""
+        """Return the components (V, Y, X) of a volume, resampled by the matrix "volume" or "volume_inverse"."""
 
     @abstractmethod
     def volume_of(self, components: list[Tensor], matrix: str) -> Tensor:
-        """The adjoint of :meth:`components`."""
+        """Return the volume of components, the adjoint of :meth:`components`."""
 
     def map_(self, x: Tensor) -> Tensor:
         return each(lambda volume: self._model(volume, inverse=False), x, len(self.volume_shape))
@@ -250,9 +290,16 @@ class ConeOperator(ConfocalOperator):
         return ConeInverse(self)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The Wiener inverse of a transient (..., T, Y, X), or of a capture's (C, T, Y, X): as many volumes.
+        """Return the Wiener inverse of a transient, linear and differentiable.
 
-        Linear in the transient, and differentiable. Raises ShapeError, DeviceError.
+        Args:
+            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
+
+        Returns:
+            As many volumes.
+
+        Raises:
+            ShapeError, DeviceError: for other transients and captures.
         """
         volume: Tensor = self.inverse(self.transients(transient))
         return volume
@@ -295,7 +342,7 @@ class ConeOperator(ConfocalOperator):
         return self._of_spectrum(out)
 
     def _correlated(self, x: Tensor, *, regularised: bool) -> list[Tensor]:
-        """What :meth:`_convolved` is the adjoint of: components (V, Y, X) of (V, Y, X)."""
+        """Return components (V, Y, X) of (V, Y, X), the adjoint of :meth:`_convolved`."""
         spectrum = self._spectrum(x)
         out = [torch.empty_like(spectrum) for _ in self.moments]
         for part, first, last in self._frequencies(spectrum):
@@ -363,20 +410,28 @@ class ConeInverse(InverseOperator):
 class LCT(ConeOperator):
     """The light-cone transform, for confocal captures of a flat wall.
 
-    ``operator(volume)``: strengths (..., Z, Y, X) of hidden points per m^3, light falling with the fourth power of the
-    distance (``target="diffuse"``) or the second ("retroreflective"), to their light in each bin (..., T, Y, X);
+    ``operator(volume)``: strengths (..., Z, Y, X) of hidden points per m^3 to their light in each bin (..., T, Y, X);
     ``operator.adjoint``: its adjoint; ``operator.inverse``: the Wiener inverse, a linear operator itself;
-    ``operator.reconstruct(transient)``: that of a capture, in the units of the volume.
+    ``operator.reconstruct(transient)``: the inverse of a capture, in the units of the volume.
 
-    ``snr``: ratio of signal to noise power at the mean power of the kernel, without a unit; larger is sharper and
-    noisier. ``v_bins``: bins of squared distance, as many as there are bins of time unless given. They are equal, and
-    coarse in depth near the wall: v_max / (2 z v_bins). Results of the inverse go below zero; clamp them for display
-    only. The kernel is band-limited: sharp volumes ring by some percent.
+    Args:
+        scan: confocal, on a regular grid of a flat wall, without legs.
+        time_axis: of the transients, from zero on.
+        target: "diffuse", light falls with the fourth power of the distance, or "retroreflective", with the second.
+        snr: ratio of signal to noise power at the mean power of the kernel, without a unit; larger is sharper and
+            noisier.
+        v_bins: bins of squared distance, None for as many as bins of time. They are equal, and coarse in depth near the
+            wall: v_max / (2 z v_bins).
+        dtype: float32 or float64.
 
-    Not supported: scans that are not confocal, curved walls, cosines of wall and hidden surfaces, hiding of points by
-    others. Raises ShapeError for scans that it cannot take and for records that are far shorter than the wall is wide,
-    UnitError for time axes that begin before zero and for an ``snr`` beyond 1e-20 to 1e20, SceneError for an unknown
-    target.
+    Raises:
+        ShapeError: for other scans, and for records that are far shorter than the wall is wide.
+        UnitError: for time axes that begin before zero and for an ``snr`` beyond 1e-20 to 1e20.
+        ArgumentError: for an unknown target.
+
+    Results of the inverse go below zero; clamp them for display only. The kernel is band-limited: sharp volumes ring by
+    some percent. Not supported: scans that are not confocal, curved walls, cosines of wall and hidden surfaces, hiding
+    of points by others.
     """
 
     moments = ((0, 0),)
@@ -401,9 +456,17 @@ class LCT(ConeOperator):
 
 
 def lct(capture: Capture, **options: Any) -> Tensor:
-    """:meth:`LCT.reconstruct` of a capture: the volume (C, Z, Y, X), on the device of its transient.
+    """Invert a confocal capture: :meth:`LCT.reconstruct` by its own scan and axis.
 
-    ``options``: of :class:`LCT`. Raises as it does.
+    Args:
+        capture: confocal, of a flat wall.
+        options: of :class:`LCT`.
+
+    Returns:
+        Volume (C, Z, Y, X), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, LCT, who="lct", **options)
 
@@ -415,21 +478,23 @@ class DirectionalLCT(ConeOperator):
     """The light-cone transform of surfaces with normals, for confocal captures of a flat wall.
 
     ``operator(volume)``: vectors (..., 3, Z, Y, X), strength per m^3 times unit normal in world coordinates, to the
-    light in each bin (..., T, Y, X), falling with the cosine at the surface and r^-4 (``target="diffuse"``) or r^-2
-    ("retroreflective"); ``operator.adjoint``, ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`,
-    from transients to such vectors. Their lengths are the albedo, their directions the normals, towards the wall.
+    light in each bin (..., T, Y, X), falling with the cosine at the surface and r^-4 or r^-2; ``operator.adjoint``,
+    ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`, from transients to such vectors. Their lengths
+    are the albedo, their directions the normals, towards the wall.
 
-    ``snr``, ``v_bins``: as of :class:`LCT`. The three components are regularised alike at the middle of the volume's
-    depth; where nothing is measured, normals are noise. Of all
-    vectors that explain the light these are the shortest, which lean towards the wall: a plate tilted by 17 degrees
-    comes out at 13, one by 34 at 21.
+    Args:
+        scan, time_axis, target, snr, v_bins, dtype: as of :class:`LCT`.
+        taper: share of each side of the scan over which the inverse fades light out towards the border, 0 (not at all)
+            to 0.5. Light that ends at the border is otherwise explained by vectors that point across it: a bright rim,
+            in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade.
 
-    ``taper``: share of each side of the scan over which the inverse fades light out towards the border (0 to 0.5, 0:
-    not at all). Light that ends at the border is otherwise explained by vectors that point across it: a bright rim, in
-    measured captures as bright as what is inside. ``forward`` and ``adjoint`` do not fade.
+    Raises:
+        ShapeError, UnitError, ArgumentError: as :class:`LCT`.
 
-    Not supported: what :class:`LCT` does not; the squared cosine of confocal light, for which the linear one stands.
-    Raises as :class:`LCT`.
+    The three components are regularised alike at the middle of the volume's depth; where nothing is measured, normals
+    are noise. Of all vectors that explain the light these are the shortest, which lean towards the wall: a plate tilted
+    by 17 degrees comes out at 13, one by 34 at 21. Not supported: as of :class:`LCT`; the squared cosine of confocal
+    light, for which the linear one stands.
     """
 
     moments = ((0, 1), (1, 0), (0, 0))
@@ -456,12 +521,12 @@ class DirectionalLCT(ConeOperator):
         self.scales = (1.0, 1.0, float(self.depths.mean()))
 
     def fall(self) -> int:
-        """One power more than the light has: w holds 1 / r."""
+        """Return one power more than the light has: w holds 1 / r."""
         return FALL[self.target] + 1
 
     def tables(self) -> dict[str, Tensor]:
-        """Those of the base; ``frame`` (3, 3): world to wall coordinates, ``relative_depth`` (Z,): over the middle;
-        ``fading`` (Y, X): of the light, towards the border.
+        """Return the tables of the base; ``frame`` (3, 3): world to wall coordinates; ``relative_depth`` (Z,): over the
+        middle; ``fading`` (Y, X): of the light, towards the border.
         """
         frame = torch.stack([self.grid.along_x, self.grid.along_y, -self.grid.normal])
         along_y, along_x = (_fading(n, self.taper) for n in self.grid.size)
@@ -499,8 +564,16 @@ def _fading(points: int, share: float) -> Tensor:
 
 
 def directional_lct(capture: Capture, **options: Any) -> Tensor:
-    """:meth:`DirectionalLCT.reconstruct` of a capture: vectors (C, 3, Z, Y, X), on the device of its transient.
+    """Invert a confocal capture to vectors: :meth:`DirectionalLCT.reconstruct` by its own scan and axis.
 
-    ``options``: of :class:`DirectionalLCT`. Raises as it does.
+    Args:
+        capture: confocal, of a flat wall.
+        options: of :class:`DirectionalLCT`.
+
+    Returns:
+        Vectors (C, 3, Z, Y, X), on the device of the transient.
+
+    Raises:
+        ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, DirectionalLCT, who="directional_lct", **options)

@@ -66,12 +66,12 @@ def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
 
 
 class LinearOperator(nn.Module, ABC):
-    """A linear map ``A`` from a volume to what a scan measures of it.
+    """A linear map ``A`` from a volume to the measurement that a scan makes of it.
 
     ``forward(volume)`` is ``A volume``, ``adjoint(y)`` is ``A^H y``, both differentiable in both modes, any number of
     times, for any leading dimensions (batch, channels), under ``torch.vmap``, and on the device of their tables
     (``operator.to(device)``). ``volume_shape``, ``data_shape``: the trailing dimensions of the two;
-    ``volume_name``, ``data_name``: what they are called.
+    ``volume_name``, ``data_name``: their names in messages.
 
     Classes define ``map_(x)`` and ``adjoint_(y)``, which run without autograd, take any leading dimensions, may be
     called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
@@ -81,7 +81,7 @@ class LinearOperator(nn.Module, ABC):
     size zero; then they are not called.
 
     Tables are buffers. Operators are differentiable by their operands alone: GradientError for tables and parameters of
-    a class that ask for a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
+    a class that require a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
     it the graph breaks at an operator, whose results are the same.
     """
 
@@ -95,11 +95,11 @@ class LinearOperator(nn.Module, ABC):
 
     @abstractmethod
     def map_(self, x: Tensor) -> Tensor:
-        """``A x``."""
+        """Return ``A x``, (..., *data_shape) of (..., *volume_shape)."""
 
     @abstractmethod
     def adjoint_(self, y: Tensor) -> Tensor:
-        """``A^H y``."""
+        """Return ``A^H y``, (..., *volume_shape) of (..., *data_shape)."""
 
     def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
         if x.numel():
@@ -113,12 +113,32 @@ class LinearOperator(nn.Module, ABC):
         return x.new_zeros(*lead, *shape, dtype=self.dtype if real else self.dtype.to_complex())
 
     def forward(self, volume: Tensor) -> Tensor:
-        """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
+        """Apply the map, ``A volume``.
+
+        Args:
+            volume: (..., *volume_shape), on the device of the operator.
+
+        Returns:
+            (..., *data_shape).
+
+        Raises:
+            ShapeError, DeviceError: for another shape or device.
+        """
         volume = self._taken(self.volume_name, volume, self.volume_shape, real=self.real_volume)
         return _apply(volume, self, False)
 
     def adjoint(self, data: Tensor) -> Tensor:
-        """``A^H data``: (..., *data_shape) to (..., *volume_shape). Raises ShapeError, DeviceError."""
+        """Apply the adjoint map, ``A^H data``.
+
+        Args:
+            data: (..., *data_shape), on the device of the operator.
+
+        Returns:
+            (..., *volume_shape).
+
+        Raises:
+            ShapeError, DeviceError: for another shape or device.
+        """
         data = self._taken(self.data_name, data, self.data_shape, real=self.real_data)
         return _apply(data, self, True)
 
@@ -156,17 +176,26 @@ class LinearOperator(nn.Module, ABC):
         return self
 
     def _converted(self) -> None:
-        """What is to be made anew in another precision."""
+        """Make tables anew in another precision."""
 
     @property
     def device(self) -> torch.device | None:
-        """Where the tables are, None for an operator without any."""
+        """Device of the tables, None for an operator without any."""
         table = next((tensor for tensor in (*self.buffers(), *self.parameters())), None)
         return None if table is None else table.device
 
 
 def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
-    """``function`` of every item of the leading dimensions of ``x``, one at a time; ``dims``: those of an item."""
+    """Apply a function to every item of the leading dimensions of a tensor, one at a time.
+
+    Args:
+        function: of an item.
+        x: (..., *item).
+        dims: number of dimensions of an item.
+
+    Returns:
+        (..., *result).
+    """
     lead = x.shape[: x.ndim - dims]
     if not lead:
         return function(x)
@@ -191,12 +220,27 @@ SUMS = 4
 
 
 def packed(described: dict[str, Any]) -> Tensor:
-    """Plain data as JSON in bytes (N,), uint8 on the CPU: files that hold tensors alone take it too."""
+    """Return plain data as JSON in bytes, which files that hold tensors alone take too.
+
+    Args:
+        described: plain data.
+
+    Returns:
+        (N,) uint8 on the CPU.
+    """
     return torch.tensor(list(json.dumps(described).encode()), dtype=torch.uint8, device="cpu")
 
 
 def unpacked(state: Any, who: str) -> Any:
-    """The plain data of :func:`packed`. Raises StorageError."""
+    """Return the plain data of :func:`packed`.
+
+    Args:
+        state: (N,) uint8.
+        who: begins the message.
+
+    Raises:
+        StorageError: for other objects.
+    """
     try:
         return json.loads(bytes(state.cpu().tolist()).decode())
     except (AttributeError, TypeError, ValueError) as error:
@@ -204,7 +248,11 @@ def unpacked(state: Any, who: str) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """A setting as plain data: records by their fields, tensors by their shape, size and some sums."""
+    """Return a setting as plain data: records by their fields, tensors by their shape, size and some sums.
+
+    Args:
+        value: number, text, tensor, record, or a list of such.
+    """
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Tensor):
@@ -222,7 +270,16 @@ def plain(value: Any) -> Any:
 
 
 def check_same(mine: Any, theirs: Any, who: str, what: str = "settings") -> None:
-    """Raises ShapeError where the state that is loaded is that of another operator, ``what`` says in which respect."""
+    """Check that a state that is loaded is that of an equal operator.
+
+    Args:
+        mine, theirs: settings as :func:`plain` returns them.
+        who: begins the message.
+        what: name of the setting.
+
+    Raises:
+        ShapeError: where they differ by more than rounding.
+    """
     if isinstance(mine, dict) and isinstance(theirs, dict) and mine.keys() == theirs.keys():
         if "sums" in mine and mine["shape"] == theirs["shape"]:
             slack = SLACK * max(mine["size"], theirs["size"]) * math.sqrt(max(1, math.prod(mine["shape"])))

@@ -36,15 +36,23 @@ from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid
 class TransientOperator(LinearOperator):
     """A linear operator between a volume and transients (..., T, *scan points).
 
-    ``scan``: a copy of what was given, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes
-    stand on, None for points that stand on none. Tables are built in double precision and kept in ``dtype``;
-    ``operator.double()`` builds them anew. They are made on the CPU, whatever torch's default device is. ``state_dict``
-    holds no tables but what the operator was made from: scan, axis, points and settings, not the precision. Loading
-    the state of another operator raises ShapeError; ``strict=False`` loads what has none.
+    ``scan``: a copy of the argument, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes stand
+    on, None for points that stand on none. Tables are built in double precision on the CPU, whatever torch's default
+    device is, and kept in ``dtype``; ``operator.double()`` builds them anew. ``state_dict`` holds no tables but the
+    scan, axis, points and settings of the operator, not the precision. Loading the state of another operator raises
+    ShapeError; ``strict=False`` loads models without such a state.
 
-    Classes say :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape`` and
-    ``grid`` (without one, they say :attr:`points`), and call ``_set_tables()`` last. Raises ShapeError for what is
-    no axis, UnitError for a dtype other than float32 and float64.
+    Classes define :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape``
+    and ``grid`` (without one, they define :attr:`points`), and call ``_set_tables()`` last.
+
+    Args:
+        scan: of any kind, or the grid of a flat wall.
+        time_axis: of the transients.
+        dtype: float32 or float64.
+
+    Raises:
+        ArgumentError: for other objects than a time axis.
+        UnitError: for another dtype, and a wall and a record that are not of one size.
     """
 
     scan: Scan | PlanarScan
@@ -60,7 +68,7 @@ class TransientOperator(LinearOperator):
 
     @property
     def points(self) -> Tensor:
-        """(..., 3) float64 on the CPU: where the values of a volume stand in world coordinates, metres."""
+        """Places of the values of a volume in world coordinates, (..., 3) float64 on the CPU, metres."""
         if self.grid is None:
             who = type(self).__name__
             raise ShapeError(f"{who}: expected a grid, or points of the class itself, got neither. Set its grid.")
@@ -72,11 +80,15 @@ class TransientOperator(LinearOperator):
         return None if self.grid is None else self.grid.depths
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The picture of a transient (..., *data_shape) or of a capture's: real, differentiable."""
+        """Return the picture of a transient, real and differentiable.
+
+        Args:
+            transient: (..., *data_shape), or a capture.
+        """
         raise NotImplementedError
 
     def tables(self) -> dict[str, Tensor]:
-        """The tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""
+        """Return the tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""
         return {}
 
     def _set_tables(self, device: torch.device | str = "cpu") -> None:
@@ -90,13 +102,23 @@ class TransientOperator(LinearOperator):
         self._set_tables(self.device or "cpu")
 
     def get_extra_state(self) -> Tensor:
-        """What the operator was made from, as bytes: its settings are those arguments of the class that it keeps under
-        their own names, records and tensors among them; of other objects it is their class alone.
+        """Return the settings of the operator as bytes.
+
+        They are the arguments of the class that it keeps under their own names, records and tensors among them; other
+        objects are known by their class alone.
         """
         return packed(self._described())
 
     def set_extra_state(self, state: Any) -> None:
-        """Raises ShapeError for the state of another operator, StorageError for what is none."""
+        """Compare a state with the settings of the operator.
+
+        Args:
+            state: of :meth:`get_extra_state`.
+
+        Raises:
+            ShapeError: for the state of another operator.
+            StorageError: for other objects.
+        """
         who = type(self).__name__
         check_same(self._described(), unpacked(state, who), who)
 
@@ -112,13 +134,17 @@ class TransientOperator(LinearOperator):
         }
 
     def _measured(self) -> Any:
-        """What of the scan the operator depends on."""
+        """Return the part of the scan that the operator depends on."""
         return telling(self.scan) if isinstance(self.scan, Scan) else self.scan
 
     def transients(self, data: Tensor | Capture) -> Tensor:
-        """The transient (..., *data_shape) of a tensor or a capture, in the operator's precision.
+        """Return a transient in the operator's precision.
 
-        Raises ShapeError for a capture of another scan or axis, of polarized light, or without a transient.
+        Args:
+            data: (..., *data_shape), or a capture.
+
+        Raises:
+            ShapeError: for a capture of another scan or axis, of polarized light, or without a transient.
         """
         if not isinstance(data, Capture):
             return self._taken("transient", data, self.data_shape, real=True)
@@ -131,7 +157,7 @@ class TransientOperator(LinearOperator):
         return self._taken("transient", transient, self.data_shape, real=True)
 
     def _takes(self, scan: Scan) -> bool:
-        """Whether captures of a scan are the operator's data."""
+        """Return True where captures of a scan are the operator's data."""
         return isinstance(self.scan, Scan) and same_light(scan, self.scan)
 
     def extra_repr(self) -> str:
@@ -147,10 +173,20 @@ def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:
 
 
 def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:
-    """``reconstruct`` of a capture by an operator of class ``kind`` for its own scan and axis, where its transient is,
-    in double precision for captures of that, else in single, unless ``options`` say ``dtype``.
+    """Reconstruct a capture by an operator for its own scan and axis, on the device of its transient.
 
-    Raises ShapeError for what is no capture, or has no transient, and what the class raises.
+    Args:
+        capture: with a transient.
+        kind: class of the operator.
+        points: of classes that take some.
+        who: begins the message.
+        options: of the class; ``dtype`` is double for captures in double precision, else single, unless given.
+
+    Returns:
+        ``reconstruct`` of the capture.
+
+    Raises:
+        ShapeError: for other objects than captures, for phasors alone, and as the class.
     """
     transient, axis = checked_capture(capture, who)
     options.setdefault("dtype", torch.float64 if transient.dtype == torch.float64 else torch.float32)
@@ -164,12 +200,17 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
 class ScanOperator(TransientOperator):
     """A linear operator between values at hidden points and transients (..., T, *scan.shape) of a scan of any kind.
 
-    ``points``: a :class:`VoxelGrid`, or points (..., 3) in world coordinates, metres; volumes have their leading
-    dimensions. ``time_axis``: of the transients, counted as the scan's ``first_and_last_leg`` says. Points that carry
-    gradients are taken as they are, detached: operators are differentiable by volumes and transients alone.
+    Args:
+        scan: of any kind.
+        points: grid, or points (..., 3) in world coordinates, metres; volumes have their leading dimensions. Points
+            that carry gradients are taken as they are, detached: operators are differentiable by volumes and transients
+            alone.
+        time_axis: of the transients, counted as the scan's ``first_and_last_leg`` says.
+        dtype: float32 or float64.
 
-    Raises ShapeError for what is no scan, axis or points, UnitError for points that are not finite and for a dtype
-    other than float32 and float64.
+    Raises:
+        ShapeError: for other objects than scans and points.
+        UnitError: for points that are not finite or far beyond the record, and for another dtype.
     """
 
     scan: Scan
@@ -195,20 +236,30 @@ CPU_CHUNK, GPU_CHUNK = 1 << 17, 1 << 24
 
 
 def chunk_rows(elements: int, device: torch.device) -> int:
-    """How many rows of ``elements`` complex numbers to work on at once."""
+    """Return the number of rows to work on at once.
+
+    Args:
+        elements: complex numbers of a row.
+        device: of the operands.
+    """
     return max(1, (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK) // max(1, elements))
 
 
 class ConfocalOperator(TransientOperator):
     """A linear operator between a volume (..., Z, Y, X) before a flat wall and confocal transients (..., T, Y, X).
 
-    ``scan``: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
-    from the spot to the sensor point (``first_and_last_leg=False``). ``time_axis``: of the transients. Voxels stand
-    behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path length. Time
-    axes start at zero or later, unless a class says :attr:`early`.
+    Voxels stand behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path
+    length. Time axes start at zero or later, unless a class sets :attr:`early`.
 
-    Raises ShapeError for other scans and axes, UnitError for time axes that begin before zero and for a
-    dtype other than float32 and float64.
+    Args:
+        scan: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
+            from the spot to the sensor point (``first_and_last_leg=False``).
+        time_axis: of the transients.
+        dtype: float32 or float64.
+
+    Raises:
+        ShapeError: for other scans and axes.
+        UnitError: for time axes that begin before zero, and for another dtype.
     """
 
     grid: VoxelGrid
@@ -242,9 +293,13 @@ class ConfocalOperator(TransientOperator):
 
 
 class InverseOperator(LinearOperator):
-    """A regularised inverse of an operator, itself a linear operator: from its data to its volume, whose
-    ``points``, ``depths`` and ``grid`` it has. It shares the operator's tables until one of them is moved or converted,
-    which leaves the other as it was.
+    """A regularised inverse of an operator, itself a linear operator from its data to its volume.
+
+    It has the ``points``, ``depths`` and ``grid`` of the operator, and shares its tables until one of them is moved or
+    converted, which leaves the other as it was.
+
+    Args:
+        operator: to be inverted.
     """
 
     def __init__(self, operator: ConfocalOperator) -> None:
@@ -259,12 +314,12 @@ class InverseOperator(LinearOperator):
 
     @property
     def axis(self) -> TimeAxis:
-        """Of the transients."""
+        """Time axis of the transients."""
         return self.operator.axis
 
     @property
     def grid(self) -> VoxelGrid:
-        """The voxels that it finds values of."""
+        """Voxels of the result."""
         return self.operator.grid
 
     @property

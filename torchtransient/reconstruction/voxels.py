@@ -25,7 +25,9 @@ OFF_GRID = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlanarScan:
-    """``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
+    """A regular grid of points on a flat wall.
+
+    ``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
     ``first``; ``normal`` points to the hidden side. Vectors are (3,) float64 on the CPU.
     """
 
@@ -39,9 +41,17 @@ class PlanarScan:
 
     @staticmethod
     def of(points: Tensor, normals: Tensor | None = None, *, who: str, what: str = "sensor points") -> PlanarScan:
-        """Of points (Y, X, 3), two along each side at least. ``normals`` (Y, X, 3): of the wall, which say where the
-        hidden side is; without them it is that of ``along_x`` times ``along_y``. Raises ShapeError for a list of
-        points, and for grids that are not regular, not at right angles, or not flat: ``who`` cannot take them.
+        """Return the grid of points.
+
+        Args:
+            points: (Y, X, 3), two along each side at least, metres.
+            normals: (Y, X, 3) of the wall, towards the hidden side; without them it is that of ``along_x`` times
+                ``along_y``.
+            who: begins the message.
+            what: name of the points in the message.
+
+        Raises:
+            ShapeError: for a list of points, and for grids that are not regular, not at right angles, or not flat.
         """
         check_real(points, f"{who}: {what}")
         p = points.detach().to("cpu", torch.float64, copy=True)
@@ -70,20 +80,32 @@ class PlanarScan:
 
     @staticmethod
     def of_scan(scan: Scan, who: str) -> PlanarScan:
-        """The sensor points of a scan, and its :func:`hidden_side`. Raises ShapeError."""
+        """Return the grid of a scan's sensor points, with its :func:`hidden_side`.
+
+        Args:
+            scan: on a regular grid of a flat wall.
+            who: begins the message.
+
+        Raises:
+            ShapeError: for other scans.
+        """
         of_class(f"{who}: scan", scan, Scan, error=ShapeError)
         wall = PlanarScan.of(scan.sensor_points, who=who)
         return replace(wall, normal=hidden_side(scan, wall.normal))
 
     @property
     def points(self) -> Tensor:
-        """(Y, X, 3) float64 on the CPU: its points in world coordinates, metres."""
+        """Points of the grid in world coordinates, (Y, X, 3) float64 on the CPU, metres."""
         rows, columns = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
         wall = self.first + (rows[:, None, None] * self.pitch[0]) * self.along_y
         return wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
 
     def matches(self, other: PlanarScan) -> bool:
-        """Whether it is the same grid with the same hidden side, to what points of a grid may be off it."""
+        """Return True for the same grid with the same hidden side, to a thousandth of the smallest pitch.
+
+        Args:
+            other: the grid to compare with.
+        """
         if self.size != other.size or float(self.normal @ other.normal) <= 0:
             return False
         off = float((self.points - other.points).norm(dim=-1).max())
@@ -94,15 +116,27 @@ class PlanarScan:
         return f"PlanarScan({columns} x {rows} points, {dx:.4g} x {dy:.4g} m apart)"
 
     def local(self, points: Tensor) -> Tensor:
-        """Coordinates (..., 3) along x, y and the normal, from the first point, metres, float64."""
+        """Return coordinates along x, y and the normal, from the first point.
+
+        Args:
+            points: (..., 3) in world coordinates, metres.
+
+        Returns:
+            (..., 3) float64 on the CPU, metres.
+        """
         off = points.detach().to("cpu", torch.float64) - self.first
         return torch.stack([off @ self.along_x, off @ self.along_y, off @ self.normal], -1)
 
 
 def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
-    """``normal`` (3,) of a scan's wall or its opposite, whichever points to the hidden side: that of the scan's
-    normals; without them, that on which its sensor and its laser stand. Where they stand in the wall or on both sides
-    of it nothing says which it is: ``normal`` as given.
+    """Return the normal of a scan's wall or its opposite, whichever points to the hidden side.
+
+    That is the side of the scan's normals; without them, the side on which its sensor and its laser stand. Where they
+    stand in the wall or on both sides of it, ``normal`` as given.
+
+    Args:
+        scan: of any kind.
+        normal: (3,).
     """
     if scan.sensor_normals is not None:
         return _with_normals(normal, scan.sensor_normals)
@@ -114,7 +148,15 @@ def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
 
 
 def check_real(points: Tensor, what: str) -> None:
-    """Raises ShapeError for complex tensors and truth values, which a conversion would make real numbers of."""
+    """Refuse complex tensors and truth values, which a conversion would make real numbers of.
+
+    Args:
+        points: any tensor.
+        what: begins the message.
+
+    Raises:
+        ShapeError: for such tensors.
+    """
     if points.is_complex() or points.dtype == torch.bool:
         raise ShapeError(f"{what}: expected real numbers, got {points.dtype}.")
 
@@ -179,23 +221,30 @@ class VoxelGrid:
         size: int | Sequence[int] | None = None,
         extent: float | Numbers | None = None,
     ) -> VoxelGrid:
-        """Planes at ``depths`` (Z,) metres before the wall of a scan, parallel to it, along its rows and columns.
+        """Make planes before the wall of a scan, parallel to it, along its rows and columns.
 
         Without ``size`` and ``extent`` a voxel stands before each sensor point of a flat, regular grid, which is what
-        :class:`PhasorField` takes at its fastest. ``size``: (X, Y) voxels or one number for both, None for as many as
-        sensor points; ``extent``: (width, height) of the planes in metres from the outer edges of the voxels, or one
-        number for both, around the middle of the sensor points; None for what the sensor points fill, each with a cell
-        of its own around it. The planes of a curved wall are parallel to its mean plane, depths count from the mean of
-        its points. Of a list of points that knows no wall, planes lie across its mean normal, without normals along the
-        plane that fits the points best (of points on one line: across the way to the sensor); columns run upwards,
-        along the world's y as far as it lies in them (z where the wall lies flat).
-
-        Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, where
-        the sensor of a list without normals stands on its one line, and for sizes that are none; UnitError for depths
-        that do not increase; SceneError where points on one line, or one point, do not say an extent.
+        :class:`PhasorField` takes at its fastest. The planes of a curved wall are parallel to its mean plane, depths
+        count from the mean of its points. Planes of a list of points that knows no wall lie across its mean normal,
+        without normals along the plane that fits the points best (of points on one line: across the way to the sensor);
+        columns run upwards, along the world's y as far as it lies in them (z where the wall lies flat).
 
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
+
+        Args:
+            scan: of any kind.
+            depths: (Z,) metres before the wall, increasing.
+            size: (X, Y) voxels or one number for both, None for as many as sensor points.
+            extent: (width, height) of the planes in metres from the outer edges of the voxels, or one number for both,
+                around the middle of the sensor points; None for the area of the sensor points, each with a cell of its
+                own around it.
+
+        Raises:
+            ShapeError: where size and extent are missing and the wall is not flat or the points are a list, where the
+                sensor of a list without normals stands on its one line, and for other sizes.
+            UnitError: for depths that do not increase.
+            SceneError: where points on one line, or one point, do not say an extent.
         """
         of_class("VoxelGrid.before: scan", scan, Scan, error=ShapeError)
         depths = checked_depths(depths, "VoxelGrid.before")
@@ -233,7 +282,15 @@ class VoxelGrid:
 
     @classmethod
     def of_wall(cls, wall: PlanarScan, depths: Any) -> VoxelGrid:
-        """A voxel before each point of a regular grid, at each of ``depths`` (Z,) metres. Raises as the class."""
+        """Make a voxel before each point of a regular grid, at each depth.
+
+        Args:
+            wall: the grid.
+            depths: (Z,) metres, increasing.
+
+        Raises:
+            ShapeError, UnitError: as the class.
+        """
         return cls(
             depths,
             wall.size,
@@ -246,10 +303,14 @@ class VoxelGrid:
 
     @classmethod
     def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
-        """Voxels that fill the box ``bounds`` (2, 3), its lowest and highest corner in world coordinates, metres.
+        """Make voxels that fill a box: the middles of equal cells, rows along y, columns along x, planes along z.
 
-        ``size``: (X, Y, Z) voxels, or one number for the three. Rows run along y, columns along x, planes along z;
-        voxels are the middles of equal cells. Raises ShapeError and UnitError.
+        Args:
+            bounds: (2, 3), the lowest and highest corner in world coordinates, metres.
+            size: (X, Y, Z) voxels, or one number for the three.
+
+        Raises:
+            ShapeError, UnitError: for other bounds and sizes.
         """
         low, high = bounds_of(bounds, "VoxelGrid.bounds")
         sizes = [count("VoxelGrid.bounds: size", n) for n in _numbers("VoxelGrid.bounds: size (X, Y, Z)", size, 3)]
@@ -263,12 +324,12 @@ class VoxelGrid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(Z, Y, X)."""
+        """Number of voxels (Z, Y, X)."""
         return (len(self.depths), *self.size)
 
     @property
     def points(self) -> Tensor:
-        """(Z, Y, X, 3) float64 on the CPU: the voxels in world coordinates, metres."""
+        """Voxels in world coordinates, (Z, Y, X, 3) float64 on the CPU, metres."""
         j, i = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
         plane = self.first + (j[:, None, None] * self.pitch[0]) * self.along_y
         plane = plane + (i[None, :, None] * self.pitch[1]) * self.along_x
@@ -276,11 +337,18 @@ class VoxelGrid:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """(width, height) of a plane from the outer edges of its voxels, metres."""
+        """Size (width, height) of a plane from the outer edges of its voxels, metres."""
         return self.size[1] * self.pitch[1], self.size[0] * self.pitch[0]
 
     def at_depths(self, depths: Any) -> VoxelGrid:
-        """The grid with other planes. Raises ShapeError and UnitError."""
+        """Return the grid with other planes.
+
+        Args:
+            depths: (Z,) metres, increasing.
+
+        Raises:
+            ShapeError, UnitError: for other depths.
+        """
         return replace(self, depths=depths)
 
     def __eq__(self, other: object) -> bool:
@@ -300,7 +368,16 @@ class VoxelGrid:
 
 
 def checked_depths(values: Any, who: str) -> Tensor:
-    """Depths (Z,) of planes, float64 on the CPU. Raises ShapeError and UnitError."""
+    """Return depths of planes, float64 on the CPU.
+
+    Args:
+        values: (Z,) metres, a tensor, an array or a list.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for depths that are not finite or do not increase.
+    """
     plain = real_array(values)
     if plain is None or plain.ndim != 1 or len(plain) == 0:
         raise ShapeError(f"{who}: expected depths (Z,) in metres, got {shown(values)}.")
@@ -365,16 +442,20 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class HiddenVolume(TensorRecord):
-    """What a method found behind a corner.
+    """A hidden volume as a record of tensors: the result of a method, its voxels, and its settings.
 
     ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
     film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
-    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and why it was taken, plain
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and the reason for it, plain
     data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
 
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
-    values and directions; grid and times stay on the CPU, and are the same in a batch. Raises ShapeError where tensors
-    and grid do not fit, UnitError for times that are not finite, StorageError for metadata that is not plain.
+    values and directions; grid and times stay on the CPU, and are the same in a batch.
+
+    Raises:
+        ShapeError: where tensors and grid do not fit.
+        UnitError: for times that are not finite.
+        StorageError: for metadata that is not plain.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)
