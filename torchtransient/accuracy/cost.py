@@ -29,7 +29,7 @@ from torchtransient.scene.variant import active_variant
 
 @dataclass(frozen=True)
 class Estimates:
-    """What one run returns: arrays by quantity, and the samples per pixel it really drew.
+    """Result of one run: arrays by quantity, and the samples per pixel really drawn.
 
     `derived`: function that makes further arrays, which is not timed.
     """
@@ -41,11 +41,11 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Task:
-    """One thing that is timed on its own: `run(spp, seed)` must return finished numbers, not pending kernels.
+    """A run that is timed on its own: `run(spp, seed)` must return finished numbers, not pending kernels.
 
-    `time_dims` gives the axis of time bins for the quantities that have one. `tails`: whether the tail of its
-    distribution is looked at first, which holds 96 runs in memory. `to_common`: functions by quantity that bring its
-    array to the shape which all choices share; they are not timed.
+    `time_dims` gives the axis of time bins for the quantities that have one. `tails`: look at the tail of its
+    distribution first, which holds 96 runs in memory. `to_common`: functions by quantity that bring its array to the
+    shape which all choices share; they are not timed.
     """
 
     run: Callable[[int, int], Estimates]
@@ -54,7 +54,7 @@ class Task:
     to_common: Mapping[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = field(default_factory=dict)
 
     def comparable(self, estimates: Estimates) -> dict[str, NDArray[np.float32]]:
-        """Arrays of a run in the shape that all choices share."""
+        """Return the arrays of a run in the shape that all choices share."""
         given = {**estimates.arrays, **estimates.derived()}
         arrays = {name: np.asarray(array, dtype=np.float32) for name, array in given.items()}
         return {name: self.to_common[name](x) if name in self.to_common else x for name, x in arrays.items()}
@@ -132,7 +132,9 @@ def _measure_count(
     tails: Mapping[Key, Tail],
     bar: Any,
 ) -> list[CostPoint]:
-    """All points at one sample count. `own`: references of each choice, `common`: those of the total error."""
+    """Measure all points at one sample count. `own`: references of each choice, `common`: references of the total
+    error.
+    """
     for candidate in candidates.values():
         for task in candidate.values():
             task.run(count, first_seed + repeats)
@@ -220,7 +222,16 @@ def _references(
 
 
 def checked_counts(spp: Sequence[int], repeats: int, reference_spp: int | None) -> list[int]:
-    """The sample counts of a measurement, in order. Raises UnitError."""
+    """Return the sample counts of a measurement, in order.
+
+    Args:
+        spp: different counts.
+        repeats: of each count.
+        reference_spp: of the reference, or None.
+
+    Raises:
+        UnitError: for other numbers.
+    """
     listed = isinstance(spp, Sequence) or getattr(spp, "ndim", None) == 1
     found = [as_whole(n) for n in spp] if listed and not isinstance(spp, (str, bytes)) else []
     counts = [n for n in found if n is not None and 1 <= n < 2**32]
@@ -246,10 +257,16 @@ Loss = Callable[[RenderOutput], torch.Tensor]
 
 
 def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
-    """The default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over
-    pixels; of phasors, the sum of their real parts, mean over pixels.
+    """Default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over pixels.
 
-    It is linear in what is measured, so that its gradient has no bias, and it changes with energy and arrival time.
+    Of phasors, the sum of their real parts, mean over pixels. It is linear in the measurement, so that its gradient has
+    no bias, and it changes with energy and arrival time.
+
+    Args:
+        out: a render.
+
+    Raises:
+        ShapeError: for a steady image alone.
     """
     response = _response(out)
     pixels = response.shape[-2] * response.shape[-1]
@@ -261,7 +278,7 @@ def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
 
 
 def _response(out: RenderOutput) -> torch.Tensor:
-    """What the film of a render measured."""
+    """Return the tensor that the film of a render measured."""
     film = layout_of_output(out)
     response = None if film is None else film.tensor(out)
     if response is None:

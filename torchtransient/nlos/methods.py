@@ -33,7 +33,17 @@ class Choice:
 
 
 def choose_method(capture: Capture) -> Choice:
-    """The method that suits a capture. Raises ShapeError for what is none."""
+    """Choose the method that suits a capture.
+
+    Args:
+        capture: of any kind.
+
+    Returns:
+        Name of the method, and the reason for it.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     if not isinstance(capture, Capture):
         raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
@@ -51,7 +61,15 @@ def choose_method(capture: Capture) -> Choice:
 
 
 def check_method(name: str, capture: Capture) -> Method:
-    """The method of a name. Raises ArgumentError for unknown ones and for scans that it does not take."""
+    """Return the method of a name.
+
+    Args:
+        name: one of ``METHODS``.
+        capture: that it is meant for.
+
+    Raises:
+        ArgumentError: for unknown names, and for scans that the method does not take.
+    """
     if not isinstance(name, str) or name not in METHODS:
         raise ArgumentError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
@@ -70,7 +88,11 @@ def check_method(name: str, capture: Capture) -> Method:
 
 
 def is_planar(scan: Scan) -> bool:
-    """Whether the sensor points are a regular grid of a flat wall."""
+    """Return True where the sensor points are a regular grid of a flat wall.
+
+    Args:
+        scan: of any kind.
+    """
     try:
         PlanarScan.of_scan(scan, "choose_method")
     except ShapeError:
@@ -79,8 +101,13 @@ def is_planar(scan: Scan) -> bool:
 
 
 def pitch_of(scan: Scan) -> float:
-    """How far sensor points are from their neighbours, metres: that of a grid, or the mean over a list's points. Zero
-    for one point.
+    """Return the distance of sensor points from their neighbours, metres.
+
+    Args:
+        scan: of any kind.
+
+    Returns:
+        Pitch of a grid, mean over the points of a list, zero for one point.
     """
     if is_planar(scan):
         return max(PlanarScan.of_scan(scan, "pitch_of").pitch)
@@ -94,11 +121,19 @@ def pitch_of(scan: Scan) -> float:
 
 
 def default_wavelength(capture: Capture) -> float:
-    """The shortest wavelength, metres of optical path, that shows no ghosts and that the bins hold: two pitches of
-    the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and four bins at
-    least.
+    """Return the shortest wavelength that shows no ghosts and that the bins hold.
 
-    Raises ShapeError for a capture without a transient.
+    Two pitches of the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and
+    four bins at least.
+
+    Args:
+        capture: with a transient.
+
+    Returns:
+        Metres of optical path.
+
+    Raises:
+        ShapeError: for a capture without a transient.
     """
     if capture.axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
@@ -112,8 +147,16 @@ AT_ONCE, POINT = 16, 40
 
 
 def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, options: Mapping[str, Any]) -> None:
-    """Raises StorageError where a method would take more memory than is left on the device of a capture; what is told
-    is the least that it takes.
+    """Check that the memory left on the device of a capture holds the volume of a method.
+
+    Args:
+        name: of the method.
+        capture: with a transient.
+        grid: voxels of methods that take some, else None.
+        options: of the method.
+
+    Raises:
+        StorageError: where even the least memory of the method is not there.
     """
     light = capture.transient
     assert light is not None
@@ -134,7 +177,17 @@ def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, optio
 
 
 def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Mapping[str, Any]) -> int:
-    """The memory that a method takes at its fullest, without what is already there: a lower bound of it."""
+    """Return a lower bound of the memory that a method takes beside its arguments.
+
+    Args:
+        name: of the method.
+        capture: with a transient.
+        grid: voxels of methods that take some, else None.
+        options: of the method.
+
+    Returns:
+        Bytes.
+    """
     light, axis = capture.transient, capture.axis
     assert light is not None and axis is not None
     number = 8 if light.dtype == torch.float64 else 4

@@ -1,8 +1,8 @@
-"""The part file of a simulation: what is finished, on disk.
+"""The part file of a simulation: finished rows, on disk.
 
-Three files: ``NAME``, JSON that says which simulation it is and which of its rows are finished; ``NAME.npy``, the rows
+Three files: ``NAME``, JSON with the key of the simulation and the numbers of its finished rows; ``NAME.npy``, the rows
 in NumPy's own format; ``NAME.lock``, held while a process works on it. Rows are written first and named afterwards,
-with a checksum, and the JSON replaces the one before in one step: a kill at any moment, or a full disk, loses what was
+with a checksum, and the JSON replaces the one before in one step: a kill at any moment, or a full disk, loses the rows
 in progress and nothing else.
 """
 
@@ -31,9 +31,10 @@ Rows = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class RowLayout:
-    """What the numbers of a row are: of one sensor point the transient (or phasor, real and imaginary part in turn) of
-    shape ``front``, then the steady image's ``steady`` channels, 0 without one. ``front`` has the laser's dimensions of
-    an exhaustive scan at its end.
+    """Layout of a capture as rows of numbers, one for each sensor point.
+
+    A row holds the transient (or phasor, real and imaginary part in turn) of shape ``front``, then the steady image's
+    ``steady`` channels, 0 without one. ``front`` has the laser's dimensions of an exhaustive scan at its end.
     """
 
     front: tuple[int, ...]
@@ -44,7 +45,7 @@ class RowLayout:
 
     @classmethod
     def of(cls, capture: Capture) -> RowLayout:
-        """That of a capture."""
+        """Return the layout of a capture."""
         measured = _measured(capture)
         rank = len(capture.scan.sensor_shape)
         steady = () if capture.steady is None else tuple(capture.steady.shape[: capture.steady.ndim - rank])
@@ -58,21 +59,21 @@ class RowLayout:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> RowLayout:
-        """Of what `plain` returned."""
+        """Return the layout that :meth:`plain` described."""
         given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
         return cls(**given)
 
     def plain(self) -> dict[str, Any]:
-        """As data for JSON."""
+        """Return the layout as data for JSON."""
         return asdict(self)
 
     @property
     def columns(self) -> int:
-        """How many numbers a row has."""
+        """Number of columns of a row."""
         return self._measured_columns() + self._steady_columns()
 
     def rows(self, capture: Capture) -> Rows:
-        """The rows (N, columns) of a capture's sensor points, those of a grid row by row."""
+        """Return the rows (N, columns) of a capture's sensor points, in the order of the scan."""
         rank = len(capture.scan.sensor_shape)
         measured = _points_first(_measured(capture), rank)
         if self.phasor:
@@ -86,7 +87,7 @@ class RowLayout:
     def capture(
         self, rows: Rows, scan: Scan, axis: TimeAxis | None, frequencies: FrequencyAxis | None
     ) -> dict[str, Any]:
-        """What :class:`Capture` is made of, but its metadata; views of ``rows`` (N, columns)."""
+        """Return the arguments of :class:`Capture`, but its metadata, as views of ``rows`` (N, columns)."""
         split, numbers = self._measured_columns(), torch.from_numpy(rows)
         measured, steady = numbers[:, :split], numbers[:, split:]
         if self.phasor:
@@ -128,11 +129,17 @@ FORMAT = "torchtransient part 2"
 
 
 class PartFile:
-    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with``
-    block, which holds the lock.
+    """Finished rows of one simulation. To be used in a ``with`` block, which holds the lock.
 
-    ``about``: plain data that was kept with them, empty at first. Raises StorageError where ``path`` is something else,
-    belongs to another simulation, is damaged, or is worked on by another process.
+    ``about``: plain data that was kept with them, empty at first.
+
+    Args:
+        path: of the JSON file.
+        key: of the simulation, "" for any, to be removed.
+
+    Raises:
+        StorageError: where ``path`` is another kind of file, belongs to another simulation, is damaged, or is worked on
+            by another process.
     """
 
     def __init__(self, path: Path, key: str) -> None:
@@ -196,7 +203,7 @@ class PartFile:
             self._check()
 
     def _check(self) -> None:
-        """Raise StorageError unless the rows are those that were written."""
+        """Check the rows by their checksums. Raises StorageError."""
         for first, count, checksum in self._done.values():
             if zlib.crc32(self._bytes(first, count)) != checksum:
                 raise StorageError(
@@ -205,7 +212,7 @@ class PartFile:
                 )
 
     def has(self, number: int) -> bool:
-        """Whether the part of that number is finished."""
+        """Return True where a part is finished."""
         return number in self._done
 
     @property
@@ -214,13 +221,13 @@ class PartFile:
         return max(self._done, default=None)
 
     def rows(self, first: int, count: int) -> Rows:
-        """Some rows, (count, columns)."""
+        """Return some rows, (count, columns)."""
         with self._errors_said():
             found = np.frombuffer(self._bytes(first, count), dtype=np.float32)
             return found.reshape(count, self._shape[1]).copy()
 
     def everything(self) -> Rows:
-        """All rows, read into memory."""
+        """Return all rows, read into memory."""
         with self._errors_said():
             return np.load(self._data, mmap_mode=None, allow_pickle=False)  # type: ignore[no-any-return]
 
@@ -237,10 +244,19 @@ class PartFile:
         self, number: int, first: int, rows: Rows, *, total: int, seconds: float, about: Mapping[str, Any],
         instead_of: int | None = None,
     ) -> None:  # fmt: skip
-        """Keep the part of a number: its ``rows`` (N, columns), from row ``first`` of ``total``, that took ``seconds``.
+        """Keep a part.
 
-        ``instead_of``: the number of a part that it takes the place of. Raises StorageError for a full disk, which
-        leaves what was finished before.
+        Args:
+            number: of the part.
+            first: its first row.
+            rows: (N, columns).
+            total: number of rows of the file.
+            seconds: that it took.
+            about: plain data to be kept with all parts.
+            instead_of: number of a part that it replaces.
+
+        Raises:
+            StorageError: for a full disk, which leaves the parts before.
         """
         with self._errors_said():
             if self._file is None:
@@ -264,7 +280,7 @@ class PartFile:
         self._file.truncate(self._start() + 4 * total * columns)
 
     def _start(self) -> int:
-        """Where the first row lies: behind the header, whose length it says itself."""
+        """Return the place of the first row: behind the header, which says its own length."""
         assert self._file is not None
         self._file.seek(8)
         return 10 + int.from_bytes(self._file.read(2), "little")
@@ -314,7 +330,11 @@ class PartFile:
 def delete_part_file(path: Path) -> None:
     """Delete the files of a simulation's parts, if there are any.
 
-    Raises StorageError for a file that is something else, or is worked on by another process.
+    Args:
+        path: of the JSON file.
+
+    Raises:
+        StorageError: for another kind of file, or one that another process works on.
     """
     if not path.exists():
         return

@@ -53,8 +53,15 @@ from torchtransient.volume_methods import FILTERS, Method
 
 
 def checked_light(capture: Capture, who: str) -> Capture:
-    """A capture whose light is finite. Raises UnitError for NaN and infinities, which transforms spread over the whole
-    volume: it says at how many points, and which is the first.
+    """Return a capture whose light is finite.
+
+    Args:
+        capture: with a transient.
+        who: begins the message.
+
+    Raises:
+        UnitError: for NaN and infinities, which transforms spread over the whole volume; it names their number and the
+            first point.
     """
     light = capture.transient
     assert light is not None  # a capture without one has been refused
@@ -75,10 +82,18 @@ def checked_light(capture: Capture, who: str) -> Capture:
 
 
 def sum_bins(capture: Capture, number: int) -> Capture:
-    """The capture with so many neighbouring bins added up; what is left over at the record's end is dropped.
+    """Add up neighbouring bins; bins left over at the record's end are dropped.
 
-    Counts stay whole (int64), half precision becomes float32; phasors beside a transient stay. Raises ShapeError
-    without a transient and for more bins than there are, SceneError for a number that is none.
+    Args:
+        capture: with a transient; phasors beside it stay.
+        number: of bins in a sum.
+
+    Returns:
+        Capture; counts stay whole (int64), half precision becomes float32.
+
+    Raises:
+        ShapeError: without a transient and for more bins than there are.
+        SceneError: for other numbers.
     """
     number = count("sum_bins: number", number)
     transient, axis = checked_capture(capture, "sum_bins")
@@ -93,9 +108,21 @@ def sum_bins(capture: Capture, number: int) -> Capture:
 
 
 def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
-    """A confocal capture without the foam slab on its wall, ``thickness`` metres, by :class:`DiffusionDeconvolution`
-    with the foam of Lindell and Wetzstein (2020); intensities below zero are zero, the other Stokes components are as
-    they come. Without legs, in double precision where the capture is, else in single. Raises as it does.
+    """Remove the foam slab on the wall of a confocal capture by :class:`DiffusionDeconvolution`.
+
+    The foam is that of Lindell and Wetzstein (2020). Intensities below zero become zero, the other Stokes components
+    stay.
+
+    Args:
+        capture: confocal, of a flat wall.
+        thickness: of the slab, metres.
+        snr: of the Wiener filter.
+
+    Returns:
+        Capture without legs, in double precision where the capture is, else in single.
+
+    Raises:
+        ShapeError, UnitError: as :class:`DiffusionDeconvolution`, and for light that is not finite.
     """
     checked_capture(capture, "without_slab")
     capture = subtract_legs(capture)
@@ -114,7 +141,15 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
 
 
 def moved_to(capture: Capture, device: Any) -> Capture:
-    """The capture on a device. Raises DeviceError where there is none of that name."""
+    """Move a capture to a device.
+
+    Args:
+        capture: of any kind.
+        device: name, or a torch.device.
+
+    Raises:
+        DeviceError: for a device that torch does not have.
+    """
     try:
         return capture.to(device)
     except (RuntimeError, AssertionError, TypeError) as error:
@@ -135,23 +170,32 @@ def reconstruct(
     progress: bool = True,
     **options: Any,
 ) -> HiddenVolume:
-    """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
+    """Reconstruct the hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and
+    others).
 
-    ``method``: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
-    scan, and ``metadata["reason"]`` says why. For confocal grids that is f-k, which bears background: a light-cone
-    transform is as good or better where background has been taken off, phasor fields where there are few photons.
-    ``grid``: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
-    and a voxel behind each point. ``depths`` (near, far), metres: what to look at; planes of the other methods outside
-    of it are left out. ``progress``: show a bar.
+    Args:
+        capture: with a transient. First and last legs are taken off where a method cannot count them, light before time
+            zero and phasors beside a transient are left out, and of polarized captures the intensity is taken.
+        method: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
+            scan, with the reason in ``metadata["reason"]``. For confocal grids that is f-k, which bears background: a
+            light-cone transform is as good or better where background has been taken off, phasor fields where there are
+            few photons.
+        grid: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
+            and a voxel behind each point.
+        depths: (near, far) to look at, metres; planes of the other methods outside of it are left out.
+        progress: show a bar.
+        options: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
+            directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None
+            for the shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp),
+            ``camera`` (phasor).
 
-    ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
-    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the
-    shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera``
-    (phasor). First and last legs are taken off where a method cannot count them, light before time zero and phasors
-    beside a transient are left out, and of polarized captures the intensity is taken.
+    Returns:
+        Values, grid, method and settings; times of a film; directions of methods that find normals.
 
-    Raises ArgumentError for a method or an option that does not fit the capture or each other, ShapeError, UnitError
-    and DeviceError as the operators.
+    Raises:
+        ArgumentError: for a method or an option that does not fit the capture or each other.
+        StorageError: for a volume beyond the memory.
+        ShapeError, UnitError, DeviceError: as the operators.
     """
     if not isinstance(capture, Capture):
         raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
@@ -195,10 +239,17 @@ def default_grid(
     extent: float | Numbers | None = None,
     planes: int | None = None,
 ) -> VoxelGrid:
-    """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
-    ``depths`` (near, far) in metres, None for all that a record reaches, and ``planes`` between them, None for one a
-    bin and 64 at most. Raises ShapeError, UnitError, and SceneError for a number of planes that is none, and where
-    sensor points on one line say nothing of an ``extent``.
+    """Make voxels before the wall of a capture.
+
+    Args:
+        capture: with a transient.
+        depths: (near, far) in metres, None for all that a record reaches.
+        size, extent: (X, Y) voxels and (width, height) in metres, as of `VoxelGrid.before`.
+        planes: between the depths, None for one a bin and 64 at most.
+
+    Raises:
+        ShapeError, UnitError: as `VoxelGrid.before`, and for phasors alone.
+        SceneError: for other numbers of planes, and where sensor points on one line say nothing of an ``extent``.
     """
     if not isinstance(capture, Capture):
         raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
@@ -228,7 +279,14 @@ def default_grid(
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:
-    """(near, far), metres. Raises UnitError."""
+    """Return (near, far).
+
+    Args:
+        depths: two numbers in metres, 0 <= near < far.
+
+    Raises:
+        UnitError: for other values.
+    """
     plain = real_array(depths)
     if plain is None or plain.shape != (2,):
         raise UnitError(f"reconstruct: expected depths as (near, far) in metres, got {shown(depths)}.")
@@ -239,8 +297,16 @@ def checked_depths(depths: Any) -> tuple[float, float]:
 
 
 def normals_of(volume: HiddenVolume) -> Tensor:
-    """Unit normals (3, Y, X) in world coordinates where a volume with directions is brightest behind each pixel: of the
-    first item of a batch, summed over its channels. Raises ShapeError for a volume without directions.
+    """Return unit normals where a volume with directions is brightest behind each pixel.
+
+    Args:
+        volume: with directions; of a batch the first item, summed over its channels.
+
+    Returns:
+        (3, Y, X) in world coordinates.
+
+    Raises:
+        ShapeError: for a volume without directions.
     """
     if not isinstance(volume, HiddenVolume) or volume.directions is None:
         raise ShapeError(
@@ -280,7 +346,7 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
 
 
 def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, Any]:
-    """All options that a method has, those too that nobody gave, as plain data."""
+    """Return all options that a method has, defaults too, as plain data."""
     found = {**entry.options, **used}
     if "v_bins" in found and found["v_bins"] is None:
         found["v_bins"] = axis.num_bins
@@ -392,10 +458,15 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
 
 
 def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
-    """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
+    """Return a virtual camera by its name.
 
-    Raises ArgumentError for unknown names, where times are missing or have no meaning, and for a count that is none,
-    UnitError for times that are not three finite numbers.
+    Args:
+        name: "direct", "confocal" or "transient".
+        times: (start, stop, count), metres, of the latter two.
+
+    Raises:
+        ArgumentError: for unknown names, and where times are missing or have no meaning.
+        UnitError: for times that are not three finite numbers.
     """
     if isinstance(name, str) and name == "direct":
         if times is not None:

@@ -43,8 +43,16 @@ from torchtransient.sensing.chain.compose import check_axis
 
 
 def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy = "expected") -> nn.Module:
-    """A sensor as the module that takes transients on ``axis``; ``grad``: what becomes of a device's noise. Raises
-    UnitError for one that was made for another axis, SceneError for one whose answer has other bins.
+    """Return a sensor as the module that takes transients.
+
+    Args:
+        sensor: module or device.
+        axis: of the transients.
+        grad: treatment of a device's noise.
+
+    Raises:
+        UnitError: for a sensor that was made for another axis.
+        SceneError: for one whose answer has other bins.
     """
     module = sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
     check_axis(module, axis)
@@ -62,7 +70,11 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
 
 
 def is_readable(tensor: torch.Tensor) -> bool:
-    """False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that)."""
+    """Return False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that).
+
+    Args:
+        tensor: of any kind.
+    """
     try:
         bool(tensor.any())
     except RuntimeError:
@@ -71,7 +83,12 @@ def is_readable(tensor: torch.Tensor) -> bool:
 
 
 def black_message(who: str, within: str = "") -> str:
-    """What is said of a capture without light. ``within``: where there is none, of what is known of a part alone."""
+    """Return the warning of a capture without light.
+
+    Args:
+        who: begins the message.
+        within: part of the record without light, "" for all of it.
+    """
     return (
         f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
         "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
@@ -81,7 +98,12 @@ def black_message(who: str, within: str = "") -> str:
 
 
 def say_black(who: str, capture: Capture) -> None:
-    """Warn of a capture without light."""
+    """Warn of a capture without light.
+
+    Args:
+        who: begins the message.
+        capture: that was rendered.
+    """
     found = (capture.steady, capture.transient, capture.phasor)
     light = next(tensor for tensor in found if tensor is not None)
     if not bool(light.any()):
@@ -90,7 +112,17 @@ def say_black(who: str, capture: Capture) -> None:
 
 
 def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
-    """What ``sensor`` makes of (..., T, [Lh, Lw,] H, W): each pair is a pixel of its own."""
+    """Apply a sensor to a transient, in which each pair of laser and sensor point is a pixel of its own.
+
+    Args:
+        transient: (..., T, [Lh, Lw,] H, W).
+        scan: of the capture.
+        sensor: module.
+        generator: of its noise.
+
+    Returns:
+        Tensor of the same shape.
+    """
     if scan.kind == "exhaustive":
         (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)
         flat = transient.reshape(*transient.shape[:-4], laser_rows * laser_columns, rows * columns)
@@ -101,7 +133,7 @@ def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: 
 
 
 def _answer(sensor: nn.Module, transient: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
-    """Of a module of ``tt.sensing``, or of any other, which may know nothing of generators."""
+    """Apply a module of ``tt.sensing``, or any other, which may take no generator."""
     known = inspect.signature(sensor.forward).parameters.values()
     if any(one.name == "generator" or one.kind is one.VAR_KEYWORD for one in known):
         answer: torch.Tensor = sensor(transient, generator=generator)
@@ -111,7 +143,15 @@ def _answer(sensor: nn.Module, transient: torch.Tensor, generator: torch.Generat
 
 
 def checked_seed(who: str, value: Any) -> int:
-    """A seed. Those that samplers cannot tell from others are refused: they have 32 bits. Raises ArgumentError."""
+    """Return a seed that samplers of 32 bits tell from others.
+
+    Args:
+        who: begins the message.
+        value: whole number from 0 to 2^32 - 1.
+
+    Raises:
+        ArgumentError: for other values.
+    """
     number = as_whole(value)
     if number is None or not 0 <= number < SEED_RANGE:
         raise ArgumentError(
@@ -122,8 +162,15 @@ def checked_seed(who: str, value: Any) -> int:
 
 
 def check_seeds(who: str, value: Any) -> None:
-    """Likewise for what a layer takes: None, one seed, one for each entry of a batch, or what ``vmap`` has given to its
-    entries, of which nothing can be said here.
+    """Check the seeds of a layer.
+
+    Args:
+        who: begins the message.
+        value: None, one seed, one for each entry of a batch, or the tensor that ``vmap`` has given to its entries,
+            which cannot be looked at.
+
+    Raises:
+        ArgumentError: for other values.
     """
     if value is None:
         return
@@ -137,7 +184,16 @@ def check_seeds(who: str, value: Any) -> None:
 
 
 def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
-    """Raise ArgumentError unless ``sensor`` can take a transient and ``generator`` draw its noise, or they are None."""
+    """Check the types of a sensor and a generator.
+
+    Args:
+        who: begins the message.
+        sensor: module, device or None.
+        generator: torch.Generator or None.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     if not isinstance(sensor, nn.Module | Device | None):
         raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
     if not isinstance(generator, torch.Generator | None):
@@ -145,7 +201,15 @@ def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
 
 
 def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
-    """Parameters by key, of a mapping or a list of keys. Raises SceneError for what is neither."""
+    """Return parameters by key.
+
+    Args:
+        who, name: begin the message.
+        given: mapping, or a list of keys.
+
+    Raises:
+        SceneError: for other objects.
+    """
     listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
     keys = list(given) if listed else [given]
     if not listed or not all(isinstance(key, str) for key in keys):
@@ -159,18 +223,19 @@ SENSOR_RAYS, LASER_RAYS, HIDDEN = "sensor of a scan", "laser of a scan", "hidden
 
 @dataclass(frozen=True, eq=False)
 class ScanWatch:
-    """Says what is wrong with a scene of a capture as it is, in one pass of rays to scan points and laser spots.
+    """Check of a capture's scene with the values of a call, in one pass of rays to scan points and laser spots.
 
-    ``tolerance``: in metres, how far from its point a ray may end. ``normals``: those of the wall at the scan points
-    (N, 3), None where they may change. It is asked in every render, so it does not look up which shapes are met: every
-    end in the wrong place counts.
+    It finds things that have moved between the wall and an origin, or behind the wall. ``tolerance``: in metres,
+    distance from its point at which a ray may end. ``normals``: of the wall at the scan points (N, 3), None where they
+    may change. It runs in every render, so it does not look up the shapes that rays meet: every end in the wrong place
+    counts.
     """
 
     tolerance: float
     normals: NDArray[np.float64] | None
 
     def __call__(self, scene: Any, number: int) -> dict[str, str]:
-        """Findings about sensor ``number`` of a scene that holds the values of a call, by what they are about."""
+        """Return findings about sensor ``number`` of a scene that holds the values of a call, by their subject."""
         import drjit as dr
         import mitsuba as mi
 
@@ -217,7 +282,7 @@ def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
 
 
 def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
-    """Which rays meet something before their length, or nothing there (Bool); NaN is elsewhere, too."""
+    """Return a mask of rays that meet something before their length, or nothing there; NaN is elsewhere, too."""
     import drjit as dr
 
     met = scene.ray_intersect_preliminary(ray, coherent=True)
@@ -246,29 +311,36 @@ _WHAT_IS_MEASURED = frozenset(("time_axis", "frequencies", "gates", "film", "eff
 class CaptureRenderer(nn.Module):
     """Captures of hidden things as a differentiable layer: :class:`TransientRenderer` behind a relay wall.
 
-    ``hidden``, ``bounces``, ``energy``: as in :func:`~torchtransient.nlos.scene.capture_scene`. ``scan``: a
-    :class:`Scan` that knows its wall. ``parameters``: keys of ``renderer.scene.parameters()`` that get an
-    ``nn.Parameter`` each, or a mapping to start values; hidden nodes keep their names (``chair.vertex_positions``,
-    ``hidden.to_world``, ``hidden.bsdf.reflectance.value``), the wall is ``wall``. ``settings``: those of
-    :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that hold all light of
-    three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive scan; 4) among them.
-    ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
-    (``device.sensor(axis, grad=...)`` makes modules with noise).
+    Args:
+        hidden, bounces, energy: as in :func:`~torchtransient.nlos.scene.capture_scene`.
+        scan: that knows its wall.
+        parameters: keys of ``renderer.scene.parameters()`` that get an ``nn.Parameter`` each, or a mapping to start
+            values; hidden nodes keep their names (``chair.vertex_positions``, ``hidden.to_world``,
+            ``hidden.bsdf.reflectance.value``), the wall is ``wall``.
+        sensor: module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
+            (``device.sensor(axis, grad=...)`` makes modules with noise).
+        variant: of Mitsuba, None for the active one.
+        settings: of :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that
+            hold all light of three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive
+            scan; 4) among them.
+
+    Raises:
+        SceneError, ArgumentError, UnitError: for a set-up that cannot be rendered.
 
     Where points of the scan require gradients they get them: the tensors of the scan themselves, as they are when it is
     called, so that an optimizer may change them. Points that were computed of other tensors (or given in another
-    precision than the scan's float64) are what they were when the scan was made: once those tensors have changed, a
-    call raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
+    precision than the scan's float64) stay as they were when the scan was made: once those tensors have changed, a call
+    raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
     :class:`Capture`, whose scan has the points of the call. ``parameters()`` and ``state_dict()`` hold nothing of
     points that the scan brings: give optimizers the leaves themselves.
 
     Values that put something hidden between the wall and an origin, all of it behind the wall, or points off the wall
-    are rendered as they are, and said as a ``PhysicsWarning``, once a scene (the constructor raises SceneError for
-    such a set-up; ``physics="error"`` raises PhysicsError for values too, ``"ignore"`` does not look). So are captures
-    without any light.
+    are rendered as they are, with a ``PhysicsWarning``, once a scene (the constructor raises SceneError for such a
+    set-up; ``physics="error"`` raises PhysicsError for values too, ``"ignore"`` does not look). So are captures without
+    any light.
 
-    ``metadata`` of a capture: ``spp``, ``seed`` (a list of a batch), ``seconds``, ``variant``, and ``light``: how which
-    light was found in the first call.
+    ``metadata`` of a capture: ``spp``, ``seed`` (a list of a batch), ``seconds``, ``variant``, and ``light``: the
+    estimator of each number of bounces in the first call.
     """
 
     def __init__(
@@ -331,9 +403,14 @@ class CaptureRenderer(nn.Module):
         progress: bool = False,
         generator: torch.Generator | None = None,
     ) -> Capture:
-        """Render a :class:`Capture`. ``values``, ``seed``, ``spp``, ``progress`` and errors as in
-        :meth:`TransientRenderer.forward`, but that seeds outside of 0 to 2^32 - 1, which modulo 2^32 are others, raise
-        SceneError; ``generator``: for the noise of ``sensor``.
+        """Render a :class:`Capture`.
+
+        Args:
+            values, seed, spp, progress: as in :meth:`TransientRenderer.forward`; seeds are below 2^32.
+            generator: of the noise of ``sensor``.
+
+        Raises:
+            SceneError, ArgumentError: as there, and for other seeds, which modulo 2^32 are those of others.
         """
         check_seeds("CaptureRenderer", seed)
         check_sensor("CaptureRenderer", self.sensor, generator)
@@ -348,13 +425,13 @@ class CaptureRenderer(nn.Module):
         return replace(capture, metadata={**capture.metadata, "light": self._light()})
 
     def _light(self) -> str:
-        """How which light is found, as it was with the values of the first call."""
+        """Return the estimators of light, as they were with the values of the first call."""
         if self._explained is None:
             self._explained = light_of(self.renderer)
         return self._explained
 
     def _say_black(self, out: RenderOutput) -> None:
-        """Of a capture without light, unless what was said of its scan explains it."""
+        """Warn of a capture without light, unless a finding about its scan explains it."""
         watch, told = self.renderer._watch, self.renderer.scene.warned
         if not self.says_black or not watch.enabled or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
             return
@@ -388,14 +465,18 @@ class CaptureRenderer(nn.Module):
 
 
 def _lasting(scan: Scan) -> dict[str, Any]:
-    """Normals of points that have moved: those of a flat wall, None elsewhere."""
+    """Return normals of points that have moved: of a flat wall, None elsewhere."""
     found = {"sensor_normals": scan.sensor_normals, "laser_normals": scan.laser_normals}
     flat = all(n is None or bool((n == n.reshape(-1, 3)[0]).all()) for n in found.values())
     return found if flat else dict.fromkeys(found)
 
 
 def light_of(renderer: TransientRenderer) -> str:
-    """How a capture's scene, as it is built, finds which light."""
+    """Return a sentence on the estimators that find the light of a capture's scene, as it is built.
+
+    Args:
+        renderer: of the scene.
+    """
     with active_variant(renderer.scene.variant):
         from torchtransient.plugins.around_corner.division import explanation
 
@@ -405,8 +486,15 @@ def light_of(renderer: TransientRenderer) -> str:
 
 
 def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
-    """Raise SceneError where sensor or laser of a capture's scene look at something else than the points of its scan:
-    a hidden thing in their way, a wall that is elsewhere.
+    """Check that sensor and laser of a capture's scene look at the points of its scan.
+
+    Args:
+        scene: of the capture.
+        scan: that it was made of.
+        options: of the build, None for a transient film.
+
+    Raises:
+        SceneError: for a hidden thing in their way, or a wall that is elsewhere.
     """
     with active_variant(scene.variant):
         built = scene.built(BuildOptions(transient=True) if options is None else options)
@@ -480,7 +568,17 @@ def _points_of(scan: Scan) -> dict[str, torch.Tensor]:
 def as_capture(
     out: RenderOutput, scan: Scan, sensor: nn.Module | None = None, generator: torch.Generator | None = None
 ) -> Capture:
-    """What a render of a capture's scene measured, in the scan's shape; views of its tensors."""
+    """Return the render of a capture's scene in the scan's shape, as views of its tensors.
+
+    Args:
+        out: of the renderer.
+        scan: of the capture.
+        sensor: module that the transient goes through.
+        generator: of its noise.
+
+    Raises:
+        ArgumentError: for gated, rate or beat films.
+    """
 
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
@@ -511,17 +609,32 @@ def as_capture(
 
 
 def in_film_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """From the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film."""
+    """Reshape a tensor from the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film.
+
+    Args:
+        tensor: (..., T, *scan.shape).
+        scan: of the capture.
+    """
     laser = laser_size(scan) if scan.kind == "exhaustive" else ()
     return tensor.reshape(*tensor.shape[: tensor.ndim - len(scan.shape)], *laser, *film_size(scan))
 
 
 def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """From (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T."""
+    """Reshape a tensor from (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T.
+
+    Args:
+        tensor: (..., T, [Lh, Lw,] H, W).
+        scan: of the capture.
+    """
     film = 4 if scan.kind == "exhaustive" else 2
     return tensor.reshape(*tensor.shape[: tensor.ndim - film], *scan.shape)
 
 
 def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """The same for an image (..., H, W)."""
+    """Reshape an image (..., H, W) to (..., *scan.sensor_shape).
+
+    Args:
+        tensor: (..., H, W).
+        scan: of the capture.
+    """
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)

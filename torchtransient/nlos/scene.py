@@ -36,12 +36,18 @@ MESH_FILES = (*_PLUGINS, ".npz")
 
 
 def mesh_file(path: Path, where: str) -> dict[str, Any]:
-    """A mesh file as a shape of a scene dictionary, without a material: .obj, .ply, .serialized, or .npz with
-    ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
+    """Return a mesh file as a shape of a scene dictionary, without a material.
 
-    Its triangles are flat, as those of arrays are: normals in the file do not count, and none are interpolated. (Give
-    ``{"type": "obj", "filename": ...}`` for what Mitsuba makes of them.) ``where``: what messages begin with. Raises
-    SceneError for other files and those that are not there, StorageError for those that cannot be read.
+    Its triangles are flat, as triangles of arrays are: normals in the file do not count, and none are interpolated.
+    (Give ``{"type": "obj", "filename": ...}`` for Mitsuba's own reading.)
+
+    Args:
+        path: .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
+        where: begins the message.
+
+    Raises:
+        SceneError: for other files and missing ones.
+        StorageError: for files that cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix == ".xml":
@@ -61,7 +67,15 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
 
 
 def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
-    """`vertices` and `faces` of an .npz file. Raises StorageError where they cannot be read."""
+    """Read `vertices` and `faces` of an .npz file.
+
+    Args:
+        path: of the file.
+        where: begins the message.
+
+    Raises:
+        StorageError: where they cannot be read.
+    """
     kind = "an archive of 'vertices' and 'faces' in NumPy's .npz"
     found = read_some(path, where, ("vertices", "faces").__contains__, kind)
     if len(found) < 2:
@@ -71,7 +85,13 @@ def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
 
 
 def mesh_arrays_shape(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
-    """`scenes.triangle_mesh`, whose errors begin with ``where``."""
+    """Call `scenes.triangle_mesh`, with errors that begin with ``where``.
+
+    Args:
+        vertices: (V, 3), metres.
+        faces: (F, 3).
+        where: begins the message.
+    """
     try:
         return scenes.triangle_mesh(vertices, faces)
     except TorchTransientError as error:
@@ -94,16 +114,22 @@ _LIGHTS = (
 def capture_scene(
     hidden: Any, scan: Scan, *, bounces: Sequence[int] | str = DEFAULT_BOUNCES, energy: Any = DEFAULT_ENERGY
 ) -> dict[str, Any]:
-    """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
+    """Make the scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own
+    yet.
 
-    ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
-    object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
-    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the
-    laser, a number or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor
-    ``wall.sensor``.
+    The scan's wall is the node ``wall``, with the sensor ``wall.sensor``. Hidden nodes keep their names.
 
-    Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
-    without a wall; UnitError for an energy below zero.
+    Args:
+        hidden: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
+            object with ``vertices`` and ``faces``, or the name of a mesh file; metres.
+        scan: that knows its wall.
+        bounces: numbers of bounces that count, without gaps, or "all"; 3 is light around one corner.
+        energy: joules of the laser, a number or a Mitsuba spectrum dictionary.
+
+    Raises:
+        SceneError: for other objects than shapes, for shapes that emit light, for names that the capture needs itself,
+            and for a scan without a wall.
+        UnitError: for an energy below zero.
     """
     of_class("capture: scan", scan, Scan)
     if scan.wall is None:
@@ -155,7 +181,14 @@ def capture_scene(
 
 
 def shapes_of(hidden: Any) -> dict[str, Any]:
-    """Hidden things, as they are given, as a dictionary of Mitsuba shapes (and what they refer to) by name."""
+    """Return hidden things as a dictionary of Mitsuba shapes (and nodes that they refer to) by name.
+
+    Args:
+        hidden: as of :func:`capture_scene`.
+
+    Raises:
+        SceneError: for other objects.
+    """
     if isinstance(hidden, (str, Path)):
         return {"hidden": mesh_file(Path(hidden), "hidden")}
     if isinstance(hidden, Mapping):
@@ -175,13 +208,21 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
 
 
 def film_size(scan: Scan) -> tuple[int, int]:
-    """(rows, columns) of the film: a list of points is one row."""
+    """Return (rows, columns) of the film: a list of points is one row.
+
+    Args:
+        scan: of the capture.
+    """
     shape = scan.sensor_shape
     return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0])
 
 
 def laser_size(scan: Scan) -> tuple[int, int]:
-    """(rows, columns) of the laser's positions, likewise; (1, 1) for a single spot."""
+    """Return (rows, columns) of the laser's positions; (1, 1) for a single spot.
+
+    Args:
+        scan: of the capture.
+    """
     shape = scan.laser_shape
     return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0] if shape else 1)
 
@@ -253,7 +294,15 @@ def _numbers(values: Any) -> np.ndarray:
 
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
-    """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
+    """Return the box around hidden things, which are built for it.
+
+    Args:
+        hidden: as of :func:`capture_scene`.
+        variant: of Mitsuba, None for the active one.
+
+    Returns:
+        (2, 3), lowest and highest coordinates, metres.
+    """
     scene = load({"type": "scene", **shapes_of(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()

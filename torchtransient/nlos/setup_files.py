@@ -62,17 +62,24 @@ _SURFACE = ("albedo", "bsdf", "flip_normals")
 
 
 def described_shapes(data: Any, folder: Path) -> dict[str, Any]:
-    """The entry `hidden` of a description: things by name, each with one of
+    """Return the entry `hidden` of a description as Mitsuba shapes: things by name, each with one of
 
     - `scene`: a function of `tt.scenes` (`nlos_letter`, ...) and its arguments; its shapes are called after both;
-    - `file`: a mesh (:func:`.mesh_file.mesh_file`);
+    - `file`: a mesh (:func:`.scene.mesh_file`);
     - `shape`: rectangle, disk, cube or sphere, as Mitsuba defines them;
     - `vertices` and `faces`: lists of rows;
 
     and, but for scenes, `albedo` (a number or a list of three, 0.5) or `bsdf` (a dictionary of Mitsuba), `flip_normals`
     and a place: `scale` (a number or three), then `rotate` ([[x, y, z], degrees], or a list of those, the first one
-    first), then `translate`; or `to_world`, a matrix of 4 x 4. Raises SceneError, StorageError for mesh files, and the
-    errors of scenes and albedos.
+    first), then `translate`; or `to_world`, a matrix of 4 x 4.
+
+    Args:
+        data: the entry.
+        folder: from which names of files are looked up.
+
+    Raises:
+        SceneError: for other entries.
+        StorageError: for mesh files that cannot be read.
     """
     if not isinstance(data, Mapping) or not data:
         raise SceneError(
@@ -140,7 +147,12 @@ def _bsdf(section: Section) -> dict[str, Any]:
 
 
 def albedo_of(section: Section, default: float = 0.5) -> Any:
-    """The entry `albedo`: a number, or three as a tuple."""
+    """Return the entry `albedo`: a number, or three as a tuple.
+
+    Args:
+        section: that holds it.
+        default: where it is missing.
+    """
     if isinstance(section.get("albedo", default), list):
         return tuple(section.numbers("albedo", (3,)))
     return section.number("albedo", default)
@@ -197,11 +209,11 @@ _SCAN_ENTRIES = (
 
 @dataclass(frozen=True)
 class CaptureDescription:
-    """What is to be simulated.
+    """Contents of a description file.
 
     ``hidden``: shapes by name, Mitsuba dictionaries. ``scan``: with the wall. ``axis``: the bins, for phasors None.
     ``frequencies``: of a phasor capture, else None. ``bounces``: the numbers of bounces that count, the laser's spot
-    being the first; None for all. ``sensor``: what the light is measured with, or None. ``entries``: the file.
+    being the first; None for all. ``sensor``: that measures the light, or None. ``entries``: the file.
     """
 
     name: str
@@ -218,10 +230,14 @@ class CaptureDescription:
 
 
 def read_description(source: str | Path) -> CaptureDescription:
-    """Read and check a description: the path of a YAML file, or YAML text. Nothing is executed.
+    """Read and check a description. Nothing is executed.
 
-    Names of files are looked up from the YAML file's folder. Raises SceneError for unknown, missing and wrong entries,
-    StorageError for files that cannot be read, and the errors of Scan, Wall, TimeAxis and Device.
+    Args:
+        source: path of a YAML file, from whose folder names of files are looked up, or YAML text.
+
+    Raises:
+        SceneError: for unknown, missing and wrong entries.
+        StorageError: for files that cannot be read.
     """
     with short_errors("capture description"):
         return _description(source)
@@ -255,7 +271,15 @@ def _name(source: str | Path) -> str:
 
 
 def wall_of(data: Any, folder: Path) -> Wall:
-    """The relay wall of an entry 'wall'. Raises SceneError."""
+    """Return the relay wall of an entry 'wall'.
+
+    Args:
+        data: the entry.
+        folder: from which names of files are looked up.
+
+    Raises:
+        SceneError: for other entries.
+    """
     if isinstance(data, Mapping) and "file" in data:
         section = Section(data, "wall", ("file", "up", "albedo"))
         path = file_beside(section.text("file"), (folder,), "wall")
@@ -270,7 +294,15 @@ def wall_of(data: Any, folder: Path) -> Wall:
 
 
 def scan_of(data: Any, wall: Wall) -> Scan:
-    """The scan of an entry 'scan'. Raises SceneError."""
+    """Return the scan of an entry 'scan'.
+
+    Args:
+        data: the entry.
+        wall: that is scanned.
+
+    Raises:
+        SceneError: for other entries.
+    """
     section = Section(data, "scan", _SCAN_ENTRIES)
     kind = section.choice("kind", GRID_KINDS)
     lists = {"laser": (2, 3), "sensor_origin": (3,), "laser_origin": (3,), "extent": (4,)}
@@ -361,18 +393,22 @@ _WALL_TO_WALL, _AROUND_A_CORNER = 2, 3
 
 
 def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
-    """The arguments of ``simulate`` that a file stands for: ``simulate(**read_setup("capture.yaml"))``.
-
-    ``path``: a YAML file of this library (:mod:`.description`), a scene file of y-tal's renderer or its folder
-    (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
-    integrator ``transient_nlos_path``, whose ``$parameters`` are filled by ``xml_parameters``.
+    """Read a file as the arguments of ``simulate``: ``simulate(**read_setup("capture.yaml"))``.
 
     Of y-tal's settings, ``filter_bounces: b`` means light of b + 1 bounces, as mitransient 1.x computes, ``max_depth``
     the largest number of bounces, and ``discard_direct_paths`` leaves out light of less than 3. The laser brings
     ``laser_emission`` in joules; y-tal's scale, that of a projector of a certain distance and field of view, is another
     by one factor for all points.
 
-    Raises StorageError for files that cannot be read, SceneError for what they say.
+    Args:
+        path: a YAML file of this library (:func:`read_description`), a scene file of y-tal's renderer or its folder
+            (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
+            integrator ``transient_nlos_path``.
+        xml_parameters: fill the ``$parameters`` of an XML file.
+
+    Raises:
+        StorageError: for files that cannot be read.
+        SceneError: for their contents.
     """
     with short_errors("read_setup"):
         return _setup(path, xml_parameters)
@@ -425,10 +461,15 @@ def _of_tal(settings: TalSettings) -> dict[str, Any]:
 
 
 def tal_bounces(max_depth: int, filter_bounces: int, discard_direct_paths: bool) -> Sequence[int] | str:
-    """The bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
+    """Return the bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
 
-    A flat wall does not light itself, so that light of two bounces is none without a limit. Raises SceneError for
-    settings that leave nothing.
+    A flat wall does not light itself, so that light of two bounces is none without a limit.
+
+    Args:
+        max_depth, filter_bounces, discard_direct_paths: as the parameters of that name of `transient_nlos_path`.
+
+    Raises:
+        SceneError: for settings that leave nothing.
     """
     first = _AROUND_A_CORNER if discard_direct_paths else _WALL_TO_WALL
     last = max_depth

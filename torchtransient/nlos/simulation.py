@@ -1,4 +1,4 @@
-"""``tt.nlos.simulate``: a capture with a bar, told of memory and time before, and with a file that keeps what is done.
+"""``tt.nlos.simulate``: a capture with a bar, a forecast of memory and time, and a file that keeps finished parts.
 
 With a part file, a scan of hidden things is rendered in tiles of sensor points, and a complete scene in passes over all
 of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was; parts
@@ -63,9 +63,10 @@ _NUMBER_BYTES = 4
 
 @dataclass(frozen=True)
 class Forecast:
-    """``scan`` in words, ``shape`` of the measured tensor, ``bytes`` that it takes, ``seconds`` (None: not estimated),
-    ``spp``, ``parts`` that it is rendered in, ``variant`` and why, ``light``: how which light is found. Printing it
-    gives a few lines.
+    """Forecast of a simulation. Printing it gives a few lines.
+
+    ``scan`` in words, ``shape`` of the measured tensor, its ``bytes``, ``seconds`` (None: not estimated), ``spp``,
+    number of ``parts``, ``variant`` and its reason, ``light``: the estimators of light.
     """
 
     scan: str
@@ -91,9 +92,14 @@ class Forecast:
 
 
 def forecast_of(work: Work, *, timed: bool) -> Forecast:
-    """Of what is about to start. ``timed``: with the time, from a small share of the samples.
+    """Forecast a simulation that is about to start.
 
-    Raises StorageError for a capture that does not fit into memory.
+    Args:
+        work: to be rendered.
+        timed: with the time, from a small share of the samples.
+
+    Raises:
+        StorageError: for a capture that does not fit into memory.
     """
     shape = _measured_shape(work)
     taken = math.prod(shape) * _NUMBER_BYTES * (1 if work.film.frequencies is None else 2)
@@ -108,7 +114,7 @@ def forecast_of(work: Work, *, timed: bool) -> Forecast:
 
 
 def _measured_shape(work: Work) -> tuple[int, ...]:
-    """That of the measured tensor."""
+    """Shape of the measured tensor."""
     renderer = work.renderer(0)
     stokes = (4,) if renderer.scene.variant.endswith("_polarized") else ()
     cube = renderer._cube_shape
@@ -120,7 +126,7 @@ def _measured_shape(work: Work) -> tuple[int, ...]:
 
 
 def _seconds(work: Work) -> float:
-    """Of all parts, from runs of the first with few samples: what starts it, and what a sample costs."""
+    """Estimate the seconds of all parts from runs of the first with few samples: a start, and a cost of each sample."""
     # Of few samples in all, those of a part: a render that has next to nothing to do says nothing of others.
     of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
     few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
@@ -162,7 +168,11 @@ def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
 
 
 def size_in_words(count: int) -> str:
-    """Bytes in words."""
+    """Return bytes in words.
+
+    Args:
+        count: of bytes.
+    """
     for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
         if count >= scale:
             return f"{count / scale:.4g} {unit}"
@@ -170,7 +180,11 @@ def size_in_words(count: int) -> str:
 
 
 def duration_in_words(seconds: float) -> str:
-    """Seconds in words."""
+    """Return seconds in words.
+
+    Args:
+        seconds: a duration.
+    """
     if seconds < 100:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -194,35 +208,41 @@ def simulate(
     progress: bool = True,
     generator: torch.Generator | None = None,
 ) -> Capture:
-    """What a scan measures of hidden things: a :class:`Capture`, without gradients (see :class:`CaptureRenderer`).
+    """Simulate the capture of hidden things by a scan, without gradients (see :class:`CaptureRenderer`).
 
-    ``hidden``, ``bounces`` ((3,)), ``energy`` (1 joule): as in :func:`~torchtransient.nlos.scene.capture_scene`.
-    ``time_axis`` or ``frequencies``: what is measured; without them bins of 16 ps that hold all light of three bounces.
-    ``spp``: paths for each sensor point, or for each pair of an exhaustive scan (4096).
+    Args:
+        hidden: as in :func:`~torchtransient.nlos.scene.capture_scene`. Without a ``scan``, a complete scene (as
+            :func:`tt.load` takes it) with the integrator ``transient_nlos_path``, a laser, a sensor of any kind and a
+            film with its bins. The scan is read off the scene: points are the ends of the rays of pixel centres.
+            ``bounces`` and ``energy`` stand in the scene then; ``spp`` and the bins may.
+        scan: that knows its wall.
+        time_axis, frequencies: of the film; without them bins of 16 ps that hold all light of three bounces.
+        spp: paths for each sensor point, or for each pair of an exhaustive scan (4096).
+        bounces: numbers of bounces that count, (3,).
+        energy: of the laser, 1 joule.
+        sensor: module of ``tt.sensing``, or a device, that the transient goes through at last; its answer has the same
+            bins. Devices draw their counts.
+        seed: whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to in
+            the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
+            :class:`CaptureRenderer` draws the paths of one part in the same variant (and spreads light by a tent in
+            time where a parameter can change lengths).
+        variant: of Mitsuba; None takes one channel where all spectra are grey, else the variant of :func:`tt.load`.
+        part: name of a file that keeps finished parts: with it a simulation that was killed goes on when it is called
+            again. It is deleted at the end.
+        tiles: number of parts, 16, 4 of exhaustive scans.
+        keep_part: leave the part file.
+        progress: print memory and time before it starts, and show a bar.
+        generator: of the noise of ``sensor``.
 
-    Without a ``scan``, ``hidden`` is a complete scene (what :func:`tt.load` takes) with the integrator
-    ``transient_nlos_path``, a laser, a sensor of any kind and a film with its bins. The scan is read off the scene:
-    points are where the rays of pixel centres end. ``bounces`` and ``energy`` stand in the scene then; ``spp`` and what
-    is measured may.
+    Returns:
+        Capture. ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``,
+            ``light``
+        (the estimators of light), ``parts``.
 
-    ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
-    ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
-    ``generator`` (devices draw their counts); its answer has the same bins.
-    ``seed``: a whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to
-    in the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
-    :class:`CaptureRenderer` draws what one part does in the same variant (and spreads it by a tent in time where a
-    parameter can change lengths).
-
-    ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
-    that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
-    ``progress``: say memory and time before it starts, and show a bar.
-
-    ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
-    light was found), ``parts``.
-
-    Raises ArgumentError, SceneError, ShapeError, UnitError and VariantError for what cannot be simulated; StorageError
-    where the capture does not fit into memory or the disk is full, and for a part file that belongs to another
-    simulation, is damaged, or is worked on by another process.
+    Raises:
+        ArgumentError, SceneError, ShapeError, UnitError, VariantError: for a set-up that cannot be simulated.
+        StorageError: where the capture does not fit into memory or the disk is full, and for a part file that belongs
+            to another simulation, is damaged, or is worked on by another process.
     """
     seed, path = checked_seed("simulate", seed), _part_path(part)
     check_sensor("simulate", sensor, generator)
@@ -252,8 +272,14 @@ def forecast(
     variant: str | None = None,
     **settings: Any,
 ) -> Forecast:
-    """What :func:`simulate` would take with the same arguments: memory, time, variant, how light is found. Errors as
-    there.
+    """Forecast memory, time, variant and estimators of light of :func:`simulate` with the same arguments.
+
+    Args:
+        hidden, scan, part, tiles, variant: as of :func:`simulate`.
+        settings: its other arguments.
+
+    Raises:
+        ArgumentError: for unknown arguments; others as :func:`simulate`.
     """
     checked_seed("forecast", settings.get("seed", DEFAULT_SEED))
     time_axis, frequencies, spp, *of_light = (
@@ -331,7 +357,7 @@ def _scene_work(
 
 
 def _is_complete(scene: Mapping[str, Any]) -> bool:
-    """Whether a dictionary has an integrator: hidden things have none."""
+    """Return True for a dictionary with an integrator: hidden things have none."""
     kinds = [str(node.get("type", "")) for node in scene.values() if isinstance(node, Mapping)]
     return any("path" in kind for kind in kinds) or "integrator" in scene
 
@@ -435,7 +461,7 @@ def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.
 
 
 def _through(transient: Any, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None) -> torch.Tensor:
-    """What a sensor makes of a capture's transient."""
+    """Apply a sensor to a capture's transient."""
     return in_scan_shape(measured(in_film_shape(transient, scan), scan, sensor, generator), scan)
 
 

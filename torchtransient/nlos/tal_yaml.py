@@ -24,9 +24,15 @@ _PLUGINS = ("bsdf", "texture")
 
 
 def material(data: Any, where: str) -> dict[str, Any]:
-    """The BSDF of an entry `material`: `id: white`, `id: copper` with `alpha`, or `id: custom` with XML as `text`.
+    """Return the BSDF of an entry `material`: `id: white`, `id: copper` with `alpha`, or `id: custom` with XML as
+    `text`.
 
-    Raises SceneError for other ids, and for XML that is more than nested BSDFs, textures and values.
+    Args:
+        data: the entry.
+        where: begins the message.
+
+    Raises:
+        SceneError: for other ids, and for XML that is more than nested BSDFs, textures and values.
     """
     identity = data.get("id") if isinstance(data, Mapping) else None
     if identity == "white":
@@ -90,7 +96,18 @@ def _value(kind: str, text: str, where: str) -> Any:
 
 
 def spectrum(text: str, where: str) -> Any:
-    """A spectrum as text: one number, or wavelengths in nm with values, "400:1, 700:2". Returns a number or pairs."""
+    """Return a spectrum that is given as text.
+
+    Args:
+        text: one number, or wavelengths in nm with values, "400:1, 700:2".
+        where: begins the message.
+
+    Returns:
+        Number, or a Mitsuba dictionary of pairs.
+
+    Raises:
+        SceneError: for other texts.
+    """
     words = text.replace(",", " ").split()
     if len(words) == 1 and ":" not in words[0]:
         return as_number(words[0], where)
@@ -122,16 +139,16 @@ _ANALYTIC = ("rectangle", "sphere")
 
 @dataclass(frozen=True)
 class TalSettings:
-    """What a scene file of y-tal asks for. Lengths in metres.
+    """Contents of a scene file of y-tal. Lengths in metres.
 
     ``hidden``: shapes by name, Mitsuba dictionaries with absolute names of mesh files. ``scan``: with the wall, in the
-    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: those that a
-    phasor film keeps of a transform of these bins, None for histograms. ``spp``: samples a sensor point.
+    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: bins that a
+    phasor film keeps of a transform of these, None for histograms. ``spp``: samples a sensor point.
 
     ``max_depth``, ``filter_bounces``, ``discard_direct_paths``: as the parameters of that name of `transient_nlos_path`
-    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: how its
-    estimator samples, which changes noise alone. ``laser_emission``: irradiance of the projector, a number, a linear
-    sRGB triple or a spectrum. ``entries``: all that stood in the file.
+    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: settings
+    of its estimator, which change noise alone. ``laser_emission``: irradiance of the projector, a number, a linear sRGB
+    triple or a spectrum. ``entries``: the file.
     """
 
     name: str
@@ -152,13 +169,20 @@ class TalSettings:
 
 
 def read_tal_yaml(source: str | Path) -> TalSettings:
-    """Read a scene file of y-tal: a path, the folder of an experiment, or YAML text. Nothing is executed.
+    """Read a scene file of y-tal. Nothing is executed.
 
     Entries that are missing or null have y-tal's defaults. Mesh files are looked up from the file's folder, the folder
     above it (where `tal render FOLDER` is called) and the current one. The relay wall may be turned, which y-tal does
-    not support. Raises StorageError for files that cannot be read, SceneError for unknown entries, wrong values, and
-    what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
-    a field of view, walls that are no rectangle.
+    not support.
+
+    Args:
+        source: path, folder of an experiment, or YAML text.
+
+    Raises:
+        StorageError: for files that cannot be read.
+        SceneError: for unknown entries, wrong values, and settings that are not supported: a laser that is not sampled
+            as a spot, bins that are found automatically, spots laid out by a field of view, walls that are no
+            rectangle.
     """
     with short_errors("y-tal scene"):
         return _settings(source)
@@ -335,7 +359,7 @@ def _aperture(section: Section) -> tuple[float, float, float, float]:
 
 
 def _equal_grids(section: Section) -> bool:
-    """Whether an exhaustive scan lights its sensor points, as mitransient does in one launch."""
+    """Return True where an exhaustive scan lights its sensor points, as mitransient does in one launch."""
     if not section.flag("simultaneous_scan", True):
         return False
     if not section.flag("integrator_force_equal_illumination_scanning", True):

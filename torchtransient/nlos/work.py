@@ -35,10 +35,18 @@ class VariantChoice:
 
 
 def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
-    """``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is
-    grey, on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
+    """Choose the cheapest variant in which a capture loses nothing.
 
-    Raises VariantError for a variant that cannot be used, SceneError for a scene that cannot be read.
+    ``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is grey,
+    on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
+
+    Args:
+        scene: of the capture.
+        requested: name of a variant, or None.
+
+    Raises:
+        VariantError: for a variant that cannot be used.
+        SceneError: for a scene that cannot be read.
     """
     import mitsuba as mi
 
@@ -58,8 +66,15 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
 
 
 def files_of(scene: Scene) -> dict[str, str]:
-    """What is in the files that a scene names anywhere, by the name that it has there: included files, defaults and
-    values of ``$parameters`` count. Raises SceneError for a description that Mitsuba cannot read.
+    """Return the contents of the files that a scene names anywhere, by the name that it has there.
+
+    Included files, defaults and values of ``$parameters`` count.
+
+    Args:
+        scene: a complete one.
+
+    Raises:
+        SceneError: for a description that Mitsuba cannot read.
     """
     import mitsuba as mi
 
@@ -81,7 +96,7 @@ def files_of(scene: Scene) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Film:
-    """What is measured: ``time_axis`` or ``frequencies``, and how well: ``spp``."""
+    """Film and effort of a simulation: ``time_axis`` or ``frequencies``, and ``spp``."""
 
     time_axis: TimeAxis | None
     frequencies: FrequencyAxis | Numbers | None
@@ -89,7 +104,7 @@ class Film:
 
 
 class HiddenWork:
-    """A scan of hidden things. Its parts are runs of sensor points: ``tiles`` of them, or less where points are few."""
+    """A scan of hidden things, rendered in runs of sensor points: ``tiles`` of them, or less where points are few."""
 
     sums = False
 
@@ -113,27 +128,27 @@ class HiddenWork:
         return len(self._runs)
 
     def run(self, number: int) -> tuple[int, int]:
-        """The first sensor point of a part, and the one behind its last."""
+        """Return the first sensor point of a part, and the one behind its last."""
         return self._runs[number]
 
     def key(self, seed: int) -> str:
-        """What a part file of this work is known by."""
+        """Return the key of a part file of this work."""
         return content_key(self.hidden, self.scan, self._settings, seed, self._runs)
 
     def weight(self, number: int) -> float:
-        """Parts are not added up."""
+        """Return 1: parts are not added up."""
         return 1.0
 
     def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
-        """Of the film: one of them."""
+        """Return time axis and frequencies of the film, one of which is None."""
         return self.renderer(0).axis, self.renderer(0).frequencies
 
     def renderer(self, number: int) -> TransientRenderer:
-        """What renders a part."""
+        """Return the renderer of a part."""
         return self._of(number).renderer
 
     def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
-        """A part as a capture: of a list of points where there are several parts."""
+        """Render a part as a capture: of a list of points where there are several parts."""
         first, last = self._runs[number]
         values = {} if self.count == 1 else {POINTS: self._points[first:last]}
         if values and self.scan.kind == "pairs":
@@ -156,7 +171,7 @@ class HiddenWork:
 
 
 class SceneWork:
-    """A complete scene. Its parts are ``passes`` over all sensor points, with a share of the samples each."""
+    """A complete scene, rendered in ``passes`` over all sensor points, with a share of the samples each."""
 
     sums = True
 
@@ -173,33 +188,33 @@ class SceneWork:
             self.scan = scan_of_scene(scene.built(self._renderer._options).scene)
 
     def run(self, number: int) -> tuple[int, int]:
-        """All sensor points."""
+        """Return the range of all sensor points."""
         return 0, math.prod(self.scan.sensor_shape)
 
     def share(self, number: int) -> int:
-        """The samples of a pass."""
+        """Return the samples of a pass."""
         whole, more = divmod(self.film.spp, self.count)
         return whole + (number < more)
 
     def key(self, seed: int) -> str:
-        """What a part file of this work is known by."""
+        """Return the key of a part file of this work."""
         scene = self._renderer.scene
         return content_key(scene._description, files_of(scene), self.film, self.variant.name, seed, self.count)
 
     def weight(self, number: int) -> float:
-        """What a pass counts in the mean of all samples."""
+        """Return the weight of a pass in the mean of all samples."""
         return self.share(number) / self.film.spp
 
     def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
-        """Of the film: one of them."""
+        """Return time axis and frequencies of the film, one of which is None."""
         return self._renderer.axis, self._renderer.frequencies
 
     def renderer(self, number: int) -> TransientRenderer:
-        """What renders all parts."""
+        """Return the renderer of all parts."""
         return self._renderer
 
     def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
-        """A pass as a capture."""
+        """Render a pass as a capture."""
         out = self._renderer(seed=seed, spp=spp or self.share(number), progress=progress)
         return as_capture(out, self.scan)
 
@@ -208,7 +223,12 @@ Work: TypeAlias = "HiddenWork | SceneWork"
 
 
 def seed_of(seed: int, number: int) -> int:
-    """The seed of a part: independent of those of others."""
+    """Return the seed of a part, independent of the seeds of other parts.
+
+    Args:
+        seed: of the simulation.
+        number: of the part.
+    """
     return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:4], "little")
 
 

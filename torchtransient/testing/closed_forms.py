@@ -48,28 +48,41 @@ class FlightLaw:
     last_piece: int | None
 
     def supports(self, piece: int) -> bool:
-        """Whether the density is non-zero on [piece, piece + 1]."""
+        """Return True where the density is non-zero on [piece, piece + 1]."""
         return piece >= self.first_piece and (self.last_piece is None or piece < self.last_piece)
 
 
 def sphere_chord(radius: float) -> FlightLaw:
-    """Flights between Lambertian points of a sphere: p(l) = l / (2 R^2) on [0, 2R], `radius` in metres.
+    """Return the law of flights between Lambertian points of a sphere: p(l) = l / (2 R^2) on [0, 2R].
 
     Mean 4R/3, variance 2R^2/9. Source: Fry et al., Applied Optics 45 (2006), integrating-cavity theory.
+
+    Args:
+        radius: R, metres.
     """
     return FlightLaw(2.0 * _length("radius", radius), lambda x: 2.0 * x, 0, 1)
 
 
 def plate_gap(separation: float) -> FlightLaw:
-    """Flights between infinite parallel Lambertian plates: p(r) = 2 h^2 / r^3 for r >= h, `separation` h in metres.
+    """Return the law of flights between infinite parallel Lambertian plates: p(r) = 2 h^2 / r^3 for r >= h.
 
     Mean 2h, infinite variance.
+
+    Args:
+        separation: h, metres.
     """
     return FlightLaw(_length("separation", separation), lambda x: 2.0 / x**3, 1, None)
 
 
 def checked_edges(edges_opl: ArrayLike) -> Array:
-    """Bin edges as a float64 array of shape (T + 1,), metres; ShapeError or UnitError unless finite and increasing."""
+    """Return bin edges as a float64 array.
+
+    Args:
+        edges_opl: (T + 1,), metres, increasing.
+
+    Raises:
+        ShapeError, UnitError: for other edges.
+    """
     edges = np.asarray(edges_opl, dtype=np.float64)
     if edges.ndim != 1 or edges.size < 2:
         raise ShapeError(f"edges_opl: expected one row of at least two edges, got shape {edges.shape}")
@@ -79,7 +92,15 @@ def checked_edges(edges_opl: ArrayLike) -> Array:
 
 
 def delta_mass(edges_opl: ArrayLike, opl: float) -> Array:
-    """Bins (T,) of one unit of energy that arrives at exactly `opl`; bins are half-open [start, end)."""
+    """Return the bins of one unit of energy that arrives at one time; bins are half-open [start, end).
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        opl: of the arrival, metres.
+
+    Returns:
+        (T,).
+    """
     edges = checked_edges(edges_opl)
     mass = np.zeros(edges.size - 1)
     index = int(np.searchsorted(edges, opl, side="right")) - 1
@@ -89,10 +110,18 @@ def delta_mass(edges_opl: ArrayLike, opl: float) -> Array:
 
 
 def flight_masses(law: FlightLaw, edges_opl: ArrayLike, start_opl: float = 0.0) -> Iterator[Array]:
-    """Yield for n = 0, 1, 2, ... the probability (T,) that `start_opl` plus n flights end in each bin.
+    """Yield for n = 0, 1, 2, ... the probability that a start plus n flights end in each bin.
 
-    Row 0 is a delta at `start_opl`. Rows are integrals over the bins, not densities times widths; what lies beyond the
-    last edge is not in any bin. Endless: the caller stops.
+    Row 0 is a delta at the start. Rows are integrals over the bins, not densities times widths; mass beyond the last
+    edge is not in any bin. Endless: the caller stops.
+
+    Args:
+        law: of a flight.
+        edges_opl: (T + 1,), metres.
+        start_opl: metres.
+
+    Yields:
+        (T,).
     """
     edges = checked_edges(edges_opl)
     yield delta_mass(edges, start_opl)
@@ -145,7 +174,7 @@ class _Grid:
         return np.asarray(legendre.legvander(2.0 * v - 1.0, NODES - 1) @ self.to_coefficients, dtype=np.float64)
 
     def _operator(self, shift: int) -> Array | None:
-        """What the density on piece i, (NODES,), adds at the nodes of piece i + shift; None if nothing.
+        """Matrix from the density on piece i, (NODES,), to its share at the nodes of piece i + shift; None if nothing.
 
         q(t) = int_0^t p(v) k(shift + t - v) dv + int_t^1 p(v) k(shift + t - v) dv: the first integral sees the flight's
         piece `shift`, the second the piece before it, so each integrand is smooth.
@@ -172,11 +201,20 @@ MAX_TERMS = 100_000
 
 
 def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, intensity: float) -> Array:
-    """Irradiance per bin (T,) at a meter beside a point light, `height` metres above an infinite Lambertian plane.
+    """Irradiance per bin at a meter beside a point light above an infinite Lambertian plane.
 
     E(tau) dtau = intensity * reflectance * h^3 / r^6 dtau with r = tau / 2 >= h (direct light, one bounce); a bin holds
-    (2 I rho h^3 / 5) (r_a^-5 - r_b^-5), the total is 2 I rho / (5 h^2). `intensity` in W/sr, result in W/m^2.
-    Derivation: radiance rho I cos / (pi d^2) of the plane, integrated against the meter's cosine.
+    (2 I rho h^3 / 5) (r_a^-5 - r_b^-5), the total is 2 I rho / (5 h^2). Derivation: radiance rho I cos / (pi d^2) of
+    the plane, integrated against the meter's cosine.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        height: h above the plane, metres.
+        reflectance: rho, 0 to 1.
+        intensity: I, W/sr.
+
+    Returns:
+        (T,), W/m^2.
     """
     edges = checked_edges(edges_opl)
     h = positive("height", height)
@@ -188,12 +226,20 @@ def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, in
 def integrating_sphere_irradiance(
     edges_opl: ArrayLike, radius: float, reflectance: float, energy: float = 1.0, max_flights: int | None = None
 ) -> Array:
-    """Irradiance per bin (T,) on the wall of a Lambertian sphere after `energy` reached the wall at t = 0.
+    """Irradiance per bin on the wall of a Lambertian sphere after energy reached the wall at t = 0.
 
     E_n(tau) = energy rho^(n-1) / (4 pi R^2) p^{*n}(tau), n >= 1 flights with p(l) = l / (2 R^2) on [0, 2R]; the steady
-    sum is energy / (4 pi R^2 (1 - rho)). `energy` is what leaves the wall for its first flight, in J; `radius` in
-    metres; result in J/m^2. `max_flights` cuts the series after that many flights. Source: Fry et al. 2006; Labsphere
-    integrating sphere guide.
+    sum is energy / (4 pi R^2 (1 - rho)). Source: Fry et al. 2006; Labsphere integrating sphere guide.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        radius: R, metres.
+        reflectance: rho, 0 to 1.
+        energy: that leaves the wall for its first flight, J.
+        max_flights: cuts the series after that many flights.
+
+    Returns:
+        (T,), J/m^2.
     """
     area = 4.0 * math.pi * positive("radius", radius) ** 2
     series = _bounce_series(sphere_chord(radius), edges_opl, 0.0, reflectance, first=1, last=max_flights)
@@ -203,13 +249,21 @@ def integrating_sphere_irradiance(
 def integrating_sphere_radiance(
     edges_opl: ArrayLike, radius: float, reflectance: float, intensity: float, max_bounces: int | None = None
 ) -> Array:
-    """Radiance per bin (T,) seen from the centre of a Lambertian sphere with a point light of `intensity` at the
-    centre.
+    """Radiance per bin seen from the centre of a Lambertian sphere with a point light at the centre.
 
     L(tau) = (rho / pi) (I / R^2) [ delta(tau - 2R) + sum_{n>=1} rho^n p^{*n}(tau - 2R) ], steady rho I / (pi R^2 (1 -
-    rho)). `radius` in metres, `intensity` in W/sr, result in W/(m^2 sr). `max_bounces` counts reflections at the wall
-    (one for the delta), as a renderer with `max_depth = max_bounces + 1` does. The scene is
-    `tt.scenes.integrating_sphere`.
+    rho)). The scene is `tt.scenes.integrating_sphere`.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        radius: R, metres.
+        reflectance: rho, 0 to 1.
+        intensity: I, W/sr.
+        max_bounces: reflections at the wall (one for the delta), as a renderer with `max_depth = max_bounces + 1`
+            counts.
+
+    Returns:
+        (T,), W/(m^2 sr).
     """
     r = positive("radius", radius)
     last = None if max_bounces is None else max_bounces - 1
@@ -218,10 +272,20 @@ def integrating_sphere_radiance(
 
 
 def integrating_sphere_decay(radius: float, reflectance: float) -> float:
-    """Optical path length, metres, over which the late signal of a Lambertian sphere falls by 1/e.
+    """Optical path length over which the late signal of a Lambertian sphere falls by 1/e.
 
     1/s with reflectance [e^{2Rs} (2Rs - 1) + 1] / (2 R^2 s^2) = 1, the pole of the renewal equation of p(l) = l / (2
-    R^2). At reflectance 0.5 it is 2R exactly. Raises UnitError unless 0 < reflectance < 1.
+    R^2). At reflectance 0.5 it is 2R exactly.
+
+    Args:
+        radius: R, metres.
+        reflectance: between 0 and 1, both excluded.
+
+    Returns:
+        Metres.
+
+    Raises:
+        UnitError: for other reflectances.
     """
     if not 0.0 < reflectance < 1.0:
         raise UnitError(f"reflectance: expected a number between 0 and 1, both excluded, got {reflectance!r}")
@@ -248,11 +312,20 @@ def integrating_sphere_decay(radius: float, reflectance: float) -> float:
 def furnace(
     edges_opl: ArrayLike, radius: float, reflectance: float, radiance: float, max_bounces: int | None = None
 ) -> Array:
-    """Radiance per bin (T,) seen from the centre of a Lambertian sphere whose wall emits `radiance` at t = 0.
+    """Radiance per bin seen from the centre of a Lambertian sphere whose wall emits at t = 0.
 
-    L(tau) = Le [ delta(tau - R) + sum_{n>=1} rho^n p^{*n}(tau - R) ], steady Le / (1 - rho). `radius` in metres.
-    `max_bounces` counts reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` does. The
-    scene is `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
+    L(tau) = Le [ delta(tau - R) + sum_{n>=1} rho^n p^{*n}(tau - R) ], steady Le / (1 - rho). The scene is
+    `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        radius: R, metres.
+        reflectance: rho, 0 to 1.
+        radiance: Le of the wall.
+        max_bounces: reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` counts.
+
+    Returns:
+        (T,), in the unit of `radiance`.
     """
     r = positive("radius", radius)
     return radiance * _bounce_series(sphere_chord(r), edges_opl, r, reflectance, first=0, last=max_bounces)
@@ -266,11 +339,21 @@ def parallel_plates(
     first_leg: float | None = None,
     max_bounces: int | None = None,
 ) -> Array:
-    """Radiance per bin (T,) seen at normal incidence between infinite Lambertian plates that emit `radiance` at t = 0.
+    """Radiance per bin seen at normal incidence between infinite Lambertian plates that emit at t = 0.
 
     L(tau) = Le [ delta(tau - z) + sum_{n>=1} rho^n p^{*n}(tau - z) ], p(r) = 2 h^2 / r^3 for r >= h, steady Le / (1 -
-    rho). `separation` h and `first_leg` z (camera to plate, h / 2 unless given) in metres. Source: the view factor of
-    parallel planes. The scene is `tt.scenes.parallel_plates`.
+    rho). Source: the view factor of parallel planes. The scene is `tt.scenes.parallel_plates`.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        separation: h, metres.
+        reflectance: rho, 0 to 1.
+        radiance: Le of the plates.
+        first_leg: z, camera to plate, metres, h / 2 unless given.
+        max_bounces: reflections (zero for the delta).
+
+    Returns:
+        (T,), in the unit of `radiance`.
     """
     h = positive("separation", separation)
     z = h / 2.0 if first_leg is None else positive("first_leg", first_leg)
@@ -278,10 +361,14 @@ def parallel_plates(
 
 
 def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[float, float]:
-    """Power reflectances (Rs, Rp) of a smooth interface met from the side of index 1, for a real relative `index`.
+    """Power reflectances (Rs, Rp) of a smooth interface met from the side of index 1.
 
     Rs = ((cos_i - n cos_t) / (cos_i + n cos_t))^2, Rp = ((n cos_i - cos_t) / (n cos_i + cos_t))^2 (Fresnel). Total
     reflection (index < 1 beyond the critical angle) gives (1, 1).
+
+    Args:
+        index: n, relative and real.
+        incidence_deg: angle from the normal, degrees.
     """
     n = positive("index", index)
     cos_i = math.cos(math.radians(incidence_deg))
@@ -313,10 +400,19 @@ def etalon_orders(
 
     With R, T = 1 - R at one interface and the travelled path q = index * thickness / cos_t: reflected m = 0: R at 0; m
     >= 1: T^2 R^(2m-1) at 2 m q; transmitted m >= 0: T^2 R^(2m) at (2m + 1) q; absorption multiplies by exp(-alpha *
-    length). Totals without absorption 2R / (1 + R) and (1 - R) / (1 + R). `side` is "reflected" or "transmitted";
-    `polarization` "s", "p" or None for the mean of both. Lengths in metres, `absorption_per_m` per metre of length in
-    the glass. The path is the one light travels, not the delay of a wavefront, 2 n d cos_t; dispersion (group index) is
-    not covered.
+    length). Totals without absorption 2R / (1 + R) and (1 - R) / (1 + R). The path is the one light travels, not the
+    delay of a wavefront, 2 n d cos_t; dispersion (group index) is not covered.
+
+    Args:
+        thickness: metres.
+        index: of refraction.
+        side: "reflected" or "transmitted".
+        incidence_deg: angle from the normal, degrees.
+        polarization: "s", "p" or None for the mean of both.
+        absorption_per_m: alpha, per metre of length in the glass.
+
+    Raises:
+        ArgumentError: for other sides and polarizations.
     """
     if side not in ("reflected", "transmitted"):
         raise ArgumentError(f"side: expected 'reflected' or 'transmitted', got {side!r}")
@@ -344,10 +440,21 @@ def etalon_orders(
 def etalon_slab(
     edges_opl: ArrayLike, thickness: float, index: float, radiance: float, air_opl: float, side: str = "transmitted"
 ) -> Array:
-    """Radiance per bin (T,) of a uniform light of `radiance` seen through, or in, a slab at normal incidence.
+    """Radiance per bin of a uniform light seen through, or in, a slab at normal incidence.
 
-    The orders of `etalon_orders` shifted by `air_opl`, the path in air in metres: 2 for
-    `tt.scenes.etalon_slab(light="behind")` with side="transmitted", 3 for light="front" with side="reflected".
+    The orders of `etalon_orders` shifted by the path in air.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        thickness: metres.
+        index: of refraction.
+        radiance: of the light.
+        air_opl: path in air, metres: 2 for `tt.scenes.etalon_slab(light="behind")` with side="transmitted", 3 for
+            light="front" with side="reflected".
+        side: "transmitted" or "reflected".
+
+    Returns:
+        (T,), in the unit of `radiance`.
     """
     edges = checked_edges(edges_opl)
     total = np.zeros(edges.size - 1)
@@ -391,12 +498,25 @@ def confocal_plane(
     energy: float = 1.0,
     radius: float = math.inf,
 ) -> Array:
-    """Radiance per bin (T,) of a confocal scan point `depth` metres before a plane that is parallel to the wall.
+    """Radiance per bin of a confocal scan point before a plane that is parallel to the wall.
 
     With K = energy wall_albedo^2 albedo / pi^3 the light at tau = 2 r is K pi depth^4 / r^7 dtau, r >= depth; a bin
-    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), all of it pi K / (3 depth^2). `radius`: of a disk around the point
-    before which the scan point stands, which ends at r = hypot(depth, radius); infinite for the plane. Derivation: the
-    patch of `hidden_patch` integrated over the plane. Raises UnitError and ShapeError.
+    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), all of it pi K / (3 depth^2). Derivation: the patch of `hidden_patch`
+    integrated over the plane.
+
+    Args:
+        edges_opl: (T + 1,), metres.
+        depth: of the plane before the scan point, metres.
+        albedo, wall_albedo: 0 to 1.
+        energy: of the laser, J.
+        radius: of a disk around the point before which the scan point stands, which ends at r = hypot(depth, radius);
+            infinite for the plane.
+
+    Returns:
+        (T,).
+
+    Raises:
+        UnitError, ShapeError: for other numbers.
     """
     z = positive("depth", depth)
     reach = math.hypot(z, positive("radius", radius)) if radius != math.inf else math.inf
@@ -417,11 +537,24 @@ def hidden_patch(
     wall_normal: ArrayLike = (0.0, 0.0, 1.0),
     energy: float = 1.0,
 ) -> tuple[float, float]:
-    """(optical path length in metres, radiance) of the light over a small diffuse patch.
+    """Optical path length and radiance of the light over a small diffuse patch.
 
     energy (wall_albedo / pi)^2 (albedo / pi) times the four cosines times area / (r1^2 r2^2), where r1 and r2 are the
     distances of the patch from the spot and the scan point, whose wall has one normal. Zero where a side faces away.
-    Points (3,) in metres, `area` in square metres. Raises ShapeError and UnitError.
+
+    Args:
+        spot, scan_point, patch: (3,), metres.
+        normal: of the patch, (3,).
+        area: m^2.
+        albedo, wall_albedo: 0 to 1.
+        wall_normal: (3,).
+        energy: of the laser, J.
+
+    Returns:
+        (metres, radiance).
+
+    Raises:
+        ShapeError, UnitError: for other numbers.
     """
     points = [_triple(name, value) for name, value in (("spot", spot), ("scan_point", scan_point), ("patch", patch))]
     wall, hidden = (_unit(name, value) for name, value in (("wall_normal", wall_normal), ("normal", normal)))

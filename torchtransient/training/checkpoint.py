@@ -41,8 +41,14 @@ _ARRAYS += [np.dtype(order + kind) for order in "<>" for kind in ("f2", "f4", "f
 
 
 def plain(value: Any, where: str) -> Any:
-    """``value`` with mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch, and tensors
-    detached. Raises StorageError, which names the place, for anything that is no data.
+    """Return a state as plain data: mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch.
+
+    Args:
+        value: of any kind; tensors are detached.
+        where: its place, for the message.
+
+    Raises:
+        StorageError: for objects that are no data, with their place.
     """
     if type(value) in _PLAIN:
         return value
@@ -83,7 +89,8 @@ def _key(key: Any, where: str) -> Any:
 
 
 def random_state() -> dict[str, Any]:
-    """Where the generators of Python, NumPy (the legacy one of the process), torch and its CUDA devices stand."""
+    """Return the states of the generators of Python, NumPy (the legacy one of the process), torch and its CUDA devices.
+    """
     numpy = np.random.get_state(legacy=False)  # noqa: NPY002 (others draw from it)
     assert isinstance(numpy, dict)
     version, words, gauss = random.getstate()
@@ -104,7 +111,14 @@ def random_state() -> dict[str, Any]:
 
 
 def check_random_state(state: Any) -> None:
-    """Raises StorageError where a state is of another number of CUDA devices, or none. Changes nothing."""
+    """Check a state of generators, and change nothing.
+
+    Args:
+        state: of :func:`random_state`.
+
+    Raises:
+        StorageError: for a state of another number of CUDA devices, and other objects.
+    """
     lacking = [name for name in ("python", "numpy", "torch") if not isinstance(state, dict) or name not in state]
     if lacking:
         raise StorageError(f"load_checkpoint: its random numbers lack those of {', '.join(lacking)}.")
@@ -118,7 +132,14 @@ def check_random_state(state: Any) -> None:
 
 
 def set_random_state(state: dict[str, Any]) -> None:
-    """Put all of them back. Raises StorageError as `check_random_state`, and for what is no such state."""
+    """Put the states of all generators back.
+
+    Args:
+        state: of :func:`random_state`.
+
+    Raises:
+        StorageError: as `check_random_state`, and for broken states.
+    """
     check_random_state(state)
     devices = len(state.get("cuda", ()))
     try:
@@ -143,13 +164,23 @@ _OF_SHAPE = (
 
 
 def kind_of(optimizer: torch.optim.Optimizer) -> str:
-    """The name of its class, with the module."""
+    """Return the name of an optimiser's class, with the module.
+
+    Args:
+        optimizer: of torch.
+    """
     return f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
 
 
 def put_back_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Load a state that was checked. What schedules and callers keep in groups, and the state lacks, stays as it is
-    here: torch would delete it, and some schedules fail without it at their next step.
+    """Load a state that was checked.
+
+    Entries that schedules and callers keep in groups, and the state lacks, stay as they are here: torch would delete
+    them, and some schedules fail without them at their next step.
+
+    Args:
+        optimizer: of torch.
+        state: of its ``state_dict``.
     """
     groups = [
         {**{key: value for key, value in own.items() if key not in group and _is_added(optimizer, key)}, **group}
@@ -161,11 +192,17 @@ def put_back_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) 
 def check_optimizer(
     name: str, optimizer: torch.optim.Optimizer, state: Any, kind: Any, is_same_torch: bool
 ) -> None:  # fmt: skip
-    """Raise StorageError or ShapeError for a state of another kind, or of other groups, settings or shapes. Changes
-    nothing.
+    """Check a state of an optimiser, and change nothing.
 
-    ``kind``: :func:`kind_of` the optimiser that has written it, None for what is not known. ``is_same_torch``: whether
-    the state is of the same torch; others may have other settings.
+    Args:
+        name: of the part.
+        optimizer: of torch.
+        state: to be loaded.
+        kind: :func:`kind_of` the optimiser that has written it, None if unknown.
+        is_same_torch: True for a state of the same torch; others may have other settings.
+
+    Raises:
+        StorageError, ShapeError: for a state of another kind, or of other groups, settings or shapes.
     """
     groups = state.get("param_groups") if isinstance(state, dict) else None
     entries = state.get("state") if isinstance(state, dict) else None
@@ -212,7 +249,9 @@ def _is_same_kind(there: Any, here: str) -> bool:
 
 
 def _is_added(optimizer: torch.optim.Optimizer, key: str) -> bool:
-    """Whether an entry of groups is none of the optimiser's own settings: a schedule's ``initial_lr`` is not."""
+    """Return True for an entry of groups that is none of the optimiser's own settings, such as a schedule's
+    ``initial_lr``.
+    """
     return key != "params" and key not in optimizer.defaults
 
 
@@ -222,10 +261,10 @@ _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint says beside the states of its parts.
+    """Contents of a checkpoint beside the states of its parts.
 
     ``step``: the number of steps that are done, which is the step to go on with. ``values``: as they were given.
-    ``libraries``: versions that wrote it, by name. ``ranks``: how many processes.
+    ``libraries``: versions that wrote it, by name. ``ranks``: number of processes.
     """
 
     step: int
@@ -243,19 +282,25 @@ def save_checkpoint(
         parts = {"model": model, "optimizer": optimizer, "schedule": schedule, "batches": batches, "noise": generator}
         tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
 
-    ``parts``: by name, whatever has ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
-    GradScaler, :class:`Batches`), and generators of torch. What DistributedDataParallel or ``torch.compile`` has
-    wrapped is stored as what it was, so that the checkpoint can be read with and without. ``step``: steps that are
-    done. ``values``: plain data (numbers, texts, tensors, lists, dictionaries) that come back. Beside them: the random
-    numbers of Python, NumPy, torch and CUDA of this process, and versions of libraries.
+    Beside parts and values it holds the random numbers of Python, NumPy, torch and CUDA of this process, and versions
+    of libraries. Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a
+    run is killed, ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and
+    the first one writes; parts are its own, random numbers and generators those of every rank.
 
-    Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a run is killed,
-    ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and the first one
-    writes; parts are its own, random numbers and generators those of every rank.
+    Args:
+        path: of the file.
+        parts: by name, objects with ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
+            GradScaler, :class:`Batches`), and generators of torch. Modules inside of DistributedDataParallel or
+            ``torch.compile`` are stored without them, so that the checkpoint can be read with and without.
+        step: number of steps that are done.
+        values: plain data (numbers, texts, tensors, lists, dictionaries) that come back.
 
-    Not in it: what the network's data come from beyond their position, buffers that modules do not put into their
-    state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
-    executing something, and where nothing can be written.
+    Raises:
+        StorageError: for states that could not be read without executing something, and where nothing can be written.
+        ArgumentError: for parts without a state.
+
+    Not in it: the source of the network's data beyond their position, buffers that modules do not put into their state,
+    and attributes.
     """
     place = path_of(path, "save_checkpoint")
     failure: str | None = "its parts or values are no state; see its own error."
@@ -283,19 +328,24 @@ def save_checkpoint(
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
     """Put the state of a run back into its parts, and return the step to go on with.
 
-    ``parts``: those of :func:`save_checkpoint`, made anew, under the same names. ``random``: whether the random numbers
-    of this process are put back, which takes as many ranks as have written it; with False, and all draws made by
-    :class:`Seeds`, the number of ranks may change.
-
     A run that was stopped and goes on ends with the same weights as one that was not, to the bit, where a step depends
     on parts, random numbers and step alone, and sums are added in the same order: same libraries and machine,
     ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
 
     Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
-    its sums, format, names of parts, names and shapes of the tensors of modules, kind, groups, settings and moments
-    of optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they
-    have one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises StorageError
-    for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
+    its sums, format, names of parts, names and shapes of the tensors of modules, kind, groups, settings and moments of
+    optimisers, order of :class:`Batches` (of other parts: the errors of their ``check_state_dict(state)``, if they have
+    one). A part that still refuses its state afterwards raises an error that says so. Every rank reads the file.
+
+    Args:
+        path: of the file.
+        parts: of :func:`save_checkpoint`, made anew, under the same names.
+        random: put the random numbers of this process back, which takes as many ranks as have written it; with False,
+            and all draws made by :class:`Seeds`, the number of ranks may change.
+
+    Raises:
+        StorageError: for a file that is not there, torn, or another kind.
+        ShapeError: for tensors of other shapes.
     """
     source = path_of(path, "load_checkpoint")
     given, where = _named(parts, "load_checkpoint"), str(source)
@@ -361,7 +411,7 @@ def _named(parts: Any, who: str) -> dict[str, Any]:
 
 
 def _inner(part: Any) -> Any:
-    """What DistributedDataParallel or torch.compile has wrapped; they share its state, under other names."""
+    """Return the module inside of DistributedDataParallel or torch.compile; they share its state, under other names."""
     while True:
         if isinstance(part, DistributedDataParallel):
             part = part.module
@@ -389,7 +439,7 @@ def _state_of(name: str, part: Any) -> Any:
 
 
 def _check(name: str, part: Any, state: Any) -> None:
-    """What can be told before anything is changed."""
+    """Check a state, and change nothing."""
     part = _inner(part)
     if isinstance(part, torch.Generator):
         if not isinstance(state, dict) or state.get("device") != part.device.type or "generators" not in state:
@@ -447,7 +497,9 @@ def _put_back(name: str, part: Any, state: Any) -> None:
 
 
 def _written(path: Path, content: dict[str, Any]) -> Exception | None:
-    """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
+    """Write a checkpoint and return the error, None without one. A full disk is an OSError, or a RuntimeError of
+    torch's.
+    """
     if not path.name:
         return OSError(f"{os.fspath(path)!r} is no name of a file")
     try:
@@ -552,7 +604,7 @@ def _of_all_ranks(state: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _told_by_first(failure: str | None) -> str | None:
-    """What went wrong in the first rank; all wait for it, so that the file is there when they go on."""
+    """Return the failure of the first rank; all wait for it, so that the file is there when they go on."""
     if not _in_group():
         return failure
     said = [failure]
