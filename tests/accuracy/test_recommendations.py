@@ -12,7 +12,7 @@ import pytest
 
 from torchtransient.accuracy import AccuracyReport
 from torchtransient.accuracy.cost import Estimates, Task, measure
-from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference, Tail
+from torchtransient.accuracy.errors_of_estimates import Tail
 from torchtransient.accuracy.report import Choice, CostPoint
 from torchtransient.accuracy.statistics import student_t_quantile
 from torchtransient.errors import ArgumentError, StorageError, UnitError
@@ -193,20 +193,6 @@ def test_the_total_error_is_noise_and_bias():
 def test_without_a_finest_setting_there_is_no_total_error():
     (only,) = measure({SLOW: candidate()}, (16,), repeats=4, progress=False).points
     assert math.isnan(only.total_error) and math.isnan(only.bias) and only.error == only.relative_error
-
-
-def test_a_reference_that_is_noisy_says_so():
-    """A scalar against a reference of few samples: squared errors are off by more than their runs scatter."""
-    off, said = [], []
-    for seed in range(300):
-        rng = np.random.default_rng(seed)
-        tally = ErrorTally(None, Reference(*rng.normal(0, 1.0, (2, 1))))
-        for run in rng.normal(5.0, 0.1, (8, 1)):
-            tally.add(run)
-        found = tally.result()
-        off.append(found.squared - (25.0 + 0.01))
-        said.append(found.squared_standard_error)
-    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(np.std(off), rel=0.2)
 
 
 def test_time_of_the_processor_is_told_apart():

@@ -13,16 +13,6 @@ from torchtransient.errors import UnitError
 from torchtransient.reconstruction import HiddenVolume, VoxelGrid
 
 
-@pytest.mark.parametrize("shape", [(2, 3, 0, 4), (0, 4), (2, 1, 3, 0)])
-def test_pictures_without_pixels(shape):
-    """Nothing counts, in each of them."""
-    empty = torch.zeros(shape)
-    for metric in (metrics.picture_correlation, metrics.picture_iou):
-        assert metric(empty, empty).isnan()
-        each = metric(empty, empty, reduction="none")
-        assert each.shape == shape[:-2] and bool(each.isnan().all())
-
-
 def test_bins_near_the_highest_number():
     """Their sum is more than single precision holds, their shares are not."""
     x = torch.tensor([0.0, 3e38, 3e38, 3e38]).reshape(1, 4, 1, 1)

@@ -10,7 +10,6 @@ import json
 import warnings
 
 import mitsuba as mi
-import numpy as np
 import pytest
 import torch
 
@@ -27,7 +26,6 @@ from torchtransient.errors import (
 )
 from torchtransient.rendering.renderer import TransientRenderer
 
-VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
 WALL = tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7)
 HIDDEN = tt.scenes.nlos_z()
@@ -81,18 +79,6 @@ def test_depths_are_said_by_bounces():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spp", [np.int64(8), np.uint16(8), torch.tensor(8)])
-def test_samples_of_any_library(spp):
-    expected = renderer(spp=8)(seed=0)
-    for made in (renderer(spp=spp)(seed=0), renderer()(seed=0, spp=spp), simulated(spp=spp)):
-        assert made.metadata["spp"] == 8 and type(made.metadata["spp"]) is int
-        torch.testing.assert_close(made.transient.sum(), expected.transient.sum(), rtol=1e-5, atol=0)
-    for wrong in (np.float32(8), np.bool_(True), torch.tensor([8, 8])):
-        with pytest.raises(UnitError, match="spp"):
-            renderer(spp=wrong)
-
-
-@pytest.mark.slow
 def test_what_metadata_say():
     """The names of a simulation's, as far as a layer knows them; the seed of a call is the one that draws it again."""
     layer, made = renderer([VERTICES]), simulated(seed=3).metadata
@@ -125,14 +111,6 @@ def test_captures_know_the_points_of_their_call(key):
     getattr(made, POINT_TENSORS[key]).sum().backward()
     assert bool((moved.grad == 1).all())
     assert made.wall is of.wall and made != of and layer.scan is of
-
-
-def test_spots_of_confocal_scans_follow_their_points():
-    layer = renderer([POINTS])
-    moved = scan().sensor_points.reshape(-1, 3) + torch.tensor([0.125, 0.0, 0.0])
-    made = layer({POINTS: moved}, seed=0).scan
-    assert made.kind == "confocal" and made.laser_points is made.sensor_points
-    assert torch.equal(made.sensor_points.reshape(-1, 3), moved)
 
 
 @pytest.mark.slow
@@ -179,23 +157,6 @@ def test_points_that_are_no_scan():
 
 
 # ------------------------------------------------------------------------------------------------------------- sensors
-
-
-class Plain(torch.nn.Module):
-    """A module that knows nothing of generators."""
-
-    def forward(self, transient):
-        return 2 * transient
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["exhaustive"])
-def test_sensors_without_a_generator(kind):
-    of, generator = scan(kind), torch.Generator().manual_seed(0)
-    bare, doubled = simulated(of=of), simulated(of=of, sensor=Plain(), generator=generator)
-    torch.testing.assert_close(doubled.transient, 2 * bare.transient, rtol=1e-5, atol=1e-9)
-    layer = renderer(of=of, sensor=Plain(), variant=VARIANT)
-    torch.testing.assert_close(layer(seed=0, generator=generator).transient, doubled.transient, rtol=1e-5, atol=1e-9)
 
 
 def response(axis):

@@ -12,17 +12,16 @@ from torchtransient.errors import TorchTransientError
 
 VERTICES, FACES = np.array([[0, 0, 1.0], [1, 0, 1], [0, 1, 1]]), [[0, 2, 1]]
 WALL = tt.nlos.Wall.plane()
-ORIGIN = [0.0, 0.0, 1.0]
 POINTS = tt.nlos.Scan.grid(WALL, 2, kind="confocal")
 AXIS = tt.TimeAxis(1.9, 0.05, 20)
 HIDDEN = scenes.nlos_z()
-BARE = {"kind": "confocal", "sensor_points": [[0, 0, 0.0]], "laser_points": [[0, 0, 0.0]]}
-BARE |= {"sensor_origin": ORIGIN, "laser_origin": ORIGIN}
 
 
 @pytest.mark.parametrize("values", [None, [1], "x", 3, torch.tensor([1.0]), {1: 2}])
 def test_values_that_are_none(values):
-    renderer = tt.nlos.CaptureRenderer(HIDDEN, POINTS, ["letter.bsdf.reflectance.value"], time_axis=AXIS, spp=2)
+    renderer = tt.nlos.CaptureRenderer(
+        HIDDEN, POINTS, ["letter.bsdf.reflectance.value"], time_axis=AXIS, spp=2, variant="llvm_ad_mono"
+    )
     if values is None:
         assert renderer(values, seed=0).transient.shape == (1, 20, 2, 2)
         return

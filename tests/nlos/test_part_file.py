@@ -144,15 +144,6 @@ def test_a_full_disk_loses_nothing(path, monkeypatch):
         np.testing.assert_array_equal(kept.rows(0, 4), np.concatenate([rows(0), rows(1)]))
 
 
-def test_a_disk_that_is_really_full(path):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("the system has no /dev/full")
-    path.with_name(path.name + ".npy").symlink_to("/dev/full")
-    with PartFile(path, "key") as kept, pytest.raises(StorageError, match="could not be read or written"):
-        keep(kept, 0)
-    assert not path.exists()
-
-
 @pytest.mark.slow
 def test_one_process_at_a_time(path):
     script = (

@@ -102,15 +102,6 @@ def test_copies_follow_their_own_points():
         assert set(twin.values) == {VERTICES}
 
 
-def test_pickles_of_points_that_were_computed():
-    leaf = torch.nn.Parameter(torch.zeros(3, dtype=torch.float64))
-    with torch.no_grad():
-        leaf += 0.0
-    layer = renderer(scan(GRID + leaf))
-    twin = pickle.loads(pickle.dumps(layer))
-    torch.testing.assert_close(twin(seed=0).transient, layer(seed=0).transient, rtol=1e-5, atol=1e-9)
-
-
 # -------------------------------------------------------------------------------------------------------------- seeds
 
 

@@ -26,10 +26,6 @@ def captured(kind="confocal", lead=(), dtype=torch.float32, axis=AXIS, channels=
     return N.Capture(torch.zeros(*lead, channels, axis.num_bins, *scan.shape, dtype=dtype), axis, scan)
 
 
-def grid(depths, size):
-    return N.VoxelGrid.before(SCANS["confocal"], torch.linspace(0.1, 0.5, depths), size=size, extent=0.5)
-
-
 # -------------------------------------------------------------------------------------------------------- default grids
 
 
@@ -182,13 +178,6 @@ def test_light_before_time_zero_is_left_out(start, kept):
     cut = tt.TimeAxis(max(0.0, start + 0.02 * (64 - kept)), 0.02, kept)
     expected = N.FK(SCANS["confocal"], time_axis=cut).reconstruct(light[:, 64 - kept :])
     torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-4 * float(expected.max()))
-
-
-def test_records_before_time_zero_hold_nothing():
-    for start, words in ((-1.28, "light after time zero, got TimeAxis"), (-1.3, "light after time zero")):
-        capture = captured(axis=tt.TimeAxis(start, 0.02, 64))
-        with pytest.raises(UnitError, match=words):
-            N.reconstruct(capture, "fk", progress=False)
 
 
 def test_planes_within_the_depths_are_kept():

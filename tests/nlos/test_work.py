@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 
 import mitsuba as mi
@@ -20,7 +19,6 @@ VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.9, 0.02, 100)
 WALL = N.Wall.plane(2.0, 1.6, albedo=0.9)
 Z = tt.scenes.nlos_z()
-simulation = importlib.import_module("torchtransient.nlos.simulation")
 pytestmark = pytest.mark.usefixtures("no_leftovers")
 
 

@@ -15,7 +15,6 @@ from support.sweeps import together
 from torchtransient.errors import SceneError, ShapeError, TorchTransientError
 from torchtransient.parametrize import (
     Albedo,
-    AxisAnglePose,
     Bounded,
     IndexOfRefraction,
     Positive,
@@ -158,10 +157,3 @@ def test_a_copy_is_parametrized_alone():
     register(twin, "known", Albedo())
     assert len(module.parametrizations.w) == 1 and len(twin.parametrizations.w) == 2
     assert "known" in module._buffers and not torch_parametrize.is_parametrized(module, "known")
-
-
-def test_under_autocast():
-    for kind, value in ((Albedo(), (0.25, 0.75)), (AxisAnglePose(), torch.eye(4).tolist())):
-        with torch.autocast("cpu", torch.bfloat16):
-            module = register(Weights(value), "w", kind)
-            assert torch.allclose(module.w, torch.tensor(value), atol=1e-6) and module.w.dtype == torch.float32

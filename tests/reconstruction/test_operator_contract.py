@@ -183,19 +183,6 @@ def test_single_precision_has_its_digits(name):
 
 
 @every
-def test_back_in_double_precision_all_digits_are_there(name):
-    operator = OPERATORS[name]
-    again = copy.deepcopy(operator).float().double()
-    torch.testing.assert_close(again.adjoint(data_of(operator)), operator.adjoint(data_of(operator)), rtol=0, atol=0)
-
-
-@every
-def test_other_precisions_are_refused(name):
-    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
-        copy.deepcopy(OPERATORS[name]).half()
-
-
-@every
 def test_copies_and_pickles_are_the_same_operator(name):
     operator = OPERATORS[name]
     y = data_of(operator)

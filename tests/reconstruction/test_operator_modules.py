@@ -48,7 +48,6 @@ def field(**options):
 
 OTHERS = {
     "axis": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, start_opl=0.12))),
-    "bins": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, num_bins=17))),
     "scan": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(MOVED, time_axis=AXIS)),
     "hidden side": (
         lambda: FK(CONFOCAL, time_axis=AXIS),
@@ -56,7 +55,6 @@ OTHERS = {
     ),
     "class": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: LCT(CONFOCAL, time_axis=AXIS)),
     "floor": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, floor=0.25)),
-    "target": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, target="retroreflective")),
     "floor of midpoints": (
         lambda: MidpointFK(SINGLE, time_axis=AXIS),
         lambda: MidpointFK(SINGLE, time_axis=AXIS, floor=1.0),
@@ -79,12 +77,7 @@ OTHERS = {
         lambda: Backprojection(SINGLE, GRID.points, time_axis=AXIS),
         lambda: Backprojection(SINGLE, GRID.points.flip(0), time_axis=AXIS),
     ),
-    "depths": (
-        lambda: Backprojection(SINGLE, GRID, time_axis=AXIS),
-        lambda: Backprojection(SINGLE, GRID.at_depths((0.1, 0.21)), time_axis=AXIS),
-    ),
     "filter": (fbp, lambda: fbp(filter=LaplacianFilter())),
-    "cycles": (fbp, lambda: fbp(filter=PhasorFilter(0.2, 4.0))),
     "pulse": (field, lambda: field(pulse=PhasorFilter(0.21, 3.0))),
 }  # fmt: skip
 
@@ -121,17 +114,6 @@ def test_scans_that_a_file_rounds_are_the_same():
     rounded = {name: getattr(scan, name).float().double() for name in ("sensor_points", "laser_points")}
     for kind in (FK, LCT, DiffusionDeconvolution):
         kind(replace(scan, **rounded), time_axis=AXIS).load_state_dict(kind(scan, time_axis=AXIS).state_dict())
-
-
-@every
-def test_replicas_of_data_parallel(name):
-    operator = OPERATORS[name]
-    replica = operator._replicate_for_data_parallel()
-    replica._buffers = {key: None if table is None else table.clone() for key, table in operator._buffers.items()}
-    y = torch.ones(operator.data_shape, dtype=torch.float64)
-    if name.startswith("inverse"):
-        y = y.to(torch.complex128) if not operator.real_data else y
-    torch.testing.assert_close(replica.adjoint(y), operator.adjoint(y), rtol=0, atol=0)
 
 
 # ----------------------------------------------------------------------------------- parameters, operators of one's own

@@ -91,14 +91,6 @@ def test_gradients_of_empty_volumes_are_finite():
         assert torch.isfinite(gradient).all()
 
 
-def test_soft_depth_goes_to_the_planes_of_the_maximum():
-    grid = grid_of(torch.linspace(0.4, 0.8, 81, dtype=F64))
-    volume, depth = slanted(grid, 0.1, 0.05, 0.02)
-    # A symmetric peak has its mean at its top.
-    assert (soft_depth(volume, grid) - depth).abs().max() < 1e-3
-    assert (soft_depth(1e-12 * volume, grid) - soft_depth(volume, grid)).abs().max() < 1e-9
-
-
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (0.25, 0.2)])
 def test_normals_of_planes(slopes):
     grid = grid_of(torch.linspace(0.3, 0.9, 61, dtype=F64))
@@ -162,20 +154,6 @@ SURFACES = {
     "normals_from_volume": normals_from_volume,
     "normals_from_depth": lambda v, grid: normals_from_depth(v[..., 0, :, :], grid),
 }
-each = pytest.mark.parametrize("name", SURFACES)
-
-
-@pytest.mark.parametrize("name", ["depth_map", "soft_depth", "normals_from_volume"])
-@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
-def test_half_precision_is_computed_in_single(name, half):
-    grid = grid_of(torch.linspace(0.3, 0.9, 512, dtype=F64))
-    volume = slanted(grid, 0.2, 0.1, 0.1)[0].to(half)
-    found, expected = SURFACES[name](volume, grid), SURFACES[name](volume.double(), grid)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
-    single = volume.float()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        torch.testing.assert_close(SURFACES[name](single, grid), SURFACES[name](volume, grid), rtol=0, atol=0)
 
 
 def test_planes_that_single_precision_does_not_tell_apart():
@@ -205,13 +183,6 @@ def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
     assert slope.isfinite().all()
 
 
-def test_confidence_of_the_dark_has_no_slope():
-    dark = torch.zeros(2, 8, 3, 3, requires_grad=True)
-    (slope,) = torch.autograd.grad(depth_map(dark, UNEVEN).confidence.sum(), dark, create_graph=True)
-    (again,) = torch.autograd.grad(slope.sum(), dark, allow_unused=True)
-    assert not slope.any() and (again is None or not again.any())
-
-
 @pytest.mark.parametrize("scale", [1e-38, 1e-25, 1e-12, 1.0, 1e12, 1e25])
 def test_nothing_depends_on_the_unit_of_the_volume(scale):
     grid = grid_of(UNEVEN)
@@ -219,19 +190,6 @@ def test_nothing_depends_on_the_unit_of_the_volume(scale):
     for name in ("depth_map", "soft_depth", "normals_from_volume"):
         found, expected = SURFACES[name](volume * scale, grid), SURFACES[name](volume, grid)
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-
-
-@each
-@pytest.mark.parametrize("lead", [(0,), (2, 0)])
-def test_batches_may_be_empty(name, lead):
-    grid = grid_of(UNEVEN)
-    like = SURFACES[name](torch.rand(grid.shape), grid)
-    volume = torch.zeros(*lead, *grid.shape, requires_grad=True)
-    found = SURFACES[name](volume, grid)
-    assert found.shape == (*lead, *like.shape)
-    assert torch.autograd.grad(found.sum(), volume)[0].shape == volume.shape
-    if name in ("depth_map", "soft_depth"):
-        assert SURFACES[name](torch.zeros(8, 0, 3), UNEVEN).shape == (0, 3)
 
 
 @pytest.mark.parametrize("level", [-2.0, 0.0])
@@ -288,15 +246,6 @@ def test_depths_of_any_volume_are_tops_of_parabolas():
     share = volume.amax(0) / volume.max()
     torch.testing.assert_close(found.confidence, share, rtol=0, atol=1e-15)
     assert torch.equal(found.mask, share >= 0.9) and 0 < int(found.mask.sum()) < 35
-
-
-def test_masks_at_the_threshold_and_below_zero():
-    volume = torch.tensor([1.0, 0.25, 0.125, 0.0, -3.0]).reshape(1, 1, 5)
-    found = depth_map(volume, [0.1], threshold=0.25)
-    assert found.mask[0].tolist() == [True, True, False, False, False]
-    assert found.confidence[0].tolist() == [1.0, 0.25, 0.125, 0.0, 0.0]
-    # A threshold of zero takes what is above zero.
-    assert depth_map(volume, [0.1], threshold=0.0).mask[0].tolist() == [True, True, True, False, False]
 
 
 def test_soft_depths_are_means_under_their_weights():

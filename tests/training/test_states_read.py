@@ -72,18 +72,6 @@ def test_kinds_of_optimizers_move_within_a_package(tmp_path):
             load_checkpoint(path, {"one": optimizer})
 
 
-def test_kinds_of_optimizers_in_older_files(tmp_path):
-    """Which do not tell them: what they lack is told."""
-    path, model = tmp_path / "run.pt", nn.Linear(2, 3)
-    save_checkpoint(path, {"one": torch.optim.Adam(model.parameters())}, step=1)
-    content = torch.load(path, weights_only=True)
-    del content["optimizers"]
-    torch.save(content, path)
-    assert load_checkpoint(path, {"one": torch.optim.Adam(model.parameters())}).step == 1
-    with pytest.raises(StorageError, match=r"another kind of optimiser, it lacks .*momentum.*; here is SGD"):
-        load_checkpoint(path, {"one": torch.optim.SGD(model.parameters())})
-
-
 @pytest.mark.parametrize("scheduled", ["LambdaLR", "OneCycleLR"])
 def test_states_from_before_there_was_a_schedule(tmp_path, scheduled):
     """What a schedule keeps in the optimiser is its own: it stays, and the schedule goes on."""
