@@ -53,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.files.capture_file import check_capture_target
-    from torchtransient.nlos.arguments import checked_seed
+    from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     target = check_capture_target(options["output"] or _beside(scene))
