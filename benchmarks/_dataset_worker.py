@@ -29,8 +29,8 @@ import numpy as np
 import torch
 from _dataset_cases import NoOne, captures, described, moving_boxes, several_views
 
-from torchtransient.data.generation.settings import Settings
-from torchtransient.data.generation.shard_making import ShardMaker
+from torchtransient.data.run_settings import Settings
+from torchtransient.data.shard_making import ShardMaker
 from torchtransient.scene.variant import active_variant
 
 CPU = time.process_time

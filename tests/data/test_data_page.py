@@ -14,13 +14,12 @@ import torchtransient as tt
 from support.pages import Page
 from torchtransient.cli.dataset import command
 from torchtransient.cli.main import main
-from torchtransient.data.recipes.checks import SAMPLES
-from torchtransient.data.recipes.distribution import Distribution
-from torchtransient.data.recipes.kept_scene import FIRST_RETURN
-from torchtransient.data.recipes.written import read_distribution
-from torchtransient.data.storage.chunks import chunk_shape
-from torchtransient.data.storage.encodings import MANTISSA_BITS, STORES
-from torchtransient.data.storage.shard_writing import FORMAT, SEAL, SEAL_BYTES
+from torchtransient.data import Distribution
+from torchtransient.data.checks import SAMPLES
+from torchtransient.data.maker import FIRST_RETURN
+from torchtransient.data.serialization import read_distribution
+from torchtransient.data.shard_format import MANTISSA_BITS, STORES, chunk_shape
+from torchtransient.data.shards import FORMAT, SEAL, SEAL_BYTES
 from torchtransient.rendering.labels import LABELS
 
 VARIANT = "llvm_ad_mono"

@@ -13,8 +13,8 @@ import pytest
 from support.fake_recipe import FakeRecipe
 from support.stored_samples import sample, write
 from torchtransient.array_files.part_files import whole_file
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.generation.settings import DECIDING, write_description
+from torchtransient.data import generate
+from torchtransient.data.run_settings import DECIDING, write_description
 from torchtransient.errors import StorageError
 
 DESCRIBED = dict.fromkeys((*DECIDING, "about"), 1)

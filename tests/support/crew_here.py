@@ -7,11 +7,9 @@ from contextlib import contextmanager
 import pytest
 
 import torchtransient as tt
-from torchtransient.data.generation import supervisor
-from torchtransient.data.generation.crew import Crew, Member
-from torchtransient.data.generation.shard_making import ShardMaker
-from torchtransient.data.generation.telling import Telling
-from torchtransient.data.generation.worker import _carry_out
+from torchtransient.data import local_engine
+from torchtransient.data.crew import Crew, Member
+from torchtransient.data.shard_making import Messages, ShardMaker, execute
 
 
 class WorkerHere(Member):
@@ -34,14 +32,14 @@ class CrewHere(Crew):
     def start(self):
         return WorkerHere(self.settings)
 
-    def look(self):
+    def poll(self):
         for worker in list(self.workers):
             task, worker.task = worker.task, None
             if not worker.ready:
-                self.heard(worker, "ready")
+                self.receive(worker, "ready")
             elif task is not None:
-                telling = Telling(lambda message, worker=worker: self.heard(worker, *message))
-                _carry_out(task, worker.maker, telling)
+                messages = Messages(lambda message, worker=worker: self.receive(worker, *message))
+                self.receive(worker, *execute(task, worker.maker, messages))
 
     def close(self, stopped):
         for worker in self.workers:
@@ -53,5 +51,5 @@ class CrewHere(Crew):
 def workers_here():
     """`generate` with such a crew, of one thread."""
     with pytest.MonkeyPatch.context() as patch, tt.threads(1):
-        patch.setattr(supervisor, "Supervisor", CrewHere)
+        patch.setattr(local_engine, "Supervisor", CrewHere)
         yield

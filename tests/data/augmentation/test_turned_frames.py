@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
-from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.data.augmentation.stokes_fields import turned_stokes
+from torchtransient.data import Affine, Augment, Crop, Flip, PixelMap, QuarterTurn
+from torchtransient.data.augment import turned_stokes
 from torchtransient.errors import SceneError, ShapeError, UnitError
 
 SIZE = (2, 3)

@@ -12,9 +12,7 @@ from support.crew_here import workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files
 from support.stored_samples import sample
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.storage.manifest import build_manifest, verify
-from torchtransient.data.storage.shard_file import Shard, ShardWriter
+from torchtransient.data import Shard, ShardWriter, build_manifest, generate, verify
 from torchtransient.errors import StorageError
 
 SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 1}

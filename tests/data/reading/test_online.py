@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import os
 import pickle
 import signal
@@ -15,6 +14,7 @@ import time
 import warnings
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,10 +22,9 @@ from torch.utils.data import DataLoader
 
 from support.marks import long_rows
 from support.online_recipe import SHAPE, OnlineRecipe
-from torchtransient.data.reading.online import OnlineDataset
-from torchtransient.data.reading.online_producers import Producers
-from torchtransient.data.reading.online_schedule import Schedule
-from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError
+from torchtransient.data import OnlineDataset
+from torchtransient.data.online import Producers, Schedule
+from torchtransient.errors import PhysicsWarning, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
 
 TESTS = Path(__file__).parents[2]
 
@@ -118,26 +117,6 @@ def test_uses_of_a_full_ring_are_what_was_asked_for():
     assert schedule.drawn / schedule.made > 4.7
 
 
-def test_without_a_bound_nobody_waits():
-    schedule = Schedule(8, 1, math.inf, 1, first=0, seed=0)
-    for _ in range(100):
-        order = schedule.order(0)
-        schedule.finished(order.index)
-    assert schedule.made == 100 and schedule.drawn == 0
-    for _ in range(1000):
-        assert schedule.can_draw()
-        schedule.draw()
-
-
-def test_orders_of_a_lost_producer_come_again():
-    schedule = Schedule(16, 2, 5.0, 1, first=7, seed=0)
-    first = [schedule.order(0) for _ in range(2)]
-    schedule.order(1)
-    assert schedule.lost(0) == [7, 8]
-    again = [schedule.order(0) for _ in range(2)]
-    assert [order.index for order in again] == [order.index for order in first] == [7, 8]
-
-
 # -------------------------------------------------------------------------------------------------- whole data sets
 
 
@@ -200,14 +179,17 @@ def test_tensors_are_the_callers_own():
     assert not kept[0]["transient"].is_shared()
 
 
-@pytest.mark.slow
 def test_loader_makes_batches():
-    recipe = OnlineRecipe()
+    """After a warning of the light that the window misses."""
+    recipe = OnlineRecipe(late=(3,))
     with OnlineDataset(recipe, capacity=16, warm=4, transform=lambda x: x.sum(1)) as data:
         loader = DataLoader(data, batch_size=8, num_workers=0)
+        with pytest.warns(PhysicsWarning, match="more than 1% in 1 of"):
+            next(iter(loader))
         for _, batch in zip(range(5), loader, strict=False):
             assert batch["transient"].shape == (8, *SHAPE) and batch["index"].shape == (8,)
             assert (batch["depth"][:, 0, 0] == batch["index"]).all()
+            assert (batch["outside"].sum(1) == 0.75 * (batch["index"] == 3)).all()
             assert len(batch["values"]["box.filename"]) == 8
             assert (batch["measurement"][:, 0, 0, 0] == 16 * batch["index"]).all()
         with pytest.raises(TorchTransientError, match="num_workers=0"):
@@ -355,12 +337,7 @@ def test_a_producer_that_hangs_is_an_error(tmp_path):
 
 @pytest.mark.slow
 def test_more_than_the_shared_memory_is_an_error(monkeypatch):
-    from torchtransient.data.reading import online_producers
-
-    class Small:
-        free = 2**16
-
-    monkeypatch.setattr(online_producers.shutil, "disk_usage", lambda path: Small)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2**16))
     with OnlineDataset(OnlineRecipe(), capacity=1024) as data, pytest.raises(StorageError, match="shared memory"):
         data.draw()
 
@@ -396,7 +373,7 @@ SCRIPT = """
 import os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from support.online_recipe import OnlineRecipe
-from torchtransient.data.reading.online import OnlineDataset
+from torchtransient.data import OnlineDataset
 
 if __name__ == "__main__":
     # A shell starts what it puts behind with interrupts ignored, which children inherit.
@@ -446,7 +423,7 @@ def test_a_script_without_a_guard_is_told(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(
         f"import sys\nsys.path.insert(0, {str(TESTS)!r})\nfrom support.online_recipe import OnlineRecipe\n"
-        "from torchtransient.data.reading.online import OnlineDataset\n"
+        "from torchtransient.data.online import OnlineDataset\n"
         "OnlineDataset(OnlineRecipe(), capacity=4).draw()\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.data.recipes.maker import MOST_KEPT
-from torchtransient.data.recipes.outside_light import OutsideLight
+from torchtransient.data.maker import MOST_KEPT
+from torchtransient.data.sample import OutsideLight
 from torchtransient.errors import (
     ArgumentError,
     PhysicsError,
@@ -428,6 +428,26 @@ def test_a_scene_for_every_sample_is_told(key, words):
     with warnings.catch_warnings():
         warnings.filterwarnings("error", ".*builds a scene of its own")
         small(scene, vary={key: D.Choice([0.1, 0.3])}).check()
+
+
+@pytest.mark.parametrize("broken", ["transient", "steady"])
+def test_light_that_is_not_finite_is_no_sample(monkeypatch, broken):
+    """Labels may have NaN where nothing is seen."""
+    forward, recipe = tt.TransientRenderer.forward, small(labels=("depth",))
+
+    def unlit(*given, **more):
+        out = forward(*given, **more)
+        light = getattr(out, broken)
+        light[(0,) * light.ndim] = float("nan")
+        return out
+
+    monkeypatch.setattr(tt.TransientRenderer, "forward", unlit)
+    with pytest.raises(UnitError, match=f"sample 5: {broken} has numbers that are not finite"):
+        recipe.sample(5)
+
+
+def test_a_reflectance_of_nothing_and_of_all_is_possible():
+    small(vary={RED: D.Uniform(0, 1)}).check()
 
 
 def test_numbers_of_samples():

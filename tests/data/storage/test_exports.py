@@ -18,12 +18,16 @@ import zstandard
 import torchtransient as tt
 from support.capture_files import grids, made
 from support.stored_samples import AXIS, cube, folder, header, sample, write
-from torchtransient.data.generation.summary import drawn_sheet, summary
-from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.recipes.written import written_frequencies
-from torchtransient.data.storage.shard_writing import ShardWriter
-from torchtransient.data.storage.tal_export import export_tal
-from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
+from torchtransient.data import (
+    ShardWriter,
+    TransientDataset,
+    export_tal,
+    export_web_dataset,
+    read_web_dataset,
+)
+from torchtransient.data.exports import decode_web_sample
+from torchtransient.data.overview import drawn_sheet, summary
+from torchtransient.data.serialization import written_frequencies
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.scan_data import scan_data, scan_from_data
 from torchtransient.tensor_record import same
@@ -100,11 +104,6 @@ def test_names_with_points(tmp_path):
     write(tmp_path / "shard-000000.h5", [replace(sample(0), arrays={"a.b": np.ones((2, 3))})])
     with pytest.raises(StorageError, match=r"expected 'a\.b' as a tensor, under a name without points"):
         export(tmp_path, tmp_path / "out")
-
-
-def test_bars(data, tmp_path, capsys):
-    export_web_dataset(data, tmp_path)
-    assert "export: 100%" in capsys.readouterr().err
 
 
 def tar_of(path, members):
