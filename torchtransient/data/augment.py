@@ -25,12 +25,12 @@ from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitErr
 from torchtransient.geometry.pinhole import camera_matrices, transforms
 from torchtransient.stokes import rotate_frame
 
-# Samples are flat but for a dictionary or two.
+# Depth of the search for images in nested entries.
 _DEEPEST = 4
 # The sensor's horizontal axis is cross(ray, up), and up in kornia's camera is -y (docs/polarization.md).
 _UP = (0.0, -1.0, 0.0)
 Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
-# Light with rows of histograms before time.
+# Light with an axis of rows before time.
 _ROWS = ("rates", "beats")
 KINDS: dict[str, Kind] = {
     **dict.fromkeys(("transient", "steady", "phasor", "gated", *_ROWS), "light"),
@@ -143,7 +143,7 @@ class Augment:
     def _augmented(self, sample: dict[str, Any], generator: torch.Generator | None) -> dict[str, Any]:
         for name, default in self.camera.items():
             if default is not None and sample.get(name) is None:
-                # A copy, since a sample is its receiver's to change.
+                # A copy, since the caller may change the sample.
                 sample[name] = default.clone()
         for name, check in (("intrinsics", camera_matrices), ("to_world", transforms)):
             if sample.get(name) is not None:
@@ -410,7 +410,7 @@ def _shape(given: Any) -> tuple[int, ...]:
         shape = given.shape if hasattr(given, "shape") else np.shape(given)
         return tuple(int(one) for one in shape)
     except (TypeError, ValueError, RuntimeError):
-        # Lists of different lengths, and objects of all kinds.
+        # Ragged lists and other objects.
         return ()
 
 

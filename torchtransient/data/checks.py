@@ -36,7 +36,7 @@ from torchtransient.scene.variant import active_variant
 
 # (2, 3): lower and upper corner of a box along the axes of the world; a point is a box without a size.
 Box = NDArray[np.float64]
-# Samples that are drawn, and structures among them that are built, for a look.
+# Samples that are drawn, and structures that are built, for a check.
 SAMPLES, STRUCTURES = 64, 8
 # Structures that are measured, and calls of each before a time counts: the second one is recorded, the third launched.
 _MEASURED, _WARM = 4, 3
@@ -109,7 +109,7 @@ def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[S
         Pairs of a structure and the samples that have it.
     """
     found: dict[str, tuple[Structure, list[int]]] = {}
-    # Every scene, however seldom it comes.
+    # Every scene, also one of small weight.
     for name in recipe.scenes.names if len(recipe.scenes.names) > 1 else ():
         structure = Structure(name, name, recipe.structure(0).entries)
         found[structure.key] = (structure, [])
@@ -251,7 +251,7 @@ def _draws(recipe: Specification, kept: Kept, indices: Iterable[int]) -> Iterato
             yield f"at the {words} end", kept.drawn({key: Extreme(upper) for key in recipe.vary})
     for index in indices:
         yield f"of sample {index}", kept.draw(index)
-    # Of what seldom comes too.
+    # Choices of small weight too.
     for key in (*kept.keys, *kept.device_keys):
         choices = recipe.vary[key]
         if isinstance(choices, Choice):
@@ -300,7 +300,7 @@ def _check_light(built: Any, kept: Kept, draws: Sequence[Mapping[str, Any]]) -> 
     brightest = {key: float(high) for key, limits, _, high in described_ranges(built.params) if limits == LIGHT}
     for key in set(brightest) & set(kept.places):
         brightest[key] = max(float(np.max(drawn[key])) for drawn in draws)
-    # A light that has no such number (a sky, a picture of the surroundings) shines.
+    # Lights without such a number (environment maps) shine.
     lights = [_emitter_of(built.params, key, mi.Emitter) for key in brightest]
     if max(brightest.values(), default=1.0) <= 0 and all(emitter in lights for emitter in emitters):
         dark = ", ".join(repr(key) for key in brightest)
@@ -430,7 +430,7 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool, 
     # Workers compute with one thread.
     with threads(1):
         for structure, indices in found[:_MEASURED]:
-            # Beginning with nothing: what check() has built is thrown away.
+            # From nothing, without the scenes that check() has built.
             maker.forget(structure)
             times = []
             for step in range(_WARM + wanted):

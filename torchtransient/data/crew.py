@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
 from torchtransient.data.processes import WorkerError
-from torchtransient.data.run_settings import Settings
+from torchtransient.data.run_settings import RunSettings
 from torchtransient.data.shard_making import Measured, raised
 from torchtransient.errors import TorchTransientError
 
@@ -27,14 +27,14 @@ DIED = "its process died or did not answer at every attempt"
 MEASURING = -1
 # Blame of a sample for the death of its worker: a crash or a hang, and a kill, which may come from outside.
 _OWN_FAULT, _KILLED = 2, 1
-# Deaths without an end of it: of one shard, and of all workers without a sample in between.
+# Most deaths at one shard, and of all workers without a sample in between.
 MOST_OF_A_SHARD, MOST_IN_A_ROW = 20, 30
-# And before the first samples: nothing says that the recipe can be rendered at all.
+# Most deaths before the first sample: the recipe may not render at all.
 MOST_BEFORE_ANY = 3
-# Seconds without a sign of life: while a worker starts or finishes a file, and in its first sample, which compiles; in
-# later samples at least so long, and so many times the slowest one so far.
+# Most seconds without a message: at the start, while a file is finished, and in the first sample, which compiles; in
+# later samples the larger of the second number and so many times the slowest sample.
 PATIENCE_S, LEAST_S, TIMES_SLOWEST = 600.0, 120.0, 30.0
-# Starts in a row that may come to nothing.
+# Failed starts in a row.
 MOST_STARTS = 10
 POLL_S = 0.5
 
@@ -85,7 +85,7 @@ class Crew(ABC, Generic[AnyMember]):
         timeout_s: seconds for one sample; None for 30 times the slowest so far, at least 120.
     """
 
-    def __init__(self, settings: Settings, workers: int, ledger: Ledger, timeout_s: float | None) -> None:
+    def __init__(self, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None) -> None:
         self.settings, self.wanted, self.ledger, self.timeout_s = settings, workers, ledger, timeout_s
         self.workers: list[AnyMember] = []
         self._starts = 0
@@ -188,7 +188,7 @@ class Crew(ABC, Generic[AnyMember]):
 
     def _end_hung(self) -> None:
         now = time.monotonic()
-        # Where this process was stopped for a while, workers had no ear to talk to.
+        # This process was stopped for a while and read no messages.
         away = now - self._polled > 4 * POLL_S
         self._polled = now
         for worker in list(self.workers):
@@ -278,7 +278,7 @@ class RunLog:
         with contextlib.suppress(OSError):
             self._handle = os.open(folder / LOG_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
             size = os.fstat(self._handle).st_size
-            # A killed run may have left half a line.
+            # A killed run may have left a part of a line.
             if size and os.pread(self._handle, 1, size - 1) != b"\n":
                 os.write(self._handle, b"\n")
 
@@ -333,7 +333,7 @@ class SampleBar:
                 self._bar.set_postfix({"failed": self.failed, "restarts": self.restarts}, refresh=False)
             self._bar.update(samples)
         except (OSError, ValueError):
-            # The terminal is gone; the night goes on.
+            # The terminal is closed; the run goes on.
             self._bar = None
 
     def close(self) -> None:

@@ -169,14 +169,14 @@ class Distribution(ABC):
 
     known: ClassVar[dict[str, type[Distribution]]] = {}
     name: ClassVar[str] = ""
-    # The field that stands for the whole where a file gives no mapping: {uniform: [0, 1]}.
+    # Fields of the short form in files, {uniform: [0, 1]}.
     short: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         name = vars(cls).get("name")
         if name:
-            # The same one again where a cell of a notebook is run twice, or a module anew.
+            # A class may be defined again, by a cell of a notebook or a reloaded module.
             other = Distribution.known.get(name)
             if other is not None and (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
                 raise SceneError(
@@ -306,7 +306,7 @@ def spread(who: str, place: Place, random: Draw, same: bool, *numbers: Any) -> t
     return (u, *arrays)
 
 
-# A truncated normal distribution keeps at least this share of the untruncated one: beyond, digits of it are lost.
+# Least share of the normal distribution that a truncated one keeps, for its digits.
 _LEAST_MASS = 1e-9
 
 
@@ -399,7 +399,7 @@ class LogUniform(Distribution):
         """
         _numbers_only("LogUniform", place)
         u, low, high = spread("LogUniform", place, random, self.same, self.low, self.high)
-        # Not beyond the ends by rounding, nor beyond what floats hold in between.
+        # Rounding stays within the ends, and the product within floats.
         drawn: NDArray[np.float64] = np.clip(np.exp((1 - u) * np.log(low) + u * np.log(high)), low, high)
         return drawn
 
@@ -658,5 +658,5 @@ def pick(random: Draw, count: int, weights: Numbers | None) -> int:
         return min(int(u * count), count - 1)
     shares = np.cumsum(np.asarray(weights, dtype=np.float64))
     chosen = int(np.searchsorted(shares, u * shares[-1], side="right"))
-    # Not one of weight zero, where rounding has reached the end.
+    # Rounding at the end chooses no value of weight zero.
     return min(chosen, max(i for i, weight in enumerate(weights) if weight > 0))

@@ -82,7 +82,7 @@ def export_web_dataset(
                 _add(tar, data[next(numbers)], compressor, measured)
                 left -= 1
         written.append(target)
-    next(numbers, None)  # which ends the bar
+    next(numbers, None)  # ends the bar
     return written
 
 
@@ -233,7 +233,7 @@ def _values(content: bytes) -> dict[str, Any]:
         name: value if name not in dtypes else torch.from_numpy(np.array(value, _number_type(dtypes[name])))
         for name, value in plain["values"].items()
     }
-    # Tars of before have no shares.
+    # Tars of earlier versions have no shares.
     outside = {"outside": outside_tensor(plain["outside"])} if "outside" in plain else {}
     return {"index": int(plain["index"]), **outside, **({"values": values} if values else {})}
 
@@ -300,7 +300,7 @@ def _scans(about: Mapping[str, Any]) -> list[Scan]:
 def _scan_of(sample: Mapping[str, Any], scans: list[Scan]) -> Scan:
     if len(scans) == 1:
         return scans[0]
-    # As recipes name an entry of a choice.
+    # The text of recipes for an entry of a choice.
     name = sample.get("values", {}).get("scan")
     chosen = str(name).removeprefix("#")
     if not chosen.isdecimal() or int(chosen) >= len(scans):

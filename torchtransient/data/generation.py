@@ -23,7 +23,7 @@ from torchtransient.data.run_settings import (
     RECIPE_FILE,
     SHARD_FILES,
     Plan,
-    Settings,
+    RunSettings,
     check_same,
     description,
     plain,
@@ -36,7 +36,7 @@ from torchtransient.data.run_settings import (
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
 
 ENGINES = ("local", "ray")
-# Samples that are tried until one tells how large all are.
+# Samples that are tried until one can be measured.
 MEASURED = 16
 _WHAT = "generate"
 
@@ -116,7 +116,8 @@ def generate(
         recipe: :class:`Recipe`, or an object of one's own with ``maker()``, ``key()`` and ``to_dict()`` that pickles.
         folder: of the data set, made if missing.
         n: samples; None takes the recipe's own number.
-        workers: processes of one thread each, replaced when they die.
+        workers: processes of one thread each, replaced when they die. 0 makes samples in this process, as torch's
+            loaders do, where a debugger finds them and a crash ends the run.
         store: "exact", "rounded" or "counts", see :class:`ShardWriter`.
         compression: "blosc2", "gzip" or "none".
         resume: False raises where the folder has a data set.
@@ -147,13 +148,14 @@ def generate(
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
         raise ArgumentError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
-    n, workers, retries = _whole("n", n, 1), _whole("workers", workers, 1), _whole("retries", retries, 0)
+    n, retries = _whole("n", n, 1), _whole("retries", retries, 0)
+    workers = _whole("workers", workers, int(is_one_of(engine, ("ray",))))
     per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
     shard = None if shard is None else _whole_pair(shard)
     _check_timeout(timeout_s)
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
-    settings = Settings(recipe, str(place), n, store, compression, retries, registered_plugins())
+    settings = RunSettings(recipe, str(place), n, store, compression, retries, registered_plugins())
     wanted = description(settings, per_shard or 0, {}, None)
     if per_shard is None:
         del wanted["per_shard"]
@@ -188,7 +190,7 @@ def generate(
     return Generated(place, kept=kept, seconds=time.monotonic() - start, **done)
 
 
-def _begin(crew: Any, settings: Settings, per_shard: int | None, wanted: dict[str, Any]) -> dict[str, Any]:
+def _begin(crew: Any, settings: RunSettings, per_shard: int | None, wanted: dict[str, Any]) -> dict[str, Any]:
     """Describe a new data set by its first sample."""
     measured = crew.measure(range(min(settings.n, MEASURED)))
     for message, category in measured.warned:
@@ -215,7 +217,7 @@ def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] 
     if found is not None:
         check_same(found, wanted, place / RECIPE_FILE)
     elif first is not None:
-        # One that is damaged says nothing, and is made again.
+        # A damaged one has no header, and is made again.
         header: dict[str, Any] = {}
         with contextlib.suppress(StorageError), Shard(first) as there:
             header = there.header
@@ -224,7 +226,7 @@ def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] 
 
 
 def _survey(
-    place: Path, settings: Settings, described: dict[str, Any], share: range, log: RunLog
+    place: Path, settings: RunSettings, described: dict[str, Any], share: range, log: RunLog
 ) -> tuple[list[int], int]:
     """Shards that are missing or damaged, and the number of samples in the others. Raises StorageError for shards of
     another data set.
@@ -291,7 +293,7 @@ def _write_manifest(place: Path) -> None:
     named, damaged = named_shards(place), set[str]()
     if (place / MANIFEST_FILE).exists():
         written = (place / MANIFEST_FILE).stat().st_mtime_ns
-        # Younger ones were finished after it. Reading all would be done by each of many machines.
+        # Younger ones were finished after it; each of many machines would read all of them.
         older = [path for path in shards_of(place) if path.stat().st_mtime_ns <= written]
         damaged = {path.name for path in older if path.name not in named and fault_of(path, named)}
     seen: set[str] | None = None
@@ -304,15 +306,15 @@ def _write_manifest(place: Path) -> None:
 
 
 def _engine(
-    name: str, settings: Settings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
+    name: str, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
 ) -> Any:
     if name == "ray":
         from torchtransient.data.ray_engine import RayCrew
 
         return RayCrew(settings, workers, ledger, timeout_s, address)
-    from torchtransient.data.local_engine import Supervisor
+    from torchtransient.data.local_engine import InProcessCrew, Supervisor
 
-    return Supervisor(settings, workers, ledger, timeout_s)
+    return (Supervisor if workers else InProcessCrew)(settings, workers, ledger, timeout_s)
 
 
 def _sweep(place: Path) -> None:

@@ -1,5 +1,5 @@
 """Workers on this machine: processes that take shards one at a time, are replaced when they die or hang, and end with
-the run.
+the run; and one without a process.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn
 
 from torchtransient.array_files.part_files import remove_unfinished
-from torchtransient.data.crew import POLL_S, Crew, Member
+from torchtransient.data.crew import POLL_S, Crew, Ledger, Member
 from torchtransient.data.processes import interrupts_blocked, unpacked
-from torchtransient.data.run_settings import Settings
+from torchtransient.data.run_settings import RunSettings
 from torchtransient.data.shard_making import Messages, ShardMaker, execute, fatal
+from torchtransient.rendering.threads import threads
 
 # Seconds for a render that is under way when the supervisor is gone, and for workers at the end of a run.
 LAST_SECONDS, END_S = 10.0, 10.0
@@ -37,7 +39,7 @@ class LocalWorker(Member):
         settings: of the run.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: RunSettings) -> None:
         super().__init__()
         context = multiprocessing.get_context("spawn")
         self.link, theirs = context.Pipe()
@@ -71,7 +73,7 @@ class LocalWorker(Member):
     def end(self) -> None:
         """Kill the process if it lives."""
         self.process.kill()
-        # One that hangs in the kernel, on a disk that is gone, is left to it.
+        # A process that hangs in the kernel, on a lost disk, is left behind.
         self.process.join(END_S)
         self.link.close()
 
@@ -131,6 +133,70 @@ class Supervisor(Crew[LocalWorker]):
             self.workers.clear()
 
 
+class InProcessWorker(Member):
+    """Worker without a process, which executes its task when the crew polls.
+
+    Args:
+        settings: of the run.
+    """
+
+    def __init__(self, settings: RunSettings) -> None:
+        super().__init__()
+        self.maker = ShardMaker(settings)
+        self.task: tuple[Any, ...] | None = None
+
+    def send(self, task: tuple[Any, ...]) -> None:
+        """Keep a task.
+
+        Args:
+            task: see `Member.assign`.
+        """
+        self.task = task
+
+    def end(self) -> None:
+        """Free the scenes."""
+        self.maker.close()
+
+
+class InProcessCrew(Crew[InProcessWorker]):
+    """Crew of the calling process, which has one thread until the run ends. Errors of samples are retried as on other
+    engines; a crash ends the run.
+    """
+
+    def __init__(self, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None) -> None:
+        super().__init__(settings, 1, ledger, timeout_s)
+        self._threads = threads(1)
+
+    def start(self) -> InProcessWorker:
+        """Build the scenes."""
+        return InProcessWorker(self.settings)
+
+    def poll(self) -> None:
+        """Execute the task."""
+        for worker in self.workers:
+            task, worker.task = worker.task, None
+            if not worker.ready:
+                self.receive(worker, "ready")
+            elif task is not None:
+                messages = Messages(partial(self._take, worker))
+                self.receive(worker, *execute(task, worker.maker, messages))
+
+    def _take(self, worker: InProcessWorker, message: tuple[Any, ...]) -> None:
+        self.receive(worker, *message)
+
+    def close(self, stopped: bool) -> None:
+        """Free the scenes, and put back the numbers of threads.
+
+        Args:
+            stopped: without effect.
+        """
+        for worker in self.workers:
+            worker.end()
+        self.workers.clear()
+        with self._threads:
+            pass
+
+
 # ---------------------------------------------------------------------------------------------- in the worker's process
 
 
@@ -139,7 +205,7 @@ def work(link: Connection, packed: bytes) -> None:
 
     Args:
         link: pipe to the supervisor.
-        packed: pickled `Settings`.
+        packed: pickled `RunSettings`.
     """
     # Ctrl-C reaches the whole group of processes; the supervisor decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

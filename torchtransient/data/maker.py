@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from torchtransient.axes import TimeAxis
     from torchtransient.capture import Scan
 
-# A label that is read off the transient.
+# Label that is computed from the transient.
 FIRST_RETURN = "first_return"
-# Camera paths at most where only the share of light outside of the window is wanted.
+# Most camera paths for the share of light outside of the window.
 _PATHS = 2**16
-# Structures whose scenes are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
+# Scenes that are kept. Mitsuba compiles a method call for all objects that are alive: with 8 scenes of the
 # Cornell box a sample takes 350 ms instead of 25, and each new scene compiles anew. To build one takes 50 ms.
 MOST_KEPT = 1
 
@@ -88,7 +88,7 @@ class Maker:
         """
         found = self._kept.pop(structure.key, None)
         if found is None:
-            # Before the next one is built.
+            # Freed before the next one is built.
             while len(self._kept) >= MOST_KEPT:
                 self._kept.popitem(last=False)
             found = Kept(self.recipe, structure)
@@ -123,7 +123,7 @@ class Maker:
             UnitError: for light that is not finite. Errors of the renderer pass.
         """
         (index,) = samples_of([index])
-        # Of sample 0, whichever comes first here: all processes refuse the same samples.
+        # Of sample 0 in every process: all refuse the same samples.
         expected = self.measures()
         structure = self.recipe.structure(index)
         kept = self.kept(structure)
@@ -173,7 +173,7 @@ class Maker:
         choices.
         """
         recipe, first = self.recipe, self.recipe.structure(0)
-        # Sample 0's scene last: it is the one that is kept.
+        # Sample 0's scene last, since the last one is kept.
         names = sorted(recipe.scenes.names, key=lambda name: name == first.name)
         several = {name: self.kept(Structure(name, "", first.entries)).named() for name in names}
         of_scenes: dict[str, Any] = dict(several[first.name])
@@ -204,16 +204,16 @@ class Maker:
         exchanged = dict(structure.entries)
         for key in self.recipe.vary:
             value, distribution = exchanged.get(key, varied.get(key)), self.recipe.vary[key]
-            # Of one kind in all samples.
+            # One kind of value in all samples.
             kinds = distribution.values if isinstance(distribution, Choice) else [value]
             is_number = not any(isinstance(one, bool) or not _is_number(one) for one in kinds)
             text = label_of(distribution, value) if not is_number else ""
-            # As the renderer takes them.
+            # In the precision of the renderer.
             found[key] = text if text else np.asarray(value, dtype=np.float32)
         return found
 
     def _check(self, index: int, arrays: Mapping[str, NDArray[Any]], measured: str) -> None:
-        # Labels have NaN where nothing is seen.
+        # Labels are NaN where no surface is seen.
         for name in (measured, "steady", "measurement"):
             if name in arrays and not np.isfinite(arrays[name]).all():
                 raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
@@ -260,7 +260,7 @@ class Kept:
             own["sensors"] = list(own["sensors"]) if isinstance(own["sensors"], tuple) else own["sensors"]
             with self._recipe_errors(lambda: given):
                 return TransientRenderer(given, parameters=self.keys, **common, **own)
-        # Imported where it is used: captures read files of this room.
+        # Here, since captures import files of this room.
         from torchtransient.nlos.renderer import CaptureRenderer
         from torchtransient.nlos.scene import capture_scene
 
@@ -478,7 +478,7 @@ class Kept:
         transient = tensors["transient"]
         is_polarized = any(isinstance(one, Analyzers | PolarizationMosaic) for one in chain.modules())
         if stokes_components(self.recipe.variant) > 1 and not is_polarized:
-            # A detector that takes no notice of polarization counts all light.
+            # Other detectors count the light of all polarizations.
             transient = transient.select(-5, 0)
         generator = torch.Generator().manual_seed(Stream(self.recipe.seed, index, NOISE).seed())
         return chain.sample(transient, generator)
@@ -646,7 +646,7 @@ def changed_device(device: Device, key: str, value: Any) -> Device:
 
 def package_versions() -> dict[str, str]:
     """Versions of the packages that determine the numbers, and of plugins that others have added."""
-    # This package's own is that of the code which runs: a checkout on the path need not be the one that is installed.
+    # The version of the running code: a checkout may differ from the installed package.
     from torchtransient import __version__
 
     others = {name: metadata.version(name) for name in ("mitsuba", "drjit", "torch", "numpy")}

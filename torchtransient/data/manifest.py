@@ -24,7 +24,7 @@ from torchtransient.rendering.progress import with_bar
 
 FORMAT = "torchtransient manifest 1"
 _WHAT = "data set"
-# Of samples, whose numbers stand in memory.
+# Most missing samples, whose numbers are held in memory.
 _MOST_MISSING = 10**8
 
 
@@ -320,7 +320,7 @@ def _write(folder: Path, entries: Sequence[_Entry]) -> dict[str, Any]:
 
 
 def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
-    if not entries:  # of shards none of which is sound
+    if not entries:  # no shard is sound
         return {"format": FORMAT, "samples": 0, "failed": {}, "shards": {}}
     first = next((entry for entry in entries if entry.index), entries[0])
     errors = sorted(e.header["standard_error"] for e in entries if _is_number(e.header.get("standard_error")))

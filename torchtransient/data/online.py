@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-import torch.multiprocessing  # teaches connections to hand over shared tensors
+import torch.multiprocessing  # lets connections carry shared tensors
 from torch.utils.data import IterableDataset, get_worker_info
 
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
@@ -42,9 +42,9 @@ from torchtransient.errors import (
 MOST_AHEAD = 64
 WHAT = "OnlineDataset"
 _SHARED = Path("/dev/shm")
-# Ends of producers while the same sample was rendered, and while none was, that are an error.
+# Ends of producers that are an error, at the same sample and between samples.
 _MOST_ENDS, _MOST_IDLE_ENDS = 2, 3
-# Samples in a row that may fail.
+# Failed samples in a row that are an error.
 _MOST_FAILED = 16
 # Seconds for producers to end, and of one wait for messages.
 _PATIENCE_S, _WAIT_S = 2.0, 1.0
@@ -112,7 +112,7 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         self.transform = checked_transform(WHAT, transform)
         schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)
         self._producers = Producers(recipe, schedule, capacity, workers, float(timeout_s))
-        # Also when the object is forgotten, and at the end of the interpreter.
+        # Also when the object is freed, and at the end of the interpreter.
         self._finalizer = weakref.finalize(self, self._producers.close)
         try:
             self._producers.start()
@@ -242,10 +242,10 @@ class Producers:
                 if not self.schedule.drawn:
                     OutsideLight.of(outside for _, _, outside in self._beside.values()).warn(WHAT)
                 sample = self._copy(self.schedule.draw())
-                # Not before it is copied: its place may be the oldest, which the next order goes to.
+                # After the copy: the next order may go to its place.
                 self._give_orders()
             except BaseException as error:
-                # An interrupt too: it may have cut a message in two.
+                # Interrupts too, which may have cut a message.
                 self._failure = error if isinstance(error, Exception) else None
                 self.close()
                 raise
@@ -288,7 +288,7 @@ class Producers:
     def _listen(self, seconds: float) -> bool:
         """Read messages, waiting so long for them, and give new orders; True where there was a message."""
         self._give_orders()
-        # A producer that has ended is heard to the end: its connection closes with it.
+        # The messages of a dead producer are read to the end; its connection closes with it.
         heard = wait([worker.connection for worker in self._workers], seconds)
         for n, worker in enumerate(self._workers):
             if worker.connection in heard:
@@ -342,7 +342,7 @@ class Producers:
         try:
             worker.connection.send(message)
         except OSError:
-            # It has ended, which is found when it is listened to.
+            # It has ended, which the next reading finds.
             return
 
     def _give_orders(self) -> None:
@@ -423,7 +423,7 @@ class Schedule:
         self.ahead = max(1, min(MOST_AHEAD, capacity // (4 * producers)))
         self.orders: dict[int, Order] = {}
         self._next = first
-        # Of producers that have ended.
+        # Samples of producers that have ended.
         self._again: deque[int] = deque()
         self._free: deque[int] = deque(range(capacity))
         self._readable: deque[int] = deque()

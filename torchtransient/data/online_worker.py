@@ -102,7 +102,7 @@ class _Producer:
         """Render samples for ever."""
         while True:
             self._listen()
-            # All of them before new ones: a kind of scene that the maker puts last has its turn, too.
+            # All of them before new orders, so that every structure has its turn.
             for index in self._maker.order(list(self._asked)):
                 self._line.say("start", index)
                 try:

@@ -277,7 +277,7 @@ class PixelMap:
         signs = np.sign(np.diag(r))
         found = np.eye(3)
         found[:2, :2] = (q * signs).T[::-1]
-        # Whole turns and mirrors are whole numbers.
+        # Quarter turns and mirrors are exact.
         near = np.round(found)
         return near if np.abs(found - near).max() < 1e-12 else found
 
@@ -308,7 +308,7 @@ class PixelMap:
     def changes_scale(self) -> bool:
         """True for a map that may change an angle of view."""
         upper = self.matrix[:2, :2] @ self._orthogonal[:2, :2].T
-        # To what float32 tells, in which kornia draws.
+        # To the precision of float32, in which kornia draws.
         return self.size != self.new_size or float(np.abs(upper - np.eye(2)).max()) > 1e-6
 
     def intrinsics(self, camera_matrix: Tensor) -> Tensor:
@@ -389,11 +389,11 @@ class PixelMap:
         self._check_image(image, name)
         fill = number
         rows, columns, inside = (one.to(image.device) for one in self._sources)
-        # Bits are moved, no numbers: torch 2.6 has no index for these unsigned types.
+        # As signed bits: torch 2.6 does not index these unsigned types.
         signed = _SIGNED.get(image.dtype)
         taken = (image if signed is None else image.view(signed))[..., rows, columns]
         has_rim = not bool(inside.all())
-        # Also where this draw happens to have no rim: others of its kind do.
+        # Also for a draw without a rim, since others of its kind have one.
         if (has_rim or not self.is_exact) and not _holds(image.dtype, fill):
             raise UnitError(
                 f"Augment: {name!r} of {image.dtype} cannot hold {fill}, which stands for nothing beyond the rim: "

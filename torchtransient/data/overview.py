@@ -25,10 +25,10 @@ from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
 from torchtransient.vis.tone_mapping import tone_map
 
-# Drawn values that a title has room for, and letters of each.
+# Most values in a title, and letters of each.
 _MOST_VALUES, _MOST_LETTERS = 3, 24
 _MEASURED = ("transient", "phasor", "gated", "rates", "beats")
-# Histograms by rows, which are added up.
+# Films with an axis of rows, which are summed.
 _ROWS = ("rates", "beats")
 NAME = "latest.png"
 EVERY_S = 10.0
@@ -217,7 +217,7 @@ def _picture(arrays: Mapping[str, NDArray[Any]], behind: int) -> NDArray[Any]:
         if name is None:
             return np.zeros((1, 1, 3))
         light = np.abs(_over_time(arrays, name, behind)).sum(1)
-        # Of pairs of points a table of all of them, of a list of points a row.
+        # Pairs of points as a table, a list of points as a row.
         while light.ndim > 3:
             light = light.reshape(light.shape[0], light.shape[1] * light.shape[2], -1)
         light = light if light.ndim == 3 else light[:, None]

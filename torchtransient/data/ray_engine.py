@@ -12,7 +12,7 @@ import warnings
 from typing import Any
 
 from torchtransient.data.crew import PATIENCE_S, POLL_S, Crew, Ledger, Member
-from torchtransient.data.run_settings import Settings
+from torchtransient.data.run_settings import RunSettings
 from torchtransient.data.shard_making import Messages, ShardMaker, execute, fatal
 from torchtransient.errors import MissingPackageError, TorchTransientError, TorchTransientWarning, level_of_user
 
@@ -36,7 +36,7 @@ class RayCrew(Crew["RayWorker"]):
     hint = "All machines of the cluster need torchtransient and the modules of the recipe."
 
     def __init__(
-        self, settings: Settings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
+        self, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
     ) -> None:
         super().__init__(settings, workers, ledger, timeout_s)
         self._ray = ray_package()
@@ -161,7 +161,7 @@ class ShardActor:
         number: of the worker, which begins each message.
     """
 
-    def __init__(self, settings: Settings, queue: Any, number: int) -> None:
+    def __init__(self, settings: RunSettings, queue: Any, number: int) -> None:
         self._settings, self._queue, self._number = settings, queue, number
         self._maker: ShardMaker | None = None
 

@@ -51,7 +51,7 @@ from torchtransient.scene.motions import BodyMotion
 from torchtransient.scene.samplers import OF_SCENE
 
 FORMAT = "torchtransient recipe 1"
-# Entries that are the constructor's arguments as they are.
+# Entries that are arguments of the constructor unchanged.
 _PLAIN = (
     "labels", "keep", "temporal_filter", "spp", "max_depth", "sensors", "bounces", "energy", "physics", "sampler",
     "variant", "seed", "n", "plugins",
@@ -321,13 +321,13 @@ def _recipe_data(recipe: Specification) -> dict[str, Any]:
         "seed": recipe.seed,
         "n": recipe.n,
     }
-    # Not in the keys of recipes without them, which are older than these settings.
+    # Left out where None, so that older recipes keep their keys.
     found |= {name: asdict(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
     if settings.sampler != OF_SCENE:
         found["sampler"] = settings.sampler
     if recipe.plugins:
         found["plugins"] = list(recipe.plugins)
-    # Of JSON: no tuples, and nothing that is not plain.
+    # Through JSON: lists in place of tuples, plain data alone.
     try:
         plain: dict[str, Any] = json.loads(json.dumps(found, allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -369,7 +369,7 @@ def _recipe_arguments(data: Mapping[str, Any], folder: str | Path | None) -> tup
     vary = section.get("vary", {})
     if not isinstance(vary, Mapping):
         raise SceneError(f"recipe: vary: expected distributions by key, got {shown(vary)}.")
-    # Files without it are older than the setting: they go on with what they were rendered with.
+    # Older files have no such entry, and keep the sampler of their scene.
     arguments.setdefault("sampler", OF_SCENE)
     arguments["vary"] = {str(key): read_distribution(f"recipe: vary: {key}", one) for key, one in vary.items()}
     arguments["time_axis"] = _axis(section)

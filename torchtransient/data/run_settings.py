@@ -1,4 +1,4 @@
-"""Settings of a run, the files of a data set, and ``recipe.json``, with which a later run is compared."""
+"""RunSettings of a run, the files of a data set, and ``recipe.json``, with which a later run is compared."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from torchtransient.errors import StorageError
 MANIFEST_FILE, RECIPE_FILE = "manifest.json", "recipe.json"
 SHARD_FILES = "shard-*.h5"
 LEAST_BYTES, MOST_BYTES = 64 * 2**20, 256 * 2**20
-# Shards that a data set has at least, where it has as many samples: all workers are busy, and a kill loses little.
+# Least number of shards, so that all workers are busy and a kill loses little.
 LEAST_SHARDS = 64
-# Beyond that many of the smallest size, shards grow instead.
+# Most shards of the smallest size; beyond, shards grow.
 MANY_SHARDS = 256
-# The first one left samples out whose light the window misses.
+# Format 1 left out samples whose light the window misses.
 FORMAT = "torchtransient data set 2"
 _WHAT = "generate"
 # Entries that determine the bytes of shards, in the order in which differences are reported.
@@ -30,8 +30,8 @@ DECIDING = ("format", "key", "n", "per_shard", "store", "compression")
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of a run, for every process. Pickles when the recipe does.
+class RunSettings:
+    """RunSettings of a run, for every process. Pickles when the recipe does.
 
     Args:
         recipe: that is generated.
@@ -49,7 +49,6 @@ class Settings:
     store: str
     compression: str
     retries: int
-    # Plugin modules of others, which every process has to add.
     plugins: PluginNames = ()
 
 
@@ -123,7 +122,7 @@ def samples_per_shard(n: int, sample_bytes: int) -> int:
     return max(1, min(by_size, n // LEAST_SHARDS))
 
 
-def shard_header(settings: Settings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
+def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
     """Header of a shard: description of the data set and number of the shard, without the folders of the recipe's
     files.
 
@@ -145,7 +144,7 @@ def _ends(plan: Plan, shard: int) -> tuple[int, int]:
     return indices.start, indices.stop
 
 
-def description(settings: Settings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
+def description(settings: RunSettings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
     """Content of ``recipe.json``.
 
     Args:

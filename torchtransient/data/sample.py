@@ -17,9 +17,9 @@ from torch import Tensor
 from torchtransient.checks import count, function, shown
 from torchtransient.errors import PhysicsWarning, TorchTransientWarning, UnitError, level_of_user
 
-# Numbers from which on arrays are turned in blocks, and pixels of a block.
+# Least size of arrays that are copied in blocks, and pixels of a block.
 _LARGE, _BLOCK = 2**15, 64
-# Share of a sample's light outside of the window from which on the sample counts as cut.
+# Share of light outside of the window above which a sample counts as cut.
 CUT = 0.01
 # Quantile of the normal distribution for an interval of 95 %.
 _Z = 1.96
@@ -189,7 +189,7 @@ def in_order(tensor: torch.Tensor) -> NDArray[Any]:
     try:
         source = tensor.view(target.shape).cpu().numpy()
     except RuntimeError:
-        # Rows and columns are no single axis in memory.
+        # Rows and columns do not form one axis in memory.
         return np.ascontiguousarray(array)
     for first in range(0, pixels, _BLOCK):
         target[..., first : first + _BLOCK] = source[..., first : first + _BLOCK]

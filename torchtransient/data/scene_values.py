@@ -15,7 +15,7 @@ from torchtransient.data.operations import PixelMap
 from torchtransient.errors import SceneError
 from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS
 
-# The same in a mirror, and for every camera. Textures of surfaces among them: they go along with the coordinates `uv`.
+# True in a mirror and for every camera, textures of surfaces too, which follow the coordinates `uv`.
 UNAFFECTED = frozenset(
     (
         "reflectance", "transmittance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
@@ -28,9 +28,9 @@ UNAFFECTED = frozenset(
         "near_clip", "far_clip", "share",
     )
 )  # fmt: skip
-# Pictures of these are thrown by a projector, and lie in its frame.
+# Textures of projectors, in the projector's frame.
 _THROWN = frozenset(("intensity", "irradiance", "energy"))
-# Of the world, and of no camera: false in a mirror, true for another camera.
+# Of the world: false in a mirror, true for another camera.
 OF_THE_WORLD = frozenset(
     (
         "position", "positions", "direction", "center", "linear", "angular", "p0", "p1", "control_points", "data",
@@ -40,11 +40,11 @@ OF_THE_WORLD = frozenset(
         "longitude", "timezone", "year", "month", "day", "hour", "minute", "second", *VERTEX_COLUMNS, *_THROWN,
     )
 )  # fmt: skip
-# A camera may have them, and everything else.
+# Of cameras and of other objects.
 POSES = frozenset(("to_world", "origin", "target", "up"))
 ANGLES_OF_VIEW = frozenset(("x_fov", "fov", "focal_length"))
 PRINCIPAL_POINT = frozenset(("principal_point_offset_x", "principal_point_offset_y"))
-# Arguments of the stages of a device: numbers that know no pixels and no directions.
+# Arguments of the stages of a device without pixels and directions.
 OF_DEVICES = frozenset(
     (
         "probability", "tau_s", "dead_time_s", "period_s", "frames", "depth", "cycles", "kind", "gate", "delays_s",
@@ -59,9 +59,9 @@ OF_DEVICES = frozenset(
         "background", "bandwidth_hz", "duration_s",
     )
 )  # fmt: skip
-# Those among them that may be maps of pixels.
+# Those that may be maps of pixels.
 _MAPS_OF_DEVICES = frozenset(("quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz", "delay_s", "background"))
-# Under which plugins keep the numbers of a texture, spectrum or volume.
+# Last parts of the keys of textures, spectra and volumes.
 _LEAVES = frozenset(("value", "values", "data", "color0", "color1"))
 
 

@@ -35,7 +35,7 @@ from torchtransient.scene.description import Plain, XmlDescription
 
 _MOST_LISTED = 64
 Record = TypeVar("Record", Pulse, Gate)
-# Keys of mappings that stand for what JSON does not have.
+# Keys of mappings for values that JSON does not have.
 _PIXELS, _VOXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__voxels__", "__scan__", "__distribution__"
 
 
@@ -218,7 +218,7 @@ def read_frequencies(data: Any) -> FrequencyAxis | None:
     return FrequencyAxis(tuple(data))
 
 
-# Longer texts name no file.
+# Most letters of a file's name.
 _MOST_LETTERS = 1024
 _DEEPEST = 16
 
@@ -237,7 +237,7 @@ def without_places(plain: Mapping[str, Any]) -> dict[str, Any]:
 
 def _placeless(value: Any) -> Any:
     if isinstance(value, Mapping):
-        # Of a scene that was written by `to_dict`.
+        # A scene as `to_dict` writes it.
         is_scene = set(value) >= {"tree", "folder"}
         return {name: _placeless(entry) for name, entry in value.items() if not (is_scene and name == "folder")}
     if isinstance(value, list):

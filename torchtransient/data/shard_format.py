@@ -29,7 +29,7 @@ COUNTED = "measurement"
 # Arrays of films, where a header does not name them.
 _FILMS = ("transient", "phasor", "gated", "rates", "beats")
 MANTISSA_BITS = 10
-ENCODINGS = ("exact", "rounded", "counts")  # of one array
+ENCODINGS = ("exact", "rounded", "counts")  # of an array
 _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 
@@ -279,7 +279,7 @@ class Compressor:
         self.dtype, self.chunks = dtype, (1, *chunk_shape(shape))
         self.options = {"chunks": self.chunks, "fletcher32": True, **_filters(compression, what)}
         # Nothing is kept in a cache: every chunk is compressed as it is written.
-        name = f"chunks {secrets.token_hex(8)}"  # which no other open file may have
+        name = f"chunks {secrets.token_hex(8)}"  # unique among open files
         self._file = h5py.File(name, "w", driver="core", backing_store=False, libver=LIBVER, rdcc_nbytes=0)
         self._data = self._file.create_dataset("x", (1, *shape), dtype, **self.options)
         self._all, self._type = h5py.h5s.ALL, h5py.h5t.py_create(dtype, logical=True)

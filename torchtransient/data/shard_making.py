@@ -13,10 +13,10 @@ from typing import Any
 
 from torchtransient.data.overview import LatestPicture
 from torchtransient.data.processes import add_plugins, traced
-from torchtransient.data.run_settings import Plan, Settings, check_same, plain, shard_file_name, shard_header
+from torchtransient.data.run_settings import Plan, RunSettings, check_same, plain, shard_file_name, shard_header
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, TorchTransientWarning
 
-# Words of a reason at most: it stands in the file for every sample that failed.
+# Most letters of a reason, which is stored for every sample that failed.
 MOST_CHARACTERS = 500
 _FOLDERS = re.compile(r"(?<![\w.])(?:/[^/\s'\":,;()]+)+/(?=[^/\s])")
 _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
@@ -30,7 +30,7 @@ class ShardMaker:
         settings: of the run.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: RunSettings) -> None:
         from torchtransient.rendering.threads import threads
 
         threads(1)

@@ -479,7 +479,7 @@ class _Column:
         return stored.dtype, self._compressor(stored.dtype).compressed(stored)
 
     def write(self, group: Any, rows: int) -> None:
-        # Counts: the type that holds the largest of all.
+        # The type of the largest count.
         """Write all rows."""
         dtype = max((kind for kind, _ in self.rows.values()), key=lambda kind: kind.itemsize)
         compressor = self._compressor(dtype)

@@ -50,7 +50,7 @@ from torchtransient.scene.variant import resolve_variant
 from torchtransient.sensing import DEVICES, Device
 from torchtransient.sensing import device as device_by_name
 
-# The key that stands for the scan of a capture.
+# Key of the scan of a capture.
 SCAN = "scan"
 
 
@@ -125,7 +125,7 @@ class Scenes:
 
     def sampler(self) -> str:
         """Return the sampler that renderers take for these scenes: a plugin name, or "auto" where scenes differ."""
-        if self.scan is not None:  # the sensors of a capture name none
+        if self.scan is not None:  # sensors of captures have none
             return sampler_for(None)
         scenes = (Scene(description, self.variant) for description in self.descriptions.values())
         return sampler_for_all(name for scene in scenes for name in described_samplers(scene))
@@ -190,7 +190,7 @@ def _description(given: Any, scan: Scan | None, parameters: Mapping[str, Any]) -
         return scene._description
     if parameters:
         raise SceneError("recipe: parameters fill the $names of XML files; a capture has none. Leave them out.")
-    # Imported where it is used: captures read files of this room.
+    # Here, since captures import files of this room.
     from torchtransient.nlos.scene import shapes_of
 
     return describe_dict({"type": "scene", **shapes_of(given)})
@@ -212,7 +212,7 @@ def _exchanged(description: Plain, key: str, value: Any) -> Plain:
     if isinstance(description, XmlDescription):
         parameters = dict(description.parameters) | {key.removeprefix("$"): str(_plain(value))}
         return replace(description, parameters=tuple(sorted(parameters.items())))
-    # Through the checks of a description of its own.
+    # Checked as a description of its own.
     fresh = describe_dict({"type": "scene", "entry": {"type": "entry", "value": value}}).tree["entry"]["value"]
     tree = copy.deepcopy(description.tree)
     *above, last = key.split(".")
@@ -249,9 +249,9 @@ def _checked_scan(value: Any) -> Scan:
     return value
 
 
-# The key of what a device's stages vary in: "device.PhotonBudget.cycles".
+# First part of the keys of a device's stages: "device.PhotonBudget.cycles".
 DEVICE = "device"
-# Purposes of random numbers that are no keys.
+# Purposes of random numbers besides keys.
 _SCENE, RENDER, NOISE, SECOND = "scene of OneOf", "seed of the render", "seed of the noise", "seed of another render"
 
 
@@ -279,7 +279,7 @@ class Settings:
     bounces: tuple[int, ...] | str = (3,)
     energy: Any = 1.0
     physics: str = "ignore"
-    # Recipes that say nothing of it, which are older than this setting.
+    # The default of recipes that are older than this setting.
     sampler: str = OF_SCENE
 
 
@@ -320,7 +320,7 @@ class Specification:
         n: int | None = None,
         plugins: Sequence[str] = (),
     ) -> None:
-        # Before the scene is looked at.
+        # Before the scene, which may use them.
         self.plugins = _checked_plugins(plugins)
         labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
         if not is_one_of(physics, ("ignore", "error")):
@@ -425,7 +425,7 @@ class Specification:
     def _is_exchanged(self, key: str, distribution: Distribution) -> bool:
         if self.is_of_device(key) or not self.scenes.has_entry(key):
             return False
-        # Of what stands in the description and is a parameter too, numbers vary as values.
+        # Numbers of entries that are parameters too vary as values.
         texts = isinstance(distribution, Choice) and any(is_entry(value) for value in distribution.values)
         return texts or key not in self._parameters
 
@@ -503,7 +503,7 @@ def label_of(distribution: Distribution, value: Any) -> str:
         Text.
     """
     if isinstance(value, str | int | float):
-        # Of a file its name: a data set is the same wherever its files are.
+        # The name of a file: data sets do not depend on its folder.
         if isinstance(value, str):
             return Path(value).name if Path(value).is_absolute() else value
         return repr(value.item() if isinstance(value, np.generic) else value)

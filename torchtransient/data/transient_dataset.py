@@ -42,7 +42,7 @@ from torchtransient.errors import (
     level_of_user,
 )
 
-# Borders that differ from a bin's by less, in bins, are that bin's.
+# Tolerance of window ends at the edges of bins, in bins.
 _SAME_EDGE = 1e-6
 WHAT = "data set"
 _OPEN = 32
@@ -259,7 +259,7 @@ class ShardTable:
             Shard.
         """
         if self._process != os.getpid():
-            # Those of the parent are not ours to close: HDF5 shares its state with it.
+            # The parent's files stay open: HDF5 shares its state with it.
             self._open, self._process = OrderedDict(), os.getpid()
         if number in self._open:
             self._open.move_to_end(number)

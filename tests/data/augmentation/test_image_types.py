@@ -148,12 +148,6 @@ def test_what_may_be_an_image_is_not_passed_over(name):
     assert Augment(Flip(p=1.0), fields={"mask": "unchanged"})(given)["mask"] is UNKNOWN[name]
 
 
-def test_pictures_of_pillow():
-    image = pytest.importorskip("PIL.Image").new("L", (W, H))
-    with pytest.raises(SceneError, match="'mask' has the size of an image"):
-        Augment(Flip(p=1.0))({"depth": torch.ones(H, W), "mask": image})
-
-
 def test_what_is_no_image_is_passed_on():
     given = {"index": 3, "name": "room", "tags": ["a", "b"], "points": np.zeros((9, 3)), "ragged": [[1], [2, 3]],
              "nothing": None, "axis": Record(3.0), "values": {}}  # fmt: skip

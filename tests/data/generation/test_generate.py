@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.crew_here import workers_here
+import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, finish, leftovers, start
 from torchtransient.data import Shard, generate, verify
@@ -55,8 +55,9 @@ def failures(folder):
 
 def test_what_is_there(calm, tmp_path):
     """A worker's bytes are those of this process."""
-    with workers_here():
-        generate(RECIPE, tmp_path, workers=1, **QUICK)
+    with tt.threads(2) as before:
+        generate(RECIPE, tmp_path, workers=0, **QUICK)
+        assert tt.threads() == before
     assert data_files(tmp_path) == data_files(calm)
     assert leftovers(calm) == []
     assert verify(calm).complete and verify(calm).samples == 23
@@ -153,7 +154,8 @@ class Unpicklable(FakeRecipe):
     [
         ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"),
         ({"n": None}, ArgumentError, "how many"),
-        ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
+        ({"workers": -1}, UnitError, "workers"), ({"workers": 0, "engine": "ray"}, UnitError, "workers"),
+        ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
         ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
         ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),

@@ -12,7 +12,7 @@ from support.fake_recipe import FakeRecipe
 from torchtransient import plugins
 from torchtransient.data import OnlineDataset, generate, verify
 from torchtransient.data.processes import registered_plugins
-from torchtransient.data.run_settings import Settings
+from torchtransient.data.run_settings import RunSettings
 from torchtransient.data.shard_making import ShardMaker
 from torchtransient.errors import PluginRegistrationError, SceneError, StorageError
 from torchtransient.plugins import _registry
@@ -83,7 +83,7 @@ def painted(**more):
 
 
 def settings_of(recipe, folder, added):
-    return Settings(recipe, str(folder), 4, "exact", "blosc2", 0, added)
+    return RunSettings(recipe, str(folder), 4, "exact", "blosc2", 0, added)
 
 
 def test_what_is_registered_is_handed_on(theirs, tmp_path):

@@ -1,4 +1,4 @@
-"""Runs of `generate` whose workers live in this process: what is made, kept and made again, and what is said of it."""
+"""Runs of `generate` in this process: what is made, kept and made again, and what is said of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from support.crew_here import CrewHere, workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import damage, data_files, leftovers
 from torchtransient.data import Shard, generate, verify
@@ -19,7 +18,7 @@ from torchtransient.data.crew import RunLog
 from torchtransient.data.overview import drawn_sheet, summary
 from torchtransient.errors import SceneError, StorageError
 
-SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 1}
+SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 0}
 RECIPE = FakeRecipe(shape=(1, 4, 2, 3))
 
 
@@ -28,17 +27,10 @@ class Counted(FakeRecipe):
     n: int = 5
 
 
-@pytest.fixture(autouse=True)
-def here():
-    with workers_here():
-        yield
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "set"
-    with workers_here():
-        done = generate(RECIPE, folder, **SMALL)
+    done = generate(RECIPE, folder, **SMALL)
     assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (7, 0, 0, 0, 4)
     assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5")) and done.folder == folder
     return folder
@@ -64,7 +56,7 @@ def test_a_run_and_its_log(whole):
     assert verify(whole).complete and verify(whole).samples == 7 and leftovers(whole) == []
     first, *shards, last = events(whole)
     assert (first["event"], first["n"], first["workers"], first["engine"], first["shard"]) == (
-        "begin", 7, 1, "local", None,
+        "begin", 7, 0, "local", None,
     )  # fmt: skip
     assert [one["shard"] for one in shards] == [0, 1, 2, 3] and {one["event"] for one in shards} == {"shard"}
     assert (last["event"], last["samples"], last["shards"], last["failed"]) == ("end", 7, 4, 0)
@@ -72,7 +64,7 @@ def test_a_run_and_its_log(whole):
 
 
 def test_two_shares_are_the_whole(whole, tmp_path):
-    first = generate(RECIPE, tmp_path, shard=(1, 2), **SMALL | {"workers": 3})
+    first = generate(RECIPE, tmp_path, shard=(1, 2), **SMALL)
     assert (first.samples, first.shards, first.kept) == (3, 2, 0)
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["shard-000001.h5", "shard-000003.h5"]
     second = generate(RECIPE, tmp_path, shard=(0, 2), **SMALL)
@@ -98,7 +90,7 @@ def test_going_on(whole, tmp_path):
 
 
 def test_how_many_samples_a_recipe_says(tmp_path):
-    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, per_shard=4, compression="none", progress=False)
+    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, workers=0, per_shard=4, compression="none", progress=False)
     assert (done.samples, done.shards) == (5, 2)
 
 
@@ -220,7 +212,7 @@ def test_recipe_json_that_is_none(tmp_path, content):
 
 def test_shards_that_are_somewhere_else(tmp_path, monkeypatch):
     """A worker has written one that this machine does not see."""
-    monkeypatch.setattr(CrewHere, "make", lambda self, left, found: None)
+    monkeypatch.setattr("torchtransient.data.local_engine.InProcessCrew.make", lambda self, left, found: None)
     with pytest.raises(StorageError, match=r"shard 0 was written, and '.*shard-000000\.h5' is not there"):
         generate(RECIPE, tmp_path, **SMALL)
     assert events(tmp_path, "stopped") and not events(tmp_path, "end")

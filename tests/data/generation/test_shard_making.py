@@ -9,7 +9,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient.data import Sample, Shard
-from torchtransient.data.run_settings import Settings
+from torchtransient.data.run_settings import RunSettings
 from torchtransient.data.shard_making import MOST_CHARACTERS, Messages, ShardMaker, fatal, raised, reason_of
 from torchtransient.errors import PhysicsWarning, SceneError, StorageError, TorchTransientError, UnitError
 
@@ -58,7 +58,7 @@ def made(tmp_path):
     """Makes a shard of three samples, or measures: (result, messages)."""
 
     def run(recipe, shard=0, retries=1, skip=(), first=(), about=None):
-        settings = Settings(recipe, str(tmp_path), 5, "exact", "none", retries)
+        settings = RunSettings(recipe, str(tmp_path), 5, "exact", "none", retries)
         sent = []
         messages = Messages(sent.append, dict(skip))
         maker = ShardMaker(settings)

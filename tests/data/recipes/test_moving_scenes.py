@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.crew_here import workers_here
 from support.moving_scenes import moving_scene, wall
 from torchtransient.data import Sample
 from torchtransient.data.overview import cell_of, summary
@@ -37,8 +36,7 @@ def recipe(scene=None, vary=None, **changes):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("fans")
-    with workers_here():
-        D.generate(recipe(), place, 3, workers=1, progress=False)
+    D.generate(recipe(), place, 3, workers=0, progress=False)
     return place
 
 

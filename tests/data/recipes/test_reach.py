@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from torchtransient.errors import SceneError
+from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.scenes.transforms import look_at, translate
 
 D = tt.data
@@ -31,6 +31,18 @@ def recipe(end, lamp=LAMP, vary=None, integrator=None, **settings):
     return D.Recipe(scene, away | (vary or {}), variant="llvm_ad_mono", spp=1, time_axis=axis, **settings)
 
 
+@pytest.fixture
+def nothing_is_rendered(monkeypatch):
+    """The check passes; its renders, which follow, fail at once."""
+
+    def render(*arguments, **keywords):
+        raise SceneError("not rendered")
+
+    monkeypatch.setattr(tt.TransientRenderer, "forward", render)
+    with pytest.warns(TorchTransientWarning, match="not rendered"):
+        yield
+
+
 def leaves(made):
     """The shortest path, where the window is too short for it."""
     with pytest.raises(SceneError, match=r"'ball\.to_world' .* leaves the window") as caught:
@@ -38,7 +50,7 @@ def leaves(made):
     return float(str(caught.value).split(" is ")[1].split(" m,")[0])
 
 
-@pytest.mark.filterwarnings("ignore::torchtransient.errors.PhysicsWarning")
+@pytest.mark.usefixtures("nothing_is_rendered")
 def test_the_shortest_path_from_a_light_to_an_eye():
     assert leaves(recipe((TO_BALL + TO_EYE) * (1 - 1e-3))) == pytest.approx(TO_BALL + TO_EYE, rel=1e-3)
     recipe((TO_BALL + TO_EYE) * (1 + 1e-3)).check()
@@ -61,7 +73,7 @@ def test_lengths_that_are_counted_from_the_first_thing_seen():
     assert leaves(recipe(5.0, integrator=unwarped)) == pytest.approx(TO_BALL, rel=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore::torchtransient.errors.PhysicsWarning")
+@pytest.mark.usefixtures("nothing_is_rendered")
 def test_lights_without_a_place_and_pulses_are_not_checked():
     recipe(1.0, {"type": "constant", "radiance": 1.0}).check()
     recipe(1.0, pulse=tt.Pulse.gaussian(0.5)).check()

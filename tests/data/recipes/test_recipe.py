@@ -215,17 +215,6 @@ def test_samples_whose_light_the_window_misses(monkeypatch):
     assert low < found.cut / 64 < high and low - 0.1 < others / 64 < high + 0.1
 
 
-@pytest.mark.slow
-def test_the_check_rounds_its_own_numbers_of_samples_silently():
-    scene = tt.scenes.cornell_box(resolution=9)
-    scene["sensor"]["sampler"] = {"type": "multijitter", "sample_count": 4096}
-    recipe = small(scene, vary={"red.reflectance.value": D.Uniform(0.1, 0.9)}, spp=4096)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=".*is rounded to")
-        warnings.simplefilter("ignore", PhysicsWarning)
-        assert recipe.check().samples == 64
-
-
 @pytest.mark.parametrize(("cut", "samples"), [(0, 64), (8, 64), (63, 64), (16, 16)])
 def test_interval_of_the_share_of_samples(cut, samples):
     """Wilson's: its ends p are 1.96 standard deviations of a share of n samples away from k / n."""
@@ -599,19 +588,6 @@ def test_values_of_a_key_are_of_one_kind():
     for index in range(3):
         same(numbers.sample(index), again.sample(index))
     assert numbers.key() == again.key() and numbers.structure(0).text == again.structure(0).text
-
-
-@pytest.mark.slow
-def test_texts_of_structures_do_not_depend_on_how_arrays_are_printed():
-    scene = box() | {"thing": {"type": "sphere", "radius": 0.9, "center": [0.0, 0.0, 0.5]}}
-    vary = {"thing.center": D.Uniform([0.01] * 3, [0.04] * 3)}
-    with np.printoptions(precision=1):
-        recipe = small(scene, vary, labels=["depth"])
-        texts = [recipe.structure(index).text for index in range(4)]
-        depths = {float(np.nanmin(recipe.sample(index).arrays["depth"])) for index in range(3)}
-    assert len(set(texts)) == 4 and len(depths) == 3
-    assert texts == [small(scene, vary).structure(index).text for index in range(4)]
-    assert small(vary={"small-box.type": D.Choice(["2", 2])})._vary["small-box.type"].values == ["2", 2]
 
 
 @pytest.mark.slow
