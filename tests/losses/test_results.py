@@ -221,8 +221,7 @@ def test_renders_of_the_library():
     """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
     from torchtransient.capture import Capture, Scan, Wall
     from torchtransient.files.result_file import Result
-    from torchtransient.reconstruction.hidden_volume import HiddenVolume
-    from torchtransient.reconstruction.voxels import VoxelGrid
+    from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
     from torchtransient.sensing.itof.itof_reading import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)

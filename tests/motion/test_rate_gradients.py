@@ -106,7 +106,7 @@ ROOM_KEYS = [
 POSES = ["back.to_world", "side.to_world", "sensor.to_world"]
 
 
-@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
 def test_velocities_colours_and_places_in_a_room(variant):
     compare(renderer_of(tt.load(room(), variant=variant).moving(MOTIONS), ROOM_KEYS))
 
@@ -195,7 +195,7 @@ def test_velocities_and_index_of_glass():
     compare(renderer_of(loaded, keys, spp=1 << 15), seeds=range(8))
 
 
-@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
 def test_velocities_of_vertices(variant):
     vertices = np.array([[-9, -9, 3.0], [9, -9, 3.2], [9, 9, 3.1], [-9, 9, 2.9]])
     speeds = np.array([[0.3, -0.4, 1.2], [0.5, 1.0, -0.7], [0.2, 0.1, 2.0], [-1.0, 0.3, 0.4]])

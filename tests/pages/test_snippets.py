@@ -13,7 +13,7 @@ import torchtransient as tt
 from support.capture_files import grids, made
 from support.pages import NOT_RUN, ROOT, Page, all_pages
 from support.sweeps import together
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 VARIANT = "llvm_ad_rgb"
 # What makes scenes small.

@@ -272,10 +272,10 @@ def _runs() -> dict[str, Case]:
         "data.SpatialFilter": Case(d.SpatialFilter, torch.nn.Identity(), images_at_once=3),
         "data.spatial_filter": Case(d.spatial_filter, torch.nn.Identity(), LIGHT, images_at_once=3),
         "data.generate": Case(
-            until(f"{DATA}.generation.generate._folder", d.generate), FakeRecipe(), "x", n=3, workers=1, per_shard=3
+            until(f"{DATA}.generation._folder", d.generate), FakeRecipe(), "x", n=3, workers=1, per_shard=3
         ),
         "data.OnlineDataset": Case(
-            until(f"{DATA}.reading.online.Producers", d.OnlineDataset),
+            until(f"{DATA}.online.Producers", d.OnlineDataset),
             FakeRecipe(),
             capacity=8,
             workers=1,
@@ -307,7 +307,7 @@ def _runs() -> dict[str, Case]:
         ),
         "training.ranks": Case(entered(t.ranks), threads=1),
         "threads": Case(until("torchtransient.rendering.threads._set", tt.threads), n=1),
-        "data.export_web_dataset": Case(until(f"{DATA}.storage.web_dataset.path_of", d.export_web_dataset), "x", "y"),
+        "data.export_web_dataset": Case(until(f"{DATA}.exports.path_of", d.export_web_dataset), "x", "y"),
         "training.Seeds": Case(t.Seeds, seed=3),
         "training.Seeds.generator": Case(t.Seeds(0).generator, step=3, sample=3),
         "training.Ranks.mean": Case(t.Ranks().mean, value=1.0),

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import assignments
-from torchtransient.cli.pictures import video_options
+from torchtransient.cli.options import assignments, video_options
 
 # Pictures of a capture: option, function of `tt.vis`, what it shows.
 PICTURES = {
@@ -54,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.files.capture_file import check_capture_target
-    from torchtransient.nlos.arguments import checked_seed
+    from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     target = check_capture_target(options["output"] or _beside(scene))
@@ -117,7 +116,7 @@ def _summary(capture: Any) -> str:
 
 
 def _drawable(hidden: Any) -> tuple[dict[str, Any], list[str]]:
-    """The shapes that a layout can show, and the names of the others."""
+    """Return the shapes that a layout can show, and the names of the others."""
     if not isinstance(hidden, dict):
         return {}, ["the shapes of the scene"]
     from torchtransient.vis.hidden_shapes import DRAWN

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchtransient import checks
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.capture.arithmetic import computed
+from torchtransient.capture.capture import computed
 from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.vis.arrival import checked_limits, peak_time_picture

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import hdf5_package
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError
 from torchtransient.gates import gates_from_text
