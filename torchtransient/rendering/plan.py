@@ -314,7 +314,9 @@ def plan(
     loaded = load(scene)
     named = {"frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
     given = requested_film(film, named)
-    wanted = _checked_outputs(outputs or ("transient" if given is None else given.output))
+    if outputs is None:
+        outputs = "transient" if given is None else given.output
+    wanted = _checked_outputs(outputs)
     inventory = scene_inventory(loaded, sensor)
     own_axis = None if given is None else given.attributes().get("axis")
     if own_axis is not None:
