@@ -12,17 +12,17 @@ from support.sensing.all_entries import each
 from support.sensing.contract import nothing_with_a_gradient_as_a_number, parts
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing.base.pixel_maps import check_map, kept_map
-from torchtransient.sensing.base.policies import straight_through
-from torchtransient.sensing.chain.first_photon_moves import multinomial_log_prob
-from torchtransient.sensing.counts.moved_counts import Moves, move_counts
+from torchtransient.sensing.chain.compose import multinomial_log_prob
+from torchtransient.sensing.coincidence import _mean_survival
+from torchtransient.sensing.counts import Moves, move_counts
 from torchtransient.sensing.dead_time.clocked import subdivision_levels
 from torchtransient.sensing.dead_time.renewal import split_dead_time, stationary_phases
-from torchtransient.sensing.estimation.depth import background_per_bin
-from torchtransient.sensing.numerics.draws import check_rates, halve, sample_first_photons, sample_multinomial, thin
-from torchtransient.sensing.numerics.time_convolution import convolve_time
-from torchtransient.sensing.pixels.coincidence import _mean_survival
-from torchtransient.sensing.spad.spad import sample_detections
+from torchtransient.sensing.depth import background_per_bin
+from torchtransient.sensing.draws import check_rates, halve, sample_first_photons, sample_multinomial, thin
+from torchtransient.sensing.parameters import check_map, kept_map
+from torchtransient.sensing.sensor import straight_through
+from torchtransient.sensing.spad import sample_detections
+from torchtransient.sensing.time_convolution import convolve_time
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 12)

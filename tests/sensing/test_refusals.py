@@ -10,19 +10,16 @@ import torch
 from support.sweeps import together
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, StorageError, TorchTransientError, UnitError
-from torchtransient.sensing.base.pixel_maps import check_map
-from torchtransient.sensing.base.policies import ScoreFunction
-from torchtransient.sensing.base.sensor import RandomSensor, Sensor
-from torchtransient.sensing.base.wrapped_detector import WrappedDetector
-from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelays
-from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
-from torchtransient.sensing.counts.added_counts import AddedCounts
-from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
+from torchtransient.sensing.afterpulsing import AfterpulseDelays
+from torchtransient.sensing.afterpulsing_spad import _LossyChain
+from torchtransient.sensing.counts import AddedCounts, MovedCounts, Moves
 from torchtransient.sensing.dead_time.renewal import _check_residual
-from torchtransient.sensing.devices.devices import Device
-from torchtransient.sensing.numerics.draws import sample_multinomial
-from torchtransient.sensing.optics.polarization import demosaic, mosaic_rows
-from torchtransient.sensing.response.responses import Response
+from torchtransient.sensing.devices import Device
+from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.parameters import check_map
+from torchtransient.sensing.polarization import demosaic, mosaic_rows
+from torchtransient.sensing.responses import Response
+from torchtransient.sensing.sensor import RandomSensor, ScoreFunction, Sensor, WrappedDetector
 
 PS = 1e-12
 WIDTH = {"bin_width_s": 100 * PS}

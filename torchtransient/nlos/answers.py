@@ -13,7 +13,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.errors import PhysicsWarning, SceneError
 from torchtransient.nlos.scene import film_size, laser_size
 from torchtransient.sensing import Compose, Device, GradPolicy, Sensor
-from torchtransient.sensing.chain.compose import check_axis
+from torchtransient.sensing.chain.stages import check_axis
 
 
 def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy = "expected") -> nn.Module:

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from torchtransient import sensing
-from torchtransient.sensing.base import remembered as remembered_module
-from torchtransient.sensing.base.remembered import remembered
-from torchtransient.sensing.response.responses import kernel_of
+from torchtransient.sensing import parameters as remembered_module
+from torchtransient.sensing.parameters import remembered
+from torchtransient.sensing.responses import kernel_of
 
 WIDTH = 50e-12
 

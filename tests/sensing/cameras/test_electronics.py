@@ -9,7 +9,7 @@ import torch
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing import ScoreFunction
-from torchtransient.sensing.cameras.electronics import (
+from torchtransient.sensing.electronics import (
     PixelElectronics,
     clipped_normal_mean,
     clipped_normal_variance,

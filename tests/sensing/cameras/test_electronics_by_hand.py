@@ -9,7 +9,7 @@ import torch
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import UnitError
-from torchtransient.sensing.cameras.electronics import clipped_normal_mean, clipped_normal_variance, ktc_noise
+from torchtransient.sensing.electronics import clipped_normal_mean, clipped_normal_variance, ktc_noise
 from torchtransient.units import SPEED_OF_LIGHT
 
 PLANCK_J_S = 6.62607015e-34

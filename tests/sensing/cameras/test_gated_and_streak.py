@@ -10,9 +10,9 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing import Compose, PixelElectronics
-from torchtransient.sensing.cameras.gated import RISE_PER_SIGMA, GatedIntegration, gate_profiles
-from torchtransient.sensing.chain.streak import StreakCamera, SweepJitter
-from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
+from torchtransient.sensing.chain.chains import StreakCamera, SweepJitter
+from torchtransient.sensing.gated import RISE_PER_SIGMA, GatedIntegration, gate_profiles
+from torchtransient.sensing.responses import FWHM_PER_SIGMA
 from torchtransient.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis.from_seconds(1e-9, 50e-12, 200)

@@ -26,9 +26,9 @@ from torchtransient.sensing import (
     SynchronousSPAD,
     sine_code,
 )
-from torchtransient.sensing.cameras.gated import GatedIntegration
-from torchtransient.sensing.estimation.linear_part import adjoint, linearity_error
-from torchtransient.sensing.response.pulse import apply_pulse
+from torchtransient.sensing.gated import GatedIntegration
+from torchtransient.sensing.impulse_response import apply_pulse
+from torchtransient.sensing.sensor import adjoint, linearity_error
 
 AXIS = TimeAxis(1.0, 0.1, 32)
 

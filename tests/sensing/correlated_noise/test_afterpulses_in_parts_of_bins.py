@@ -7,11 +7,11 @@ import torch
 
 from support.marks import long
 from torchtransient import TimeAxis, sensing
-from torchtransient.sensing.correlated_noise import afterpulsing_spad as carriers
-from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
+from torchtransient.sensing import afterpulsing_spad as carriers
+from torchtransient.sensing.afterpulsing_spad import _LossyChain
 from torchtransient.sensing.dead_time import renewal
 from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, stationary_phases
-from torchtransient.sensing.spad.spad import exposed_cycles
+from torchtransient.sensing.spad import exposed_cycles
 
 BINS, WIDTH = 5, 100e-12
 AXIS = TimeAxis.from_seconds(0.0, WIDTH, BINS)

@@ -16,9 +16,9 @@ from torchtransient.sensing import (
     ScoreFunction,
     add_afterpulses,
     add_crosstalk,
+    crosstalk,
     hot_pixel_rates,
 )
-from torchtransient.sensing.correlated_noise import crosstalk
 
 BINS = 40
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchtransient.sensing.counts import moved_counts
-from torchtransient.sensing.counts.moved_counts import Moves, move_counts
-from torchtransient.sensing.numerics import draws
+from torchtransient.sensing import counts as moved_counts
+from torchtransient.sensing import draws
+from torchtransient.sensing.counts import Moves, move_counts
 
 
 def fits(found, expected, draws_of_each):

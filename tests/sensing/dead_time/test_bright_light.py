@@ -21,7 +21,7 @@ from torchtransient.sensing.dead_time.renewal import (
     solve_banded,
     stationary_phases,
 )
-from torchtransient.sensing.spad.free_running import state_image
+from torchtransient.sensing.free_running import state_image
 
 BINS = 32
 FLUXES = [0.01, 0.3, 3.0, 30.0, 300.0, 1000.0, 3000.0]

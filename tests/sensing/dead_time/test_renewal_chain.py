@@ -10,7 +10,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.correlated_noise.afterpulsing_spad import trapped_carrier_lines
+from torchtransient.sensing.afterpulsing_spad import trapped_carrier_lines
 from torchtransient.sensing.dead_time import free_running, renewal
 from torchtransient.sensing.dead_time.clocked import CycleMeans, cycle_means, response_series, series_degree
 from torchtransient.sensing.dead_time.clocked_counts import _cycle_steps, _merge_states, _sum_pieces

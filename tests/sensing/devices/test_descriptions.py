@@ -13,7 +13,7 @@ from torch import nn
 from torchtransient import TimeAxis, losses, sensing
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.sensing import Device, build_stage
-from torchtransient.sensing.devices.devices import KINDS
+from torchtransient.sensing.devices import KINDS
 
 NS = 1e-9
 AXIS = TimeAxis.from_seconds(0.0, 1e-10, 32)

@@ -12,12 +12,13 @@ import torch
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.sensing import DEVICES, Device, build_stage, device, read_itof
-from torchtransient.sensing.cameras.electronics import PixelElectronics
 from torchtransient.sensing.chain.compose import Compose
-from torchtransient.sensing.estimation.physics import deepinv_physics
-from torchtransient.sensing.itof.itof import ItofCorrelation
-from torchtransient.sensing.itof.itof_codes import sine_code
-from torchtransient.sensing.response.impulse_response import GaussianResponse, ImpulseResponse
+from torchtransient.sensing.electronics import PixelElectronics
+from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.itof.codes import sine_code
+from torchtransient.sensing.itof.correlation import ItofCorrelation
+from torchtransient.sensing.physics import deepinv_physics
+from torchtransient.sensing.responses import GaussianResponse
 
 each = pytest.mark.parametrize("name", sorted(DEVICES))
 
@@ -89,7 +90,7 @@ def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingPackageError, match="PyYAML"):
         device("kinect_v2_like").to_yaml()
-    monkeypatch.delitem(sys.modules, "torchtransient.sensing.estimation.deepinverse", raising=False)
+    monkeypatch.delitem(sys.modules, "torchtransient.sensing.deepinverse", raising=False)
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.setitem(sys.modules, "deepinv.physics", None)
     with pytest.raises(MissingPackageError, match="deepinv"):

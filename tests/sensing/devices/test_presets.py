@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchtransient.sensing import DEVICES, TailedResponse, device, frames_to_rate
-from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
+from torchtransient.sensing.responses import FWHM_PER_SIGMA
 from torchtransient.units import SPEED_OF_LIGHT
 
 each = pytest.mark.parametrize("name", sorted(DEVICES))

@@ -14,7 +14,7 @@ from torchtransient import sensing
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.losses import first_photon_nll, poisson_nll
 from torchtransient.sensing import covariance_bound, crlb, return_rates
-from torchtransient.sensing.estimation.cramer_rao import shares_between
+from torchtransient.sensing.cramer_rao import shares_between
 from torchtransient.units import SPEED_OF_LIGHT
 
 PS = 1e-12

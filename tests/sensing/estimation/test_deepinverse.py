@@ -12,7 +12,7 @@ from torchtransient import TimeAxis, sensing
 from torchtransient.errors import MissingPackageError, ShapeError, UnitError
 
 AXIS = TimeAxis.from_seconds(0.0, 1e-10, 12)
-MODULE = "torchtransient.sensing.estimation.deepinverse"
+MODULE = "torchtransient.sensing.deepinverse"
 
 
 class Physics(torch.nn.Module):
@@ -40,7 +40,7 @@ def deepinv(monkeypatch):
 def forget():
     """The module is imported anew, with whatever package is there."""
     sys.modules.pop(MODULE, None)
-    vars(sys.modules["torchtransient.sensing.estimation"]).pop("deepinverse", None)
+    vars(sys.modules["torchtransient.sensing"]).pop("deepinverse", None)
 
 
 def light(seed=0):

@@ -9,9 +9,8 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import ml_position
-from torchtransient.sensing.estimation import depth
-from torchtransient.sensing.response.impulse_response import GaussianResponse
+from torchtransient.sensing import depth, ml_position
+from torchtransient.sensing.responses import GaussianResponse
 from torchtransient.units import SPEED_OF_LIGHT
 
 BINS, WIDTH_S = 64, 100e-12

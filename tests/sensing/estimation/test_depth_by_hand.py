@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.estimation import depth
+from torchtransient.sensing import depth
 from torchtransient.units import SPEED_OF_LIGHT
 
 

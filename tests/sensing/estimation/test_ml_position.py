@@ -11,7 +11,7 @@ import torch
 from support.marks import long_rows
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.sensing.estimation.position_likelihood import _top
+from torchtransient.sensing.depth import _top
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 64)

@@ -13,8 +13,11 @@ import torch
 from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.cameras.electronics import PixelElectronics
-from torchtransient.sensing.itof import itof, itof_codes, itof_depth, itof_reading
+from torchtransient.sensing.electronics import PixelElectronics
+from torchtransient.sensing.itof import codes as itof_codes
+from torchtransient.sensing.itof import correlation as itof
+from torchtransient.sensing.itof import depth as itof_depth
+from torchtransient.sensing.itof import depth as itof_reading
 from torchtransient.units import SPEED_OF_LIGHT
 
 TURN = 2 * math.pi

@@ -11,8 +11,10 @@ import torch
 from torchtransient import TimeAxis, sensing
 from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import PhysicsWarning, ShapeError, UnitError
-from torchtransient.sensing.itof import itof_codes, itof_depth, itof_reading
-from torchtransient.sensing.itof.itof_weights import rounding_of, taps_by_pixel
+from torchtransient.sensing.itof import codes as itof_codes
+from torchtransient.sensing.itof import depth as itof_depth
+from torchtransient.sensing.itof import depth as itof_reading
+from torchtransient.sensing.itof.correlation import rounding_of, taps_by_pixel
 from torchtransient.units import SPEED_OF_LIGHT
 
 TURN = 2 * math.pi

@@ -14,7 +14,7 @@ from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import PhysicsWarning, UnitError
-from torchtransient.sensing.itof.itof_pixels import _DEEPEST_M
+from torchtransient.sensing.itof.correlation import _DEEPEST_M
 from torchtransient.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis.from_seconds(0.0, 100e-12, 500)

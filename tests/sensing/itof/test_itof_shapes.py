@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchtransient import sensing
-from torchtransient.sensing.itof import itof_codes, itof_reading
+from torchtransient.sensing.itof import codes as itof_codes
+from torchtransient.sensing.itof import depth as itof_reading
 
 TURN = 2 * math.pi
 

@@ -15,7 +15,7 @@ from torchtransient.sensing.dead_time.renewal import (
     moments,
     second_moment,
 )
-from torchtransient.sensing.numerics.time_convolution import sum_before
+from torchtransient.sensing.time_convolution import sum_before
 
 BELOW = math.nextafter(1.0, 0.0)
 SMALL = [0.0, 1e-12, 1e-3, 0.4, BELOW, 1.0]

@@ -9,7 +9,7 @@ from scipy import stats
 
 from support.sweeps import together
 from torchtransient.errors import UnitError
-from torchtransient.sensing.numerics.draws import LagTable, add_passing, halve, thin
+from torchtransient.sensing.draws import LagTable, add_passing, halve, thin
 
 DRAWS = 25_000
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from torchtransient import sensing
-from torchtransient.sensing.numerics import draws
-from torchtransient.sensing.numerics.draws import parallel_map
+from torchtransient.sensing import draws
+from torchtransient.sensing.draws import parallel_map
 
 
 @pytest.fixture(params=[1, 2, 3])
@@ -124,7 +124,7 @@ _AT_THE_END = """
 import atexit, sys, threading
 import torch
 torch.set_num_threads(2)
-from torchtransient.sensing.numerics.draws import parallel_map
+from torchtransient.sensing.draws import parallel_map
 assert parallel_map(int, "12") == [1, 2]
 def late():
     threading.main_thread().join()

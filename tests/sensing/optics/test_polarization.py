@@ -10,7 +10,7 @@ import torch
 from torchtransient import stokes as light
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import Compose, PixelElectronics
-from torchtransient.sensing.optics.polarization import (
+from torchtransient.sensing.polarization import (
     Analyzers,
     PolarizationMosaic,
     analyze,

@@ -10,7 +10,7 @@ import torch
 
 from torchtransient.errors import ShapeError
 from torchtransient.sensing import LensBlur, SpatialPSF, blur_image, defocus_psf, gaussian_psf
-from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
+from torchtransient.sensing.responses import FWHM_PER_SIGMA
 
 
 def point(height=15, width=15):

@@ -26,7 +26,7 @@ from torchtransient.sensing import (
     emg_survival,
     resample_counts,
 )
-from torchtransient.sensing.response.response_shapes import FWHM_PER_SIGMA
+from torchtransient.sensing.responses import FWHM_PER_SIGMA
 
 PS = 1e-12
 

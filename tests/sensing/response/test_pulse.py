@@ -12,7 +12,7 @@ from support.marks import long
 from tools.small_room import make_room
 from torchtransient import plugins
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.response.pulse import apply_pulse, axis_with_margin, pulse_kernel
+from torchtransient.sensing.impulse_response import apply_pulse, axis_with_margin, pulse_kernel
 
 VARIANT = "llvm_ad_mono"
 MEASURED = tt.Pulse.tabulated([-0.1, 0.0, 0.05, 0.4], [0, 2, 1, 0])

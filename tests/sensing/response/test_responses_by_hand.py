@@ -11,12 +11,11 @@ from scipy import stats
 
 from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.correlated_noise.afterpulsing import exponential_kernel, exponential_shares
-from torchtransient.sensing.counts.moved_counts import Moves, move_counts, shifted
-from torchtransient.sensing.estimation.cramer_rao import shares_between
-from torchtransient.sensing.response import response_shapes as shapes
-from torchtransient.sensing.response.composed_responses import _full_convolution, _gathered
-from torchtransient.sensing.response.responses import _between
+from torchtransient.sensing import responses as shapes
+from torchtransient.sensing.afterpulsing import exponential_kernel, exponential_shares
+from torchtransient.sensing.counts import Moves, move_counts, shifted
+from torchtransient.sensing.cramer_rao import shares_between
+from torchtransient.sensing.responses import _between, _full_convolution, _gathered
 
 NS = 1e-9
 

@@ -22,8 +22,8 @@ from torchtransient.sensing import (
     sample_detections,
 )
 from torchtransient.sensing.dead_time.clocked_counts import armed_time
-from torchtransient.sensing.numerics.draws import fast_poisson, sample_first_photons, sample_multinomial
-from torchtransient.sensing.numerics.time_convolution import sum_before
+from torchtransient.sensing.draws import fast_poisson, sample_first_photons, sample_multinomial
+from torchtransient.sensing.time_convolution import sum_before
 
 BINS = 48
 

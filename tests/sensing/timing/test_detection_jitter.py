@@ -21,8 +21,8 @@ from torchtransient.sensing import (
     TailedResponse,
     random_code_widths,
 )
-from torchtransient.sensing.chain.first_photon_moves import multinomial_log_prob
-from torchtransient.sensing.counts.moved_counts import Moves, move_counts
+from torchtransient.sensing.chain.compose import multinomial_log_prob
+from torchtransient.sensing.counts import Moves, move_counts
 
 PS, WIDTH = 1e-12, 20e-12
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.base.given import is_dual
+from torchtransient.sensing.checks import is_dual
 from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, check_dead_bins, split_dead_time
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import TIME
-from torchtransient.sensing.base.policies import gaussian_noise
+from torchtransient.sensing.checks import TIME
 from torchtransient.sensing.dead_time.clocked import (
     DeadTimeBlocks,
     DetectionScan,
@@ -37,7 +36,8 @@ from torchtransient.sensing.dead_time.renewal import (
     second_moment,
     split_dead_time,
 )
-from torchtransient.sensing.numerics.draws import halve, sample_multinomial
+from torchtransient.sensing.draws import halve, sample_multinomial
+from torchtransient.sensing.sensor import gaussian_noise
 
 _MOST_MERGED = 4  # pieces of the means that are drawn as one
 _MOST_STEPS = 40  # of Newton's method

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.base.layout import TIME
+from torchtransient.sensing.checks import TIME
 from torchtransient.sensing.dead_time.clocked import rows_by_subdivision
 from torchtransient.sensing.dead_time.clocked_counts import (
     StepCounts,
@@ -37,7 +37,7 @@ from torchtransient.sensing.dead_time.renewal import (
     stationary_phases,
     sum_of_detections,
 )
-from torchtransient.sensing.numerics.draws import sample_multinomial
+from torchtransient.sensing.draws import sample_multinomial
 
 DARK = 1e-12  # photons per period; below, detections equal photons
 _BELOW_ZERO = 1e-5  # of the largest bin: counts as far below zero show bins too wide for the light in them

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing.base.layout import one_number
+from torchtransient.sensing.checks import one_number
 
 ROOT3 = math.sqrt(3.0)
 _SERIES_BELOW = 1.0
