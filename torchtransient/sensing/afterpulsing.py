@@ -59,7 +59,17 @@ _MOST = 0.5  # afterpulses of a detection
 
 
 def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: int) -> Tensor:
-    """Share of afterpulses in bins `first`, ... after their detection, (K, number), for delays `tau_bins` (K,)."""
+    """Share of afterpulses in bins after their detection, for exponential delays.
+
+    Args:
+        tau_bins: time constants (K,) in bins.
+        dead_bins: dead time in bins.
+        first: first bin after the detection.
+        number: bins.
+
+    Returns:
+        (K, number).
+    """
     tau = tau_bins.unsqueeze(1)
     k = torch.arange(first - 1, first + number, dtype=torch.float64, device=tau.device)
     # mean over the bin of the chance that the afterpulse is yet to come: 1 while the detector is dead
@@ -70,7 +80,16 @@ def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: i
 
 
 def exponential_kernel(tau_bins: Tensor, dead_bins: float, period_bins: int) -> Tensor:
-    """`exponential_shares` of all bins, folded into one period: (K, period_bins), every sum 1."""
+    """Shares of all bins after a detection, folded into one period; see `exponential_shares`.
+
+    Args:
+        tau_bins: time constants (K,) in bins.
+        dead_bins: dead time in bins.
+        period_bins: bins of the period.
+
+    Returns:
+        (K, period_bins), every sum 1.
+    """
     start = math.floor(dead_bins)
     shares = exponential_shares(tau_bins, dead_bins, start, 3 * period_bins).view(-1, 3, period_bins)
     # two bins are cut by the dead time; those of the third round and all later ones are a geometric series

@@ -439,8 +439,15 @@ def clocked_hazard(
 def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
     """Rate of carriers that fire an armed free-running detector, 0 in the dark.
 
-    Args, Returns:
-        As `clocked_hazard`, for rates per period.
+    Args:
+        rate: (P, T) photons per period and bin, float64.
+        dead_bins: dead time in bins, scalar float64.
+        seen: (K,) carriers of a detection.
+        tau: (K,) mean delays beyond the dead time, in bins.
+        steps: equal parts of a bin, a power of 2.
+
+    Returns:
+        (P, steps T) per period and part of a bin.
     """
     dark = rate.sum(-1, keepdim=True) < DARK
     safe = torch.where(dark, 0.1, rate)
@@ -626,7 +633,11 @@ class AfterpulsingSPAD(WrappedDetector):
 
     @in_single
     def rate(self, x: Tensor) -> Tensor:
-        """Rate of photons and released carriers."""
+        """Rate of photons and released carriers.
+
+        Args:
+            x: rate of photons per cycle and bin, (..., C, T, H, W).
+        """
         return x + self.released(x)
 
     def _steps(self) -> int:

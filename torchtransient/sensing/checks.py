@@ -19,7 +19,18 @@ from torchtransient.errors import ArgumentError, GradientError, ShapeError, Unit
 
 
 def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:
-    """A tensor of an array of numbers, of any byte order. UnitError for what holds none."""
+    """Make a tensor of an array of numbers.
+
+    Args:
+        array: numbers of any byte order, read-only arrays too.
+        where: name of the caller, for errors.
+
+    Returns:
+        A tensor on the memory of the array where that can be written to.
+
+    Raises:
+        UnitError: for arrays without numbers.
+    """
     native = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("=")) if array.dtype.kind != "O" else array
     try:
         return torch.from_numpy(native if native.flags.writeable else native.copy())
@@ -28,7 +39,16 @@ def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:
 
 
 def check_dense(x: Tensor, where: str, name: str = "") -> Tensor:
-    """The tensor. ShapeError for a sparse one."""
+    """Return a tensor that is dense.
+
+    Args:
+        x: tensor.
+        where: name of the caller, for errors.
+        name: name of the argument.
+
+    Raises:
+        ShapeError: for a sparse one.
+    """
     if x.layout != torch.strided:
         said = f"{name} as a dense tensor" if name else "a dense tensor"
         raise ShapeError(f"{where}: expected {said}, got {x.layout}. x.to_dense() makes one.")
@@ -36,24 +56,54 @@ def check_dense(x: Tensor, where: str, name: str = "") -> Tensor:
 
 
 def no_arrays(value: Any, where: str) -> Any:
-    """The value, or a tensor of an array with dimensions."""
+    """Return a value, or a tensor of an array with dimensions.
+
+    Args:
+        value: anything.
+        where: name of the caller, for errors.
+
+    Returns:
+        The value itself, or a tensor.
+    """
     return tensor_of(value, where) if isinstance(value, np.ndarray) and value.ndim else value
 
 
 def numbers_of(value: Any, name: str, where: str) -> Any:
-    """A list of the numbers of a tensor of one dimension; anything else as it is. GradientError as `refuse_cut_off`."""
+    """Return the list of numbers of a tensor of one dimension, and anything else as it is.
+
+    Args:
+        value: number, sequence or tensor.
+        name: name of the argument.
+        where: name of the caller, for errors.
+
+    Raises:
+        GradientError: for a tensor that requires a gradient.
+    """
     refuse_cut_off(value, name, where)
     return value.tolist() if isinstance(value, Tensor) and value.ndim == 1 else value
 
 
 def refuse_cut_off(value: object, name: str, where: str) -> None:
-    """GradientError for a number that requires a gradient and is about to be taken without it."""
+    """Refuse a tensor that requires a gradient where its value alone is used.
+
+    Args:
+        value: anything.
+        name: name of the argument.
+        where: name of the caller, for errors.
+
+    Raises:
+        GradientError: for a tensor with a gradient or a forward-mode tangent.
+    """
     if isinstance(value, Tensor) and (is_dual(value) or (value.requires_grad and torch.is_grad_enabled())):
         raise GradientError(_cut_off_message(name, where))
 
 
 def is_dual(value: Tensor) -> bool:
-    """Whether a tensor carries a tangent of forward-mode differentiation."""
+    """Return True for a tensor with a tangent of forward-mode differentiation.
+
+    Args:
+        value: tensor.
+    """
     if torch.compiler.is_compiling():
         return False
     return forward_ad.unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
@@ -72,7 +122,14 @@ def _cut_off_message(name: str, where: str) -> str:
 
 
 def careful_init(init: Callable[..., None]) -> Callable[..., None]:
-    """An ``__init__`` that takes arrays, and refuses tensors whose gradient the module has not kept."""
+    """Wrap an ``__init__`` to take arrays, and to refuse tensors whose gradient the module has not kept.
+
+    Args:
+        init: the ``__init__`` of a class.
+
+    Returns:
+        The wrapped method.
+    """
 
     @functools.wraps(init)
     def run(self: nn.Module, *args: Any, **keywords: Any) -> None:
@@ -93,7 +150,16 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
 
 
 def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
-    """GradientError for a given tensor that requires a gradient, of which the module holds neither it nor a result."""
+    """Check that a module holds every argument that requires a gradient, or a result of it.
+
+    Args:
+        module: the module that was made.
+        given: its arguments by their names.
+        where: name of the class, for errors.
+
+    Raises:
+        GradientError: for an argument that was lost.
+    """
     wanted = [(name, t) for name, value in given.items() for t in _tensors(value) if t.requires_grad or is_dual(t)]
     if not wanted:
         return
@@ -109,7 +175,14 @@ def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
 
 
 def refuse_gradients(record: object) -> None:
-    """GradientError for fields of a dataclass that require a gradient; for records whose numbers are taken as such."""
+    """Refuse fields of a dataclass that require a gradient, where records are taken by their values.
+
+    Args:
+        record: a dataclass.
+
+    Raises:
+        GradientError: for a field that requires a gradient.
+    """
     where = type(record).__name__
     for field in fields(record):  # type: ignore[arg-type]
         for tensor in _tensors(getattr(record, field.name)):
@@ -167,14 +240,30 @@ _OTHER_FILMS = (
 
 
 def check_tensor(x: object, where: str) -> Tensor:
-    """`x` when it is a tensor, else ShapeError: a renderer's output, or the transient that a film does not measure."""
+    """Return `x` if it is a dense tensor.
+
+    Args:
+        x: anything; a renderer's output is answered with what to do.
+        where: name of the caller, for errors.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     if not isinstance(x, Tensor):
         raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {not_a_transient(x)}")
     return check_dense(x, where)
 
 
 def check_tensors(where: str, **given: object) -> None:
-    """ShapeError that names the first argument that is no tensor."""
+    """Check that arguments are dense tensors.
+
+    Args:
+        where: name of the caller, for errors.
+        given: arguments by their names.
+
+    Raises:
+        ShapeError: names the first that is not.
+    """
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise ShapeError(f"{where}: expected {name} as a tensor, got {shown(value)}. torch.as_tensor makes one.")
@@ -182,8 +271,19 @@ def check_tensors(where: str, **given: object) -> None:
 
 
 def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
-    """Tensors of real numbers; whole numbers and truth values, which counts may be, in the default dtype
-    or `whole`, which holds all their digits. ShapeError for no tensors, UnitError for complex numbers.
+    """Return arguments as floating tensors of real numbers.
+
+    Args:
+        where: name of the caller, for errors.
+        whole: dtype of whole numbers and truth values; None takes the default dtype.
+        given: tensors by their names.
+
+    Returns:
+        The tensors in their order; floating ones as they are.
+
+    Raises:
+        ShapeError: for anything that is no tensor.
+        UnitError: for complex numbers.
     """
     check_tensors(where, **given)
     found = []
@@ -196,7 +296,16 @@ def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tupl
 
 
 def complex_tensor(where: str, **given: object) -> Tensor:
-    """The one tensor given, of complex numbers. ShapeError for no tensor, UnitError for real numbers."""
+    """Return the one argument given, a complex tensor.
+
+    Args:
+        where: name of the caller, for errors.
+        given: the tensor by its name.
+
+    Raises:
+        ShapeError: for anything that is no tensor.
+        UnitError: for real numbers.
+    """
     check_tensors(where, **given)
     ((name, value),) = given.items()
     if not isinstance(value, Tensor) or not value.is_complex():
@@ -206,7 +315,15 @@ def complex_tensor(where: str, **given: object) -> Tensor:
 
 
 def check_broadcast(where: str, **given: Tensor) -> None:
-    """ShapeError for tensors whose shapes do not go together."""
+    """Check that tensors broadcast to one shape.
+
+    Args:
+        where: name of the caller, for errors.
+        given: tensors by their names.
+
+    Raises:
+        ShapeError: if they do not.
+    """
     shapes = [tuple(x.shape) for x in given.values()]
     ends = [{shape[-k] for shape in shapes if len(shape) >= k} - {1} for k in range(1, max(map(len, shapes)) + 1)]
     if any(len(sizes) > 1 for sizes in ends):
@@ -215,21 +332,47 @@ def check_broadcast(where: str, **given: Tensor) -> None:
 
 
 def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
-    """`reals` whose shapes broadcast. ShapeError for others."""
+    """Return arguments as floating tensors of shapes that broadcast.
+
+    Args:
+        where: name of the caller, for errors.
+        given: tensors by their names.
+
+    Raises:
+        ShapeError: for other shapes, and errors of `reals`.
+    """
     found = reals(where, None, **given)
     check_broadcast(where, **dict(zip(given, found, strict=True)))
     return found
 
 
 def number_or_tensor(value: Any, name: str, where: str) -> Any:
-    """A finite number as a float, or a tensor as `reals` takes it, with its gradient. UnitError, ShapeError."""
+    """Return a finite number as a float, or a tensor of real numbers with its gradient.
+
+    Args:
+        value: number or tensor.
+        name: name of the argument.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for complex numbers, NaN and infinity.
+    """
     if isinstance(value, Tensor):
         return reals(where, None, **{name: value})[0]
     return check_number(value, name, where, low=-math.inf)
 
 
 def check_transient(x: Tensor, where: str) -> Tensor:
-    """`x` when it is a floating tensor (..., C, T, H, W), else ShapeError or UnitError."""
+    """Return `x` if it is a floating tensor (..., C, T, H, W).
+
+    Args:
+        x: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        ShapeError: for fewer than four dimensions.
+        UnitError: for complex or whole numbers.
+    """
     if check_tensor(x, where).ndim < 4:
         raise ShapeError(
             f"{where}: expected a tensor (..., C, T, H, W), got {tuple(x.shape)}. Add the missing dimensions."
@@ -245,14 +388,26 @@ def check_transient(x: Tensor, where: str) -> Tensor:
 
 
 def check_bins(x: Tensor, where: str) -> Tensor:
-    """As `check_transient`, of one bin at least: nothing is the largest of none. ShapeError."""
+    """Return `x` if it is a floating tensor (..., C, T, H, W) of one bin or more.
+
+    Args:
+        x: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        ShapeError: without bins, and errors of `check_transient`.
+    """
     if not check_transient(x, where).shape[TIME]:
         raise ShapeError(f"{where}: expected one bin or more along time, got {tuple(x.shape)}.")
     return x
 
 
 def not_a_transient(x: object) -> str:
-    """What was given instead of a transient, and what to do: the end of a message."""
+    """Describe an object given in place of a transient, and the remedy: the end of a message.
+
+    Args:
+        x: the object.
+    """
     if x is None:
         return f"None, which is the transient of a render with another film. {_OTHER_FILMS}"
     if getattr(x, "transient", None) is not None:
@@ -268,9 +423,19 @@ def not_a_transient(x: object) -> str:
 def check_number(
     value: float, name: str, where: str, *, low: float = 0.0, high: float = math.inf, open_low: bool = False
 ) -> float:
-    """`value` as a float when it is finite and in [low, high] (or (low, high] with `open_low`), else UnitError.
+    """Return a finite number as a float.
 
-    GradientError for a tensor that requires a gradient, which a float cannot carry.
+    Args:
+        value: number, or a tensor of one without gradient.
+        name: name of the argument, which ends in its unit.
+        where: name of the caller, for errors.
+        low: least value.
+        high: largest value.
+        open_low: exclude `low` itself.
+
+    Raises:
+        UnitError: outside of the range, for NaN, infinity and anything that is no number.
+        GradientError: for a tensor that requires a gradient, which a float cannot carry.
     """
     refuse_cut_off(value, name, where)
     if isinstance(value, Tensor):
@@ -286,7 +451,16 @@ def check_number(
 
 
 def one_number(value: Any, name: str, where: str) -> Any:
-    """One real number as a float, or a tensor of one as it is, with its gradient. UnitError."""
+    """Return one real number as a float, or a tensor of one element with its gradient.
+
+    Args:
+        value: number, or tensor of one element.
+        name: name of the argument.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for anything else.
+    """
     plain = isinstance(value, Tensor) and value.numel() == 1 and value.layout == torch.strided
     if plain and not value.is_complex() and value.dtype != torch.bool:
         return value
@@ -297,7 +471,18 @@ def one_number(value: Any, name: str, where: str) -> Any:
 
 
 def check_count(value: float, name: str, where: str, *, low: int = 1, most: int = MOST) -> int:
-    """`value` as an int when it is a whole number from low to most, else UnitError."""
+    """Return a whole number as an int, with all its digits.
+
+    Args:
+        value: number.
+        name: name of the argument.
+        where: name of the caller, for errors.
+        low: least value.
+        most: largest value.
+
+    Raises:
+        UnitError: for fractions, and outside of the range.
+    """
     number = check_number(value, name, where, low=low)
     if number != int(number):
         raise UnitError(f"{where}: expected {name} to be a whole number, got {shown(value)}.")
@@ -310,14 +495,32 @@ def check_count(value: float, name: str, where: str, *, low: int = 1, most: int 
 
 
 def check_choice(value: str, choices: object, name: str, where: str) -> None:
-    """ArgumentError unless `value` is one of the strings of a Literal type."""
+    """Check that a value is one of the strings of a Literal type.
+
+    Args:
+        value: anything.
+        choices: the Literal type.
+        name: name of the argument.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     allowed = get_args(choices)
     if not is_one_of(value, allowed):
         raise ArgumentError(f"{where}: expected {name} to be one of {', '.join(allowed)}, got {shown(value)}.")
 
 
 def check_one_of(where: str, given: Mapping[str, Any]) -> None:
-    """ArgumentError unless exactly one of the arguments named is there."""
+    """Check that exactly one of several arguments is given.
+
+    Args:
+        where: name of the caller, for errors.
+        given: arguments by their names, None for those left out.
+
+    Raises:
+        ArgumentError: for none or more than one.
+    """
     there = [name for name, value in given.items() if value is not None]
     if len(there) != 1:
         got = " and ".join(there) if there else "none of them"
@@ -326,10 +529,17 @@ def check_one_of(where: str, given: Mapping[str, Any]) -> None:
 
 
 def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> float:
-    """Bin width in seconds from a TimeAxis or a number; exactly one of them. UnitError otherwise.
+    """Return a bin width in seconds from an axis or a number.
 
-    A width of a microsecond or more is refused: it is most likely given in nanoseconds, picoseconds or bins. An axis in
-    metres may be that wide.
+    Args:
+        axis: time axis, in seconds or metres, or None.
+        bin_width_s: width in seconds, or None. A microsecond or more is most likely given in nanoseconds, picoseconds
+            or bins.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: unless exactly one is given.
+        UnitError: for widths out of range.
     """
     check_one_of(where, {"axis= (the TimeAxis of the light)": axis, "bin_width_s=": bin_width_s})
     if axis is not None:
@@ -339,7 +549,17 @@ def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -
 
 
 def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, where: str) -> int:
-    """How many bins a laser period has. UnitError unless it is a whole number, and `num_bins` where that is given."""
+    """Return the number of bins in a laser period.
+
+    Args:
+        period_s: laser period in seconds.
+        bin_width_s: bin width in seconds.
+        num_bins: number that it has to be, or None.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for periods that are no whole number of bins (to 1e-6), or another one.
+    """
     bins = check_seconds(period_s, "period_s", where, open_low=True, high=1.0) / bin_width_s
     # 1 in 1e6 for periods such as 1/rate that were rounded on the way
     if round(bins) < 1 or abs(bins - round(bins)) > 1e-6 * bins or num_bins not in (None, round(bins)):
@@ -352,7 +572,15 @@ def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, wh
 
 
 def check_time_axis(axis: object, where: str) -> TimeAxis:
-    """`axis` when it is a TimeAxis, else UnitError."""
+    """Return `axis` if it is a TimeAxis.
+
+    Args:
+        axis: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     if not isinstance(axis, TimeAxis):
         raise ArgumentError(
             f"{where}: expected axis to be a TimeAxis, got {type(axis).__name__}. Take the renderer's, or "
@@ -362,7 +590,15 @@ def check_time_axis(axis: object, where: str) -> TimeAxis:
 
 
 def check_generator(generator: object, where: str) -> None:
-    """UnitError for a generator that is none, a seed for instance."""
+    """Check that a generator is one, or None.
+
+    Args:
+        generator: anything; a seed for instance.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ArgumentError(
             f"{where}: expected generator to be a torch.Generator, got {generator!r}. "
@@ -373,10 +609,21 @@ def check_generator(generator: object, where: str) -> None:
 def check_seconds(
     value: float, name: str, where: str, *, open_low: bool = False, signed: bool = False, high: float = 1e-3
 ) -> float:
-    """A duration in seconds, finite, not negative unless `signed`, below `high`; UnitError otherwise.
+    """Return a duration in seconds.
 
     Widths, delays and dead times of detectors are far below the 1 ms that a picosecond is in nanoseconds; repetition
     periods of lasers are not, and take `high` = 1 s.
+
+    Args:
+        value: number.
+        name: name of the argument.
+        where: name of the caller, for errors.
+        open_low: exclude zero.
+        signed: take negative durations.
+        high: limit of the magnitude, in seconds, not included.
+
+    Raises:
+        UnitError: outside of the range.
     """
     number = check_number(value, name, where, low=-math.inf if signed else 0.0, open_low=open_low)
     if abs(number) >= high:

@@ -61,9 +61,12 @@ _NO_LIGHT = torch.finfo(torch.float64).tiny
 
 @dataclass(frozen=True)
 class Trains:
-    """`number` SPADs alike in each of P pixels: `rate` (P, T) float64 of one of them per period and bin.
+    """SPADs alike in each of P pixels.
 
-    `dead_bins`: infinite for one detection per cycle.
+    Attributes:
+        rate: (P, T) float64 of one of them per period and bin.
+        dead_bins: dead time in bins, infinite for one detection per cycle.
+        number: SPADs.
     """
 
     rate: Tensor
@@ -73,7 +76,7 @@ class Trains:
 
 @dataclass(frozen=True)
 class Seen:
-    """Detections of trains, and time in bins that they were armed, (P, T) each: what their score is made of."""
+    """Detections of trains, and time in bins that they were armed, (P, T) each, for their score."""
 
     detected: Tensor
     armed: Tensor
@@ -90,11 +93,20 @@ def draw_coincidences(
     seen: Sequence[Seen] | None = None,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Coincidences (P, T) of `cycles` periods; `window` in bins, `seen` of each group is added to where it is given.
+    """Draw coincidences event by event: detections that bring the number of those within a window up to `coincidence`.
 
-    A coincidence is a detection that brings the number of those within `window` up to `coincidence`. `free`: trains go
-    on over periods, and lines stay up from one to the next. `weights` (P, M): what a coincidence of the periods
-    m, m + M, ... counts instead of one.
+    Args:
+        groups: SPADs of equal shares.
+        cycles: periods.
+        coincidence: number of detections.
+        window: in bins.
+        free: trains go on over periods, and lines stay up from one to the next.
+        generator: source of randomness.
+        seen: records of the groups that detections are added to, or None.
+        weights: (P, M), value of a coincidence of the periods m, m + M, ... in place of one.
+
+    Returns:
+        Coincidences (P, T).
     """
     pixels, bins = groups[0].rate.shape
     lead = max(_PERIODS // 2, math.ceil(_DEAD_TIMES * groups[0].dead_bins / bins)) if free else 0
@@ -248,9 +260,12 @@ _PARTS = 64  # of the cycles, that the normal surrogate weighs
 
 @dataclass(frozen=True)
 class _Group:
-    """SPADs of an equal share: detections `one` (..., T, H, W) of each per cycle and bin, and how many there are.
+    """SPADs of an equal share.
 
-    `rate`: of SPADs that detect once per cycle; None where detections are spread evenly over a bin.
+    Attributes:
+        one: detections (..., T, H, W) of each per cycle and bin.
+        rate: rate of SPADs that detect once per cycle; None where detections are spread evenly over a bin.
+        number: SPADs.
     """
 
     one: Tensor
@@ -291,32 +306,45 @@ def _mean_survival(x: Tensor) -> Tensor:
 
 
 class CoincidencePixel(RandomSensor):
-    """Coincidences (..., C, T, H, W) of a pixel of several SPADs, in counts: `coincidence` of them within `window_s`.
+    """Pixel of several SPADs that counts coincidences of their detections, (..., C, T, H, W).
 
     Every detection raises its SPAD's line for `window_s`; a coincidence is counted when the number of lines that are up
-    reaches `coincidence`, at the detection that does so. All of a cycle are counted. Input, `detector`, `spads` and
-    `weights` as of `MacroPixel`; `window_s` is at most the dead time, so that a line goes up once in a window, and at
-    most the window of bins. A `coincidence` of 1 is an OR of all lines: detections of others are lost while it is up.
+    reaches `coincidence`, at the detection that does so. All of a cycle are counted. A `coincidence` of 1 is an OR of
+    all lines: detections of others are lost while it is up.
 
-    The mean is exact for independent SPADs in any light: detections of each SPAD times the chance that
-    `coincidence` - 1 of the others have detected within the window before. In constant light of r detections per second
-    of many SPADs it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; so are
-    detections in the mean, except those of one per cycle, of which the first photons of a bin are the first: with a
-    dead time, use bins of at most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a
-    pixel with thousands of photons in a bin takes ten times as long, for the whole image.
-    Lines are down at the start of a cycle of a SynchronousSPAD, and come round the period of a FreeRunningSPAD.
+    The mean is exact for independent SPADs in any light: detections of each SPAD times the chance that `coincidence` -
+    1 of the others have detected within the window before. In constant light of r detections per second of many SPADs
+    it is r (r w)^(k - 1) exp(-r w) / (k - 1)!. Inside a bin the light is spread evenly; so are detections in the mean,
+    except those of one per cycle, of which the first photons of a bin are the first: with a dead time, use bins of at
+    most one photon a SPAD. Integrals over a bin are right to 1e-6, however bright it is; a pixel with thousands of
+    photons in a bin takes ten times as long, for the whole image. Lines are down at the start of a cycle of a
+    SynchronousSPAD, and come round the period of a FreeRunningSPAD.
 
     Samples follow every SPAD through every cycle, so that coincidences of a cycle exclude or bring one another as those
     of events do: in a pulse a total varies several times less than of independent bins. Time grows with cycles times
     SPADs, a few 1e6 of which take a second. Of paralyzable detectors they are independent binomials, as the detector's
     own.
 
-    Policies: all. `gaussian`: normal numbers with the covariance of the draws, whose size is differentiated as that of
+    All policies. `gaussian`: normal numbers with the covariance of the draws, whose size is differentiated as that of
     independent bins; `score`: that of the detections of all SPADs. `variance` and `log_prob` are those of single bins
-    with at most one coincidence per cycle, and of bins taken as independent. Raises UnitError for more SPADs in
-    coincidence than there are, a window longer than the dead time, and a detector made for other bins; of paralyzable
-    detectors for draws of light that has more than one coincidence per cycle in a bin. GradientError for the score of a
-    learnt dead time.
+    with at most one coincidence per cycle, and of bins taken as independent.
+
+    Args:
+        detector: one of the SPADs, as of `MacroPixel`.
+        spads: number of SPADs.
+        coincidence: detections of a coincidence.
+        window_s: duration of a line in seconds; at most the dead time, so that a line goes up once in a window, and at
+            most the window of bins.
+        weights: shares of the light, as of `MacroPixel`.
+        axis: axis of the light, or
+        bin_width_s: its bin width in seconds.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for more SPADs in coincidence than there are, a window longer than the dead time, and a detector made
+            for other bins; of paralyzable detectors for draws of light that has more than one coincidence per cycle in
+            a bin.
+        GradientError: for the score of a learnt dead time.
     """
 
     takes, gives = ("rate",), "counts"
@@ -359,7 +387,11 @@ class CoincidencePixel(RandomSensor):
 
     @in_single
     def probabilities(self, x: Tensor) -> Tensor:
-        """Expected coincidences per cycle and bin."""
+        """Expected coincidences per cycle and bin.
+
+        Args:
+            x: rate of the pixel per cycle and bin, (..., C, T, H, W).
+        """
         check_transient(x, "CoincidencePixel")
         self._check_window(x)
         window = self.window_s / self.bin_width_s
@@ -492,7 +524,7 @@ class CoincidencePixel(RandomSensor):
         seen: list[Seen] | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """A draw, and what was `seen` of the SPADs of every share, whose pixels are rows; `weights` of coincidences."""
+        """Draw coincidences, and append the detections of every share, whose pixels are rows, to `seen`."""
         with torch.no_grad():
             wide = self._check_window(check_rates(check_tensor(x, "CoincidencePixel"), "CoincidencePixel")).double()
             groups = []
@@ -521,7 +553,7 @@ class CoincidencePixel(RandomSensor):
         measurement = self._drawn(x, generator, seen)
 
         def log_prob() -> Tensor:
-            """Of the detections of all SPADs: armed detectors fire at the rate of the light."""
+            """Log-probability of the detections of all SPADs: armed detectors fire at the rate of the light."""
             total = torch.zeros_like(x.select(TIME, 0), dtype=torch.float64)
             for (share, _), known in zip(self.groups, seen, strict=True):
                 rate = self._lit(x.double(), share)[0].movedim(TIME, -1)
@@ -543,7 +575,14 @@ class CoincidencePixel(RandomSensor):
         return p
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Of bins as independent binomials, each of which is exact; `grad="score"` scores the draws themselves."""
+        """Log-probability of bins as independent binomials, each of which is exact.
+
+        `grad="score"` scores the draws themselves.
+
+        Args:
+            measurement: counts (..., C, T, H, W).
+            x: rate of the pixel per cycle and bin, (..., C, T, H, W).
+        """
         p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
         quiet = self.cycles - n
         value = safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p)
@@ -557,7 +596,7 @@ def _binomials(q: Tensor, number: int, most: int) -> list[Tensor]:
 
 
 def _product(a: list[Tensor], b: list[Tensor], most: int) -> list[Tensor]:
-    """Of polynomials by their coefficients, up to the power `most`."""
+    """Product of polynomials by their coefficients, up to the power `most`."""
     found: list[Tensor | None] = [None] * min(len(a) + len(b) - 1, most + 1)
     for i, left in enumerate(a):
         for j, right in enumerate(b):

@@ -16,11 +16,21 @@ from torchtransient.sensing.sensor import Sensor
 
 @in_single
 def equi_depth_edges(counts: Tensor, depth: int) -> Tensor:
-    """Positions, in bins, between which every pixel has equal shares of its counts: (..., C, depth - 1, H, W).
+    """Positions between which every pixel has equal shares of its counts.
 
-    The quantiles 1/depth, 2/depth, ... of each histogram, a bin's counts being spread evenly over it; differentiable
-    in `counts` where the bin of a quantile has any. A pixel without counts gets the quantiles of even light. Source:
-    Ingle and Maier, Count-free single-photon 3D imaging with race logic, TPAMI 2023 (their circuits track these edges).
+    The quantiles 1/depth, 2/depth, ... of each histogram, a bin's counts being spread evenly over it; differentiable in
+    `counts` where the bin of a quantile has any. Source: Ingle and Maier, Count-free single-photon 3D imaging with race
+    logic, TPAMI 2023 (their circuits track these edges).
+
+    Args:
+        counts: (..., C, T, H, W), >= 0.
+        depth: number of shares, 2 and more.
+
+    Returns:
+        (..., C, depth - 1, H, W), in bins; quantiles of even light for a pixel without counts.
+
+    Raises:
+        UnitError: for negative counts.
     """
     check_bins(counts, "equi_depth_edges")
     parts = check_count(depth, "depth", "equi_depth_edges", low=2)
@@ -43,7 +53,11 @@ def equi_depth_edges(counts: Tensor, depth: int) -> Tensor:
 
 
 class EquiDepthHistogram(Sensor):
-    """(..., C, T, H, W) counts to the `depth` - 1 equi-depth boundaries, in bins; see `equi_depth_edges`."""
+    """Counts (..., C, T, H, W) to equi-depth boundaries (..., C, depth - 1, H, W) in bins; see `equi_depth_edges`.
+
+    Args:
+        depth: number of shares, 2 and more.
+    """
 
     def __init__(self, depth: int) -> None:
         super().__init__()
@@ -54,10 +68,20 @@ class EquiDepthHistogram(Sensor):
 
 
 def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
-    """(K, T) float64: cosines and sines of the lowest frequencies over the window, rows of unit length.
+    """Cosines and sines of the lowest frequencies over the window, rows of unit length.
 
     Rows 0, 1 are one turn, 2, 3 two turns, and so on (truncated Fourier of Gutierrez-Barragan et al., Compressive
     single-photon 3D cameras, CVPR 2022). The constant is left out: it does not see time.
+
+    Args:
+        num_bins: T.
+        num_codes: K, at most T - 1.
+
+    Returns:
+        (K, T) float64.
+
+    Raises:
+        ShapeError: for more codes.
     """
     bins = check_count(num_bins, "num_bins", "fourier_codes", most=MOST_MADE)
     codes = check_count(num_codes, "num_codes", "fourier_codes")
@@ -81,8 +105,15 @@ def _coded_sums(x: Tensor, matrix: Tensor) -> Tensor:
 class CodedHistogram(Sensor):
     """Coded sums (..., C, K, H, W) of a histogram (..., C, T, H, W): y = codes h, built up on the fly in a pixel.
 
-    `codes`: (K, T), any real numbers; `learnable` makes them a parameter. `adjoint` and `pseudo_inverse` go back to T
-    bins. Linear: shot noise belongs before it.
+    Linear: shot noise belongs before it.
+
+    Args:
+        codes: (K, T), any real numbers.
+        learnable: make them a parameter.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for codes that are not finite.
     """
 
     codes: Tensor
@@ -111,9 +142,20 @@ class CodedHistogram(Sensor):
         return self._apply_matrix(self.codes, x, "expected")
 
     def adjoint(self, y: Tensor) -> Tensor:
-        """The transpose: (..., C, K, H, W) to (..., C, T, H, W)."""
+        """Apply the transpose: (..., C, K, H, W) to (..., C, T, H, W).
+
+        Args:
+            y: coded sums.
+        """
         return self._apply_matrix(self.codes.T, y, "adjoint")
 
     def pseudo_inverse(self, y: Tensor) -> Tensor:
-        """The histogram of least length with these coded sums."""
+        """Histogram of least length with these coded sums.
+
+        Args:
+            y: coded sums (..., C, K, H, W).
+
+        Returns:
+            (..., C, T, H, W).
+        """
         return self._apply_matrix(torch.linalg.pinv(self.codes.double()), y, "pseudo_inverse")

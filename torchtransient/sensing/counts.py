@@ -27,10 +27,19 @@ _EXACT_FLOAT32 = 2.0**24
 
 @in_single
 def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Poisson counts with the given mean (any shape), without gradient; dtype and device are kept.
+    """Draw Poisson counts of a given mean, without gradient.
 
-    Half precision gives float32. Float32 above 2^24 is drawn in float64, then rounded to the dtype of `mean`. Raises
-    UnitError for negative or non-finite means: negative lobes of a filter have to be dealt with where they arise.
+    Float32 above 2^24 is drawn in float64, then rounded to the dtype of `mean`.
+
+    Args:
+        mean: any shape, finite, >= 0; half precision gives float32.
+        generator: source of randomness.
+
+    Returns:
+        Counts in shape, dtype and device of `mean`.
+
+    Raises:
+        UnitError: for negative or non-finite means: negative lobes of a filter have to be dealt with where they arise.
     """
     (mean,) = reals("poisson", mean=mean)
     check_generator(generator, "poisson")
@@ -47,7 +56,15 @@ def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
 def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
     """Log-probability of counts under Poisson means, elementwise; finite gradients at mean 0 with count 0.
 
-    A count above 0 where the mean is 0 has log-probability -inf. Shapes broadcast.
+    Args:
+        counts: any shape.
+        mean: of a shape that broadcasts.
+
+    Returns:
+        Broadcast shape; -inf for a count above 0 where the mean is 0.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
     """
     counts, mean = going_together("poisson_log_prob", counts=counts, mean=mean)
     empty = counts == 0
@@ -57,7 +74,11 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
 
 class ShotNoise(RandomSensor):
-    """Poisson counts of a mean (..., C, T, H, W), in counts. Fano factor 1. All four gradient policies."""
+    """Draw Poisson counts of a mean (..., C, T, H, W). Fano factor 1. All four gradient policies.
+
+    Args:
+        grad: gradient policy.
+    """
 
     takes, gives = ("electrons",), "counts"
 
@@ -85,9 +106,15 @@ _WORTH_THREADS = 1 << 17  # entries, above which threads cost less than they sav
 
 
 def look_at_items(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Which items (C, T, H, W) of a batch hold whole numbers >= 0 alone, and their sums: two (..., 1, 1, 1, 1).
+    """Find the items (C, T, H, W) of a batch that hold whole numbers >= 0 alone, and their sums.
 
-    Item by item, so that an item is drawn or not whatever is beside it in a batch. Sums are float64.
+    Item by item, so that an item is drawn or not whatever is beside it in a batch.
+
+    Args:
+        counts: (..., C, T, H, W).
+
+    Returns:
+        Mask and float64 sums, both (..., 1, 1, 1, 1).
     """
     shape = (*counts.shape[:-4], 1, 1, 1, 1)
     rows = counts.reshape(math.prod(shape), math.prod(counts.shape[-4:]))
@@ -111,32 +138,59 @@ def _look_at_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def whole_items(counts: Tensor) -> Tensor:
-    """(..., 1, 1, 1, 1): which items of a batch hold whole numbers >= 0 alone; see `look_at_items`."""
+    """Mask of the items of a batch that hold whole numbers >= 0 alone.
+
+    Args:
+        counts: (..., C, T, H, W).
+
+    Returns:
+        Mask (..., 1, 1, 1, 1).
+    """
     return look_at_items(counts)[0]
 
 
 class AddedCounts(RandomSensor):
-    """A sensor that adds counts n to those it is given: x + n with mean `extra(x)`. All four policies.
+    """Base of sensors that add counts n to those they are given: x + n with mean `extra(x)`. All four policies.
 
     The counts given pass with their own gradient under every policy. Every detection triggers others with a small
-    probability: whole counts are followed one by one (`trigger`), which is exact. Where there is no such number, or
-    no use in it, Poisson numbers of the same mean stand for the sum: for items (C, T, H, W) of which not all counts are
+    probability: whole counts are followed one by one (`trigger`), which is exact. Poisson numbers of the same mean
+    stand for the sum where there is no such number, or no use in it: for items (C, T, H, W) of which not all counts are
     whole (the means of another sensor), for those with more than 16 events per entry on average, and under the policy
     "score", whose probabilities are theirs. Their variance is off by the probability of the effect (by 1 % at 1 %).
+
+    A subclass defines `extra`, `trigger` and `share`.
+
+    Args:
+        grad: gradient policy.
     """
 
     takes, gives = ("counts",), "counts"
 
     def extra(self, x: Tensor) -> Tensor:
-        """Mean of the counts added, in the shape of `x`."""
+        """Mean of the counts added.
+
+        Args:
+            x: counts (..., C, T, H, W).
+
+        Returns:
+            Shape of `x`.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define extra(x).")
 
     def trigger(self, counts: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Whole `counts` (..., C, T, H, W) >= 0, float32 or float64, with what they trigger, drawn event by event."""
+        """Add the detections that counts trigger, drawn event by event.
+
+        Args:
+            counts: whole numbers >= 0, (..., C, T, H, W), float32 or float64.
+            generator: source of randomness.
+
+        Returns:
+            Shape of `counts`.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define trigger(counts, generator).")
 
     def share(self) -> float:
-        """Expected events of one detection."""
+        """Return the expected events of one detection."""
         raise NotImplementedError(f"{type(self).__name__} has to define share().")
 
     def expected(self, x: Tensor) -> Tensor:
@@ -198,23 +252,23 @@ _FEW = 0.25  # share of occupied entries below which these alone are followed
 
 
 class Moving(Protocol):
-    """Where counts go: what `MovedCounts` asks of a table of moves."""
+    """Table of moves, as `MovedCounts` uses it."""
 
     @property
     def learned(self) -> bool:
-        """Whether the probabilities have gradients."""
+        """True if the probabilities have gradients."""
 
     def detached(self) -> Moving:
-        """The same without."""
+        """Return the same without gradients."""
 
     def mean(self, x: Tensor) -> Tensor:
-        """The mean of moved counts, linear in `x` (..., T, H, W)."""
+        """Mean of moved counts, linear in `x` (..., T, H, W)."""
 
     def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Normal noise with the covariance of moved counts `x` that are known themselves."""
+        """Draw normal noise with the covariance of moved counts `x` that are known themselves."""
 
     def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
-        """Whole `counts`, float32 or float64, each moved by itself, and if `tally` how many went each way."""
+        """Move each of whole `counts`, float32 or float64; if `tally` also return how many went each way."""
 
     def log_prob(self, tallies: Tensor) -> Tensor:
         """Log-probability of the ways that were drawn, (..., C, H, W) float64, differentiable."""
@@ -222,9 +276,12 @@ class Moving(Protocol):
 
 @dataclass(frozen=True)
 class Moves:
-    """Shares of the counts of a bin that go `first + l` bins later: (L,) for all bins, or (L, T) for each.
+    """Shares of the counts of a bin that go some bins later.
 
-    They sum to 1 over L, or to less: the rest is lost. `boundary`: what happens to counts that leave the window.
+    Attributes:
+        first: lag of the first share, in bins.
+        shares: (L,) for all bins, or (L, T) for each. They sum to 1 over L, or to less: the rest is lost.
+        boundary: "zero" loses counts that leave the window; "periodic" brings them in at the other end.
     """
 
     first: int
@@ -250,19 +307,19 @@ class Moves:
         return (tallies.double() * shares.view(-1, *[1] * (tallies.ndim - 1))).sum(0)
 
     def of_lag(self, index: int, like: Tensor) -> Tensor:
-        """The share of one lag, for entries (..., T, H, W)."""
+        """Return the share of one lag for entries (..., T, H, W)."""
         share = self.shares[index].to(like)
         return share.view(-1, 1, 1) if share.ndim else share
 
     def mean(self, x: Tensor) -> Tensor:
-        """The mean of moved counts, linear in `x` (..., T, H, W)."""
+        """Mean of moved counts, linear in `x` (..., T, H, W)."""
         total = torch.zeros_like(x)
         for index in range(self.shares.shape[0]):
             total = total + shifted(x * self.of_lag(index, x), self.first + index, self.boundary)
         return total
 
     def noise(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Normal noise with the covariance of moved counts `x` that are known themselves. One draw for each lag.
+        """Draw normal noise with the covariance of moved counts `x` that are known themselves, one draw for each lag.
 
         Counts of a bin that go elsewhere are missing where they would have gone: n (diag p - p p^T) for each bin.
         """
@@ -280,7 +337,16 @@ class Moves:
 
 
 def shifted(x: Tensor, lag: int, boundary: Boundary) -> Tensor:
-    """`x` (..., T, H, W) with every entry `lag` bins later."""
+    """Shift light or counts to later bins.
+
+    Args:
+        x: (..., T, H, W).
+        lag: bins, of either sign.
+        boundary: "zero" or "periodic".
+
+    Returns:
+        Shape of `x`.
+    """
     if boundary == "periodic":
         return x.roll(lag, TIME)
     bins = x.shape[TIME]
@@ -294,9 +360,16 @@ def shifted(x: Tensor, lag: int, boundary: Boundary) -> Tensor:
 def move_counts(
     counts: Tensor, moves: Moves, generator: torch.Generator | None = None, *, tally: bool = False
 ) -> tuple[Tensor, Tensor | None]:
-    """Whole `counts` (..., T, H, W) >= 0, float32 or float64, each detection moved by itself. No gradient.
+    """Move each detection of whole counts by itself, without gradient. Exact for any counts that the dtype holds.
 
-    `tally`: also how many took each lag, (L, ..., H, W). Exact for any counts that the dtype holds.
+    Args:
+        counts: whole numbers >= 0, (..., T, H, W), float32 or float64.
+        moves: shares of the lags.
+        generator: source of randomness.
+        tally: also count how many took each lag.
+
+    Returns:
+        Counts in the shape of `counts`, and tallies (L, ..., H, W) or None.
     """
     given = counts.detach()
     bins, shape = given.shape[TIME], given.shape
@@ -450,17 +523,26 @@ class _Tree:
 
 
 class MovedCounts(RandomSensor):
-    """A sensor that moves detections in time. All four policies.
+    """Base of sensors that move detections in time. All four policies.
 
     Whole counts move one by one; draws refuse NaN and infinity with UnitError. Items (C, T, H, W) of which not all
     counts are whole, the means of another stage, stay means under every policy but "gaussian", which takes its input
     for a normal surrogate of counts; what is beside an item in a batch makes no difference. Under "score" the
     probabilities are those of the moves; the counts given pass with the gradient of the mean, as under
     "straight_through".
+
+    A subclass defines `expected` and `moves`.
+
+    Args:
+        grad: gradient policy.
     """
 
     def moves(self, x: Tensor) -> Moving:
-        """Where the counts of `x` go; differentiable in the parameters."""
+        """Table of moves, differentiable in the parameters.
+
+        Args:
+            x: counts (..., C, T, H, W).
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define moves(x).")
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:

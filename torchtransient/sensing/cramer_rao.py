@@ -1,4 +1,4 @@
-"""How well depth can be known: the Cramer-Rao bound of one return in a histogram, with background and pile-up.
+"""Cramer-Rao bound of distance, signal and background of one return in a histogram, with background and pile-up.
 
 No unbiased estimate has a covariance below the inverse of the Fisher information. Of Poisson counts of mean m(p) that
 is ``sum m_i m_j / m`` over the bins, m_i the derivative by parameter i; of the first photons of N cycles at rates r(p)
@@ -37,9 +37,12 @@ _FINE = 32  # parts of a bin, of responses that know their kernel only
 class CramerRaoBound(TensorRecord):
     """Least standard deviations of unbiased estimates, of the shape of the pixels; infinite where nothing is known.
 
-    ``distance_m``: metres one way; ``delay_s``: the same as a time there and back; ``signal`` and ``background`` in the
-    units they were given in, None where they are known. ``covariance`` (..., P, P): of distance, signal and background,
-    as far as they are unknown, in that order.
+    Attributes:
+        distance_m: metres one way.
+        delay_s: the same as a time there and back.
+        signal: in the unit it was given in, None if known.
+        background: in the unit it was given in, None if known.
+        covariance: (..., P, P) of distance, signal and background, as far as they are unknown, in that order.
     """
 
     distance_m: Tensor
@@ -58,12 +61,24 @@ def return_rates(
     signal: Tensor | float,
     background: Tensor | float = 0.0,
 ) -> Tensor:
-    """The mean histogram of one return of a plane: ``signal`` times the response around ``2 distance / c``, integrated
-    over the bins, plus ``background`` in each bin: (..., T) float64 for pixels of any shape (...).
+    """Mean histogram of one return of a plane: the response around ``2 distance / c``, integrated over the bins.
 
-    ``distance_m``: metres one way; ``signal`` and ``background`` (per bin) as expected detections, of the exposure or
-    of a cycle. Numbers, or tensors that broadcast; differentiable in them and in the response. What arrives outside of
-    the axis is lost. ``.movedim(-1, -3)`` of pixels (..., C, H, W) is what sensors take. Raises ShapeError, UnitError.
+    Numbers, or tensors that broadcast to the shape of the pixels (...); differentiable in them and in the response.
+    What arrives outside of the axis is lost.
+
+    Args:
+        response: impulse response.
+        axis: axis of the histogram.
+        distance_m: metres one way.
+        signal: expected detections, of the exposure or of a cycle.
+        background: the same in each bin.
+
+    Returns:
+        (..., T) float64. ``.movedim(-1, -3)`` of pixels (..., C, H, W) is what sensors take.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
+        UnitError: for negative numbers.
     """
     where = "return_rates"
     _check_response(response, where)
@@ -82,19 +97,30 @@ def crlb(
     cycles: int | None = None,
     unknown: Sequence[str] = UNKNOWNS,
 ) -> CramerRaoBound:
-    """The Cramer-Rao bound of distance, signal and background of the return of `return_rates`, for each pixel.
+    """Cramer-Rao bound of distance, signal and background of the return of `return_rates`, for each pixel.
 
-    ``cycles`` None: Poisson counts; signal and background (per bin) are expected detections of the whole exposure.
-    ``cycles`` N: the first photon of each of N cycles, with pile-up; they are rates per cycle of a detector that is
-    never dead, as `first_photon_nll` and `SynchronousSPAD` take them. ``unknown``: what is estimated together, of
-    "distance" (always), "signal" and "background"; what is known narrows the rest. Pixels have any shape and do not see
-    each other; results are those of its float dtype, float32 at least, and differentiable in all tensors and in the
-    parameters of the response, so that a device can be designed by them.
+    Pixels have any shape and do not see each other; results are those of its float dtype, float32 at least, and
+    differentiable in all tensors and in the parameters of the response, so that a device can be designed by them.
+    Without background, in bins that are narrow beside a normal pulse, ``distance_m`` is `range_deviation_m`. Memory:
+    some ten numbers of 8 bytes for each pixel and bin. Not supported: dead times with several detections a cycle,
+    free-running detectors, readout noise: `covariance_bound` where their statistics are one of the two.
 
-    Without background, in bins that are narrow beside a normal pulse, ``distance_m`` is `range_deviation_m`.
-    Memory: some ten numbers of 8 bytes for each pixel and bin.
-    Not supported: dead times with several detections a cycle, free-running detectors, readout noise: `covariance_bound`
-    where their statistics are one of the two. Raises ShapeError, UnitError, DeviceError.
+    Args:
+        response: impulse response.
+        axis: axis of the histogram.
+        distance_m: metres one way.
+        signal: expected detections.
+        background: the same in each bin.
+        cycles: None for Poisson counts; signal and background are expected detections of the whole exposure. N for the
+            first photon of each of N cycles, with pile-up; they are rates per cycle of a detector that is never dead,
+            as `first_photon_nll` and `SynchronousSPAD` take them.
+        unknown: estimated together, of "distance" (always), "signal" and "background"; what is known narrows the rest.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
+        UnitError: for negative numbers.
+        ArgumentError: for other unknowns.
+        DeviceError: for tensors on another device than the response.
     """
     where = "crlb"
     _check_response(response, where)
@@ -128,18 +154,28 @@ def crlb(
 def covariance_bound(
     mean: Callable[..., Tensor], parameters: Sequence[Tensor], *, cycles: int | None = None
 ) -> Tensor:
-    """The least covariance (..., C, H, W, P, P) of unbiased estimates of P parameters of any chain's mean.
+    """Least covariance of unbiased estimates of P parameters of any chain's mean.
 
-    ``mean(*parameters)`` (..., C, T, H, W), such as ``lambda d, s: chain.expected(light(d, s))``; ``parameters``: maps
-    (..., C, H, W), each of which acts on its own pixel. Derivatives by forward mode, one call each. ``cycles`` None:
-    counts are independent Poisson numbers of that mean; N: those of N cycles with at most one detection each, which
-    stages behind the detector may have moved (jitter, converter) or lost. The root of ``.diagonal(dim1=-2, dim2=-1)``
-    are standard deviations, infinite where a parameter has no say. float64 parameters are advised; differentiable as
-    far as the chain is twice.
+    Derivatives by forward mode, one call each. float64 parameters are advised; differentiable as far as the chain is
+    twice. Not supported: statistics of other kinds (several detections a cycle, afterpulses, free-running detectors,
+    readout noise), for which this is no bound; parameters that act on other pixels, whose light would count as their
+    own.
 
-    Not supported: statistics of other kinds (several detections a cycle, afterpulses, free-running detectors, readout
-    noise), for which this is no bound; parameters that act on other pixels, whose light would count as their own.
-    Raises ShapeError, UnitError, GradientError for a chain without forward derivatives.
+    Args:
+        mean: function of the parameters that returns (..., C, T, H, W), such as ``lambda d, s: chain.expected(light(d,
+            s))``.
+        parameters: maps (..., C, H, W), each of which acts on its own pixel.
+        cycles: None for independent Poisson counts of that mean; N for those of N cycles with at most one detection
+            each, which stages behind the detector may have moved (jitter, converter) or lost.
+
+    Returns:
+        (..., C, H, W, P, P). The roots of ``.diagonal(dim1=-2, dim2=-1)`` are standard deviations, infinite where a
+        parameter has no say.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for negative means, and more detections than cycles.
+        GradientError: for a chain without forward derivatives.
     """
     where = "covariance_bound"
     given = tuple(parameters) if isinstance(parameters, Sequence) else ()
@@ -180,13 +216,22 @@ def covariance_bound(
 
 
 def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
-    """(..., T): the share of a return at `distance` in each bin."""
+    """Share of a return at `distance` in each bin, (..., T)."""
     edges = axis.edges_s.to(distance.device) - distance.unsqueeze(-1) * (2 / SPEED_OF_LIGHT)
     return shares_between(response, edges, axis.bin_width_s)
 
 
 def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
-    """(..., K): the share of a response, of light at one known time, between edges (..., K + 1) in seconds."""
+    """Share of a response, of light at one known time, between edges.
+
+    Args:
+        response: impulse response.
+        edges_s: (..., K + 1) in seconds.
+        bin_width_s: width of the bins, for responses without a distribution function.
+
+    Returns:
+        (..., K).
+    """
     if type(response).cdf is Response.cdf:
         found = _by_kernel(response, bin_width_s / _FINE, edges_s)
     else:
@@ -207,7 +252,7 @@ def _by_kernel(response: Response, width_s: float, edges_s: Tensor) -> Tensor:
 
 
 def _inverse(information: Tensor) -> Tensor:
-    """The covariance; infinite variances where a parameter has no information, of all where they cannot be told apart.
+    """Invert information; infinite variances where a parameter has none, of all where they cannot be told apart.
 
     In units in which every parameter alone has the variance one: metres and counts differ by many decades.
     """
@@ -278,7 +323,7 @@ def _check_response(response: object, where: str) -> None:
 
 
 def _check_unknown(unknown: Sequence[str], where: str) -> list[str]:
-    """In the order of `UNKNOWNS`."""
+    """Return the unknowns in the order of `UNKNOWNS`."""
     names = [unknown] if isinstance(unknown, str) else list(unknown)
     if "distance" not in names or not set(names) <= set(UNKNOWNS):
         raise ArgumentError(f"{where}: expected unknown as 'distance' and any of {UNKNOWNS[1:]}, got {unknown!r}.")

@@ -18,10 +18,14 @@ from torchtransient.sensing.sensor import Sensor, adjoint
 
 
 class SensorPhysics(Physics):  # type: ignore[misc]
-    """``y = sensor(x)`` with ``A`` its mean and the sensor's own noise; x is (B, C, T, H, W) as everywhere here.
+    """Sensor as a `Physics`: ``y = sensor(x)`` with ``A`` its mean and the sensor's own noise.
 
     ``forward`` draws from the sensor under its own gradient policy (and with ``generator``); ``A`` is `Sensor.expected`
     and ``A_vjp`` the transpose of its derivative.
+
+    Args:
+        sensor: sensor or chain, of light (B, C, T, H, W).
+        keywords: of `Physics`.
     """
 
     def __init__(self, sensor: Sensor, **keywords: Any) -> None:
@@ -29,16 +33,16 @@ class SensorPhysics(Physics):  # type: ignore[misc]
         self.sensor_module = sensor
 
     def A(self, x: Tensor, **kwargs: Any) -> Tensor:
-        """The mean of the measurement."""
+        """Mean of the measurement."""
         return self.sensor_module.expected(x)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None, **kwargs: Any) -> Tensor:
-        """A measurement, with the noise of the sensor."""
+        """Measure light, with the noise of the sensor."""
         y: Tensor = self.sensor_module(x, generator=generator)
         return y
 
     def A_vjp(self, x: Tensor, v: Tensor, **kwargs: Any) -> Tensor:
-        """Transpose of the derivative of ``A`` at ``x``, applied to ``v``."""
+        """Apply the transpose of the derivative of ``A`` at ``x`` to ``v``."""
         onwards = torch.is_grad_enabled() and (v.requires_grad or x.requires_grad)
         with torch.enable_grad():
             at = x if x.requires_grad else x.detach().requires_grad_()
@@ -47,12 +51,20 @@ class SensorPhysics(Physics):  # type: ignore[misc]
 
 
 class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
-    """A linear sensor without its offset: ``A x = expected(x) - expected(0)``, with its exact transpose.
+    """Linear sensor without its offset: ``A x = expected(x) - expected(0)``, with its exact transpose.
 
-    DeepInverse asks for ``A(0) = 0`` of every `LinearPhysics`. What ambient light and dark counts add is `offset`, and
+    DeepInverse asks for ``A(0) = 0`` of every `LinearPhysics`. Ambient light and dark counts are `offset`, and
     ``forward`` is a measurement less the offset: ``A x`` plus noise of zero mean, hence below zero at times.
     Measurements from elsewhere are handed to DeepInverse as ``y - physics.offset()``; its Poisson likelihood takes them
-    as they are, with ``bkg=physics.offset()``. ``img_size``: (C, T, H, W) of the inputs.
+    as they are, with ``bkg=physics.offset()``.
+
+    Args:
+        sensor: sensor or chain.
+        img_size: (C, T, H, W) of the light.
+        keywords: of `LinearPhysics`.
+
+    Raises:
+        ShapeError: for fewer dimensions.
     """
 
     def __init__(self, sensor: Sensor, img_size: tuple[int, ...], **keywords: Any) -> None:
@@ -62,9 +74,10 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
         self.sensor_module = sensor
 
     def offset(self, x: Tensor | None = None) -> Tensor:
-        """The measurement's mean in the dark, for inputs like ``x``, by default one of ``img_size`` in float32.
+        """Mean of the measurement in the dark, differentiable in the sensor's parameters.
 
-        Differentiable in the sensor's parameters.
+        Args:
+            x: light of the wanted shape and dtype; None for ``img_size`` in float32.
         """
         if x is None:
             numbers = itertools.chain(self.sensor_module.parameters(), self.sensor_module.buffers())
@@ -72,14 +85,14 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
         return self.sensor_module.expected(torch.zeros_like(x))
 
     def A(self, x: Tensor, **kwargs: Any) -> Tensor:
-        """The linear part of the mean."""
+        """Linear part of the mean."""
         return self.sensor_module.expected(x) - self.offset(x)
 
     def A_adjoint(self, y: Tensor, **kwargs: Any) -> Tensor:
-        """Its exact transpose, by one backward pass."""
+        """Apply the exact transpose, by one backward pass."""
         return adjoint(self.sensor_module, y, (y.shape[0], *self.img_size))
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None, **kwargs: Any) -> Tensor:
-        """A measurement without the offset, with the noise of the sensor."""
+        """Measure light without the offset, with the noise of the sensor."""
         y: Tensor = self.sensor_module(x, generator=generator)
         return y - self.offset(x)

@@ -53,14 +53,25 @@ def log_matched_filter(
     signal_to_background: float = 1e3,
     boundary: Boundary = "zero",
 ) -> Tensor:
-    """Log-likelihood of every arrival bin, up to a constant: (..., C, T, H, W).
+    """Log-likelihood of every arrival bin, up to a constant.
 
-    ``score[t] = sum_j histogram[t + first + j] log(1 + s kernel[j])`` with ``kernel`` (K,) and ``first`` those of the
-    impulse response (`Response.kernel`) and ``s`` the detections of the signal over those of the background in one
-    bin. Its largest entry is the maximum-likelihood bin of one return in Poisson counts of constant background; for
-    large ``s`` it becomes ``sum histogram log kernel``. Differentiable in histogram and kernel.
+    ``score[t] = sum_j histogram[t + first + j] log(1 + s kernel[j])`` with ``s`` the signal to background. Its largest
+    entry is the maximum-likelihood bin of one return in Poisson counts of constant background; for large ``s`` it
+    becomes ``sum histogram log kernel``. Differentiable in histogram and kernel.
 
-    Raises UnitError unless ``signal_to_background`` is above zero and the kernel holds shares (>= 0).
+    Args:
+        histogram: (..., C, T, H, W).
+        kernel: shares (K,) of the impulse response (`Response.kernel`).
+        first: lag of its first entry in bins.
+        signal_to_background: detections of the signal over detections of the background in one bin.
+        boundary: as of `convolve_time`.
+
+    Returns:
+        (..., C, T, H, W).
+
+    Raises:
+        UnitError: unless the ratio is above zero and the kernel holds shares (>= 0).
+        ShapeError: for other shapes.
     """
     me = "log_matched_filter"
     ratio = check_number(signal_to_background, "signal_to_background", me, open_low=True)
@@ -80,12 +91,18 @@ def log_matched_filter(
 
 @in_single
 def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
-    """Position of the largest entry, (..., C, H, W); with ``refine`` the top of the parabola through it and its
-    neighbours, within half a bin of it.
+    """Position of the largest entry.
 
-    A normal pulse makes the log-matched filter a parabola, so that this is exact there; of a histogram itself it is
-    pulled towards the middle of the bin. Differentiable through the parabola only. Without refinement, in the first
+    A normal pulse makes the log-matched filter a parabola, so that ``refine`` is exact there; of a histogram itself it
+    is pulled towards the middle of the bin. Differentiable through the parabola only. Without refinement, in the first
     or last bin and where the three entries are equal, it is the middle of the bin with derivative zero.
+
+    Args:
+        scores: (..., C, T, H, W).
+        refine: take the top of the parabola through the entry and its neighbours, within half a bin of it.
+
+    Returns:
+        (..., C, H, W) in bins; NaN for scores with NaN.
     """
     check_bins(scores, "peak_position")
     index = scores.argmax(TIME, keepdim=True)
@@ -112,17 +129,22 @@ def _parabola(scores: Tensor, index: Tensor) -> Tensor:
 def center_of_mass(
     histogram: Tensor, *, background: Tensor | float = 0.0, half_width_bins: int | None = None
 ) -> Tensor:
-    """Mean arrival position, (..., C, H, W), of what exceeds the background.
-
-    ``background``: counts per bin, a number or (..., C, H, W) (`background_per_bin`), subtracted before; a background
-    left in pulls the result to the middle of the window. ``half_width_bins``: only bins within that distance of the
-    largest one count. Differentiable in histogram and background. Where nothing is left: the middle of the window
-    (or of the largest bin), derivative zero.
+    """Mean arrival position of what exceeds the background.
 
     Negative differences count as they are, which keeps the mean unbiased, as long as their sum S is more than its noise
     N, ``N^2 = sum excess^2``; entries that are all positive always have that much. A sum of less does not say where
     light is: the result goes to the middle as ``S^2 / N^2``, its derivative stays bounded, and it never leaves the
     window (or the bins that count). Half precision is summed in float32.
+
+    Args:
+        histogram: (..., C, T, H, W).
+        background: counts per bin, a number or (..., C, H, W) (`background_per_bin`), subtracted before; a background
+            left in pulls the result to the middle of the window.
+        half_width_bins: only bins within that distance of the largest one count; None for all.
+
+    Returns:
+        (..., C, H, W) in bins, differentiable in histogram and background; where nothing is left the middle of the
+        window (or of the largest bin), derivative zero.
     """
     check_bins(histogram, "center_of_mass")
     excess = histogram - _per_pixel(background, histogram, "center_of_mass", "background")
@@ -154,11 +176,18 @@ def center_of_mass(
 
 @in_single
 def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
-    """``sum_k softmax(scores / temperature)_k (k + 1/2)``, (..., C, H, W): a smooth stand-in for the largest entry.
+    """Smooth stand-in for the largest entry: ``sum_k softmax(scores / temperature)_k (k + 1/2)``.
 
     With the log-matched filter and temperature 1 it is the posterior mean of the arrival under a flat prior. Larger
     temperatures and background pull it to the middle of the window; with so many counts (or so small a temperature)
     that the posterior is narrower than half a bin, it snaps to the middle of a bin. Differentiable everywhere.
+
+    Args:
+        scores: (..., C, T, H, W).
+        temperature: above 0, in the unit of the scores.
+
+    Returns:
+        (..., C, H, W) in bins.
     """
     check_bins(scores, "soft_argmax")
     dtype = scores.dtype
@@ -171,8 +200,13 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Returns(TensorRecord):
-    """``position`` in bins and ``strength`` (the entry there), (..., C, R, H, W), in order of time; ``valid``: bool,
-    the same shape. Entries that are not valid come last and hold zero."""
+    """Returns of a pixel in order of time; entries that are not valid come last and hold zero.
+
+    Attributes:
+        position: (..., C, R, H, W) in bins.
+        strength: entry there, the same shape.
+        valid: mask, the same shape.
+    """
 
     position: Tensor
     strength: Tensor
@@ -181,12 +215,16 @@ class Returns(TensorRecord):
 
 @in_single
 def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
-    """Where a histogram first reaches the threshold: `Returns` with R = 1.
+    """First crossing of a threshold: `Returns` with R = 1.
 
-    ``threshold``: counts, a number or (..., C, H, W). The crossing lies on the straight line between the middles of
-    the bins before and at it, and is differentiable in histogram and threshold; in the very first bin it is its
-    middle. Earlier than the peak by a share of the pulse: a leading-edge discriminator has the same walk error.
-    An entry of zero or less is no return, whatever the threshold: a share of the largest entry is 0 in an empty pixel.
+    The crossing lies on the straight line between the middles of the bins before and at it, and is differentiable in
+    histogram and threshold; in the very first bin it is its middle. Earlier than the peak by a share of the pulse: a
+    leading-edge discriminator has the same walk error. An entry of zero or less is no return, whatever the threshold: a
+    share of the largest entry is 0 in an empty pixel.
+
+    Args:
+        histogram: (..., C, T, H, W).
+        threshold: counts, a number or (..., C, H, W).
     """
     check_bins(histogram, "first_return")
     level = _per_pixel(threshold, histogram, "first_return", "threshold")
@@ -205,12 +243,17 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
 
 @in_single
 def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_separation_bins: int = 1) -> Returns:
-    """Up to ``max_returns`` (R) local maxima of at least ``threshold``, the strongest ones, in order of time.
+    """Local maxima of at least a threshold, the strongest ones, in order of time.
 
-    Maxima closer than ``min_separation_bins`` to a stronger one are left out. Positions are refined by a parabola and
-    strengths are the entries themselves; both are differentiable there. Takes histograms, filtered ones, or scores.
-    A pixel of equal entries, an empty one too, has no maximum, whatever the threshold.
-    Memory and time grow as R.
+    Positions are refined by a parabola and strengths are the entries themselves; both are differentiable there. Takes
+    histograms, filtered ones, or scores. A pixel of equal entries, an empty one too, has no maximum, whatever the
+    threshold. Memory and time grow as R.
+
+    Args:
+        scores: (..., C, T, H, W).
+        max_returns: R.
+        threshold: least entry.
+        min_separation_bins: maxima closer than that to a stronger one are left out.
     """
     me = "multi_return"
     check_bins(scores, me)
@@ -242,16 +285,30 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
 
 
 def background_per_bin(histogram: Tensor) -> Tensor:
-    """Median over the bins, (..., C, H, W), without gradient: the level where most bins hold background only."""
+    """Median over the bins, without gradient: the level where most bins hold background only.
+
+    Args:
+        histogram: (..., C, T, H, W).
+
+    Returns:
+        (..., C, H, W).
+    """
     return check_bins(histogram, "background_per_bin").detach().median(TIME).values
 
 
 @in_single
 def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
-    """Metres one way for positions in bins: half the optical path ``start_opl + position bin_width_opl``.
+    """Distance one way of positions in bins: half the optical path ``start_opl + position bin_width_opl``.
 
     For light that leaves from and returns to the sensor; t = 0 when it leaves. Computed in float64 from the axis and
     returned in the dtype given: float32 resolves 4e-6 m at 100 m.
+
+    Args:
+        position: any shape, in bins.
+        axis: axis of the histogram.
+
+    Returns:
+        Metres.
     """
     check_time_axis(axis, "distance_of_position")
     (position,) = reals("distance_of_position", position=position)
@@ -260,11 +317,20 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
 
 @in_single
 def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
-    """Points (..., H, W, 3) in the frame of the camera for distances (..., H, W) along the rays of its pixels, metres.
+    """Points in the frame of the camera for distances along the rays of its pixels. Differentiable in both arguments.
 
-    ``intrinsics``: (3, 3), or (B, 3, 3) for distances (B, H, W); kornia's camera: x right, y down, z forward, pixel
-    centres at *integer* coordinates, so that the middle of a picture is ``((W - 1) / 2, (H - 1) / 2)``. Distances are
-    Euclidean, as times of flight are; not depths along z. Differentiable in both. Raises ShapeError.
+    The camera is kornia's: x right, y down, z forward, pixel centres at *integer* coordinates, so that the middle of a
+    picture is ``((W - 1) / 2, (H - 1) / 2)``.
+
+    Args:
+        distance_m: (..., H, W) in metres, Euclidean, as times of flight are; not depths along z.
+        intrinsics: (3, 3), or (B, 3, 3) for distances (B, H, W).
+
+    Returns:
+        (..., H, W, 3) in metres.
+
+    Raises:
+        ShapeError: for other shapes.
     """
     distance_m, intrinsics = reals("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
     if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
@@ -286,10 +352,20 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
 
 @in_single
 def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
-    """Cramer-Rao bound of the distance from one normal pulse without background: ``c sigma / (2 sqrt(N))`` in metres.
+    """Cramer-Rao bound of the distance from one normal pulse without background: ``c sigma / (2 sqrt(N))``.
 
-    ``detections``: expected signal detections, any shape; infinite at zero. The bins count as narrow beside the pulse;
-    `crlb` knows bins, background, pile-up and other responses, and is this in its limit. Raises UnitError.
+    The bins count as narrow beside the pulse; `crlb` knows bins, background, pile-up and other responses, and is this
+    in its limit.
+
+    Args:
+        response_fwhm_s: full width at half maximum of the pulse in seconds.
+        detections: expected signal detections, any shape; infinite deviation at zero.
+
+    Returns:
+        Metres.
+
+    Raises:
+        UnitError: for negative detections.
     """
     from torchtransient.sensing.responses import FWHM_PER_SIGMA
     from torchtransient.units import SPEED_OF_LIGHT
@@ -304,7 +380,7 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
 
 
 def _per_pixel(value: Tensor | float, histogram: Tensor, where: str, name: str) -> Tensor:
-    """A number, or one for each pixel (..., C, H, W), ready to meet a histogram."""
+    """Broadcast a number, or one for each pixel (..., C, H, W), to a histogram."""
     value = number_or_tensor(value, name, where)
     if not isinstance(value, Tensor) or value.ndim == 0:
         return torch.as_tensor(value, dtype=histogram.dtype, device=histogram.device)
@@ -336,18 +412,31 @@ def ml_position(
     bin_width_s: float | None = None,
     signal_to_background: float = 1e3,
 ) -> Tensor:
-    """Position (..., C, H, W) in bins of one return in Poisson counts, by the greatest likelihood within its bin.
+    """Position of one return in Poisson counts, by the greatest likelihood within its bin.
 
     Maximises ``sum_k histogram[k] log(1 + s share_k(position))``, share_k what bin k holds of the response around the
-    position and ``s`` the detections of the signal over those of the background in one bin, as in `log_matched_filter`,
-    which finds the bin. At the Cramer-Rao bound from some 30 photons on, for tails and in wide bins too
-    (docs/photon_counting.md). For `distance_of_position`. Where the likelihood is flat, as of a pulse that lies inside
-    one bin, it is the middle of the flat part. NaN in a histogram is NaN; one without counts gives 1/2.
+    position and ``s`` the signal to background, as in `log_matched_filter`, which finds the bin. At the Cramer-Rao
+    bound from some 30 photons on, for tails and in wide bins too (docs/photon_counting.md). Where the likelihood is
+    flat, as of a pulse that lies inside one bin, it is the middle of the flat part. What the window cuts off of the
+    response is taken for light that was not there: for returns inside the window. Of pile-up, give it the rate of
+    `coates`. Computed in float64.
 
     Differentiable in the histogram and in the parameters of the response, by how the top of the likelihood moves; zero
-    where it is flat. Bins are those of ``axis`` or ``bin_width_s``. What the window cuts off of the response is taken
-    for light that was not there: for returns inside the window. Of pile-up, give it the rate of `coates`. Computed in
-    float64. Raises ShapeError, UnitError.
+    where it is flat.
+
+    Args:
+        histogram: (..., C, T, H, W).
+        response: impulse response.
+        axis: axis of the histogram, or
+        bin_width_s: its bin width in seconds.
+        signal_to_background: detections of the signal over detections of the background in one bin.
+
+    Returns:
+        (..., C, H, W) in bins, for `distance_of_position`; NaN for a histogram with NaN, 1/2 for one without counts.
+
+    Raises:
+        ShapeError: for another T than that of the axis.
+        UnitError: for numbers out of range.
     """
     where = "ml_position"
     check_bins(histogram, where)

@@ -38,6 +38,7 @@ from torchtransient.sensing.chain.compose import Compose, PixelGroups
 from torchtransient.sensing.checks import check_number
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
 from torchtransient.sensing.coincidence import CoincidencePixel
+from torchtransient.sensing.composed_responses import ComposedResponse, MeasuredResponse
 from torchtransient.sensing.compressed_histograms import CodedHistogram, EquiDepthHistogram, fourier_codes
 from torchtransient.sensing.counts import ShotNoise
 from torchtransient.sensing.crosstalk import Crosstalk
@@ -60,13 +61,7 @@ from torchtransient.sensing.itof.correlation import ItofCalibration, ItofCorrela
 from torchtransient.sensing.macro_pixel import MacroPixel, ZoneSum
 from torchtransient.sensing.photon_budget import Optics, PhotonBudget, ambient_photon_rate, hot_pixel_rates
 from torchtransient.sensing.polarization import Analyzers, PolarizationMosaic, circular_analyzers, linear_analyzers
-from torchtransient.sensing.responses import (
-    ComposedResponse,
-    GaussianResponse,
-    MeasuredResponse,
-    TailedResponse,
-    UniformResponse,
-)
+from torchtransient.sensing.responses import GaussianResponse, TailedResponse, UniformResponse
 from torchtransient.sensing.sensor import GradPolicy
 from torchtransient.sensing.spad import BinaryFrames, SynchronousSPAD
 from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF, defocus_psf, gaussian_psf
@@ -81,12 +76,12 @@ from torchtransient.sensing.timing import (
 
 
 def _seeded_code_widths(num_bins: int, dnl_std: float, seed: int = 0) -> torch.Tensor:
-    """The same random TDC wherever the file is read."""
+    """Draw the widths of a random TDC, the same ones wherever the file is read."""
     return random_code_widths(num_bins, dnl_std, torch.Generator().manual_seed(seed))
 
 
 def _seeded_dark_rates(height: int, width: int, seed: int = 0, **numbers: float) -> torch.Tensor:
-    """The same hot pixels wherever the file is read."""
+    """Draw hot pixels, the same ones wherever the file is read."""
     return hot_pixel_rates(height, width, generator=torch.Generator().manual_seed(seed), **numbers)
 
 
@@ -127,12 +122,18 @@ _BY_VALUE = ("PixelGroups.by_value", "make")
 
 @dataclass(frozen=True)
 class Device:
-    """A named sensor: its stages, what they stand for, and where its numbers are from.
+    """Named sensor: its stages and the sources of its numbers. Plain data: equal when all of it is.
 
-    ``sources``: one line each, with "assumed:" in front of numbers that no source gives. ``stages``: dictionaries as
-    above. ``bin_width_s`` and ``num_bins``: what the device records with, for `axis`; None where it has no bins.
-    Plain data: equal when all of it is. Raises StorageError for sources or stages that are no lists, and for a
-    stage that is no such dictionary.
+    Attributes:
+        name: of the device.
+        description: a sentence.
+        sources: one line each, with "assumed:" in front of numbers that no source gives.
+        stages: dictionaries with a kind, see the top of this file.
+        bin_width_s: of the records, for `axis`; None without bins.
+        num_bins: of the records; None without bins.
+
+    Raises:
+        StorageError: for sources or stages that are no lists, and for a stage that is no such dictionary.
     """
 
     name: str
@@ -163,13 +164,28 @@ class Device:
             _check_spec(stage, self.name)
 
     def axis(self, start_s: float = 0.0) -> TimeAxis:
-        """The device's own bins from ``start_s`` on. Raises StorageError for a device without bins."""
+        """Make the axis of the device's own bins.
+
+        Args:
+            start_s: start of the first bin in seconds.
+
+        Raises:
+            StorageError: for a device without bins.
+        """
         if self.bin_width_s is None or self.num_bins is None:
             raise StorageError(f"Device '{self.name}': expected bin_width_s and num_bins, but it records no bins.")
         return TimeAxis.from_seconds(start_s, self.bin_width_s, self.num_bins)
 
     def sensor(self, axis: TimeAxis | None = None, *, grad: GradPolicy = "expected") -> Compose:
-        """The chain of modules for transients on ``axis`` (by default `axis()`, from t = 0), under one policy."""
+        """Build the chain of modules.
+
+        Args:
+            axis: axis of the light; None for `axis()`, from t = 0.
+            grad: gradient policy.
+
+        Raises:
+            StorageError: for stages that are no modules.
+        """
         if axis is None and self.bin_width_s is not None:
             axis = self.axis()
         budget = next((s for s in self.stages if s["kind"] == "PhotonBudget"), None)
@@ -180,9 +196,15 @@ class Device:
         return Compose(stages, grad=grad)
 
     def changed(self, stage: int | str, **arguments: Any) -> Device:
-        """The same device with other arguments of one stage: its number, or its kind where that is there once.
+        """Make the same device with other arguments of one stage.
 
-        A kind may be that of a part, the `SynchronousSPAD` of a `MacroPixel` for instance.
+        Args:
+            stage: its number, or its kind where that is there once; a kind may be that of a part, the `SynchronousSPAD`
+                of a `MacroPixel` for instance.
+            arguments: new arguments.
+
+        Raises:
+            StorageError: for a stage that is missing or there twice.
         """
         stages = [copy.deepcopy(s) for s in self.stages]
         if isinstance(stage, str):
@@ -209,7 +231,7 @@ class Device:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists, dictionaries, numbers and strings."""
+        """Return plain lists, dictionaries, numbers and strings."""
         return {
             "name": self.name,
             "description": self.description,
@@ -221,7 +243,14 @@ class Device:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
-        """What `to_dict` made. Raises StorageError for missing or unknown entries."""
+        """Make a device of the result of `to_dict`.
+
+        Args:
+            data: the entries.
+
+        Raises:
+            StorageError: for missing or unknown entries.
+        """
         with short_errors("Device"):
             return cls._from_dict(data)
 
@@ -238,7 +267,17 @@ class Device:
         )  # fmt: skip
 
     def to_json(self, path: str | Path | None = None) -> str:
-        """JSON text, also written to ``path`` when given. Raises StorageError for what JSON cannot hold."""
+        """Write JSON text.
+
+        Args:
+            path: file to write, or None.
+
+        Returns:
+            The text.
+
+        Raises:
+            StorageError: for numbers and objects that JSON cannot hold.
+        """
         try:
             text = json.dumps(self.to_dict(), indent=2, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -249,11 +288,25 @@ class Device:
 
     @classmethod
     def from_json(cls, source: str | Path) -> Device:
-        """A device from a file (a `Path`, or a name without a brace) or from JSON text. Raises StorageError."""
+        """Read a device from JSON.
+
+        Args:
+            source: a file (a `Path`, or a name without a brace), or text.
+
+        Raises:
+            StorageError: for a file that is missing, or other content.
+        """
         return cls.from_dict(json_data(_text(source, "{", "Device.from_json"), "Device.from_json"))
 
     def to_yaml(self, path: str | Path | None = None) -> str:
-        """YAML text, also written to ``path`` when given. Needs PyYAML (``pip install torchtransient[yaml]``)."""
+        """Write YAML text. Needs PyYAML (``pip install torchtransient[yaml]``).
+
+        Args:
+            path: file to write, or None.
+
+        Returns:
+            The text.
+        """
         text: str = _yaml().safe_dump(json.loads(self.to_json()), sort_keys=False)
         if path is not None:
             write_text(path, text, "Device.to_yaml")
@@ -261,17 +314,29 @@ class Device:
 
     @classmethod
     def from_yaml(cls, source: str | Path) -> Device:
-        """A device from a YAML file or text, read by the safe loader. Raises StorageError."""
+        """Read a device from YAML, by the safe loader.
+
+        Args:
+            source: a file or text.
+
+        Raises:
+            StorageError: for a file that is missing, or other content.
+        """
         yaml = _yaml()
         return cls.from_dict(yaml_data(_text(source, "\n", "Device.from_yaml"), "Device.from_yaml", yaml))
 
 
 def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, Any] | None = None) -> Any:
-    """The object that a stage stands for: a sensor, response, code, or the value itself where it is no dictionary.
+    """Build the object of a stage: a sensor, response, code, or the value itself where it is no dictionary.
 
-    ``budget``: the stage of the `PhotonBudget` that ``"@cycles"``, ``"@period_s"`` and ``"@background"`` refer to.
-    Raises StorageError for an unknown kind, an argument that the kind does not take, or a placeholder for what is not
-    there; errors of the values themselves (UnitError, ShapeError) pass.
+    Args:
+        spec: the stage.
+        axis: axis for ``"@axis"`` and ``"@num_bins"``.
+        budget: stage of the `PhotonBudget` for ``"@cycles"``, ``"@period_s"`` and ``"@background"``.
+
+    Raises:
+        StorageError: for an unknown kind, an argument that the kind does not take, or a placeholder without a value;
+            errors of the values themselves (UnitError, ShapeError) pass.
     """
     if isinstance(spec, str) and spec.startswith("@"):
         return _placeholder(spec, axis, budget)
@@ -297,7 +362,7 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
 
 
 def _maker(spec: Any, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Callable[[float], Any]:
-    """What makes a stage of a value, "@value" in its description. StorageError where it does not stand there."""
+    """Return a function that makes a stage of a value, "@value" in its description. StorageError without one."""
     if not isinstance(spec, dict) or "@value" not in json.dumps(spec, default=str):
         raise StorageError(
             f"build_stage: expected make of PixelGroups.by_value as a stage with '@value' in it, got {shown(spec)}."
@@ -344,7 +409,7 @@ def _check_spec(spec: Any, where: str) -> None:
 
 
 def _check_value(value: Any, kind: str, where: str) -> None:
-    """StorageError for numbers that are not finite and unknown kinds, in lists and dictionaries too."""
+    """Raise StorageError for numbers that are not finite and unknown kinds, in lists and dictionaries too."""
     if isinstance(value, float) and not math.isfinite(value):
         raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
     if isinstance(value, dict) and "kind" in value:
@@ -358,7 +423,7 @@ def _check_value(value: Any, kind: str, where: str) -> None:
 
 
 def _parts(spec: Any) -> list[dict[str, Any]]:
-    """Every dictionary with a kind in a stage, or in a list of them: the stage, and what it is made of."""
+    """Return every dictionary with a kind in a stage, or in a list of them: the stage, and its parts."""
     if isinstance(spec, (list, tuple)):
         return [part for entry in spec for part in _parts(entry)]
     if not isinstance(spec, dict):

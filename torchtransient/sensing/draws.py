@@ -64,8 +64,12 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
     torch.binomial does not return from a NaN count, and formulas of saturating detectors give plausible counts of
     negative light. Skipped where values cannot be read (`floating.holds`).
 
+    Args:
+        rate: any shape.
+        where: name of the caller, for errors.
+
     Raises:
-        UnitError: for negative, infinite or NaN rates, in the name of `where`.
+        UnitError: for negative, infinite or NaN rates.
     """
     low, high = torch.aminmax(rate.detach()) if rate.numel() else (rate.new_zeros(()), rate.new_zeros(()))
     if not holds((low >= 0) & torch.isfinite(high)):
@@ -195,7 +199,15 @@ def _in_columns(
 
 
 def fast_poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Poisson numbers of finite means >= 0, float32 or float64, on several cores."""
+    """Draw Poisson numbers on several cores.
+
+    Args:
+        mean: finite, >= 0, float32 or float64.
+        generator: source of randomness.
+
+    Returns:
+        Shape and dtype of `mean`.
+    """
     return _in_columns(lambda m, g: torch.poisson(m, generator=g), mean, generator)
 
 
@@ -283,7 +295,11 @@ class BinomialTables:
 
 
 class LagTable:
-    """Draws of 0 ... K - 1 with `probabilities` (K,) float64 of sum 1, K at most 32767, on the CPU."""
+    """Draws of 0 ... K - 1 with given probabilities, from a table.
+
+    Args:
+        probabilities: (K,) float64 of sum 1, K at most 32767, on the CPU.
+    """
 
     def __init__(self, probabilities: Tensor) -> None:
         self._below = probabilities.cumsum(0)[:-1]
@@ -306,7 +322,12 @@ class LagTable:
 
 
 def sixteen_bits(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Uniform int16 numbers, one for each entry of `like`: four from every 64 random bits."""
+    """Draw uniform int16 numbers, four from every 64 random bits.
+
+    Args:
+        like: tensor, one number for each entry.
+        generator: source of randomness.
+    """
     words = torch.empty((like.numel() + 3) // 4, dtype=torch.int64, device=like.device)
     return words.random_(-(2**63), None, generator=generator).view(torch.int16)[: like.numel()]
 
@@ -325,7 +346,12 @@ def _distribution(probabilities: Tensor, most: int) -> Tensor:
 
 @functools.lru_cache(maxsize=32)
 def binomial_table(probability: float, *, small: bool = False) -> BinomialTables:
-    """Table of one probability in [0, 1/2]; `small` takes less time to make, for fewer entries."""
+    """Make the table of binomial numbers of one probability.
+
+    Args:
+        probability: in [0, 1/2].
+        small: a table that takes less time to make, for fewer entries.
+    """
     most = _RARE_TRIALS if probability <= _RARE and not small else _FEW_TRIALS
     return BinomialTables(torch.tensor([probability], dtype=torch.float64, device="cpu"), most, 256 if small else 1024)
 

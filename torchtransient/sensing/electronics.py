@@ -39,17 +39,34 @@ ELEMENTARY_CHARGE_C = 1.602176634e-19  # exact (SI)
 
 
 def ktc_noise(capacitance_f: float, temperature_k: float = 300.0) -> float:
-    """Reset noise of a sense node in electrons, ``sqrt(k T C) / q``; 10 fF at 300 K: 40.2. UnitError below zero."""
+    """Reset noise of a sense node, ``sqrt(k T C) / q``; 10 fF at 300 K: 40.2.
+
+    Args:
+        capacitance_f: in farads.
+        temperature_k: in kelvins.
+
+    Returns:
+        rms electrons.
+
+    Raises:
+        UnitError: for numbers out of range.
+    """
     capacitance = check_number(capacitance_f, "capacitance_f", "ktc_noise", high=1e-9)
     temperature = check_number(temperature_k, "temperature_k", "ktc_noise")
     return math.sqrt(BOLTZMANN_J_PER_K * temperature * capacitance) / ELEMENTARY_CHARGE_C
 
 
 def clipped_normal_mean(mean: Tensor, variance: Tensor, low: float = -math.inf, high: float = math.inf) -> Tensor:
-    """Mean of a normal variable clipped to [low, high]; smooth in mean and variance. Shapes broadcast.
+    """Mean of a normal variable clipped to [low, high]; smooth in mean and variance.
 
     The variance is softened by ``VARIANCE_FLOOR`` so that the slope at zero variance is finite; at a variance of zero
     the result is off by at most 0.004, and only within 0.03 of a limit.
+
+    Args:
+        mean: any shape.
+        variance: of a shape that broadcasts.
+        low: lower limit.
+        high: upper limit.
     """
     scale = (variance.clamp_min(0) + VARIANCE_FLOOR).sqrt()
     result = mean
@@ -61,7 +78,13 @@ def clipped_normal_mean(mean: Tensor, variance: Tensor, low: float = -math.inf, 
 
 
 def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tensor:
-    """Variance of ``min(X, high)`` for a normal X; ``variance`` far below the limit, 0 far above. Shapes broadcast."""
+    """Variance of ``min(X, high)`` for a normal X: the variance far below the limit, 0 far above.
+
+    Args:
+        mean: any shape.
+        variance: of a shape that broadcasts.
+        high: upper limit.
+    """
     if not math.isfinite(high):
         return variance
     variance = variance.clamp_min(0)
@@ -75,9 +98,21 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
 def fixed_pattern(
     shape: tuple[int, ...], spread: float, *, center: float = 0.0, generator: torch.Generator | None = None
 ) -> Tensor:
-    """A normal pattern ``center + spread * normal``, float32: fixed differences between pixels or taps.
+    """Draw fixed differences between pixels or taps: ``center + spread * normal``.
 
-    For ``gain_map`` (center 1, spread 0.5 to 2 %) and ``offset_map_e`` of `PixelElectronics`. UnitError below zero.
+    For ``gain_map`` (center 1, spread 0.5 to 2 %) and ``offset_map_e`` of `PixelElectronics`.
+
+    Args:
+        shape: of the pattern.
+        spread: standard deviation.
+        center: mean.
+        generator: source of randomness.
+
+    Returns:
+        Tensor of that shape, float32.
+
+    Raises:
+        UnitError: for a spread below zero.
     """
     me = "fixed_pattern"
     spread, center = check_number(spread, "spread", me), check_number(center, "center", me, low=-math.inf)
@@ -90,22 +125,35 @@ def fixed_pattern(
 
 
 class PixelElectronics(RandomSensor):
-    """The chain above, on mean electrons (..., C, N, H, W), with N exposures, taps or gates where time was.
+    """Pixel that collects charge and reads it out, on mean electrons (..., C, N, H, W): the chain of this file.
 
-    ``shot_noise`` False: the input is a charge that an earlier stage has drawn. ``full_well_e`` electrons or None;
-    ``read_noise_e``, ``ktc_noise_e`` rms electrons; ``excess_noise`` F^2 >= 1 of an intensifier (2 is an exponential
-    pulse height), drawn as normal gain noise; ``gain_e_per_dn`` with ``bits`` adds the converter, both or neither;
-    ``signed``: of codes in two's complement, for the differences of two taps, which a converter without room below
-    zero would clip. ``dark_e``: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
-    ``gain_map`` and ``offset_map_e`` broadcast to the input: buffers, or learnt as an `nn.Parameter`. Output in
-    electrons, in the shape of the input.
-
-    ``expected`` is the mean with both clips, which takes the charge as normal: 0.01 e off for a full well of 100 e and
-    better above. Rounding has the mean zero when the noise is at least half a step, which it does not check.
+    N are exposures, taps or gates where time was. Output in electrons, in the shape of the input. ``expected`` is the
+    mean with both clips, which takes the charge as normal: 0.01 e off for a full well of 100 e and better above.
+    Rounding has the mean zero when the noise is at least half a step, which it does not check.
 
     Gradients: ``gaussian`` is pathwise (shot noise as normal), with the step of the converter passed straight through
     and zero beyond a clip; ``straight_through`` uses the slope of the mean; ``score`` has the exact score of the
-    Poisson draw. All see the full chain's noise. UnitError for numbers out of range, ShapeError for a bad map.
+    Poisson draw. All see the full chain's noise.
+
+    Args:
+        shot_noise: False if the input is a charge that an earlier stage has drawn.
+        full_well_e: in electrons, or None.
+        read_noise_e: rms electrons.
+        ktc_noise_e: rms electrons.
+        excess_noise: F^2 >= 1 of an intensifier (2 is an exponential pulse height), drawn as normal gain noise.
+        dark_e: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
+        gain_e_per_dn: electrons per number of the converter, with ``bits``; None without one.
+        bits: of the converter.
+        signed: codes in two's complement, for the differences of two taps, which a converter without room below zero
+            would clip.
+        black_level_dn: number of no charge.
+        gain_map: broadcasts to the input: a buffer, or learnt as an `nn.Parameter`.
+        offset_map_e: the same, in electrons.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for numbers out of range.
+        ShapeError: for a map that does not broadcast.
     """
 
     takes: tuple[Quantity, ...] = ("electrons",)
@@ -176,7 +224,11 @@ class PixelElectronics(RandomSensor):
 
     @in_single
     def collected(self, x: Tensor) -> Tensor:
-        """Mean electrons before saturation: with the gain map and the dark electrons. UnitError for negative light."""
+        """Mean electrons before saturation: with the gain map and the dark electrons.
+
+        Args:
+            x: mean electrons (..., C, N, H, W).
+        """
         check_transient(x, type(self).__name__)
         if self.gain_map is not None:
             x = x * self._map(self.gain_map, "gain_map", x)
@@ -188,7 +240,11 @@ class PixelElectronics(RandomSensor):
         return clipped_normal_mean(mean, variance, low, high) if self.bits is not None else mean
 
     def variance(self, x: Tensor) -> Tensor:
-        """Variance before the converter's clip, in electrons squared, with its rounding noise of 1/12 step squared."""
+        """Variance before the converter's clip, in electrons squared, with its rounding noise of 1/12 step squared.
+
+        Args:
+            x: mean electrons (..., C, N, H, W).
+        """
         _, variance = self._moments(x)
         return variance if self.gain_e_per_dn is None else variance + self.gain_e_per_dn**2 / 12
 

@@ -71,7 +71,12 @@ def free_running_rate(rate_hz: Tensor, dead_time_s: float, kind: DeadTime = "non
 
 
 def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
-    """Stationary state for rates (..., T, H, W), in the same layout."""
+    """Stationary state for rates, in the same layout.
+
+    Args:
+        rate: per period and bin, (..., T, H, W).
+        dead_bins: dead time in bins.
+    """
     if rate.numel() == 0:
         empty = rate.to(torch.float64)
         return FreeRunningState(empty, empty, empty, split_dead_time(torch.as_tensor(dead_bins))[0])
@@ -247,7 +252,11 @@ class FreeRunningSPAD(RandomSensor):
 
     @in_single
     def probabilities(self, x: Tensor) -> Tensor:
-        """Expected detections per period and bin."""
+        """Expected detections per period and bin.
+
+        Args:
+            x: rate per period and bin, (..., C, T, H, W).
+        """
         if self.kind == "paralyzable":
             return paralyzable_histogram(x, self._dead_bins)
         return nonparalyzable_histogram(x, self._dead_bins)

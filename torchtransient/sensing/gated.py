@@ -31,12 +31,25 @@ RISE_PER_SIGMA = 2 * 1.2815515655446004
 def gate_profiles(
     delays_s: Tensor, widths_s: Tensor, axis: TimeAxis, *, rise_s: float, fall_s: float, leakage: float = 0.0
 ) -> Tensor:
-    """(G, T) float64: mean over every bin of the transmission of every gate, between ``leakage`` and 1.
+    """Mean transmission of every gate over every bin, between ``leakage`` and 1.
 
-    ``delays_s`` and ``widths_s`` (G,): middle of the opening edge, counted from the emission of the light, and time
-    from there to the middle of the closing edge. ``rise_s``, ``fall_s``: from 10 % to 90 %, above zero. Differentiable
-    in delays and widths. A gate narrower than its edges does not open fully, and what
-    the formula has below zero before it is zero. Raises UnitError, ShapeError.
+    Differentiable in delays and widths. A gate narrower than its edges does not open fully, and what the formula has
+    below zero before it is zero.
+
+    Args:
+        delays_s: middle of the opening edge, counted from the emission of the light, (G,), in seconds.
+        widths_s: time from there to the middle of the closing edge, (G,), in seconds.
+        axis: axis of the light.
+        rise_s: opening edge from 10 % to 90 %, above zero, in seconds.
+        fall_s: closing edge from 90 % to 10 %, above zero, in seconds.
+        leakage: transmission of the closed gate.
+
+    Returns:
+        (G, T) float64.
+
+    Raises:
+        UnitError: for numbers out of range.
+        ShapeError: for other shapes.
     """
     me = "gate_profiles"
     rise = check_seconds(rise_s, "rise_s", me, open_low=True) / RISE_PER_SIGMA
@@ -66,10 +79,21 @@ def _edge_integral(time_s: Tensor, middle_s: Tensor, sigma_s: float) -> Tensor:
 class GatedIntegration(Sensor):
     """Photoelectrons per bin (..., C, T, H, W) to the mean electrons behind every gate (..., C, G, H, W).
 
-    ``delays_s``: of the G gates; ``widths_s``: one for all or one each; edges and leakage as in `gate_profiles` (an
-    intensifier's leakage is 1e-7 and less, a shuttered CMOS pixel's 1e-3). ``electrons_per_unit`` counts all exposures.
-    ``learnable``: delays and widths are parameters, `delay_ps` and `log_width_s`. Shot noise, intensifier
-    and read noise follow in `PixelElectronics`.
+    Shot noise, intensifier and read noise follow in `PixelElectronics`.
+
+    Args:
+        delays_s: of the G gates, in seconds.
+        widths_s: one for all or one each, in seconds.
+        axis: axis of the light.
+        rise_s: opening edge from 10 % to 90 %, in seconds.
+        fall_s: closing edge; None as the opening one.
+        leakage: transmission of a closed gate; 1e-7 and less of an intensifier, 1e-3 of a shuttered CMOS pixel.
+        electrons_per_unit: electrons of all exposures for light of one.
+        learnable: make delays and widths parameters, `delay_ps` and `log_width_s`.
+
+    Raises:
+        UnitError: for numbers out of range.
+        ShapeError: for other numbers of widths than delays.
     """
 
     takes, gives = ("electrons", "counts"), "electrons"

@@ -23,7 +23,15 @@ from torchtransient.sensing.time_convolution import Boundary, Method, convolve_t
 
 
 def check_response(response: object, where: str) -> Response:
-    """`response` when it is a Response, else ArgumentError."""
+    """Return `response` if it is a Response.
+
+    Args:
+        response: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     if not isinstance(response, Response):
         raise ArgumentError(
             f"{where}: expected a response such as GaussianResponse, got {type(response).__name__}. A "
@@ -33,16 +41,25 @@ def check_response(response: object, where: str) -> Response:
 
 
 class ImpulseResponse(Sensor):
-    """Convolves a transient (..., C, T, H, W) with a response along time: the shape of light before it is detected.
+    """Convolve light (..., C, T, H, W) with a response along time: its shape before it is detected.
 
-    For the laser's pulse and the optics. What moves single detections, the jitter of the detector and of its timing,
-    is `DetectionJitter`, behind the detector. Constant light, ambient and dark counts, comes after this too:
+    For the laser's pulse and the optics. `DetectionJitter`, behind the detector, is for the jitter of the detector and
+    its timing, which moves single detections. Constant light, ambient and dark counts, comes after this too:
     `PhotonBudget` adds it. With boundary "zero" light that leaves the window is lost and nothing comes in, so that
-    constant light would starve at its edges; `Compose` refuses that order.
+    constant light would starve at its edges; `Compose` refuses that order. Sums over time are conserved with
+    "periodic", and with "zero" as far as light stays in the window.
 
-    The bin width comes from `axis` or `bin_width_s`; boundary and method as in `convolve_time`. Sums over time are
-    conserved with "periodic", and with "zero" as far as light stays in the window. `within_bin` "uniform": light lies
-    evenly in its bin; "center": in the middle (`Response.kernel`). Raises UnitError, ShapeError.
+    Args:
+        response: shape of the delays.
+        axis: axis of the light, or
+        bin_width_s: its bin width in seconds.
+        boundary: as of `convolve_time`.
+        method: as of `convolve_time`.
+        within_bin: place of light in its bin, as of `Response.kernel`.
+
+    Raises:
+        ArgumentError: for other objects than responses, and other choices.
+        UnitError: for widths out of range.
     """
 
     gives = "the same"
@@ -84,10 +101,17 @@ _NODES = 4096
 
 
 def pulse_kernel(bin_width_opl: float, *pulses: Pulse) -> tuple[int, Tensor]:
-    """Share of the light of one bin that ends up in each bin: ``(first, (K,) float64)``.
+    """Share of the light of one bin that pulses bring into each bin.
 
-    Entry k belongs to the bin ``first + k`` bins later; the entries sum to one. Several pulses are convolved with one
-    another. ``bin_width_opl`` in metres. Raises UnitError for a width that is not positive or without a pulse.
+    Args:
+        bin_width_opl: bin width in metres.
+        pulses: one or more, convolved with one another.
+
+    Returns:
+        First lag in bins, and shares (K,) float64 of the lags from there on, summing to one.
+
+    Raises:
+        UnitError: for a width that is not positive, or without a pulse.
     """
     if not (math.isfinite(bin_width_opl) and bin_width_opl > 0):
         raise UnitError(f"pulse_kernel: expected a bin width above 0 metres, got {bin_width_opl!r}.")
@@ -108,7 +132,15 @@ def pulse_kernel(bin_width_opl: float, *pulses: Pulse) -> tuple[int, Tensor]:
 
 
 def axis_with_margin(axis: TimeAxis, *pulses: Pulse) -> TimeAxis:
-    """``axis`` with the bins around it whose light the pulses bring into it: render on it, then keep ``axis``."""
+    """Add the bins around an axis whose light pulses bring into it: render on the result, then keep ``axis``.
+
+    Args:
+        axis: wanted axis.
+        pulses: one or more.
+
+    Returns:
+        A longer axis of the same bins.
+    """
     check_time_axis(axis, "axis_with_margin")
     first, kernel = pulse_kernel(axis.bin_width_opl, *pulses)
     before, after = max(first + kernel.numel() - 1, 0), max(-first, 0)
@@ -119,13 +151,21 @@ def axis_with_margin(axis: TimeAxis, *pulses: Pulse) -> TimeAxis:
 def apply_pulse(transient: Tensor, axis: TimeAxis, *pulses: Pulse, keep: TimeAxis | None = None) -> Tensor:
     """Convolve a transient with pulses along time.
 
-    ``transient``: (..., T, H, W) with the bins of ``axis``, radiance integrated over each bin, so that (C, T, H, W) and
-    batches of it are taken; the result has the same dtype and device. Light that is spread beyond the axis is lost:
-    what was there minus what is left. ``keep``: an axis made of bins of ``axis``, the ones to return. To miss nothing,
-    render on ``axis_with_margin(wanted, *pulses)`` and keep ``wanted``.
+    Light that is spread beyond the axis is lost. To miss nothing, render on ``axis_with_margin(wanted, *pulses)`` and
+    keep ``wanted``. Differentiable in ``transient``, in both modes and twice.
 
-    Differentiable in ``transient``, in both modes and twice. Raises ShapeError where T is not that of ``axis``, or
-    ``keep`` does not consist of its bins; UnitError without a pulse or for whole numbers.
+    Args:
+        transient: (..., T, H, W), radiance integrated over each bin of ``axis``.
+        axis: its time axis.
+        pulses: one or more.
+        keep: an axis made of bins of ``axis``, the ones to return.
+
+    Returns:
+        (..., T or bins of ``keep``, H, W), in dtype and device of ``transient``.
+
+    Raises:
+        ShapeError: if T is not that of ``axis``, or ``keep`` does not consist of its bins.
+        UnitError: without a pulse, or for whole numbers.
     """
     check_time_axis(axis, "apply_pulse")
     if check_tensor(transient, "apply_pulse").ndim < 3 or transient.shape[-3] != axis.num_bins:

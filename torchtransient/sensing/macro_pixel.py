@@ -28,7 +28,20 @@ Groups = list[tuple[float, int]]  # (share of the light, SPADs that have it)
 
 
 def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
-    """SPADs with the same share of the light; shares add up to 1 over all SPADs."""
+    """Group SPADs with the same share of the light.
+
+    Args:
+        spads: number of SPADs.
+        weights: one for each SPAD, of which only the ratios matter; None for equal shares.
+        where: name of the caller, for errors.
+
+    Returns:
+        Shares, which add up to 1 over all SPADs, and the number of SPADs of each.
+
+    Raises:
+        ShapeError: for another number of weights.
+        UnitError: for weights below 0.
+    """
     number = check_count(spads, "spads", where)
     if weights is None:
         return [(1.0 / number, number)]
@@ -45,7 +58,15 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
 
 
 def checked_detector(detector: object, where: str) -> RandomSensor:
-    """`detector` when it is a SPAD, else UnitError."""
+    """Return `detector` if it is a SPAD.
+
+    Args:
+        detector: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for anything else.
+    """
     if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD, AfterpulsingSPAD)):
         raise UnitError(
             f"{where}: expected detector to be a SynchronousSPAD, FreeRunningSPAD or AfterpulsingSPAD, got "
@@ -55,18 +76,24 @@ def checked_detector(detector: object, where: str) -> RandomSensor:
 
 
 class MacroPixel(WrappedDetector):
-    """Counts (..., C, T, H, W) of a pixel of several SPADs, each with its own dead time, summed.
+    """Pixel of several SPADs, each with its own dead time, whose counts (..., C, T, H, W) are summed.
 
     The input is the rate of the whole pixel, per cycle and bin (`PhotonBudget` with the area and the dark counts of all
-    its SPADs). `detector`: one of them, for the cycles of the exposure. They share the light evenly, or by `weights`
-    (`spads` numbers, of which only the ratios matter; 0 switches a SPAD off). A pixel of N SPADs piles up at N times
-    the light of one. SPADs in step with the laser and of equal shares are drawn at
-    once, and the cost does not depend on their number; each that runs free is a train of its own.
+    its SPADs). A pixel of N SPADs piles up at N times the light of one. SPADs in step with the laser and of equal
+    shares are drawn at once, and the cost does not depend on their number; each that runs free is a train of its own.
+    Dark counts are shared as light is, and so is the `background` of an AfterpulsingSPAD: that of the whole pixel, too.
+    One converter for all, which is dead after the first of them, is a SPAD of its own: use the detector alone.
 
-    Policies: all, those of the detector (`grad` None leaves its own). Dark counts are shared as light is,
-    and so is the `background` of an AfterpulsingSPAD: that of the whole pixel, too. One converter
-    for all, which is dead after the first of them, is a SPAD of its own: use the detector alone. Raises ShapeError for
-    another number of weights, UnitError for weights below 0.
+    Args:
+        detector: one of the SPADs, for the cycles of the exposure.
+        spads: number of SPADs.
+        weights: shares of the light, one for each SPAD, of which only the ratios matter; 0 switches a SPAD off; None
+            for equal ones.
+        grad: gradient policy; None leaves the detector's own.
+
+    Raises:
+        ShapeError: for another number of weights.
+        UnitError: for weights below 0, and other detectors.
     """
 
     takes, gives = ("rate",), "counts"
@@ -89,7 +116,11 @@ class MacroPixel(WrappedDetector):
         return [(several_of(self.detector, number, share), x * share) for share, number in self.groups]
 
     def probabilities(self, x: Tensor) -> Tensor:
-        """Expected detections of all SPADs per cycle and bin."""
+        """Expected detections of all SPADs per cycle and bin.
+
+        Args:
+            x: rate of the pixel per cycle and bin, (..., C, T, H, W).
+        """
         return self.expected(x) / cycles_of(self.detector)
 
     def expected(self, x: Tensor) -> Tensor:
@@ -106,7 +137,15 @@ class MacroPixel(WrappedDetector):
             return added(detector.sample(rate, generator) for detector, rate in self._parts(x))
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Of the sum of equal SPADs. GradientError for several shares: the sum does not tell who counted."""
+        """Log-probability of the sum of equal SPADs, summed over time.
+
+        Args:
+            measurement: counts (..., C, T, H, W).
+            x: rate of the pixel per cycle and bin, (..., C, T, H, W).
+
+        Raises:
+            GradientError: for several shares: the sum does not tell which SPAD counted.
+        """
         if len(self.groups) > 1:
             raise GradientError(
                 "MacroPixel.log_prob: expected SPADs of equal shares; the sum does not tell which of them counted. Use "
@@ -116,7 +155,12 @@ class MacroPixel(WrappedDetector):
         return detector.log_prob(measurement, rate)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The sum of what the SPADs measure, each under this policy."""
+        """Sum the measurements of the SPADs, each under the policy.
+
+        Args:
+            x: rate of the pixel per cycle and bin, (..., C, T, H, W).
+            generator: source of randomness.
+        """
         return added(detector(rate, generator=generator) for detector, rate in self._parts(x))
 
     def extra_repr(self) -> str:
@@ -124,10 +168,16 @@ class MacroPixel(WrappedDetector):
 
 
 class ZoneSum(Sensor):
-    """Counts of an image of SPADs summed over zones: (..., C, T, H, W) to (..., C, T, H / rows, W / columns).
+    """Sum the counts of an image of SPADs over zones: (..., C, T, H, W) to (..., C, T, H / rows, W / columns).
 
-    Behind detectors, crosstalk and the like, where every SPAD is a pixel of the render. Linear. Raises ShapeError for
-    an image that is not made of whole zones.
+    Behind detectors, crosstalk and the like, where every SPAD is a pixel of the render. Linear.
+
+    Args:
+        rows: SPADs of a zone along H.
+        columns: SPADs of a zone along W.
+
+    Raises:
+        ShapeError: for an image that is not made of whole zones.
     """
 
     gives = "the same"

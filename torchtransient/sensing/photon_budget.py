@@ -35,7 +35,17 @@ PLANCK_J_S = 6.626_070_15e-34  # exact by the definition of the kilogram (SI)
 
 
 def photon_energy_j(wavelength_m: float) -> float:
-    """Energy of one photon in joules: h c / wavelength. Refuses wavelengths that are none of light: 10 nm to 1 mm."""
+    """Energy of one photon: h c / wavelength.
+
+    Args:
+        wavelength_m: in metres, 10 nm to 1 mm.
+
+    Returns:
+        Joules.
+
+    Raises:
+        UnitError: for other wavelengths, such as those in nanometres.
+    """
     wavelength = check_number(wavelength_m, "wavelength_m", "photon_energy_j", open_low=True)
     if not 1e-8 <= wavelength < 1e-3:
         raise UnitError(f"photon_energy_j: expected wavelength_m in metres, got {wavelength!r}. 532 nm is 532e-9.")
@@ -44,11 +54,17 @@ def photon_energy_j(wavelength_m: float) -> float:
 
 @dataclass(frozen=True)
 class Optics:
-    """A lens and a pixel. Lengths in metres.
+    """Lens and pixel.
 
-    `f_number`: focal length over diameter of the aperture; `pixel_area_m2`: active area of a pixel; `transmission`:
-    share of light that filters and lenses let through. `solid_angle_sr` replaces what the f-number gives, for sensors
-    that are not behind a lens. Raises UnitError outside the ranges.
+    Attributes:
+        f_number: focal length over diameter of the aperture.
+        pixel_area_m2: active area of a pixel in m^2.
+        transmission: share of light that filters and lenses let through.
+        solid_angle_sr: replaces what the f-number gives, for sensors that are not behind a lens, in steradians.
+
+    Raises:
+        UnitError: outside the ranges.
+        ArgumentError: unless one of f-number and solid angle is given.
     """
 
     _: KW_ONLY
@@ -71,7 +87,17 @@ class Optics:
     def from_aperture(
         cls, focal_length_m: float, aperture_diameter_m: float, *, pixel_area_m2: float, transmission: float = 1.0
     ) -> Optics:
-        """The optics of a lens of this focal length and aperture."""
+        """Make the optics of a lens of a focal length and aperture.
+
+        Args:
+            focal_length_m: in metres.
+            aperture_diameter_m: in metres.
+            pixel_area_m2: active area of a pixel in m^2.
+            transmission: share of light that filters and lenses let through.
+
+        Raises:
+            UnitError: for f-numbers that no lens has (two units?).
+        """
         focal = check_number(focal_length_m, "focal_length_m", "Optics", open_low=True)
         diameter = check_number(aperture_diameter_m, "aperture_diameter_m", "Optics", open_low=True)
         if not 0.1 <= focal / diameter <= _DARKEST:
@@ -111,15 +137,26 @@ def ambient_photon_rate(
 ) -> float | Tensor:
     """Ambient photons per second on a pixel that sees a diffuse surface in the sun: for `PhotonBudget`.
 
-    rate = irradiance x bandwidth x illumination x albedo / pi x etendue / photon energy
-
-    `albedo`: a number or a map (H, W), (..., C, H, W), between 0 and 1; `spectral_irradiance_w_m2_nm`: of the sun on a
-    surface that faces it, W / (m^2 nm), constant over the filter of width `filter_bandwidth_m` (metres, 1 um and
-    less); `illumination`: cosine of the angle between sun and normal times the share of the sun that is not in shadow,
-    a number or a map, 0 to 1. Numbers give a number, maps a map of photons per second, differentiable in both.
+        rate = irradiance x bandwidth x illumination x albedo / pi x etendue / photon energy
 
     A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; what the
-    sky adds belongs to the irradiance. Raises UnitError outside the ranges.
+    sky adds belongs to the irradiance.
+
+    Args:
+        optics: lens and pixel.
+        albedo: a number or a map (H, W), (..., C, H, W), between 0 and 1.
+        spectral_irradiance_w_m2_nm: of the sun on a surface that faces it, W / (m^2 nm), constant over the filter.
+        filter_bandwidth_m: in metres, 1 um and less.
+        wavelength_m: in metres.
+        illumination: cosine of the angle between sun and normal times the share of the sun that is not in shadow, a
+            number or a map, 0 to 1.
+
+    Returns:
+        Photons per second: a number of numbers, a map of maps, differentiable in both.
+
+    Raises:
+        UnitError: outside the ranges.
+        ShapeError: for maps that do not broadcast.
     """
     where = "ambient_photon_rate"
     _check_optics(optics, where)
@@ -142,10 +179,14 @@ def ambient_photon_rate(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BudgetReport(TensorRecord):
-    """Where the detections of a pixel come from. Rates per laser cycle, before pile-up and dead time.
+    """Sources of the detections of a pixel. Rates per laser cycle, before pile-up and dead time.
 
-    `signal_per_cycle`: (..., C, H, W), detections of laser light; `ambient_per_cycle`, `dark_per_cycle`: the same for
-    the whole window, numbers, or maps where the budget has maps; `cycles`; `exposure_s`.
+    Attributes:
+        signal_per_cycle: detections of laser light, (..., C, H, W).
+        ambient_per_cycle: those of ambient light in the whole window, a number, or a map where the budget has maps.
+        dark_per_cycle: dark counts in the whole window, the same.
+        cycles: laser cycles of the exposure.
+        exposure_s: duration of the exposure in seconds.
     """
 
     _: KW_ONLY
@@ -171,31 +212,42 @@ class BudgetReport(TensorRecord):
 
     @property
     def piles_up(self) -> Tensor:
-        """Whether more than 5 % of the cycles have a detection, above which first-photon pile-up shows: bool."""
+        """Mask of pixels with detections in more than 5 % of the cycles, above which first-photon pile-up shows."""
         return self.signal_per_cycle + self.background_per_cycle > 0.05
 
 
 class PhotonBudget(Sensor):
     """Expected detections per laser cycle and bin of a transient (..., C, T, H, W) of radiance.
 
-    rate = transient x pulse_energy_j x etendue x quantum_efficiency / photon energy + background
+        rate = transient x pulse_energy_j x etendue x quantum_efficiency / photon energy + background
 
     The transient is rendered with an emitter of unit energy: W / (m^2 sr) per bin for a source of 1 W fired as one
-    pulse of 1 J, so that times the pulse energy it is J / (m^2 sr). `ambient_rate_hz`: ambient photons on the pixel per
-    second, after the optics (detected: times the quantum efficiency), see `ambient_photon_rate`;
-    `dark_count_rate_hz`: per pixel, see `hot_pixel_rates`. The background is spread evenly over the bins.
-    `repetition_rate_hz` and either `cycles` or `exposure_s` give the number of cycles.
+    pulse of 1 J, so that times the pulse energy it is J / (m^2 sr). The background is spread evenly over the bins.
 
-    `quantum_efficiency` (the probability that a photon is detected), `ambient_rate_hz` and `dark_count_rate_hz` are
-    numbers or maps, (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other
-    maps are buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`). Learnt
-    rates are in hertz, which no optimizer's steps suit: learn their logarithm (docs/photon_counting.md). A learnt
-    number that has left its range is a UnitError of the next measurement.
+    Maps are (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other maps are
+    buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`). Learnt rates are
+    in hertz, which no optimizer's steps suit: learn their logarithm (docs/photon_counting.md). A learnt number that has
+    left its range is a UnitError of the next measurement. Not modelled: angle dependence of the filter, speckle;
+    vignetting is a map of the efficiency as far as it acts on ambient and laser light alike.
 
-    Raises UnitError outside the ranges, for wavelengths in nanometres, for a window longer than a laser period, for
-    more than 1 kW on average, for exposures of more than an hour or of less than one cycle, ShapeError for maps of
-    other images. Not modelled: angle dependence of the filter, speckle; vignetting is a map of the efficiency as far as
-    it acts on ambient and laser light alike.
+    Args:
+        optics: lens and pixel.
+        pulse_energy_j: energy of a pulse in joules.
+        wavelength_m: in metres.
+        repetition_rate_hz: laser cycles per second.
+        cycles: laser cycles of the exposure, or
+        exposure_s: duration of the exposure in seconds.
+        quantum_efficiency: probability that a photon is detected, a number or a map.
+        ambient_rate_hz: ambient photons on the pixel per second, after the optics (detected: times the quantum
+            efficiency), a number or a map; see `ambient_photon_rate`.
+        dark_count_rate_hz: dark counts of a pixel per second, a number or a map; see `hot_pixel_rates`.
+        axis: axis of the light, or
+        bin_width_s: its bin width in seconds.
+
+    Raises:
+        UnitError: outside the ranges, for wavelengths in nanometres, for a window longer than a laser period, for more
+            than 1 kW on average, for exposures of more than an hour or of less than one cycle.
+        ShapeError: for maps of other images.
     """
 
     takes, gives = ("radiance",), "rate"
@@ -277,7 +329,11 @@ class PhotonBudget(Sensor):
 
     @in_single
     def signal(self, x: Tensor) -> Tensor:
-        """Expected detections of laser light per cycle and bin, without background."""
+        """Expected detections of laser light per cycle and bin, without background.
+
+        Args:
+            x: radiance (..., C, T, H, W).
+        """
         check_transient(x, "PhotonBudget")
         window_s = x.shape[TIME] * self.bin_width_s
         # 1 in 1e6 for rates such as 1/(T dt) that were rounded on the way
@@ -306,7 +362,14 @@ class PhotonBudget(Sensor):
 
     @in_single
     def report(self, x: Tensor) -> BudgetReport:
-        """Signal and background of every pixel, for a transient of radiance: maps where the budget has them."""
+        """Signal and background of every pixel.
+
+        Args:
+            x: radiance (..., C, T, H, W).
+
+        Returns:
+            Numbers, or maps where the budget has them.
+        """
         signal = self.signal(x).sum(TIME)
         window_s = x.shape[TIME] * self.bin_width_s
 

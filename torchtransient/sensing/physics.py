@@ -15,14 +15,21 @@ if TYPE_CHECKING:
 
 
 def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, check: bool = True) -> Physics:
-    """The sensor as a DeepInverse physics, ``y = physics(x)`` with x (B, C, T, H, W).
+    """Make a physics of DeepInverse of a sensor, ``y = physics(x)`` with x (B, C, T, H, W).
 
-    With ``img_size`` (C, T, H, W): a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from
-    them (``check`` tries the linearity on random light first: UnitError when it fails by more than 1e-4). ``A`` is the
-    linear part of the mean alone, with ``A(0) = 0``: ambient light and dark counts are ``physics.offset()``,
-    (1, ...) in the shape of a measurement, and ``physics(x)`` is a measurement less the offset. Take it off measured
-    data as well. Without ``img_size``: a `Physics` of any sensor, with ``A``, the whole mean, and ``A_vjp``. Raises
-    MissingPackageError when ``deepinv`` is not installed (``pip install 'torchtransient[deepinv]'``).
+    With ``img_size``: a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from them. ``A`` is
+    the linear part of the mean alone, with ``A(0) = 0``: ambient light and dark counts are ``physics.offset()``, (1,
+    ...) in the shape of a measurement, and ``physics(x)`` is a measurement less the offset. Take it off measured data
+    as well. Without it: a `Physics` of any sensor, with ``A``, the whole mean, and ``A_vjp``.
+
+    Args:
+        sensor: sensor or chain.
+        img_size: (C, T, H, W) of the light of a linear sensor, or None.
+        check: try the linearity on random light first.
+
+    Raises:
+        UnitError: for a sensor that fails by more than 1e-4.
+        MissingPackageError: when ``deepinv`` is not installed (``pip install 'torchtransient[deepinv]'``).
     """
     try:
         from torchtransient.sensing import deepinverse

@@ -38,10 +38,19 @@ _ROUNDING = 1e-5
 def linear_analyzers(
     angles_deg: Numbers, extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
-    """(A, 4) float64: the rows of linear analysers at the angles given.
+    """Rows of linear analysers.
 
-    ``extinction_ratio``: power along over power across, at least 1; 100 to 400 in sensor chips, infinite when ideal.
-    ``transmission``: of light along, in [0, 1]. Raises UnitError, ShapeError for no angle.
+    Args:
+        angles_deg: angles in degrees, (A,).
+        extinction_ratio: power along over power across, at least 1; 100 to 400 in sensor chips, infinite when ideal.
+        transmission: of light along, in [0, 1].
+
+    Returns:
+        (A, 4) float64.
+
+    Raises:
+        UnitError: for numbers out of range.
+        ShapeError: for no angle.
     """
     me = "linear_analyzers"
     share = _extinction(extinction_ratio, me)
@@ -57,7 +66,18 @@ def linear_analyzers(
 
 
 def circular_analyzers(extinction_ratio: float = math.inf, transmission: float = 1.0) -> Tensor:
-    """(2, 4) float64: the analysers of right and of left circular light; arguments as in `linear_analyzers`."""
+    """Rows of the analysers of right and of left circular light.
+
+    Args:
+        extinction_ratio: power of the one over power of the other, at least 1.
+        transmission: in [0, 1].
+
+    Returns:
+        (2, 4) float64.
+
+    Raises:
+        UnitError: for numbers out of range.
+    """
     share = _extinction(extinction_ratio, "circular_analyzers")
     factor = check_number(transmission, "transmission", "circular_analyzers", high=1.0)
     right, left = (circular_polarizer(hand)[0].double() for hand in (False, True))
@@ -67,7 +87,18 @@ def circular_analyzers(extinction_ratio: float = math.inf, transmission: float =
 @in_single
 @without_autocast
 def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
-    """Light behind every analyser, (..., A, C, T, H, W), of Stokes vectors (..., 4, C, T, H, W). ShapeError."""
+    """Light behind every analyser.
+
+    Args:
+        stokes: Stokes vectors (..., 4, C, T, H, W).
+        rows: analysers (A, 4).
+
+    Returns:
+        (..., A, C, T, H, W).
+
+    Raises:
+        ShapeError: for other shapes.
+    """
     _check_stokes(stokes, "analyze")
     (rows,) = reals("analyze", rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4:
@@ -78,11 +109,20 @@ def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
 @in_single
 @without_autocast
 def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
-    """Least-squares Stokes vectors (..., 4, C, T, H, W) of measurements (..., A, C, T, H, W) behind analysers (A, 4).
+    """Least-squares Stokes vectors of measurements behind analysers.
 
-    Components that the analysers cannot see (S3 behind linear ones) are zero. For 0, 45, 90, 135 degrees it is
-    ``S0 = sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see
-    `project_physical`. Raises ShapeError.
+    Components that the analysers cannot see (S3 behind linear ones) are zero. For 0, 45, 90, 135 degrees it is ``S0 =
+    sum / 2, S1 = I0 - I90, S2 = I45 - I135``. Not constrained: noise can make S0 < |S123|, see `project_physical`.
+
+    Args:
+        measurements: (..., A, C, T, H, W).
+        rows: analysers (A, 4).
+
+    Returns:
+        (..., 4, C, T, H, W).
+
+    Raises:
+        ShapeError: for other shapes.
     """
     measurements, rows = reals("stokes_from", measurements=measurements, rows=rows)
     if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
@@ -105,7 +145,18 @@ def _by_rows(matrix: Tensor, x: Tensor) -> Tensor:
 
 @in_single
 def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
-    """``max(|S123| - S0, 0)``, without ``dim``: zero for every Stokes vector that light can have. ShapeError."""
+    """Excess of polarized over all light, ``max(|S123| - S0, 0)``: zero for every Stokes vector that light can have.
+
+    Args:
+        stokes: Stokes vectors, four components along ``dim``.
+        dim: their dimension.
+
+    Returns:
+        The shape without ``dim``.
+
+    Raises:
+        ShapeError: for another number of components.
+    """
     (stokes,) = reals("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
@@ -113,10 +164,20 @@ def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
 @in_single
 def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
-    """The nearest Stokes vectors that light can have (S0 >= |S123|), in the same shape.
+    """Nearest Stokes vectors that light can have (S0 >= |S123|).
 
     Euclidean projection onto the cone: with excess ``|S123| > S0`` both become ``(S0 + |S123|) / 2``, and zero where
-    that is negative. Continuous, with gradients that are finite everywhere (zero in dark). ShapeError.
+    that is negative. Continuous, with gradients that are finite everywhere (zero in dark).
+
+    Args:
+        stokes: Stokes vectors, four components along ``dim``.
+        dim: their dimension.
+
+    Returns:
+        Shape of ``stokes``.
+
+    Raises:
+        ShapeError: for another number of components.
     """
     (stokes,) = reals("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
@@ -146,13 +207,18 @@ def _parts(stokes: Tensor, dim: int) -> tuple[Tensor, Tensor]:
 
 
 class PolarizationMosaic(Sensor):
-    """A sensor chip with one analyser per pixel: Stokes (..., 4, C, T, H, W) to raw light (..., C, T, H, W).
+    """Sensor chip with one analyser per pixel: Stokes (..., 4, C, T, H, W) to raw light (..., C, T, H, W).
 
-    ``rows``: (P, Q, 4), the analysers of a block of P x Q pixels that repeats from the top left pixel; `polarsens` and
-    `mosaic_rows` make them. A gather: every pixel sees its own analyser, nothing is interpolated. Differentiable.
-    Values that rounding leaves below zero (within 1e-5 of S0) become zero; light that no Stokes vector can have stays
-    as it is, for the photon counting behind to refuse: see `project_physical`. Crosstalk between pixels is a spatial
-    spread behind this stage.
+    A gather: every pixel sees its own analyser, nothing is interpolated. Differentiable. Values that rounding leaves
+    below zero (within 1e-5 of S0) become zero; light that no Stokes vector can have stays as it is, for the photon
+    counting behind to refuse: see `project_physical`. Crosstalk between pixels is a spatial spread behind this stage.
+
+    Args:
+        rows: (P, Q, 4), the analysers of a block of P x Q pixels that repeats from the top left pixel; `polarsens` and
+            `mosaic_rows` make them.
+
+    Raises:
+        ShapeError: for other shapes.
     """
 
     rows: Tensor
@@ -166,11 +232,21 @@ class PolarizationMosaic(Sensor):
 
     @classmethod
     def polarsens(cls, extinction_ratio: float = 300.0, transmission: float = 1.0) -> PolarizationMosaic:
-        """The arrangement of Sony's IMX250MZR: 90, 45 over 135, 0 degrees."""
+        """Make the arrangement of Sony's IMX250MZR: 90, 45 over 135, 0 degrees.
+
+        Args:
+            extinction_ratio: as of `linear_analyzers`.
+            transmission: as of `linear_analyzers`.
+        """
         return cls(mosaic_rows(POLARSENS_DEG, extinction_ratio, transmission))
 
     def weights(self, height: int, width: int) -> Tensor:
-        """(4, H, W): the analyser of every pixel."""
+        """Analyser of every pixel, (4, H, W).
+
+        Args:
+            height: pixels.
+            width: pixels.
+        """
         p, q = self.rows.shape[:2]
         tiles = self.rows.repeat(-(-height // p), -(-width // q), 1)
         return tiles[:height, :width].movedim(-1, 0)
@@ -183,11 +259,25 @@ class PolarizationMosaic(Sensor):
         return torch.where((raw < 0) & (raw >= slack), 0.0, raw)
 
     def demosaic(self, raw: Tensor) -> Tensor:
-        """(..., P Q, C, T, H, W): the light behind each analyser everywhere, interpolated; see `demosaic`."""
+        """Light behind each analyser everywhere, interpolated; see `demosaic`.
+
+        Args:
+            raw: (..., C, T, H, W).
+
+        Returns:
+            (..., P Q, C, T, H, W).
+        """
         return demosaic(raw, (int(self.rows.shape[0]), int(self.rows.shape[1])))
 
     def stokes(self, raw: Tensor) -> Tensor:
-        """(..., 4, C, T, H, W): Stokes vectors of raw light (..., C, T, H, W), by `demosaic` and least squares."""
+        """Stokes vectors of raw light, by `demosaic` and least squares.
+
+        Args:
+            raw: (..., C, T, H, W).
+
+        Returns:
+            (..., 4, C, T, H, W).
+        """
         return stokes_from(self.demosaic(raw), self.rows.flatten(0, 1))
 
 
@@ -199,7 +289,20 @@ def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
 def mosaic_rows(
     angles_deg: Sequence[Sequence[float]], extinction_ratio: float = math.inf, transmission: float = 1.0
 ) -> Tensor:
-    """(P, Q, 4): rows of linear analysers at the angles of a block of pixels; arguments as `linear_analyzers`."""
+    """Rows of linear analysers of a block of pixels.
+
+    Args:
+        angles_deg: (P, Q) angles in degrees.
+        extinction_ratio: as of `linear_analyzers`.
+        transmission: as of `linear_analyzers`.
+
+    Returns:
+        (P, Q, 4) float64.
+
+    Raises:
+        ShapeError: for rows of unequal length.
+        UnitError: for numbers out of range.
+    """
     if isinstance(angles_deg, Tensor):
         check_dense(angles_deg, "mosaic_rows", "angles_deg")
     rows = angles_deg.tolist() if hasattr(angles_deg, "tolist") else angles_deg
@@ -214,11 +317,20 @@ def mosaic_rows(
 @in_single
 @without_autocast
 def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
-    """(..., P Q, C, T, H, W) from raw light (..., C, T, H, W): every pixel of a block spread over the others.
+    """Interpolate the pixels of each kind in a mosaic over all others.
 
     Linear interpolation between the pixels of one kind, P and Q apart; at the rim, of those there are, weighted the
-    same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Order: row by row
-    within the block. Linear in the light. Raises ShapeError for less than one block.
+    same. A constant picture stays constant, and the pixels themselves keep their values for 2 x 2. Linear in the light.
+
+    Args:
+        raw: (..., C, T, H, W).
+        block: sizes P and Q of a block.
+
+    Returns:
+        (..., P Q, C, T, H, W), row by row within the block.
+
+    Raises:
+        ShapeError: for less than one block.
     """
     (raw,) = reals("demosaic", raw=raw)
     sizes: list[Any] = several("demosaic: block", block, "numbers of pixels")
@@ -246,9 +358,15 @@ def _tent(period: int) -> Tensor:
 
 
 class Analyzers(Sensor):
-    """Pictures one after another behind the analysers ``rows`` (A, 4): (..., 4, C, T, H, W) to (..., A, C, T, H, W).
+    """Pictures one after another behind analysers: (..., 4, C, T, H, W) to (..., A, C, T, H, W).
 
     A rotating polarizer, or a set of filters. As in `PolarizationMosaic`, rounding below zero becomes zero.
+
+    Args:
+        rows: analysers (A, 4).
+
+    Raises:
+        ShapeError: for other shapes.
     """
 
     rows: Tensor
@@ -266,7 +384,14 @@ class Analyzers(Sensor):
         return torch.where((light < 0) & (light >= slack), 0.0, light)
 
     def stokes(self, measurements: Tensor) -> Tensor:
-        """(..., 4, C, T, H, W): least-squares Stokes vectors of the pictures."""
+        """Least-squares Stokes vectors of the pictures.
+
+        Args:
+            measurements: (..., A, C, T, H, W).
+
+        Returns:
+            (..., 4, C, T, H, W).
+        """
         return stokes_from(measurements, self.rows)
 
 

@@ -20,7 +20,7 @@ _GATES_S = [round(0.68e-9 + 0.34e-9 * k, 14) for k in range(64)]
 
 
 def _chip_budget(cycles: int, repetition_rate_hz: float) -> dict[str, Any]:
-    """Consumer chips say little about their insides: the same assumptions for all of them."""
+    """Budget of consumer chips, which say little about their insides: the same assumptions for all of them."""
     return {
         "kind": "PhotonBudget",
         "optics": {"kind": "Optics", "f_number": 2.0, "pixel_area_m2": 1e-8, "transmission": 0.6},
@@ -42,19 +42,19 @@ def _zone() -> dict[str, Any]:
 
 
 def _pulse(response: dict[str, Any]) -> dict[str, Any]:
-    """The shape of the light: in front of the budget, which adds what is constant."""
+    """Shape of the light: in front of the budget, which adds what is constant."""
     return {"kind": "ImpulseResponse", "response": response, "axis": _AXIS}
 
 
 def _jitter(response: dict[str, Any]) -> dict[str, Any]:
-    """What moves detections: behind the detector."""
+    """Jitter of detections: behind the detector."""
     return {"kind": "DetectionJitter", "response": response, "axis": _AXIS}
 
 
 def _counter(
     name: str, label: str, bin_width_s: float, jitter_fwhm_s: float, sources: tuple[str, ...], **counting: Any
 ) -> Device:
-    """A counter; ``counting``: arguments of its `SynchronousSPAD`, none where it counts once per cycle."""
+    """Counter; ``counting``: arguments of its `SynchronousSPAD`, none where it counts once per cycle."""
     often = "several detections" if counting else "one detection"
     return Device(
         name=name,
@@ -361,7 +361,14 @@ DEVICES = {d.name: d for d in _DEVICES}
 
 
 def device(name: str) -> Device:
-    """The device of that name; `DEVICES` holds them all. Raises ArgumentError for another name."""
+    """Return the device of a name; `DEVICES` holds them all.
+
+    Args:
+        name: of the device.
+
+    Raises:
+        ArgumentError: for another name.
+    """
     if not isinstance(name, str) or name not in DEVICES:
         raise ArgumentError(f"device: expected one of {', '.join(sorted(DEVICES))}, got {shown(name)}.")
     return DEVICES[name]

@@ -8,21 +8,18 @@ into the middle. Parameters can be learnt: positive ones are kept as logarithms 
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import MOST_MADE, Numbers, as_whole, is_one_of, several, shown
+from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_number, check_seconds, going_together, one_number, reals
 from torchtransient.sensing.parameters import remembered
 from torchtransient.sensing.sensor import PhysicalModule
-from torchtransient.sensing.time_convolution import filter_rows
 
 # --------------------------------------------------------------------------------------------------------- closed forms
 
@@ -31,13 +28,21 @@ FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))  # 2.3548
 
 
 def normal_cdf(u: Tensor) -> Tensor:
-    """Cumulative normal distribution; keeps relative precision for u far below 0."""
+    """Cumulative normal distribution, with relative precision for u far below 0.
+
+    Args:
+        u: standard deviations above the mean, any shape.
+    """
     share: Tensor = 0.5 * torch.special.erfc(-u / math.sqrt(2))
     return share
 
 
 def normal_integral(u: Tensor) -> Tensor:
-    """Integral of `normal_cdf` up to u: u Phi(u) + phi(u). Keeps 1e-13 of itself down to u = -30."""
+    """Integral of `normal_cdf` up to u: u Phi(u) + phi(u), to 1e-13 of itself down to u = -30.
+
+    Args:
+        u: standard deviations above the mean, any shape.
+    """
     return u * normal_cdf(u) + torch.exp(-0.5 * u * u) / math.sqrt(2 * math.pi)
 
 
@@ -58,10 +63,22 @@ def _tail_term(u: Tensor, ratio: Tensor) -> Tensor:
 
 
 def emg_density(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
-    """Density (1/s) of a normal delay plus an exponential one: the exponentially modified Gaussian.
+    """Density of a normal delay plus an exponential one: the exponentially modified Gaussian.
 
-    `mean_s`, `sigma_s`: of the normal part; `tau_s`: mean of the exponential part. Stable for every ratio of the two.
-    Source: Grushka, Anal. Chem. 44 (1972); erfcx form as in Kalambet et al., J. Chemometrics 25 (2011).
+    Stable for every ratio of the two. Source: Grushka, Anal. Chem. 44 (1972); erfcx form as in Kalambet et al., J.
+    Chemometrics 25 (2011).
+
+    Args:
+        time_s: times in seconds; all arguments broadcast.
+        mean_s: mean of the normal part, in seconds.
+        sigma_s: standard deviation of the normal part, in seconds.
+        tau_s: mean of the exponential part, in seconds.
+
+    Returns:
+        Density in 1/s.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
     """
     given = going_together("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
     time_s, mean_s, sigma_s, tau_s = given
@@ -69,7 +86,17 @@ def emg_density(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) 
 
 
 def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
-    """Share of `emg_density` before `time_s`."""
+    """Share of an exponentially modified Gaussian before each time.
+
+    Args:
+        time_s: times in seconds; all arguments broadcast.
+        mean_s: mean of the normal part, in seconds.
+        sigma_s: standard deviation of the normal part, in seconds.
+        tau_s: mean of the exponential part, in seconds.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
+    """
     given = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
     time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
@@ -77,7 +104,17 @@ def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> T
 
 
 def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
-    """Share of `emg_density` after `time_s`, with relative precision far out in the tail."""
+    """Share of an exponentially modified Gaussian after each time, with relative precision far out in the tail.
+
+    Args:
+        time_s: times in seconds; all arguments broadcast.
+        mean_s: mean of the normal part, in seconds.
+        sigma_s: standard deviation of the normal part, in seconds.
+        tau_s: mean of the exponential part, in seconds.
+
+    Raises:
+        ShapeError: for shapes that do not broadcast.
+    """
     given = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
     time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
@@ -85,15 +122,33 @@ def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor)
 
 
 def normal_integrals(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor) -> tuple[Tensor, Tensor]:
-    """Integrals of the cumulative normal up to each time and of its survival from there on, in seconds."""
+    """Integrals of the cumulative normal up to each time and of its survival from there on.
+
+    Args:
+        time_s: times in seconds.
+        mean_s: mean in seconds.
+        sigma_s: standard deviation in seconds.
+
+    Returns:
+        Both in seconds.
+    """
     u = (time_s - mean_s) / sigma_s
     return sigma_s * normal_integral(u), sigma_s * normal_integral(-u)
 
 
 def emg_integrals(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> tuple[Tensor, Tensor]:
-    """Integrals of `emg_cdf` up to each time and of `emg_survival` from there on, in seconds.
+    """Integrals of `emg_cdf` up to each time and of `emg_survival` from there on.
 
     The tail term is tau times the density, so that its integral is tau times the cumulative.
+
+    Args:
+        time_s: times in seconds.
+        mean_s: mean of the normal part, in seconds.
+        sigma_s: standard deviation of the normal part, in seconds.
+        tau_s: mean of the exponential part, in seconds.
+
+    Returns:
+        Both in seconds.
     """
     below, above = normal_integrals(time_s, mean_s, sigma_s)
     cdf, survival = emg_cdf(time_s, mean_s, sigma_s, tau_s), emg_survival(time_s, mean_s, sigma_s, tau_s)
@@ -101,10 +156,19 @@ def emg_integrals(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor
 
 
 def integrated_counts(counts: Tensor, width_s: float, time_s: Tensor, start_s: float | Tensor = 0.0) -> Tensor:
-    """Integral, up to each time, of the counts that lie before: (K,) float64, counts times seconds.
+    """Integrate, up to each time, the counts that lie before.
 
-    `counts`: (T,) in bins of `width_s` from `start_s` on, spread evenly over each bin, so that the result is quadratic
-    inside the bins. `time_s`: (K,). Differentiable in the counts, the times and the start.
+    Counts are spread evenly over each bin, so that the result is quadratic inside the bins. Differentiable in the
+    counts, the times and the start.
+
+    Args:
+        counts: (T,).
+        width_s: bin width in seconds.
+        time_s: times (K,) in seconds.
+        start_s: start of the first bin in seconds.
+
+    Returns:
+        (K,) float64, counts times seconds.
     """
     values = counts.to(torch.float64)
     before = torch.nn.functional.pad(values.cumsum(0), (1, 0))
@@ -119,10 +183,23 @@ def integrated_counts(counts: Tensor, width_s: float, time_s: Tensor, start_s: f
 
 
 def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s: float | Tensor = 0.0) -> Tensor:
-    """Counts between new edges, by integrating: a bin's counts are spread evenly over it, and sums are conserved.
+    """Resample a histogram to new bins by integrating: sums are conserved.
 
-    `counts`: (T,) in bins of `width_s` from `start_s` on; `edges_s`: (K + 1,) increasing; returns (K,) float64. What
-    lies outside the new edges is left out. Differentiable in the counts, the edges and the start.
+    Counts are spread evenly over each bin; those outside of the new edges are left out. Differentiable in the counts,
+    the edges and the start.
+
+    Args:
+        counts: (T,).
+        width_s: bin width in seconds.
+        edges_s: new edges (K + 1,) in seconds, increasing.
+        start_s: start of the first bin in seconds.
+
+    Returns:
+        (K,) float64.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for numbers that are not real.
     """
     me = "resample_counts"
     counts, edges_s = reals(me, torch.float64, counts=counts, edges_s=edges_s)
@@ -139,10 +216,19 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
 
 
 def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
-    """A measured histogram without its background, not below 0, sum 1: float64.
+    """Take the background off a measured histogram and normalise the rest.
 
-    `floor` True: the median of all bins, which is the background when the response fills less than half of them; False:
-    none; a number: so many counts of every bin. Raises UnitError for other floors, and where nothing is left.
+    Args:
+        counts: (T,).
+        floor: True for the median of all bins, which is the background when the response fills less than half of them;
+            False for none; a number of counts of every bin.
+        where: name of the caller, for errors.
+
+    Returns:
+        (T,) float64, not below 0, sum 1.
+
+    Raises:
+        UnitError: for other floors, and where nothing is left.
     """
     numbers = counts.to(torch.float64)
     level = floor if isinstance(floor, (bool, np.bool_)) else check_number(floor, "floor", where)
@@ -168,12 +254,18 @@ _MOST_PANELS = 4096
 
 
 class Response(PhysicalModule):
-    """A distribution of delays. Subclasses give `cdf` and the `support_s` outside which nothing matters.
+    """Base of distributions of delays.
 
-    `survival` and `integrals` are for better digits and less time: without them `kernel` is right to 1e-9 where `cdf`
-    is smooth over an eighth of the support, and to 1e-3 where it has corners.
+    A subclass defines `cdf` and `support_s`. `survival` and `integrals` are for better digits and less time: without
+    them `kernel` is right to 1e-9 where `cdf` is smooth over an eighth of the support, and to 1e-3 where it has
+    corners.
 
-    `learnable`: whether the numbers are `nn.Parameter`s or buffers.
+    Args:
+        delay_s: shift in seconds.
+        learnable: make the numbers `nn.Parameter`s in place of buffers.
+
+    Raises:
+        UnitError: for delays of a millisecond and more.
     """
 
     delay_ps: Tensor
@@ -204,37 +296,62 @@ class Response(PhysicalModule):
         return self.delay_ps.double() * 1e-12
 
     def cdf(self, time_s: Tensor) -> Tensor:
-        """Share of the response before each time, float64, differentiable in time and parameters."""
+        """Share of the response before each time, float64, differentiable in time and parameters.
+
+        Args:
+            time_s: any shape, in seconds.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define cdf.")
 
     def survival(self, time_s: Tensor) -> Tensor:
-        """Share of the response after each time; 1 - cdf with better digits where the subclass has them."""
+        """Share of the response after each time.
+
+        Args:
+            time_s: any shape, in seconds.
+        """
         return 1 - self.cdf(time_s)
 
     def support_s(self) -> tuple[float, float]:
-        """Times between which all but about 1e-9 of the response lies."""
+        """Return the times in seconds between which all but about 1e-9 of the response lies."""
         raise NotImplementedError(f"{type(self).__name__} has to define support_s.")
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Integral of `cdf` up to each time (K,) and of `survival` from there on, in seconds, float64.
+        """Integrals of `cdf` up to each time and of `survival` from there on, float64, in seconds.
 
-        None where a subclass has no closed form: `kernel` then integrates `cdf` and `survival` numerically.
+        Args:
+            time_s: (K,), in seconds.
+
+        Returns:
+            None without a closed form: `kernel` then integrates `cdf` and `survival` numerically.
         """
         return None
 
     def mass(self, edges_s: Tensor) -> Tensor:
-        """Share between consecutive edges (K + 1,): (K,). Tails keep their relative precision.
+        """Share between consecutive edges, with relative precision in the tails.
 
-        This is what bins hold of light that arrives at one known time; `kernel` is for light that is known to a bin.
+        Shares of bins for light that arrives at one known time; `kernel` is for light that is known to a bin.
+
+        Args:
+            edges_s: (K + 1,), in seconds.
+
+        Returns:
+            (K,).
         """
         return _between(self.cdf(edges_s), self.survival(edges_s))
 
     def kernel(self, bin_width_s: float, within_bin: WithinBin = "uniform") -> tuple[int, Tensor]:
-        """(first, (K,) float64): shares of the light of a bin that arrive `first + k` bins later, summing to 1.
+        """Shares of the light of a bin that arrive some bins later.
 
-        `within_bin` "uniform": light lies evenly in its bin, exact by the second difference of the integrated
-        distribution; "center": all of it in the middle. Raises UnitError for parameters that are not finite and for
-        responses of more than 2^24 bins.
+        Args:
+            bin_width_s: bin width in seconds.
+            within_bin: "uniform" for light that lies evenly in its bin, exact by the second difference of the
+                integrated distribution; "center" for light in the middle.
+
+        Returns:
+            First lag in bins, and shares (K,) float64 of the lags from there on, summing to 1.
+
+        Raises:
+            UnitError: for parameters that are not finite and for responses of more than 2^24 bins.
         """
         check_choice(within_bin, WithinBin, "within_bin", type(self).__name__)
         first, last = self._lags(bin_width_s)
@@ -295,7 +412,18 @@ def _between(below: Tensor, above: Tensor) -> Tensor:
 
 
 def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
-    """`response.kernel`; responses with a kernel of their own need not know of the default `within_bin`. Remembered."""
+    """Return `Response.kernel`, from a cache while nothing is learnt.
+
+    A response with a kernel of its own may leave out the argument `within_bin`.
+
+    Args:
+        response: the response.
+        bin_width_s: bin width in seconds.
+        within_bin: "uniform" or "center".
+
+    Returns:
+        First lag in bins, and shares (K,).
+    """
 
     def kernel() -> tuple[int, Tensor]:
         return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
@@ -304,7 +432,16 @@ def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> 
 
 
 class GaussianResponse(Response):
-    """A normal distribution around `delay_s`, full width at half maximum `fwhm_s` (2.3548 standard deviations)."""
+    """Normal distribution of delays.
+
+    Args:
+        fwhm_s: full width at half maximum in seconds, 2.3548 standard deviations.
+        delay_s: mean in seconds.
+        learnable: learn the logarithm of the width, and the delay in picoseconds.
+
+    Raises:
+        UnitError: for numbers that are no seconds.
+    """
 
     def __init__(self, fwhm_s: float, delay_s: float = 0.0, *, learnable: bool = False) -> None:
         super().__init__(delay_s, learnable)
@@ -335,7 +472,16 @@ class GaussianResponse(Response):
 
 
 class UniformResponse(Response):
-    """Equal probability over `width_s` around `delay_s`: a clock without dither, or a square pulse."""
+    """Equal probability over a width: a clock without dither, or a square pulse.
+
+    Args:
+        width_s: full width in seconds.
+        delay_s: middle in seconds.
+        learnable: learn the logarithm of the width, and the delay in picoseconds.
+
+    Raises:
+        UnitError: for numbers that are no seconds.
+    """
 
     def __init__(self, width_s: float, delay_s: float = 0.0, *, learnable: bool = False) -> None:
         super().__init__(delay_s, learnable)
@@ -364,12 +510,22 @@ def _ramp_integral(u: Tensor) -> Tensor:
 
 
 class TailedResponse(Response):
-    """A Gaussian core and exponential diffusion tails: fraction_0 N + sum of fraction_i (N + Exp(tail_s[i])).
+    """Gaussian core with exponential diffusion tails: fraction_0 N + sum of fraction_i (N + Exp(tail_s[i])).
 
-    `tails_s`: mean delays of the tails; `fractions`: share of light in each of them, positive, in all at most 1 (the
-    rest is the pure Gaussian). One tail of fraction 1 is the exponentially modified Gaussian; two tails are the model
-    of Hernandez et al., A computational model of a single-photon avalanche diode sensor (arXiv 1703.02635).
-    `delay_s` is that of the Gaussian; the mean lies sum(fraction_i tail_i) later.
+    One tail of fraction 1 is the exponentially modified Gaussian; two tails are the model of Hernandez et al., A
+    computational model of a single-photon avalanche diode sensor (arXiv 1703.02635). The mean lies sum(fraction_i
+    tail_i) behind `delay_s`.
+
+    Args:
+        fwhm_s: full width at half maximum of the core, in seconds.
+        tails_s: mean delays of the tails, in seconds.
+        fractions: share of light in each tail, positive, in all at most 1; the core has the rest.
+        delay_s: delay of the core, in seconds.
+        learnable: learn logarithms of widths, logits of shares, and the delay in picoseconds.
+
+    Raises:
+        ShapeError: for unequal numbers of tails and fractions.
+        UnitError: for numbers out of range.
     """
 
     log_tails_s: Tensor
@@ -436,12 +592,24 @@ class TailedResponse(Response):
         return self.widened_survival(time_s, self.delay_s, self.sigma_s)
 
     def widened_cdf(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`cdf` with another delay and core: of what this response and normal ones make together."""
+        """`cdf` with another delay and core, of this response and normal ones together.
+
+        Args:
+            time_s: times in seconds.
+            delay_s: delay of the core.
+            sigma_s: standard deviation of the core.
+        """
         tail = emg_cdf(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
         return self._mix(time_s, normal_cdf((time_s - delay_s) / sigma_s), tail)
 
     def widened_survival(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`survival` of the same."""
+        """`survival` with another delay and core.
+
+        Args:
+            time_s: times in seconds.
+            delay_s: delay of the core.
+            sigma_s: standard deviation of the core.
+        """
         tail = emg_survival(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
         return self._mix(time_s, normal_cdf((delay_s - time_s) / sigma_s), tail)
 
@@ -449,7 +617,13 @@ class TailedResponse(Response):
         return self.widened_integrals(time_s, self.delay_s, self.sigma_s)
 
     def widened_integrals(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> tuple[Tensor, Tensor]:
-        """`integrals` with another delay and core: what this response and normal ones make together."""
+        """`integrals` with another delay and core.
+
+        Args:
+            time_s: times in seconds.
+            delay_s: delay of the core.
+            sigma_s: standard deviation of the core.
+        """
         core = normal_integrals(time_s, delay_s, sigma_s)
         tail = emg_integrals(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
         below, above = (self._mix(time_s, c, t) for c, t in zip(core, tail, strict=True))
@@ -461,205 +635,12 @@ class TailedResponse(Response):
 
 
 def emg_response(fwhm_s: float, tau_s: float, delay_s: float = 0.0, *, learnable: bool = False) -> TailedResponse:
-    """The exponentially modified Gaussian: normal jitter of `fwhm_s` plus an exponential delay of mean `tau_s`."""
+    """Make an exponentially modified Gaussian: normal jitter plus an exponential delay.
+
+    Args:
+        fwhm_s: full width at half maximum of the normal part, in seconds.
+        tau_s: mean of the exponential part, in seconds.
+        delay_s: delay of the normal part, in seconds.
+        learnable: as of `TailedResponse`.
+    """
     return TailedResponse(fwhm_s, [tau_s], [1.0], delay_s=delay_s, learnable=learnable)
-
-
-# -------------------------------------------------------------------------------------- measured and composed responses
-
-
-_TABLE = 2000  # bins of a response without a closed form
-
-
-class MeasuredResponse(Response):
-    """A measured histogram `counts` (T,) in bins of `bin_width_s`, resampled by integrating.
-
-    `floor`: what is taken off as background: True the median of all bins, False nothing, or a number of counts of every
-    bin. The rest is normalised to 1. `align`
-    "center_of_mass" puts the mean delay at `delay_s` (the highest bin would shift an asymmetric response by about its
-    tail); "start" puts the start of the first bin there. `learnable` makes the delay and the shape (as logits) learnt.
-    """
-
-    shares: Tensor
-
-    share_logits: Tensor
-
-    def __init__(
-        self,
-        counts: Tensor,
-        bin_width_s: float,
-        delay_s: float = 0.0,
-        *,
-        align: str = "center_of_mass",
-        floor: float | bool = True,
-        learnable: bool = False,
-    ) -> None:
-        super().__init__(delay_s, learnable)
-        if not isinstance(counts, Tensor) or counts.ndim != 1 or counts.numel() < 2:
-            shape = tuple(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
-            raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {shape}.")
-        if not is_one_of(align, ("center_of_mass", "start")):
-            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {shown(align)}.")
-        self.bin_width_s = check_seconds(bin_width_s, "bin_width_s", "MeasuredResponse", open_low=True)
-        values = reals("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
-        if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
-            raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
-        shares = above_floor(values, floor, "MeasuredResponse")
-        self.align = align
-        if self.learnable:
-            # a bin without light starts at e^-30 of the whole, so that it can be learnt at all
-            self.register_parameter("share_logits", nn.Parameter(shares.clamp_min(1e-13).log()))
-        else:
-            self.register_buffer("shares", shares)
-
-    def _shares(self) -> Tensor:
-        if self.learnable:
-            logits: Tensor = self.share_logits
-            return logits.double().softmax(0)
-        return self.shares.double()
-
-    def _start_s(self, shares: Tensor) -> Tensor:
-        if self.align == "start":
-            return self.delay_s
-        middles = (torch.arange(shares.numel(), dtype=torch.float64, device=shares.device) + 0.5) * self.bin_width_s
-        return self.delay_s - (shares * middles).sum()
-
-    def cdf(self, time_s: Tensor) -> Tensor:
-        shares = self._shares()
-        start = self._start_s(shares)
-        flat = time_s.reshape(-1)
-        # resample_counts from far before the response to each time, as one running sum
-        edges = torch.cat([(start - self.bin_width_s).reshape(1), flat])
-        total = resample_counts(shares, self.bin_width_s, edges, start_s=start).cumsum(0)
-        return total.reshape(time_s.shape)
-
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        shares = self._shares()
-        start = self._start_s(shares)
-        end = start + shares.numel() * self.bin_width_s
-        # seen from its end, the response runs the other way
-        above = integrated_counts(shares.flip(0), self.bin_width_s, end - time_s)
-        return integrated_counts(shares, self.bin_width_s, time_s, start), above
-
-    def support_s(self) -> tuple[float, float]:
-        shares = self._shares()
-        start = float(self._start_s(shares).detach())
-        kept = torch.nonzero(shares > 1e-12).flatten()
-        return start + int(kept[0]) * self.bin_width_s, start + (int(kept[-1]) + 1) * self.bin_width_s
-
-
-class ComposedResponse(Response):
-    """Independent delays one after another: laser pulse, detector jitter, timing electronics. Variances add.
-
-    Normal ones, with at most one `TailedResponse` among them, have a closed form. Others are convolved on a grid
-    `oversampling` (odd) times finer than the bins, and gathered into bins at the end. The grid keeps the mean and adds
-    a variance of (bin width/oversampling)^2/6 for each; with `within_bin="center"` half of that.
-    """
-
-    def __init__(self, responses: Sequence[Response], *, oversampling: int = 9) -> None:
-        super().__init__(0.0, learnable=False)
-        responses = several("ComposedResponse", responses, "responses such as GaussianResponse")
-        if len(responses) == 0:
-            raise ShapeError("ComposedResponse: expected at least one response, got none.")
-        wrong = [type(r).__name__ for r in responses if not isinstance(r, Response)]
-        if wrong:
-            raise ShapeError(f"ComposedResponse: expected responses such as GaussianResponse, got {wrong}.")
-        odd = as_whole(oversampling)
-        if odd is None or odd < 1 or odd % 2 == 0 or odd > MOST_MADE:
-            raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {shown(oversampling)}.")
-        self.responses = nn.ModuleList(responses)
-        self.oversampling = odd
-
-    def _normal_part(self) -> tuple[TailedResponse | None, Tensor, Tensor] | None:
-        """The one tailed response, delay and standard deviation of all cores; None where that is not all there is."""
-        parts = list(self.responses)
-        tailed = [r for r in parts if isinstance(r, TailedResponse)]
-        if len(tailed) > 1 or not all(isinstance(r, (GaussianResponse, TailedResponse)) for r in parts):
-            return None
-        delay = torch.stack([r.delay_s for r in parts]).sum()  # type: ignore[misc]
-        sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()  # type: ignore[misc]
-        return (tailed[0] if tailed else None), delay, sigma
-
-    def cdf(self, time_s: Tensor) -> Tensor:
-        """Without a closed form: from a histogram of 2000 bins, 1e-6 off where the parts are of one size."""
-        if len(self.responses) == 1:
-            return self.responses[0].cdf(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            return _below(shares, width_s, start_s, time_s)
-        tailed, delay, sigma = found
-        return normal_cdf((time_s - delay) / sigma) if tailed is None else tailed.widened_cdf(time_s, delay, sigma)
-
-    def survival(self, time_s: Tensor) -> Tensor:
-        if len(self.responses) == 1:
-            return self.responses[0].survival(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            # seen from its end, the response runs the other way
-            return _below(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_cdf((delay - time_s) / sigma)
-        above: Tensor = tailed.widened_survival(time_s, delay, sigma)
-        return above
-
-    def _table(self) -> tuple[Tensor, float, float]:
-        """Shares (K,) in bins of a width that suits the response, and where the first begins."""
-        low, high = self.support_s()
-        width_s = (high - low) / _TABLE
-        first, shares = self.kernel(width_s)
-        return shares, width_s, (first - 0.5) * width_s
-
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        found = self._normal_part()
-        if found is None:
-            return None
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_integrals(time_s, delay, sigma)
-        return tailed.widened_integrals(time_s, delay, sigma)
-
-    def support_s(self) -> tuple[float, float]:
-        # the sum of all supports holds all of it, and more
-        ends = [r.support_s() for r in self.responses]  # type: ignore[operator]
-        return sum(low for low, _ in ends), sum(high for _, high in ends)
-
-    def kernel(self, bin_width_s: float, within_bin: WithinBin = "uniform") -> tuple[int, Tensor]:
-        check_choice(within_bin, WithinBin, "within_bin", "ComposedResponse")
-        if len(self.responses) == 1:
-            return kernel_of(self.responses[0], bin_width_s, within_bin)  # type: ignore[arg-type]
-        if within_bin == "uniform" and self._normal_part() is not None:
-            first, last = self._lags(bin_width_s)
-            if last - first <= CLOSED_BINS:
-                return super().kernel(bin_width_s)
-        fine = self.oversampling
-        parts = [kernel_of(r, bin_width_s / fine, within_bin) for r in self.responses]  # type: ignore[arg-type]
-        first = sum(begin for begin, _ in parts)
-        total = functools.reduce(_full_convolution, [weights for _, weights in parts])
-        # a fine lag goes to the bin round(lag/fine), or, where light is spread evenly, to two bins by linear shares,
-        # which are `fine` such roundings from all places of a bin
-        places = [(fine - 1) // 2] if within_bin == "center" else range(fine)
-        coarse = first // fine
-        tops = [_gathered(total, first + place - coarse * fine, fine, len(total) // fine + 3) for place in places]
-        shares = torch.stack(tops).mean(0)
-        return coarse, shares / shares.sum()
-
-
-def _below(shares: Tensor, width_s: float, start_s: float, time_s: Tensor) -> Tensor:
-    """Sum of a histogram before each time, even within its bins."""
-    times = time_s.reshape(-1)
-    edges = torch.cat([times.new_full((1,), start_s - width_s), times])
-    return resample_counts(shares, width_s, edges, start_s=start_s).cumsum(0).reshape(time_s.shape)
-
-
-def _gathered(fine_shares: Tensor, before: int, fine: int, bins: int) -> Tensor:
-    """Sums over `fine` neighbours each, the first entry standing `before` entries into the first of `bins` sums."""
-    padded = torch.nn.functional.pad(fine_shares, (before, bins * fine - before - fine_shares.numel()))
-    return padded.view(bins, fine).sum(1)
-
-
-def _full_convolution(a: Tensor, b: Tensor) -> Tensor:
-    length = a.numel() + b.numel() - 1
-    return filter_rows(a, torch.fft.rfft(b, n=length), length, 0, length)

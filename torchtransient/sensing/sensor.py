@@ -53,23 +53,46 @@ _ACTIVE: ContextVar[tuple[ScoreFunction, ...]] = ContextVar("active_score_functi
 
 
 def check_policy(grad: str, where: str) -> GradPolicy:
-    """`grad` when it is one of GRAD_POLICIES, else GradientError."""
+    """Return `grad` if it is one of GRAD_POLICIES.
+
+    Args:
+        grad: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     if not is_one_of(grad, GRAD_POLICIES):
         raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {shown(grad)}.")
     return cast("GradPolicy", grad)
 
 
 def standard_normal(like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Standard normal numbers in the shape, dtype and on the device of `like`."""
+    """Draw standard normal numbers.
+
+    Args:
+        like: tensor whose shape, dtype and device they have.
+        generator: source of randomness.
+    """
     return torch.randn(like.shape, dtype=like.dtype, device=like.device, generator=generator)
 
 
 @in_single
 def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """Zero-mean normal noise of the given variance (any shape, counts squared), differentiable in the variance.
+    """Draw normal noise of mean 0 and a given variance, differentiable in the variance.
 
     The scale is sqrt(v + e) - sqrt(e) with e = VARIANCE_FLOOR: an empty bin stays empty, its gradient is finite (at
-    most 50 |eps|), and at v = 1 the variance is 2 % short. Negative variances (rounding) count as 0.
+    most 50 |eps|), and at v = 1 the variance is 2 % short.
+
+    Args:
+        variance: any shape, counts squared; negative ones (rounding) count as 0.
+        generator: source of randomness.
+
+    Returns:
+        Shape and dtype of `variance`.
+
+    Raises:
+        UnitError: for complex numbers.
     """
     (variance,) = reals("gaussian_noise", variance=variance)
     check_generator(generator, "gaussian_noise")
@@ -79,16 +102,24 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
 
 
 def straight_through(sample: Tensor, mean: Tensor) -> Tensor:
-    """The values of `sample` with the gradient of `mean`. Exact for losses that are linear in the sample."""
+    """Return the values of a sample with the gradient of its mean: exact for losses that are linear in the sample.
+
+    Args:
+        sample: drawn values.
+        mean: their mean; shapes broadcast.
+
+    Raises:
+        ShapeError: for shapes that do not.
+    """
     sample, mean = going_together("straight_through", sample=sample, mean=mean)
     return sample.detach() + (mean - mean.detach())
 
 
 class ScoreFunction:
-    """Collects log-probabilities of what random sensors draw inside the context, and turns losses into surrogates.
+    """Collect log-probabilities of random sensors inside a context, and turn losses into surrogates.
 
-    Sensors in a row add their log-probabilities, each given its own input, so chains of random sensors are right too.
-    Contexts nest; each thread and task has its own.
+    Sensors in a row add their log-probabilities, each given its own input, so that chains of random sensors are right
+    too. Contexts nest; each thread and task has its own. See the example at the top of this file.
     """
 
     def __init__(self) -> None:
@@ -108,9 +139,17 @@ class ScoreFunction:
             self._token = None
 
     def log_prob(self, shape: tuple[int, ...] | torch.Size) -> Tensor:
-        """Sum of the collected log-probabilities over all dimensions behind `shape`.
+        """Sum the collected log-probabilities over all dimensions behind `shape`.
 
-        Raises ShapeError when `shape` does not begin the shape of what was collected, GradientError when nothing was.
+        Args:
+            shape: leading dimensions of what was collected, (..., C, H, W).
+
+        Returns:
+            Tensor of that shape.
+
+        Raises:
+            ShapeError: for a shape that does not begin the shape of what was collected.
+            GradientError: if nothing was collected.
         """
         if not self._log_probs:
             raise GradientError(
@@ -128,13 +167,24 @@ class ScoreFunction:
         return functools.reduce(torch.add, parts)
 
     def surrogate(self, losses: Tensor, baseline: Tensor | float | Literal["leave_one_out"] | None = None) -> Tensor:
-        """The losses, value unchanged, whose gradient is unbiased for the gradient of their expectation.
+        """Return the losses, value unchanged, with an unbiased gradient of their expectation.
 
-        `losses`: one number per item, shape () or (B,) or as far as (..., C, H, W); an item may depend only on draws
-        that share its leading indices (a per-pixel loss behind crosstalk is biased). `baseline`: what is subtracted
-        from the loss in front of the score: a number, a tensor without dependence on the draws, or "leave_one_out":
-        the mean of the other items along dimension 0 (independent items, at least 2; unbiased when all items have the
-        same expectation or not). Dependence of the loss on anything else keeps its ordinary gradient.
+        Dependence of the loss on anything else than the draws keeps its ordinary gradient.
+
+        Args:
+            losses: one number per item, () or (B,) or as far as (..., C, H, W); an item may depend only on draws that
+                share its leading indices (a per-pixel loss behind crosstalk is biased).
+            baseline: subtracted from the loss in front of the score: a number, a tensor without dependence on the
+                draws, or "leave_one_out", the mean of the other items along dimension 0 (independent items, at least
+                2).
+
+        Returns:
+            Tensor of the shape of `losses`.
+
+        Raises:
+            ShapeError: for losses that do not fit the log-probabilities, or less than two items to leave one out.
+            ArgumentError: for another baseline.
+            GradientError: if no sensor ran inside the context.
         """
         advantage = losses.detach()
         if isinstance(baseline, str):
@@ -153,10 +203,14 @@ class ScoreFunction:
 
 
 def record_score(log_prob: Callable[[], Tensor], where: str) -> None:
-    """Hand a log-probability, shape (..., C, H, W), to the innermost ScoreFunction. For sensors with grad="score".
+    """Hand a log-probability to the innermost ScoreFunction, for sensors with grad="score".
 
-    `log_prob` is called only if a gradient is wanted. Raises GradientError when it is and no context is open: the
-    gradient would silently be zero otherwise.
+    Args:
+        log_prob: gives the log-probability (..., C, H, W); called only if a gradient is wanted.
+        where: name of the sensor, for errors.
+
+    Raises:
+        GradientError: without a context, where the gradient would silently be zero.
     """
     if not torch.is_grad_enabled():
         return
@@ -182,13 +236,13 @@ SAME_BIN = 1e-6
 
 
 class PhysicalModule(ScalarState):
-    """A module whose own numbers are physical and stay in the precision they have when a model goes to half precision.
+    """Module whose numbers are physical and keep their precision when a model goes to half precision.
 
     In bfloat16 the logarithm of 60 ps is that of 62 ps, and 1e5 dark counts are infinite in float16. Devices, float32
     and float64 are followed; modules of another kind inside follow everything.
 
     Constructors of every subclass take arrays where they take tensors. An argument that requires a gradient is kept
-    with it, or refused with GradientError: see `given`.
+    with it, or refused with GradientError.
     """
 
     def __init_subclass__(cls, **keywords: Any) -> None:
@@ -219,7 +273,7 @@ _FEW = 8  # numbers of a list that a repr shows
 
 
 def _shown(module: nn.Module, name: str) -> str:
-    """An attribute as a repr shows it; nothing for one that is not there, or has learnt what it must not be."""
+    """Return an attribute as a repr shows it; nothing for one that is missing, or has learnt a value out of range."""
     try:
         return _text(getattr(module, name, None))
     except TorchTransientError:
@@ -257,7 +311,7 @@ _ENTRANCES = {
 
 
 def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
-    """A method of a sensor that looks at the light before it takes it; see `Sensor`."""
+    """Wrap a method of a sensor to check the light and the generator; see `Sensor`."""
     careful = in_single(method)
     names = list(inspect.signature(method).parameters)[1:]
     draws = names.index("generator") if "generator" in names else None
@@ -273,19 +327,21 @@ def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
 
 
 class Sensor(PhysicalModule):
-    """Maps a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
+    """Base of sensors: a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
 
-    `forward` takes `generator` in every sensor, so that chains need not know which of their links are random.
+    A subclass defines `expected`. `forward` takes `generator` in every sensor, so that chains call random and
+    deterministic links alike. Half precision is taken and measured in float32, the least in which counts are counts.
+    Light of another number of bins than `num_bins` is a ShapeError. Both hold for the methods of every subclass that
+    light enters by: `expected`, `forward`, `sample`, `variance`, `gaussian`, `probabilities` and `log_prob`.
 
-    `num_bins`: T of the axis that the sensor was made with, None for one that takes any. Light of another number of
-    bins is refused with ShapeError. Half precision is taken and measured in float32, the least in which counts are
-    counts. Both hold for the methods of every subclass that light enters by: `expected`, `forward`, `sample`,
-    `variance`, `gaussian`, `probabilities` and `log_prob`.
+    Attributes:
+        num_bins: T of the axis that the sensor was made with, None for one that takes any.
+        takes: quantities that it can be given, empty for any. Chains compare them with what the stage before gives.
+        gives: quantity of its output, "the same" as its input, None if unknown.
+        window_is_period: True if its bins are one whole laser period.
     """
 
     num_bins: int | None = None
-    # What chains compare: what the sensor takes (anything, if it does not say) and gives (None: nobody knows), and
-    # whether it takes its bins for one whole laser period.
     takes: tuple[Quantity, ...] = ()
     gives: Quantity | Literal["the same"] | None = None
     window_is_period: bool = False
@@ -297,7 +353,14 @@ class Sensor(PhysicalModule):
                 setattr(cls, name, _entrance(cls.__dict__[name], place))
 
     def check_bins(self, x: object) -> None:
-        """ShapeError for a tensor whose T is not that of the axis that the sensor was made with."""
+        """Check the number of bins of light.
+
+        Args:
+            x: light (..., C, T, H, W); anything else passes.
+
+        Raises:
+            ShapeError: if T is not that of the axis that the sensor was made with.
+        """
         if self.num_bins is None or not isinstance(x, Tensor) or x.ndim < 4 or x.shape[TIME] == self.num_bins:
             return
         raise ShapeError(
@@ -306,19 +369,31 @@ class Sensor(PhysicalModule):
         )
 
     def expected(self, x: Tensor) -> Tensor:
-        """The mean of the measurement, differentiable in `x` and in the parameters."""
+        """Mean of the measurement, differentiable in the light and in the parameters.
+
+        Args:
+            x: light (..., C, T, H, W).
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define expected(x).")
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """`expected(x)`. `generator` is taken and not needed: nothing here is random."""
+        """Return ``expected(x)``.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: taken for chains, not used.
+        """
         return self.expected(x)
 
 
 class RandomSensor(Sensor):
-    """A sensor that draws. `grad` says what `forward` returns and how gradients pass (see `policies`).
+    """Base of sensors that draw.
 
     A subclass defines `expected`, `sample`, and as far as it supports the policy: `variance` (or `gaussian`) for
-    "gaussian", `log_prob` for "score". GradientError when the policy is not supported.
+    "gaussian", `log_prob` for "score". A policy without its method is a GradientError.
+
+    Args:
+        grad: gradient policy: what `forward` returns, and how gradients pass.
     """
 
     def __init__(self, grad: GradPolicy = "expected") -> None:
@@ -326,23 +401,62 @@ class RandomSensor(Sensor):
         self.grad: GradPolicy = check_policy(grad, type(self).__name__)
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """One draw, without gradient, in the shape and dtype of `expected(x)`."""
+        """Draw a measurement, without gradient.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+
+        Returns:
+            Shape and dtype of ``expected(x)``.
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define sample(x, generator).")
 
     def variance(self, x: Tensor) -> Tensor:
-        """Variance of every entry of the measurement, in the shape of `expected(x)`."""
+        """Variance of every entry of the measurement.
+
+        Args:
+            x: light (..., C, T, H, W).
+
+        Returns:
+            Shape of ``expected(x)``.
+
+        Raises:
+            GradientError: for sensors without one.
+        """
         raise GradientError(f"{type(self).__name__}: grad='gaussian' is not supported; choose another policy.")
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A differentiable normal surrogate of `sample`. Independent entries unless a subclass knows better."""
+        """Draw a differentiable normal surrogate of `sample`, with independent entries by default.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+        """
         return self.expected(x) + gaussian_noise(self.variance(x), generator)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Log-probability of a measurement, time summed: (..., C, H, W), differentiable in `x`."""
+        """Log-probability of a measurement, summed over time, differentiable in the light.
+
+        Args:
+            measurement: result of `sample`.
+            x: light (..., C, T, H, W).
+
+        Returns:
+            (..., C, H, W).
+
+        Raises:
+            GradientError: for sensors without one.
+        """
         raise GradientError(f"{type(self).__name__}: grad='score' is not supported; choose another policy.")
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The measurement under the policy `grad`; equal generators in equal states give equal measurements."""
+        """Measure light under the policy `grad`; equal generators in equal states give equal measurements.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+        """
         if self.grad == "expected":
             return self.expected(x)
         check_generator(generator, type(self).__name__)
@@ -357,7 +471,14 @@ class RandomSensor(Sensor):
 
 
 def bins_of(sensor: Sensor) -> Bins:
-    """Return the bins that a sensor, or the first stage of a chain with bins, was made for."""
+    """Return the bins that a sensor, or the first stage of a chain with bins, was made for.
+
+    Args:
+        sensor: sensor or chain.
+
+    Returns:
+        Width in seconds and number, None where any fits.
+    """
     for part in sensor.modules():
         if not isinstance(part, Sensor):
             continue
@@ -370,7 +491,19 @@ def bins_of(sensor: Sensor) -> Bins:
 
 
 def common_bins(sensors: Iterable[Sensor], where: str, own: Bins = (None, None)) -> Bins:
-    """Return the bins of all sensors and of ``own``. Raises UnitError for sensors made for different ones."""
+    """Return the bins of several sensors.
+
+    Args:
+        sensors: the sensors.
+        where: name of the caller, for errors.
+        own: bins of the caller.
+
+    Returns:
+        Width in seconds and number, None where any fits.
+
+    Raises:
+        UnitError: for sensors that were made for different ones.
+    """
     width, number = own
     owner = where
     for sensor in sensors:
@@ -397,12 +530,23 @@ def _bins_text(width: float | None, number: int | None) -> str:
 
 
 def added(parts: Iterable[Tensor]) -> Tensor:
-    """The sum of tensors, in their order."""
+    """Sum tensors in their order.
+
+    Args:
+        parts: tensors of one shape.
+    """
     return functools.reduce(torch.add, parts)
 
 
 class WrappedDetector(RandomSensor):
-    """A random sensor whose draws are made by its `detector`. `grad` is the detector's, and sets it."""
+    """Base of random sensors around a detector, which makes the draws.
+
+    A subclass defines `rate`. ``grad`` is the detector's, and sets it.
+
+    Args:
+        detector: the detector.
+        grad: gradient policy, None to leave the detector's.
+    """
 
     detector: RandomSensor
     # cycles by which counts of the whole exposure and pixel are divided; None: those of the detector
@@ -429,11 +573,19 @@ class WrappedDetector(RandomSensor):
         self.detector.check_bins(x)
 
     def rate(self, x: Tensor) -> Tensor:
-        """The rate that the detector is given."""
+        """Rate of the detector.
+
+        Args:
+            x: light (..., C, T, H, W).
+        """
         raise NotImplementedError(f"{type(self).__name__} has to define rate(x).")
 
     def probabilities(self, x: Tensor) -> Tensor:
-        """Expected detections per cycle and bin."""
+        """Expected detections per cycle and bin.
+
+        Args:
+            x: light (..., C, T, H, W).
+        """
         result: Tensor = self.detector.probabilities(self.rate(x))  # type: ignore[operator]
         return result
 
@@ -454,16 +606,28 @@ class WrappedDetector(RandomSensor):
             return self.detector.sample(self.rate(x), generator)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The measurement under the policy of the detector."""
+        """Measure light under the policy of the detector.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+        """
         result: Tensor = self.detector(self.rate(x), generator=generator)
         return result
 
 
 def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> RandomSensor:
-    """As many detectors alike as one whose counts are their sum, in the same light each: the cycles of all of them,
-    and the same parameters.
+    """Make a detector whose counts are the sum of several alike, in the same light each.
 
-    `share`: what each has of light, and of counts, that are given for a whole pixel.
+    It has the cycles of all of them, and the same parameters.
+
+    Args:
+        detector: one of them.
+        number: how many.
+        share: part that each has of light, and of counts, that are given for a whole pixel.
+
+    Returns:
+        A shallow copy of the detector.
     """
     other = copy.copy(detector)
     if isinstance(other, WrappedDetector):
@@ -478,7 +642,11 @@ def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> Rando
 
 
 def cycles_of(detector: RandomSensor) -> int:
-    """How many laser cycles a detector counts."""
+    """Return the number of laser cycles that a detector counts.
+
+    Args:
+        detector: a detector, or a sensor around one.
+    """
     inner = detector
     while isinstance(inner, WrappedDetector):
         inner = inner.detector
@@ -490,12 +658,23 @@ def cycles_of(detector: RandomSensor) -> int:
 
 @in_single
 def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
-    """``A^T y``: the transpose of a sensor's mean, exactly, for inputs of ``input_shape``; dtype and device of ``y``.
+    """Apply the transpose of a sensor's mean, exactly: ``A^T y``.
 
     ``A`` is the linear part of `expected`, ``x -> expected(x) - expected(0)``; a sensor that is not linear gives the
     transpose of its derivative at zero: see `linearity_error`. Differentiable in ``y`` and in the sensor's parameters,
-    so that an unrolled reconstruction can be trained through it. Raises ShapeError when ``y`` is no output for that
-    shape.
+    so that an unrolled reconstruction can be trained through it.
+
+    Args:
+        sensor: the sensor.
+        y: measurement, in the shape of the sensor's output.
+        input_shape: shape of the light.
+
+    Returns:
+        Tensor of ``input_shape``, in dtype and device of ``y``.
+
+    Raises:
+        ShapeError: if ``y`` is no output for that shape.
+        GradientError: for a sensor without gradients.
     """
     _check_sensor("adjoint", sensor, y=y)
     learnt = any(p.requires_grad for p in sensor.parameters())
@@ -515,7 +694,15 @@ def adjoint(sensor: Sensor, y: Tensor, input_shape: Sequence[int]) -> Tensor:
 
 
 def linearity_error(sensor: Sensor, x: Tensor) -> float:
-    """``|A(2 x) - 2 A(x)| / |A(2 x)|`` of the mean without its offset: rounding for a linear sensor."""
+    """Measure how far a sensor's mean is from linear: ``|A(2 x) - 2 A(x)| / |A(2 x)|`` without its offset.
+
+    Args:
+        sensor: the sensor.
+        x: light (..., C, T, H, W).
+
+    Returns:
+        Rounding for a linear sensor.
+    """
     _check_sensor("linearity_error", sensor, x=x)
     with torch.no_grad():
         offset = sensor.expected(torch.zeros_like(x))

@@ -195,7 +195,13 @@ def sample_detections(
 
 
 def multinomial_noise(probabilities: Tensor, trials: int, generator: torch.Generator | None = None) -> Tensor:
-    """Normal noise with the covariance of multinomial counts, trials (diag p - p p^T), differentiable in p."""
+    """Draw normal noise with the covariance of multinomial counts, trials (diag p - p p^T), differentiable in p.
+
+    Args:
+        probabilities: (..., T, H, W).
+        trials: number of trials.
+        generator: source of randomness.
+    """
     z = gaussian_noise(trials * probabilities, generator)
     none = 1 - probabilities.sum(TIME, keepdim=True)
     rest = gaussian_noise(trials * none, generator)
@@ -270,7 +276,11 @@ class SynchronousSPAD(RandomSensor):
         return x * self.gate.to(x.dtype).view(-1, 1, 1)
 
     def probabilities(self, x: Tensor) -> Tensor:
-        """Expected detections per cycle and bin, after pile-up."""
+        """Expected detections per cycle and bin, after pile-up.
+
+        Args:
+            x: rate per cycle and bin, (..., C, T, H, W).
+        """
         rate = self._gated(x)
         if self.dead_bins is None:
             return first_photon_probabilities(rate)[0]
@@ -337,9 +347,12 @@ class SynchronousSPAD(RandomSensor):
 
 
 def log_of_firing(rate: Tensor) -> Tensor:
-    """log(1 - exp(-rate)), the log-probability that an armed detector fires, with all digits of dark and bright bins.
+    """Log-probability that an armed detector fires, log(1 - exp(-rate)), with all digits of dark and bright bins.
 
-    Differentiable; -inf at rate 0. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
+    Differentiable. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
+
+    Args:
+        rate: any shape, >= 0; -inf at 0.
     """
     bright = rate > math.log(2)
     if not bool(bright.any()):  # as a rule: half the cost
@@ -351,7 +364,16 @@ def log_of_firing(rate: Tensor) -> Tensor:
 
 
 def exposed_cycles(counts: Tensor, cycles: int, dead_bins: float | None) -> Tensor:
-    """Cycles that could fire in each bin (..., T, H, W), times the part of it in which they could, float64."""
+    """Cycles that could fire in each bin, times the part of it in which they could.
+
+    Args:
+        counts: (..., T, H, W).
+        cycles: number of cycles.
+        dead_bins: dead time in bins; None for one detection per cycle.
+
+    Returns:
+        (..., T, H, W) float64.
+    """
     if dead_bins is None:
         return cycles - sum_before(counts)
     return armed_time(counts, cycles, float(dead_bins)).exposed

@@ -21,11 +21,21 @@ Border = Literal["constant", "reflect", "replicate", "circular"]
 
 @without_autocast
 def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
-    """Convolve (..., C, T, H, W) with a PSF (h, w), odd sizes, over the image plane; the PSF's own centre stays put.
+    """Convolve light with a point spread function over the image plane; the PSF's own centre stays put.
 
-    `border`: what lies outside the picture: "constant" darkness (light is lost), "reflect", "replicate", "circular"
-    (sums are conserved). Differentiable in both arguments. Raises ShapeError for even sizes, or a PSF that reaches
-    further than the picture does where that is needed.
+    Differentiable in both arguments.
+
+    Args:
+        x: (..., C, T, H, W).
+        psf: (h, w), odd sizes.
+        border: outside of the picture: "constant" darkness (light is lost), "reflect", "replicate", "circular" (sums
+            are conserved).
+
+    Returns:
+        Shape and dtype of `x`.
+
+    Raises:
+        ShapeError: for even sizes, or a PSF that reaches further than the picture does where that is needed.
     """
     check_transient(x, "blur_image")
     check_choice(border, Border, "border", "blur_image")
@@ -49,7 +59,15 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
 
 
 def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
-    """(size, size) float64 normal spot of `fwhm_px` pixels, integrated over pixels, sum 1; differentiable in fwhm."""
+    """Normal spot integrated over pixels, sum 1; differentiable in the width.
+
+    Args:
+        fwhm_px: full width at half maximum in pixels, a scalar tensor.
+        size: pixels across.
+
+    Returns:
+        (size, size) float64.
+    """
     (fwhm_px,) = reals("gaussian_psf", fwhm_px=fwhm_px)
     size = check_count(size, "size", "gaussian_psf", most=_LARGEST)
     sigma = fwhm_px.double() / FWHM_PER_SIGMA
@@ -60,9 +78,17 @@ def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
 
 
 def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
-    """(n, n) float64 disc of `radius_px` pixels, the defocus of a round aperture, area-sampled, sum 1.
+    """Area-sampled disc, the defocus of a round aperture, sum 1. Not differentiable in the radius.
 
-    Not differentiable in the radius.
+    Args:
+        radius_px: radius in pixels, a tenth and more.
+        oversampling: points across a pixel.
+
+    Returns:
+        (n, n) float64.
+
+    Raises:
+        UnitError: for radii out of range.
     """
     radius = check_number(radius_px, "radius_px", "defocus_psf", open_low=True)
     oversampling = check_count(oversampling, "oversampling", "defocus_psf")
@@ -82,7 +108,17 @@ def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
 
 
 class SpatialPSF(Sensor):
-    """A measured point spread function `psf` (h, w), odd sizes, values >= 0; normalised to 1. Source: `blur_image`."""
+    """Blur by a measured point spread function; see `blur_image`.
+
+    Args:
+        psf: (h, w), odd sizes, values >= 0; normalised to 1.
+        border: as of `blur_image`.
+        learnable: learn the PSF, as logits.
+
+    Raises:
+        ShapeError: for even sizes.
+        UnitError: for negative values, or none.
+    """
 
     gives = "the same"
 
@@ -112,9 +148,19 @@ class SpatialPSF(Sensor):
 
 
 class LensBlur(Sensor):
-    """A Gaussian lens blur of `fwhm_px` pixels full width at half maximum, learnable as `log_fwhm_px`.
+    """Gaussian blur of a lens.
 
-    The size of the kernel, 2 FWHM (4.7 standard deviations) to each side (or `size`), is fixed when the module is made.
+    The size of the kernel is fixed when the module is made.
+
+    Args:
+        fwhm_px: full width at half maximum in pixels.
+        border: as of `blur_image`.
+        size: pixels across the kernel, odd; None for 2 FWHM (4.7 standard deviations) to each side.
+        learnable: make the logarithm `log_fwhm_px` a parameter.
+
+    Raises:
+        UnitError: for widths out of range.
+        ShapeError: for an even size.
     """
 
     gives = "the same"

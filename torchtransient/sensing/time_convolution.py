@@ -75,7 +75,17 @@ def convolve_time(
 
 
 def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:
-    """Fold (kernel, first) into one period, or crop it to lags inside a window of `bins`; empty if it misses it."""
+    """Fold a kernel into one period, or crop it to lags inside a window.
+
+    Args:
+        kernel: (K,).
+        first: lag of kernel[0] in bins.
+        bins: length of the window.
+        boundary: "periodic" folds, "zero" crops.
+
+    Returns:
+        Kernel and its first lag; an empty kernel if it misses the window.
+    """
     if boundary == "periodic":
         if kernel.numel() <= bins:
             return kernel, first % bins
@@ -202,5 +212,12 @@ def _apply(x: Tensor, reverse: bool) -> Tensor:
 
 
 def sum_before(x: Tensor) -> Tensor:
-    """Sum of the earlier bins of (..., T, H, W), float64, differentiable to any order."""
+    """Sum of the earlier bins, differentiable to any order.
+
+    Args:
+        x: (..., T, H, W).
+
+    Returns:
+        Shape of `x`, float64.
+    """
     return _apply(x, False)

@@ -40,20 +40,30 @@ from torchtransient.sensing.time_convolution import Boundary, convolve_time, win
 
 
 class DetectionJitter(MovedCounts):
-    """Moves every detection of counts (..., C, T, H, W) by a random delay of `response`; the same shape, in counts.
+    """Move every detection of counts (..., C, T, H, W) by a random delay.
 
     Jitter of the detector and of the timing electronics acts on what is detected: it stands behind pile-up and dead
-    time, which know only when photons arrived. In front of them it would let detections pile up at times at which
-    none arrived. The laser's pulse is not jitter but light: `ImpulseResponse`, in front.
+    time, which know only when photons arrived. In front of them it would let detections pile up at times at which none
+    arrived. The laser's pulse is not jitter but light: `ImpulseResponse`, in front.
 
     The mean is a convolution. Whole counts are drawn one by one (multinomial over the delays); counts that are not
     whole stay means. Policies: all four. "gaussian" has the covariance of the moves, given the counts; "score" the
     probabilities of the delays that were drawn, for learnable responses, while the counts given pass with the gradient
-    of the mean. `boundary` "periodic": what leaves the window comes in at the other end, so that constant counts stay
-    constant; "zero": it is lost. `within_bin` as in `Response.kernel`.
+    of the mean. Behind a detector of one detection per cycle `Compose` draws both at once: the same distribution, in
+    the time of the detector alone. Not modelled: jitter that depends on the rate (time walk).
 
-    Behind a detector of one detection per cycle `Compose` draws both at once: the same distribution, in the time of
-    the detector alone. Raises UnitError, ShapeError. Not modelled: jitter that depends on the rate (time walk).
+    Args:
+        response: distribution of the delays.
+        axis: axis of the counts, or
+        bin_width_s: their bin width in seconds.
+        boundary: "periodic": what leaves the window comes in at the other end, so that constant counts stay constant;
+            "zero": it is lost.
+        within_bin: place of detections in their bin, as of `Response.kernel`.
+        grad: gradient policy.
+
+    Raises:
+        ArgumentError: for other objects than responses, and other choices.
+        UnitError: for widths out of range.
     """
 
     takes, gives = ("counts",), "counts"
@@ -93,15 +103,24 @@ class DetectionJitter(MovedCounts):
 
 
 class SweepJitter(RandomSensor):
-    """Shifts the time axis of (..., C, T, H, W) by normal jitter, a number of sweeps averaged.
+    """Shift the time axis of (..., C, T, H, W) by normal jitter, a number of sweeps averaged.
 
-    ``jitter_fwhm_s`` of one sweep; ``sweeps`` averaged per exposure. Each item in front of C draws its own shifts, all
-    its pixels share them. A shift by a part of a bin is linear interpolation, which broadens by less than a bin.
-    ``expected``: the mean over the jitter, exactly. ``boundary`` "periodic": what is shifted out of the window comes in
-    at its other end, so that constant light stays constant; "zero": it is lost, and darkness moves in.
+    Each item in front of C draws its own shifts, all its pixels share them. A shift by a part of a bin is linear
+    interpolation, which broadens by less than a bin. ``expected`` is the mean over the jitter, exactly. The draw is a
+    random *linear* map that does not depend on the input, so that every policy but ``expected`` gives its ordinary
+    gradient, which is unbiased for any loss.
 
-    The draw is a random *linear* map that does not depend on the input, so that every policy but ``expected`` gives
-    its ordinary gradient, which is unbiased for any loss.
+    Args:
+        jitter_fwhm_s: jitter of one sweep, full width at half maximum in seconds.
+        axis: axis of the light, or
+        bin_width_s: its bin width in seconds.
+        sweeps: sweeps averaged in an exposure.
+        boundary: "periodic": what is shifted out of the window comes in at its other end, so that constant light stays
+            constant; "zero": it is lost, and darkness moves in.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for numbers out of range, and for jitter beyond the window.
     """
 
     gives = "the same"
@@ -199,11 +218,21 @@ def _moved(x: Tensor, whole: Tensor, boundary: Boundary) -> Tensor:
 
 @in_single
 def shift_time(x: Tensor, delay_bins: Tensor | float, *, boundary: Boundary = "periodic") -> Tensor:
-    """(..., C, T, H, W) later by `delay_bins`, a number or a map that broadcasts to (..., C, H, W); below 0 earlier.
+    """Shift light to later times, pixel by pixel, to fractions of a bin.
 
-    "periodic": the window is one laser period, sums are conserved and constant light stays constant. "zero": what
-    leaves the window is lost and nothing comes in. Differentiable in `x` and in the delays (piecewise linear); dtype
-    and device of `x` are kept, half precision gives float32. Raises ShapeError for maps of other images.
+    Differentiable in `x` and in the delays (piecewise linear).
+
+    Args:
+        x: (..., C, T, H, W).
+        delay_bins: a number or a map that broadcasts to (..., C, H, W), in bins; below 0 earlier.
+        boundary: "periodic": the window is one laser period, sums are conserved and constant light stays constant;
+            "zero": what leaves the window is lost and nothing comes in.
+
+    Returns:
+        Shape, dtype and device of `x`; half precision gives float32.
+
+    Raises:
+        ShapeError: for maps of other images.
     """
     check_transient(x, "shift_time")
     check_choice(boundary, Boundary, "boundary", "shift_time")
@@ -239,7 +268,7 @@ class _Delays(PhysicalModule):
         return self.delay_ps.double() * 1e-12
 
     def bins(self, x: Tensor, where: str) -> Tensor:
-        """(..., C, H, W) or (), float64, checked against the pixels of `x`."""
+        """Delays in bins, (..., C, H, W) or (), float64, checked against the pixels of `x`."""
         pixels_of(self.delay_ps, x, "delay_s", where)
         return self.delay_ps.double() * (1e-12 / self.bin_width_s)
 
@@ -269,7 +298,7 @@ class Delayed:
         return _moved(late, self.whole + 1, self.boundary) - _moved(late, self.whole, self.boundary)
 
     def draw(self, counts: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None]:
-        """Each goes to the earlier or the later bin; tallies are (2, ..., H, W)."""
+        """Move each count to the earlier or the later bin; tallies are (2, ..., H, W)."""
         counts = counts.contiguous()
         late = halve(counts, self.part.to(counts.dtype).expand(counts.shape).contiguous(), generator)
         early = counts - late
@@ -286,13 +315,21 @@ class Delayed:
 
 
 class PixelSkew(Sensor):
-    """Light or rates of every pixel later by a delay of its own; see `shift_time`. Deterministic, linear in the light.
+    """Delay light or rates of every pixel by a time of its own; see `shift_time`. Deterministic, linear in the light.
 
-    In front of the detector: paths of different lengths, a fibre array, a shutter that runs over the rows. What comes
-    late by its electronics is a `DetectionSkew`, behind it. `delay_s`: a number or a map (H, W) or what broadcasts to
-    (..., C, H, W), seconds, of either sign. `learnable`: `delays.delay_ps` is a parameter, in picoseconds.
+    In front of the detector: paths of different lengths, a fibre array, a shutter that runs over the rows.
+    `DetectionSkew`, behind the detector, is for delays of its electronics.
 
-    Raises UnitError for a millisecond or more (picoseconds?), ShapeError for maps of other images.
+    Args:
+        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        axis: axis of the light, or
+        bin_width_s: its bin width in seconds.
+        boundary: as of `shift_time`.
+        learnable: make `delays.delay_ps` a parameter, in picoseconds.
+
+    Raises:
+        UnitError: for a millisecond or more (picoseconds?).
+        ShapeError: for maps of other images.
     """
 
     gives = "the same"
@@ -320,11 +357,22 @@ class PixelSkew(Sensor):
 
 
 class DetectionSkew(MovedCounts):
-    """Detections (counts) of every pixel later by a delay of its own: a signal tree, a converter that starts late.
+    """Delay detections (counts) of every pixel by a time of its own: a signal tree, a converter that starts late.
 
     Draws move whole counts one by one: each of a bin goes to the earlier or the later of the two bins that its delay
-    reaches, a binomial number. Arguments as of `PixelSkew`; policies as of `MovedCounts`, the score that of learnable
-    delays. Raises UnitError, ShapeError as `PixelSkew`, and UnitError for draws of NaN or infinity.
+    reaches, a binomial number. Policies as of `MovedCounts`, the score that of learnable delays.
+
+    Args:
+        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        axis: axis of the counts, or
+        bin_width_s: their bin width in seconds.
+        boundary: as of `shift_time`.
+        learnable: make `delays.delay_ps` a parameter, in picoseconds.
+        grad: gradient policy.
+
+    Raises:
+        UnitError: for a millisecond or more (picoseconds?), and for draws of NaN or infinity.
+        ShapeError: for maps of other images.
     """
 
     takes, gives = ("counts",), "counts"
@@ -375,7 +423,19 @@ _FILLED = 1e-5
 
 
 def random_code_widths(num_bins: int, dnl_std: float, generator: torch.Generator | None = None) -> Tensor:
-    """(T,) float64 relative widths of codes, mean 1, normal with standard deviation `dnl_std`, at least 0.05 before."""
+    """Draw relative widths of the codes of a converter.
+
+    Args:
+        num_bins: number of codes T.
+        dnl_std: standard deviation of the widths, in mean widths.
+        generator: source of randomness.
+
+    Returns:
+        (T,) float64, normal, at least 0.05, mean 1.
+
+    Raises:
+        UnitError: for numbers out of range.
+    """
     std = check_number(dnl_std, "dnl_std", "random_code_widths", high=1.0)
     widths = 1 + std * torch.randn(
         check_count(num_bins, "num_bins", "random_code_widths"), dtype=torch.float64, generator=generator
@@ -387,11 +447,18 @@ def random_code_widths(num_bins: int, dnl_std: float, generator: torch.Generator
 def code_bands(
     edges: Tensor, num_bins: int, *, periodic: bool = False, dither: bool = False
 ) -> tuple[int, Tensor]:
-    """(first, (T, B) float64): share of the true bin k + first + b that gets the code k.
+    """Share of the light of each true bin that gets each code, as a band around the diagonal.
 
-    `edges`: (T + 1,) borders of the codes, in true bins, increasing. Light lies evenly in its true bin; `dither` adds a
-    time that is uniform over one bin. Light outside [0, num_bins] is in no bin, or, if `periodic`, in the bin a whole
-    number of windows away.
+    Light lies evenly in its true bin.
+
+    Args:
+        edges: borders of the codes in true bins, (T + 1,), increasing.
+        num_bins: true bins.
+        periodic: light outside of the window lies in the bin a whole number of windows away; else in none.
+        dither: add a time that is uniform over one bin.
+
+    Returns:
+        First lag, and (T, B) float64: share of the true bin k + first + b that gets the code k.
     """
     lower, upper = edges[:-1], edges[1:]
     index = torch.arange(lower.shape[0], dtype=torch.float64, device=edges.device)
@@ -415,33 +482,37 @@ def _triangle(z: Tensor) -> Tensor:
 
 
 def _bands_of_loaded_widths(module: nn.Module, incompatible: object) -> None:
-    """The share matrix follows code widths that came from a state_dict."""
+    """Make the share matrix anew for code widths that came from a state_dict."""
     if isinstance(module, TDC):
         module.first, bands = module._bands(module.code_widths.double())
         module.bands = bands.to(module.code_widths)
 
 
 class TDC(MovedCounts):
-    """Turns equal true bins into the codes of a real converter, (..., C, T, H, W) to the same shape.
+    """Convert equal true bins into the codes of a real converter, (..., C, T, H, W) to the same shape.
 
-    `code_widths`: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the INL.
-    Light of a true bin is taken to be spread evenly over it. `sliding_scale`: number of known offsets,
-    0, 1, 2, ... mean code widths, one of which is added before every conversion, at random, and taken off its code.
-    That evens the DNL out; the mean of the INL at the codes used stays. Beyond the last code the widths begin again.
-    `dither`: an unknown time, uniform over one bin, that is added before the conversion and not taken off: of equal
-    codes, half the events get the next one.
-    `offset_bins`: where, in true bins, the first code begins; light then gets earlier codes by as much.
+    Light of a true bin is taken to be spread evenly over it. The mean is linear; the expectation over offsets is exact.
+    Codes that do not fill the window (mean width not 1) are taken with boundary "zero".
 
-    `acts_on` "detections": the input are counts behind a detector. Each of them gets its code: whole counts by a draw,
-    under the policies of `MovedCounts`; counts that are not whole stay means. It is the last stage where bins stand
-    for codes. "rates": the input is light in front of a detector, nothing is drawn; pile-up then happens in codes.
+    Args:
+        code_widths: (T,) relative widths (mean about 1): their deviations are the DNL, the running sum of these the
+            INL.
+        offset_bins: start of the first code in true bins; light then gets earlier codes by as much.
+        sliding_scale: number of known offsets, 0, 1, 2, ... mean code widths, one of which is added before every
+            conversion, at random, and taken off its code. That evens the DNL out; the mean of the INL at the codes used
+            stays. Beyond the last code the widths begin again.
+        dither: add an unknown time, uniform over one bin, before the conversion: of equal codes, half the events get
+            the next one.
+        acts_on: "detections": counts behind a detector, each of which gets its code: whole counts by a draw, under the
+            policies of `MovedCounts`; counts that are not whole stay means. It is the last stage where bins stand for
+            codes. "rates": light in front of a detector, nothing is drawn; pile-up then happens in codes.
+        boundary: "periodic": codes that fill the window go round, so that constant light stays constant up to the
+            widths of the codes; "zero": light outside the window is none, and what falls beyond the last code is lost.
+        grad: gradient policy.
 
-    `boundary` "periodic": codes that fill the window go round, so that constant light stays constant up to the widths
-    of the codes; "zero": light outside the window is none, and what falls beyond the last code is lost. Codes that do
-    not fill the window (mean width not 1) are taken with "zero".
-
-    The mean is linear; the expectation over offsets is exact. Raises UnitError for widths that are not positive,
-    ShapeError when T does not fit.
+    Raises:
+        UnitError: for widths that are not positive.
+        ShapeError: for light of another T.
     """
 
     code_widths: Tensor
@@ -489,7 +560,7 @@ class TDC(MovedCounts):
 
     @property
     def goes_round(self) -> bool:
-        """Whether the codes fill the window and are taken round it."""
+        """True if the codes fill the window and are taken round it."""
         codes = self.code_widths.shape[0]
         filled = abs(float(self.code_widths.double().sum()) - codes) < _FILLED * codes
         return self.boundary == "periodic" and filled
@@ -518,12 +589,12 @@ class TDC(MovedCounts):
 
     @property
     def differential_nonlinearity(self) -> Tensor:
-        """(T,) deviation of each code's width from the bin, in bins."""
+        """Deviation of each code's width from the bin, (T,), in bins."""
         return self.code_widths - 1
 
     @property
     def integral_nonlinearity(self) -> Tensor:
-        """(T,) deviation of each code's end from where it should be, in bins."""
+        """Deviation of each code's end from its nominal place, (T,), in bins."""
         return self.differential_nonlinearity.cumsum(0)
 
     def check_bins(self, x: object) -> None:

@@ -17,7 +17,7 @@ from torchtransient.sensing.electronics import PixelElectronics
 from torchtransient.sensing.itof import codes as itof_codes
 from torchtransient.sensing.itof import correlation as itof
 from torchtransient.sensing.itof import depth as itof_depth
-from torchtransient.sensing.itof import depth as itof_reading
+from torchtransient.sensing.itof import reading as itof_reading
 from torchtransient.units import SPEED_OF_LIGHT
 
 TURN = 2 * math.pi

@@ -13,7 +13,7 @@ from torchtransient.axes import FrequencyAxis
 from torchtransient.errors import PhysicsWarning, ShapeError, UnitError
 from torchtransient.sensing.itof import codes as itof_codes
 from torchtransient.sensing.itof import depth as itof_depth
-from torchtransient.sensing.itof import depth as itof_reading
+from torchtransient.sensing.itof import reading as itof_reading
 from torchtransient.sensing.itof.correlation import rounding_of, taps_by_pixel
 from torchtransient.units import SPEED_OF_LIGHT
 

@@ -9,7 +9,7 @@ import torch
 
 from torchtransient import sensing
 from torchtransient.sensing.itof import codes as itof_codes
-from torchtransient.sensing.itof import depth as itof_reading
+from torchtransient.sensing.itof import reading as itof_reading
 
 TURN = 2 * math.pi
 

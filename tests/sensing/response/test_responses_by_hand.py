@@ -13,9 +13,10 @@ from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import responses as shapes
 from torchtransient.sensing.afterpulsing import exponential_kernel, exponential_shares
+from torchtransient.sensing.composed_responses import _full_convolution, _gathered
 from torchtransient.sensing.counts import Moves, move_counts, shifted
 from torchtransient.sensing.cramer_rao import shares_between
-from torchtransient.sensing.responses import _between, _full_convolution, _gathered
+from torchtransient.sensing.responses import _between
 
 NS = 1e-9
 

@@ -51,16 +51,29 @@ def counting_chain(
     readout: Sequence[Sensor] | None = (),
     grad: GradPolicy | None = None,
 ) -> Compose:
-    """Radiance (..., C, T, H, W) to counts: the parts of a single-photon detector as one chain, whatever their order.
+    """Make a chain of the parts of a single-photon detector, radiance (..., C, T, H, W) to counts, in their order.
 
     Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds what is constant;
-    `detector` counts them (`SynchronousSPAD`, `FreeRunningSPAD`, a `MacroPixel` of them, ...); `jitter` and `skew` move
-    every detection; `afterpulsing` and `crosstalk` add others; `converter` gives each of them its code; `readout` is
-    what the pixel keeps (`ZoneSum`, `CodedHistogram`). A `Response` is taken for the bins of the budget. Why so:
-    docs/photon_counting.md. `grad` as of `Compose`.
+    `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add others;
+    `converter` gives each of them its code; `readout` is what the pixel keeps. The reasons: docs/photon_counting.md.
 
-    Raises ArgumentError for a part that is none of its kind, UnitError for parts that do not go together: another
-    number of cycles, another laser period, other bins, afterpulses of a detector that has its own (`AfterpulsingSPAD`).
+    Args:
+        budget: rates of detections.
+        detector: `SynchronousSPAD`, `FreeRunningSPAD`, a `MacroPixel` of them, ...
+        optics: sensors that spread light over pixels.
+        pulse: pulse of the laser; a `Response` is taken for the bins of the budget.
+        jitter: jitter of detections; a `Response` is taken for the bins of the budget.
+        skew: delays of pixels.
+        afterpulsing: afterpulses.
+        crosstalk: crosstalk.
+        converter: time-to-digital converter.
+        readout: `ZoneSum`, `CodedHistogram`, ...
+        grad: gradient policy, as of `Compose`.
+
+    Raises:
+        ShapeError: for a part that is none of its kind.
+        ArgumentError: for afterpulses of a detector that has its own (`AfterpulsingSPAD`).
+        UnitError: for parts that do not go together: another number of cycles, another laser period, other bins.
     """
     where = "counting_chain"
     _check(budget, (PhotonBudget,), "budget", where)
@@ -88,7 +101,7 @@ def counting_chain(
 
 
 def _parts(parts: Sequence[nn.Module] | None, name: str, where: str) -> list[nn.Module]:
-    """A list of sensors, or None for none of them."""
+    """Return a list of sensors, empty for None."""
     if parts is None:
         return []
     if not isinstance(parts, (list, tuple, nn.ModuleList, nn.Sequential)):
@@ -120,14 +133,26 @@ def _check(part: nn.Module | None, kinds: tuple[type, ...], name: str, where: st
 
 
 class StreakCamera(Compose):
-    """A streak camera on photoelectrons per bin and exposure (..., C, T, H, W), output in electrons, the same shape.
+    """Streak camera on photoelectrons per bin and exposure (..., C, T, H, W), output in electrons, the same shape.
 
-    ``time_fwhm_s``: resolution along time; ``spatial_fwhm_px`` of optics and tube, ``phosphor_fwhm_px`` behind the
-    gain, 0 leaves a stage out; ``jitter_fwhm_s`` and ``sweeps`` of the sweep; ``excess_noise`` of the channel plate;
-    ``read_noise_e``, ``full_well_e``, ``gain_e_per_dn``, ``bits``: the camera, referred to photoelectrons.
-    ``boundary``: of the window in time, for spread and jitter; "periodic" keeps a constant background constant, while
-    light close to one end shows a trace at the other; "zero" loses what leaves.
     The mean is exact; gradient policies as those of the stages. Not modelled: curvature of the sweep, space charge.
+
+    Args:
+        axis: axis of the light.
+        time_fwhm_s: resolution along time in seconds; 0 leaves the stage out.
+        spatial_fwhm_px: blur of optics and tube in pixels; 0 leaves the stage out.
+        phosphor_fwhm_px: blur behind the gain in pixels; 0 leaves the stage out.
+        jitter_fwhm_s: jitter of a sweep in seconds.
+        sweeps: sweeps of an exposure.
+        excess_noise: of the channel plate, F^2.
+        read_noise_e: of the camera, referred to photoelectrons, as the following.
+        full_well_e: as of `PixelElectronics`.
+        gain_e_per_dn: as of `PixelElectronics`.
+        bits: as of `PixelElectronics`.
+        black_level_dn: as of `PixelElectronics`.
+        boundary: of the window in time, for spread and jitter; "periodic" keeps a constant background constant, while
+            light close to one end shows a trace at the other; "zero" loses what leaves.
+        grad: gradient policy.
     """
 
     def __init__(

@@ -32,7 +32,11 @@ Step = Callable[[nn.Module, Tensor], Tensor]
 
 
 def row_of(stage: nn.Module) -> nn.Module | None:
-    """The container of the stages that a row is made of; None for a single stage."""
+    """Return the container of the stages that a row is made of; None for a single stage.
+
+    Args:
+        stage: a stage of a chain.
+    """
     if isinstance(stage, nn.ModuleList):
         return stage
     if isinstance(stage, nn.Sequential):
@@ -42,18 +46,31 @@ def row_of(stage: nn.Module) -> nn.Module | None:
 
 
 def branches_of(stage: nn.Module) -> Sequence[tuple[str, nn.Module]]:
-    """The sensors of which every pixel passes one, with their names; none for a stage that has no branches."""
+    """Return the sensors of which every pixel passes one, with their names; none for a stage without branches.
+
+    Args:
+        stage: a stage of a chain.
+    """
     inner = getattr(stage, "sensors", None) if isinstance(stage, Sensor) else None
     return named(inner) if isinstance(inner, nn.ModuleList) else []
 
 
 def named(row: nn.Module) -> list[tuple[str, nn.Module]]:
-    """The stages of a container, a stage that stands there twice as well, which torch lists once."""
+    """Return the stages of a container by their names, a stage that stands there twice as well, which torch lists once.
+
+    Args:
+        row: a container.
+    """
     return [(name, stage) for name, stage in row._modules.items() if stage is not None]
 
 
 def in_order(stages: Iterable[tuple[str, nn.Module]], prefix: str = "") -> Iterator[tuple[str, nn.Module]]:
-    """The single stages of rows in rows, in the order of the light, with their places: ``0``, ``1.0``, ``1.1``."""
+    """Yield the single stages of rows in rows, in the order of the light, with their places: ``0``, ``1.0``, ``1.1``.
+
+    Args:
+        stages: stages by their names.
+        prefix: put in front of names.
+    """
     for name, stage in stages:
         row = row_of(stage)
         if row is None:
@@ -63,19 +80,33 @@ def in_order(stages: Iterable[tuple[str, nn.Module]], prefix: str = "") -> Itera
 
 
 def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
-    """Stages with their numbers for names."""
+    """Return stages with their numbers for names.
+
+    Args:
+        stages: stages in a row.
+    """
     return ((str(number), stage) for number, stage in enumerate(stages))
 
 
 def parts_of(chain: nn.Module) -> Iterator[tuple[str, Sensor]]:
-    """Every sensor in a chain with its place, those that other sensors are made of too."""
+    """Yield every sensor in a chain with its place, parts of other sensors too.
+
+    Args:
+        chain: a chain, which is left out itself.
+    """
     for name, part in chain.named_modules(remove_duplicate=False):
         if part is not chain and isinstance(part, Sensor):
             yield name.replace("stages.", ""), part
 
 
 def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
-    """Stages to call one after another. Rows of torch's own with sensors in them are opened: they know no generator."""
+    """Return stages to call one after another.
+
+    Rows of torch's own with sensors in them are opened: they know no generator.
+
+    Args:
+        stages: stages in a row.
+    """
     found: list[nn.Module] = []
     for stage in stages:
         row = None if isinstance(stage, Sensor) else row_of(stage)
@@ -87,12 +118,20 @@ def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
 
 
 def draws(stage: nn.Module) -> bool:
-    """Whether anything in a stage draws."""
+    """Return True if anything in a stage draws.
+
+    Args:
+        stage: a stage of a chain.
+    """
     return any(isinstance(part, RandomSensor) for part in stage.modules())
 
 
 def policies_of(stage: nn.Module) -> set[GradPolicy]:
-    """The policies of the random stages in it; those of what a sensor is made of are its own affair."""
+    """Return the policies of the random stages in a stage, parts of other sensors left out.
+
+    Args:
+        stage: a stage of a chain.
+    """
     found: set[GradPolicy] = set()
     for _, part in in_order([("", stage)]):
         inner = branches_of(part)
@@ -104,7 +143,15 @@ def policies_of(stage: nn.Module) -> set[GradPolicy]:
 
 
 def check_draws(stages: Iterable[nn.Module], where: str) -> None:
-    """ShapeError for a stage with random sensors inside that does not say how it is drawn: it would hand on means."""
+    """Check that stages with random sensors inside can be drawn: they would hand on means.
+
+    Args:
+        stages: stages in a row.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for a stage without `expected` and `sample`.
+    """
     for name, stage in in_order(numbered(stages)):
         if draws(stage) and not (isinstance(stage, Sensor) and callable(getattr(stage, "sample", None))):
             inside = sorted({type(part).__name__ for part in stage.modules() if isinstance(part, RandomSensor)})
@@ -116,7 +163,11 @@ def check_draws(stages: Iterable[nn.Module], where: str) -> None:
 
 
 def ends_of(stages: Iterable[nn.Module]) -> tuple[tuple[Quantity, ...], Quantity | str | None]:
-    """What a row takes and gives, as `Sensor.takes` and `Sensor.gives`."""
+    """Return the quantities that a row takes and gives, as `Sensor.takes` and `Sensor.gives`.
+
+    Args:
+        stages: stages in a row.
+    """
     takes: tuple[Quantity, ...] = ()
     gives: Quantity | str | None = "the same"
     for _, stage in in_order(numbered(stages)):
@@ -134,13 +185,24 @@ def ends_of(stages: Iterable[nn.Module]) -> tuple[tuple[Quantity, ...], Quantity
 
 
 def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
-    """The mean of one stage."""
+    """Mean of one stage.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+    """
     result: Tensor = stage.expected(x) if isinstance(stage, Sensor) else stage(x)
     return result
 
 
 def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
-    """A draw of one stage whatever its policy; the mean of one that draws nothing."""
+    """Draw one stage whatever its policy; the mean of one that draws nothing.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
     if isinstance(stage, Sensor) and hasattr(stage, "sample"):
         result: Tensor = stage.sample(x, generator)  # type: ignore[operator]
         return result
@@ -148,7 +210,13 @@ def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> T
 
 
 def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
-    """The normal surrogate of one stage; the mean of one that draws nothing."""
+    """Draw the normal surrogate of one stage; the mean of one that draws nothing.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
     if isinstance(stage, Sensor) and hasattr(stage, "gaussian"):
         result: Tensor = stage.gaussian(x, generator)  # type: ignore[operator]
         return result
@@ -156,7 +224,13 @@ def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) ->
 
 
 def measurement_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
-    """What one stage gives under its own policy."""
+    """Measure light with one stage under its own policy.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
     result: Tensor = stage(x, generator=generator) if isinstance(stage, Sensor) else stage(x)
     return result
 
@@ -177,7 +251,7 @@ _WORDS: dict[Quantity, str] = {
 
 @dataclass(frozen=True)
 class Stage:
-    """A sensor in a chain, with the words that name it in messages."""
+    """Sensor in a chain, with its name for messages."""
 
     name: str
     sensor: Sensor
@@ -188,7 +262,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class _Light:
-    """What is known of the light between two stages, and which stage it is from."""
+    """Light between two stages, and the stages that its quantity and bins are known from."""
 
     quantity: Quantity | None = None
     giver: Stage | None = None
@@ -198,17 +272,29 @@ class _Light:
 
 
 def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
-    """The sensors of a chain in their order, those of nested chains too; None for modules of another kind."""
+    """Yield the sensors of a chain in their order, those of nested chains too; None for modules of another kind.
+
+    Args:
+        chain: a chain.
+    """
     for name, stage in in_order(named(getattr(chain, "stages", chain))):
         yield Stage(name, stage) if isinstance(stage, Sensor) else None
 
 
 def check_stages(chain: nn.Module) -> bool:
-    """UnitError for stages of which one is not made for what those before it give. Whether `check_window` has more to
-    say of light whose bins are known.
+    """Check that each stage takes what the stages before it give.
 
-    Compared are bins, `cycles`, laser periods and quantities. What a module of another kind does to the light is not
-    known, nor what a sensor does that has no `gives`: behind these, bins and quantities are compared anew.
+    Compared are bins, `cycles`, laser periods and quantities. The output of a module of another kind, or of a sensor
+    without `gives`, is unknown: behind these, bins and quantities are compared anew.
+
+    Args:
+        chain: a chain.
+
+    Returns:
+        True if `check_window` has to be called again for light whose bins are known.
+
+    Raises:
+        UnitError: for stages that do not go together.
     """
     _through(stages_of(chain), _Light())
     parts = _parts_of(chain)
@@ -219,7 +305,7 @@ def check_stages(chain: nn.Module) -> bool:
 
 
 def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
-    """The light behind stages in a row, each compared with what comes to it; every branch with the same."""
+    """Compare each stage in a row with its light, every branch with the same, and return the light behind."""
     for stage in stages:
         if stage is None:
             light = _Light()
@@ -235,7 +321,7 @@ def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
 
 
 def _parts_of(chain: nn.Module) -> list[Stage]:
-    """Every sensor of a chain, those that other sensors are made of too."""
+    """Return every sensor of a chain, parts of other sensors too."""
     return [Stage(name, part) for name, part in parts_of(chain)]
 
 
@@ -243,7 +329,15 @@ def _parts_of(chain: nn.Module) -> list[Stage]:
 
 
 def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
-    """UnitError when a sensor, or one that is part of it, was made for other bins than those of ``axis``."""
+    """Check that a sensor and its parts were made for the bins of an axis.
+
+    Args:
+        sensor: sensor or chain.
+        axis: axis of the light.
+
+    Raises:
+        UnitError: for other bins.
+    """
     for name, module in sensor.named_modules():
         if not isinstance(module, Sensor):
             continue  # a measured response has bins of its own
@@ -265,7 +359,7 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
 
 
 def _same_bins(light: _Light, stage: Stage) -> _Light:
-    """The light with the stage that its bins are known from. UnitError for a stage that was made for others."""
+    """Add the bins of a stage to the light; UnitError for a stage that was made for others."""
     width, number = _bins(stage)
     other: Stage | None = None
     if light.number is not None and number not in (None, _bins(light.number)[1]):
@@ -285,7 +379,7 @@ def _same_bins(light: _Light, stage: Stage) -> _Light:
 
 
 def _bins(stage: Stage) -> tuple[float | None, int | None]:
-    """(width in seconds, number) of the bins that a sensor was made for; None for what it takes any of."""
+    """Return width in seconds and number of the bins that a sensor was made for; None where any fits."""
     axis, width = getattr(stage.sensor, "axis", None), as_number(getattr(stage.sensor, "bin_width_s", None))
     if isinstance(axis, TimeAxis):
         return axis.bin_width_s, axis.num_bins
@@ -303,7 +397,7 @@ def _shown(bins: tuple[float | None, int | None]) -> str:
 
 
 def _check_quantity(light: _Light, stage: Stage) -> None:
-    """UnitError for a stage that takes other light than the stages before it give."""
+    """Raise UnitError for a stage that takes other light than the stages before it give."""
     takes, given = stage.sensor.takes, light.quantity
     if not takes or given is None or given in takes:
         return
@@ -348,7 +442,7 @@ def _after(stage: Stage, light: _Light) -> _Light:
 
 
 def _check_cycles(stages: list[Stage]) -> None:
-    """UnitError for stages that count different numbers of laser cycles."""
+    """Raise UnitError for stages that count different numbers of laser cycles."""
     counting = [(s, s.sensor.cycles) for s in stages if isinstance(getattr(s.sensor, "cycles", None), int)]
     for stage, cycles in counting[1:]:
         first, wanted = counting[0]
@@ -360,12 +454,18 @@ def _check_cycles(stages: list[Stage]) -> None:
 
 
 def check_window(chain: nn.Module, num_bins: int | None) -> None:
-    """UnitError where bins, dead times and the laser period of a chain do not go together.
+    """Check that bins, dead times and the laser period of a chain go together.
 
     A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; any other
     detector has to be armed again when the next cycle begins, with the dead time of its afterpulses as with its own.
-    The period is that of a `PhotonBudget`, or without one the `period_s` of an Afterpulsing. ``num_bins``: of the
-    light, None while there is none, which leaves out the window of stages that were made with a width alone.
+    The period is that of a `PhotonBudget`, or without one the `period_s` of an Afterpulsing.
+
+    Args:
+        chain: a chain.
+        num_bins: bins of the light; None leaves out the window of stages that were made with a width alone.
+
+    Raises:
+        UnitError: if they do not.
     """
     stages = _parts_of(chain)
     budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
@@ -384,7 +484,11 @@ def check_window(chain: nn.Module, num_bins: int | None) -> None:
 
 
 def has_period(chain: nn.Module) -> bool:
-    """Whether a laser period is known in a chain."""
+    """Return True if a laser period is known in a chain.
+
+    Args:
+        chain: a chain.
+    """
     names = ("repetition_rate_hz", "period_s")
     return any(isinstance(getattr(part.sensor, name, None), float) for part in _parts_of(chain) for name in names)
 
@@ -418,7 +522,7 @@ def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | 
 
 
 def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
-    """UnitError for a detector that is still dead when the next cycle begins."""
+    """Raise UnitError for a detector that is still dead when the next cycle begins."""
     (width_s, number), dead_s = _bins(stage), _dead_time(stage) or 0.0
     # what is not known yet is looked at when light comes
     window_s = 0.0 if width_s is None else (number or num_bins or 0) * width_s
@@ -431,10 +535,16 @@ def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | No
 
 
 def check_dead_times(chain: nn.Module) -> None:
-    """UnitError for an `Afterpulsing` behind a detector of another dead time: one detector has one.
+    """Check that an `Afterpulsing` has the dead time of the detector before it: one detector has one.
 
     A detector of one detection per cycle has none of its own. In `PixelGroups`, whose sensors stand beside one another,
     the dead time has to be that of one of them.
+
+    Args:
+        chain: a chain.
+
+    Raises:
+        UnitError: for another dead time.
     """
     before: list[Stage] = []
     for stage in _parts_of(chain):
@@ -469,17 +579,22 @@ _PULSE_AND_JITTER = (
 
 
 def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
-    """What to do about a zero boundary; a camera that is made of responses has a boundary of its own."""
+    """Return the remedy for a zero boundary; a camera that is made of responses has a boundary of its own."""
     within = any(getattr(o, "boundary", None) and o is not stage and stage in list(o.modules()) for o in outer)
     return _PULSE_AND_JITTER if isinstance(stage, ImpulseResponse) and not within else "Use boundary='periodic'."
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the light has passed: a background, what has made counts of it, what has made codes of its bins, and
-    whether taps were subtracted and the detector had afterpulses of its own.
+    """Properties of the light so far.
 
-    `outer`: the stages of the chain as they were given.
+    Attributes:
+        background: True behind a budget with ambient light or dark counts.
+        behind: detector that has made counts of it.
+        codes: converter that has made codes of its bins.
+        difference: True behind a difference of taps.
+        pulses: True if the detector has afterpulses of its own.
+        outer: stages of the chain as they were given.
     """
 
     background: bool = False
@@ -490,7 +605,7 @@ class _Seen:
     outer: tuple[nn.Module, ...] = ()
 
     def also(self, other: _Seen) -> _Seen:
-        """What pixels of one kind or another have passed."""
+        """Return the properties of light of which pixels have passed one or the other."""
         return _Seen(
             background=self.background or other.background,
             behind=self.behind or other.behind,
@@ -502,7 +617,11 @@ class _Seen:
 
 
 def has_background(budget: PhotonBudget) -> bool:
-    """Whether a budget adds ambient light or dark counts, or may learn to."""
+    """Return True if a budget adds ambient light or dark counts, or may learn to.
+
+    Args:
+        budget: the budget.
+    """
     ambient, dark = torch.as_tensor(budget.ambient_rate_hz), torch.as_tensor(budget.dark_count_rate_hz)
     efficiency = torch.as_tensor(budget.quantum_efficiency)
     if ambient.requires_grad or dark.requires_grad:
@@ -512,18 +631,26 @@ def has_background(budget: PhotonBudget) -> bool:
 
 
 def _detects(stage: nn.Module) -> bool:
-    """Whether a stage makes counts of light."""
+    """Return True if a stage makes counts of light."""
     return isinstance(stage, Sensor) and stage.gives == "counts" and bool({"rate", "electrons"} & set(stage.takes))
 
 
 def check_order(stages: Iterable[nn.Module], where: str) -> None:
-    """UnitError where constant light meets the end of a window, or counts and rates are taken for one another."""
+    """Check the order of a chain: constant light and ends of windows, rates and counts.
+
+    Args:
+        stages: stages in a row.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: where constant light would starve at the end of a window, or counts would be averaged.
+    """
     outer = list(stages)
     _follow([stage for _, stage in in_order(numbered(outer))], _Seen(outer=tuple(outer)), [], where)
 
 
 def _follow(row: list[nn.Module], seen: _Seen, after: list[nn.Module], where: str) -> _Seen:
-    """What has been passed at the end of a row of single stages, with the stages `after` it; see `check_order`."""
+    """Check a row of single stages with the stages `after` it, and return the properties of the light behind."""
     for number, stage in enumerate(row):
         rest = row[number + 1 :] + after
         branches = branches_of(stage)
@@ -596,7 +723,7 @@ def _codes(stage: nn.Module) -> bool:
 
 
 def _check_signed(stage: PixelElectronics, where: str) -> None:
-    """UnitError for the electronics of a difference that know no numbers below zero."""
+    """Raise UnitError for the electronics of a difference that know no numbers below zero."""
     if stage.shot_noise:
         raise UnitError(
             f"{where}: expected no shot noise behind a TapDifference, whose negative numbers are no light, got a "

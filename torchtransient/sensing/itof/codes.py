@@ -27,11 +27,14 @@ _TURN = 2 * math.pi
 
 
 class CorrelationCode(ABC):
-    """One weight in [-1, 1] per tap as a function of the phase in turns. Tensors are float64 on the CPU.
+    """Base of codes: one weight in [-1, 1] per tap as a function of the phase in turns. Tensors are float64 on the CPU.
 
-    ``num_taps``: N. ``shifts``: (N,) float64 turns when all taps are one function moved along, else None; only then
-    does the phase follow from the taps by a Fourier sum (`itof_depth.tap_phasor`). A code of two taps cannot tell
-    phase, amplitude and offset apart: it is for pixels with two taps, see `itof_pixels.TwoTapCode`.
+    A code of two taps cannot tell phase, amplitude and offset apart: it is for pixels with two taps, see `TwoTapCode`.
+
+    Attributes:
+        num_taps: N.
+        shifts: (N,) float64 turns when all taps are one function moved along, else None; only then does the phase
+            follow from the taps by a Fourier sum (`tap_phasor`).
     """
 
     num_taps: int
@@ -39,28 +42,56 @@ class CorrelationCode(ABC):
 
     @abstractmethod
     def evaluate(self, turns: Tensor) -> Tensor:
-        """(N, *turns.shape): the weights at a phase in turns, of any size and sign. Differentiable."""
+        """Weights at a phase, differentiable.
+
+        Args:
+            turns: phase in turns, of any size and sign.
+
+        Returns:
+            (N, *turns.shape).
+        """
 
     @abstractmethod
     def bin_means(self, edges_turns: Tensor) -> Tensor:
-        """(N, T): exact means of the weights between successive entries of ``edges_turns`` (T + 1,), ascending."""
+        """Exact means of the weights between successive edges.
+
+        Args:
+            edges_turns: (T + 1,), ascending.
+
+        Returns:
+            (N, T).
+        """
 
     @abstractmethod
     def coefficients(self, harmonics: Sequence[int]) -> Tensor:
-        """(N, len(harmonics)) complex128: ``c`` of ``weight(x) = sum over all integers h of c_h exp(2 pi i h x)``."""
+        """Fourier coefficients ``c`` of ``weight(x) = sum over all integers h of c_h exp(2 pi i h x)``.
+
+        Args:
+            harmonics: whole numbers h.
+
+        Returns:
+            (N, len(harmonics)) complex128.
+        """
 
     @property
     @abstractmethod
     def harmonics(self) -> tuple[int, ...] | None:
-        """The non-negative harmonics that the code has, or None when there are infinitely many."""
+        """Non-negative harmonics that the code has, or None when there are infinitely many."""
 
 
 class FourierCode(CorrelationCode):
-    """``sum_h amplitude_h cos(2 pi h (x - n / N) + phase_h)``: a sine with the harmonics that a real camera adds.
+    """Sine with the harmonics that a real camera adds: ``sum_h amplitude_h cos(2 pi h (x - n / N) + phase_h)``.
 
-    Two taps are a quarter of a turn apart instead of a half (`phase_steps`). ``harmonics_of_one_tap``: harmonic ->
-    (amplitude, phase in radians). Raises UnitError when the weights could leave [-1, 1] (the amplitudes sum to more
-    than one) or a harmonic is not a positive whole number, ShapeError for less than two taps.
+    Two taps are a quarter of a turn apart instead of a half (`phase_steps`).
+
+    Args:
+        num_taps: N, two and more.
+        harmonics_of_one_tap: harmonic -> (amplitude, phase in radians).
+
+    Raises:
+        UnitError: when the weights could leave [-1, 1] (the amplitudes sum to more than one), or a harmonic is not a
+            positive whole number.
+        ShapeError: for less than two taps.
     """
 
     def __init__(self, num_taps: int, harmonics_of_one_tap: Mapping[int, tuple[float, float]]) -> None:
@@ -119,9 +150,14 @@ def _harmonic(h: object, pair: object) -> tuple[int, tuple[float, float]]:
 class PiecewiseLinearCode(CorrelationCode):
     """Straight lines between knots, periodic: every correlation of rectangular pulses, and sampled measurements.
 
-    ``knots``: (N, J) ascending turns within one period; ``values``: (N, J) in [-1, 1]; both are copied to float64.
-    ``shifts`` as in the base class. Raises ShapeError for other shapes, UnitError for knots that do not ascend
-    within one turn or values outside [-1, 1].
+    Args:
+        knots: (N, J) ascending turns within one period; copied to float64.
+        values: (N, J) in [-1, 1]; copied to float64.
+        shifts: as of `CorrelationCode`.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for knots that do not ascend within one turn or values outside [-1, 1].
     """
 
     def __init__(self, knots: Tensor, values: Tensor, shifts: Tensor | None = None) -> None:
@@ -149,7 +185,7 @@ class PiecewiseLinearCode(CorrelationCode):
         self._integral = torch.cat([torch.zeros_like(area[:, :1]), area.cumsum(dim=1)], dim=1)
 
     def _locate(self, turns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Whole periods, index of the line, and distance from its first knot, each (N, M) for turns (M,)."""
+        """Return whole periods, index of the line, and distance from its first knot, each (N, M) for turns (M,)."""
         x = turns.to(torch.float64).cpu() - self._start
         periods = torch.floor(x)
         x = x - periods
@@ -187,16 +223,30 @@ class PiecewiseLinearCode(CorrelationCode):
 
 
 def sine_code(num_taps: int = 4) -> FourierCode:
-    """Sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``; two taps, and errors, as `FourierCode`."""
+    """Make the code of sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``.
+
+    Args:
+        num_taps: N, two and more.
+
+    Raises:
+        ShapeError: for less than two taps.
+    """
     return FourierCode(num_taps, {1: (1.0, 0.0)})
 
 
 def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0.5) -> PiecewiseLinearCode:
-    """Rectangular light of ``light_duty`` turns against rectangular gates of ``gate_duty``, tap n moved by n / N (two
-    taps by a quarter of a turn).
+    """Make the code of rectangular light against rectangular gates, tap n moved by n / N turns.
 
-    With both at one half the weight is a triangle wave, whose odd harmonics fall as ``1 / h^2``. The gates are placed
-    so that tap 0 weighs phase zero highest, as in `sine_code`. Raises UnitError for duties outside (0, 1).
+    Two taps are moved by a quarter of a turn. With both duties at one half the weight is a triangle wave, whose odd
+    harmonics fall as ``1 / h^2``. The gates are placed so that tap 0 weighs phase zero highest, as in `sine_code`.
+
+    Args:
+        num_taps: N, two and more.
+        light_duty: turns that the light is on, in (0, 1).
+        gate_duty: turns that a gate is open, in (0, 1).
+
+    Raises:
+        UnitError: for duties outside (0, 1).
     """
     light_duty = check_number(light_duty, "light_duty", "square_code")
     gate_duty = check_number(gate_duty, "gate_duty", "square_code")
@@ -210,10 +260,16 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
 
 
 def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
-    """Hamiltonian code of 3 or 4 taps (Gupta et al. 2018): short light pulses against binary gates.
+    """Make the Hamiltonian code of 3 or 4 taps (Gupta et al. 2018): short light pulses against binary gates.
 
-    3 taps: light on for 1/6 turn, gates half a turn, a third apart. 4 taps: light on for 1/12 turn; two gates are
-    open for half a turn, two of them twice within a turn. Raises ShapeError for another number of taps.
+    3 taps: light on for 1/6 turn, gates half a turn, a third apart. 4 taps: light on for 1/12 turn; two gates are open
+    for half a turn, two of them twice within a turn.
+
+    Args:
+        num_taps: 3 or 4.
+
+    Raises:
+        ShapeError: for another number of taps.
     """
     taps = as_whole(num_taps)
     if taps == 3:
@@ -228,10 +284,17 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
 def binary_code(
     light_duty: float, gates: Sequence[Sequence[tuple[float, float]]], shifts: Tensor | None = None
 ) -> PiecewiseLinearCode:
-    """Light that is on for the first ``light_duty`` turns of a period, against gates of any number of openings.
+    """Make the code of light that is on at the start of a period, against gates of any number of openings.
 
-    ``gates``: per tap its openings as (start, end) in turns, ``0 < end - start < 1``. Light of phase x falls into an
-    opening with the part of it that overlaps; all of it gives +1, none -1. Raises UnitError where openings overlap.
+    Light of phase x falls into an opening with the part of it that overlaps; all of it gives +1, none -1.
+
+    Args:
+        light_duty: turns that the light is on.
+        gates: per tap its openings as (start, end) in turns, ``0 < end - start < 1``.
+        shifts: as of `CorrelationCode`.
+
+    Raises:
+        UnitError: where openings overlap.
     """
     light_duty = check_number(light_duty, "light_duty", "binary_code", high=1.0, open_low=True)
     if shifts is not None:
@@ -252,10 +315,15 @@ def binary_code(
 
 
 def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
-    """Correlation functions measured at equal steps of the phase over one period.
+    """Make a code of correlation functions measured at equal steps of the phase over one period.
 
-    ``samples``: (N, S), any unit; each tap is scaled by its largest magnitude. ``closed``: the last sample repeats
-    the first one of the next period and is left out. Raises ShapeError, and UnitError for a tap that is zero.
+    Args:
+        samples: (N, S), any unit; each tap is scaled by its largest magnitude.
+        closed: the last sample repeats the first one of the next period and is left out.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for a tap that is zero.
     """
     table = _plain(samples, "samples", "measured_code")
     if table.ndim != 2 or table.shape[1] < 3:
@@ -279,7 +347,7 @@ def _plain(given: object, name: str, where: str) -> Tensor:
 
 
 def _overlap(x: Tensor, light: float, a: float, b: float) -> Tensor:
-    """How much of the light interval [x, x + light) lies in the opening [a, b), both modulo one turn."""
+    """Length of the light interval [x, x + light) in the opening [a, b), both modulo one turn."""
     if not 0 < b - a < 1 or not 0 < light < 1:
         raise UnitError(f"binary_code: expected openings and light of 0 to 1 turn, got ({a}, {b}) and {light}.")
     total = torch.zeros_like(x)
@@ -301,7 +369,14 @@ def _pad_knots(knots: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tenso
 
 
 def phase_steps(num_taps: int) -> Tensor:
-    """(N,) float64 turns: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice."""
+    """Phases of the taps: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice.
+
+    Args:
+        num_taps: N, two and more.
+
+    Returns:
+        (N,) float64 turns.
+    """
     num_taps = _check_taps(num_taps)
     steps = torch.arange(num_taps, dtype=torch.float64)
     return steps / (num_taps if num_taps > 2 else 4)
@@ -341,9 +416,14 @@ def _not_none(value: Tensor | None) -> Tensor:
 class TwoTapCode(CorrelationCode):
     """Pixels of two taps: the 2 N taps A_0, B_0, A_1, B_1, ... of a code of N gates, with B the opposite of A.
 
-    ``code``: of any kind, with N >= 2 phase steps, exposed one after another. Light is conserved whatever the code.
-    For a pixel whose B is not the opposite of its A, measure both and give 2 N functions to `measured_code`. Raises
-    UnitError for what is no code or has two taps already.
+    Light is conserved whatever the code. For a pixel whose B is not the opposite of its A, measure both and give 2 N
+    functions to `measured_code`.
+
+    Args:
+        code: of any kind, with N >= 2 phase steps, exposed one after another.
+
+    Raises:
+        UnitError: for anything else, and for a code that has two taps already.
     """
 
     def __init__(self, code: CorrelationCode) -> None:
@@ -369,9 +449,13 @@ class TwoTapCode(CorrelationCode):
 
 
 class ReversedCode(CorrelationCode):
-    """A code whose phase steps go the other way: tap n is moved by minus its shift.
+    """Code whose phase steps go the other way: tap n is moved by minus its shift.
 
-    Raises UnitError for a code that is not one function moved along (`CorrelationCode.shifts` is None).
+    Args:
+        code: one function moved along.
+
+    Raises:
+        UnitError: for other codes (`CorrelationCode.shifts` is None).
     """
 
     def __init__(self, code: CorrelationCode) -> None:
@@ -402,7 +486,15 @@ class ReversedCode(CorrelationCode):
 
 
 def in_direction(code: CorrelationCode, direction: int) -> CorrelationCode:
-    """The code itself for +1; with its phase steps reversed for -1. Errors as `ReversedCode`."""
+    """Return a code, or the code with its phase steps reversed.
+
+    Args:
+        code: the code.
+        direction: 1, or -1 to reverse.
+
+    Raises:
+        UnitError: for a code that `ReversedCode` refuses.
+    """
     if direction == 1:
         return code
     return TwoTapCode(ReversedCode(code.code)) if isinstance(code, TwoTapCode) else ReversedCode(code)

@@ -62,16 +62,22 @@ _DEEPEST_M = 10.0  # depth that a pixel or its wires may add; millimetres are a 
 
 @dataclass(frozen=True, eq=False)
 class ItofCalibration:
-    """What a camera adds to the phase of light: raw phase = direction x (phase + offset + maps).
+    """Phases that a camera adds to that of light: raw phase = direction x (phase + offset + maps).
 
-    ``phase_offset_rad``: of all pixels, one number or one for each frequency; a delay in the camera is positive, as if
-    the scene were further away. ``direction``: -1 for a camera whose phase steps go the other way. ``phase_map_rad``:
-    fixed pattern of the pixels, (H, W) for all frequencies or (F, H, W). ``depth_map_m``: the same as metres of depth,
-    (H, W), ``4 pi f / c`` radians each (wires and drivers are delays). Maps and offsets add up. Tensors keep their
-    gradients, in `read_itof` and, as an `nn.Parameter`, in an `ItofCorrelation` of a sine code.
+    Maps and offsets add up. Tensors keep their gradients, in `read_itof` and, as an `nn.Parameter`, in an
+    `ItofCorrelation` of a sine code. `ItofCorrelation` puts them in, `read_itof` takes them off.
 
-    `ItofCorrelation` puts them in, `read_itof` takes them off. Raises UnitError, for more than two turns (degrees?)
-    and for depths beyond 10 m (millimetres?) too, and ShapeError.
+    Attributes:
+        phase_offset_rad: of all pixels, one number or one for each frequency; a delay in the camera is positive, as if
+            the scene were further away.
+        direction: -1 for a camera whose phase steps go the other way.
+        phase_map_rad: fixed pattern of the pixels, (H, W) for all frequencies or (F, H, W).
+        depth_map_m: the same as metres of depth, (H, W), ``4 pi f / c`` radians each (wires and drivers are delays).
+
+    Raises:
+        UnitError: for numbers that are not finite, more than two turns (degrees?) and depths beyond 10 m
+            (millimetres?).
+        ShapeError: for other dimensions.
     """
 
     _: KW_ONLY
@@ -93,19 +99,26 @@ class ItofCalibration:
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """Names of what requires a gradient."""
+        """Names of the tensors that require a gradient."""
         values = {name: getattr(self, name) for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m")}
         return tuple(name for name, v in values.items() if isinstance(v, Tensor) and v.requires_grad)
 
     @property
     def has_map(self) -> bool:
-        """Whether pixels differ."""
+        """True if pixels differ."""
         return self.phase_map_rad is not None or self.depth_map_m is not None
 
     def phases_rad(self, frequencies_hz: Numbers) -> Tensor:
-        """(F, H, W) float64 on the CPU: offset and maps together, (F, 1, 1) without maps, with their gradients.
+        """Sum offset and maps, with their gradients.
 
-        Raises ShapeError when offsets or maps are of another number of frequencies, or maps of different sizes.
+        Args:
+            frequencies_hz: F modulation frequencies in hertz.
+
+        Returns:
+            (F, H, W) float64 on the CPU, (F, 1, 1) without maps.
+
+        Raises:
+            ShapeError: for offsets or maps of another number of frequencies, or maps of different sizes.
         """
         count = len(frequencies_hz)
         offset = _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1))
@@ -135,8 +148,11 @@ class ItofCalibration:
 
 
 def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math.inf, why: str = "") -> Tensor:
-    """float64 on the CPU, with its gradient. UnitError for what holds no finite numbers or larger ones than ``most``,
-    ShapeError for other numbers of dimensions.
+    """Return finite numbers in float64 on the CPU, with their gradient.
+
+    Raises:
+        UnitError: for anything else, and for magnitudes above ``most``.
+        ShapeError: for other numbers of dimensions.
     """
     if given is None:
         return torch.zeros((), dtype=torch.float64)
@@ -167,13 +183,27 @@ _LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 
 def rounding_of(weights: Tensor) -> float:
-    """What weights may be off by in their dtype."""
+    """Largest rounding error of weights in their dtype.
+
+    Args:
+        weights: tensor.
+    """
     most = float(weights.abs().max()) if weights.numel() else 1.0
     return max(float(torch.finfo(weights.dtype).eps), 1e-9) * max(most, 1.0)
 
 
 def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis, within_bin: str) -> Tensor:
-    """(F x 2 harmonics, T) float64: cosine and sine of every harmonic of every frequency."""
+    """Cosine and sine of every harmonic of every frequency, over the bins.
+
+    Args:
+        harmonics: whole numbers.
+        frequencies: F modulation frequencies in hertz.
+        axis: axis of the light.
+        within_bin: "uniform" or "center".
+
+    Returns:
+        (F x 2 harmonics, T) float64.
+    """
     rows = []
     for f in frequencies:
         for h in harmonics:
@@ -187,7 +217,20 @@ def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: 
 def taps_by_pixel(
     x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, contrast: float, within_bin: str, phase: Tensor
 ) -> Tensor:
-    """Taps (..., N, H, W) of light (..., T, H, W), each pixel with weights of its own, at phases (H, W)."""
+    """Taps of light, each pixel with weights of its own.
+
+    Args:
+        x: light (..., T, H, W).
+        code: N taps.
+        f: modulation frequency in hertz.
+        axis: axis of the light.
+        contrast: demodulation contrast.
+        within_bin: "uniform" or "center".
+        phase: (H, W) or (1, 1), in radians.
+
+    Returns:
+        (..., N, H, W).
+    """
     light, bins = x.flatten(-2), axis.num_bins
     turns = (phase.to("cpu", torch.float64) / _TURN % 1.0).flatten()
     turns = turns.expand(light.shape[-1]) if turns.numel() == 1 else turns
@@ -222,7 +265,15 @@ Frequencies = float | Sequence[float] | Tensor | NDArray[Any]
 
 
 def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
-    """Modulation frequencies in hertz as a tuple; UnitError unless there are some, between 1 kHz and 1 THz."""
+    """Return modulation frequencies as a tuple.
+
+    Args:
+        frequencies_hz: one or several, in hertz.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: unless there are some, between 1 kHz and 1 THz.
+    """
     refuse_cut_off(frequencies_hz, "frequencies_hz", where)
     array = real_array(frequencies_hz)
     given: Sequence[Any] = [frequencies_hz]  # what is no row of numbers is told by the check of its entries
@@ -245,15 +296,26 @@ def tap_weights(
     within_bin: WithinBin = "uniform",
     calibration: ItofCalibration | None = None,
 ) -> Tensor:
-    """(F N, T) float64 on the CPU: what share of the light of every bin goes to every tap.
+    """Share of the light of every bin in every tap.
 
-    ``within_bin``: "uniform" spreads the light of a bin evenly over it (the mean of the code over the bin, exact for
-    light that is nowhere special); "center" puts it in the middle. ``contrast``: demodulation contrast in [0, 1],
-    0.5 to 0.9 in cameras. The shares of the taps sum to one where the code's shifted copies sum to zero (sine, square
-    with half duty and an even N or any N of its sine part, every `TwoTapCode`), so that light is conserved.
-    ``calibration``: phase offset and direction; maps of pixels are for `ItofCorrelation`.
+    The shares of the taps sum to one where the code's shifted copies sum to zero (sine, square with half duty and an
+    even N or any N of its sine part, every `TwoTapCode`), so that light is conserved.
 
-    Raises UnitError, and ShapeError for a code of two taps that is no `TwoTapCode`.
+    Args:
+        code: N taps.
+        frequencies_hz: F modulation frequencies in hertz.
+        axis: axis of the light, of T bins.
+        contrast: demodulation contrast in [0, 1], 0.5 to 0.9 in cameras.
+        within_bin: "uniform" spreads the light of a bin evenly over it (the mean of the code over the bin, exact for
+            light that is nowhere special); "center" puts it in the middle.
+        calibration: phase offset and direction; maps of pixels are for `ItofCorrelation`.
+
+    Returns:
+        (F N, T) float64 on the CPU.
+
+    Raises:
+        UnitError: for numbers out of range, and maps of pixels.
+        ShapeError: for a code of two taps that is no `TwoTapCode`.
     """
     me = "tap_weights"
     code, phases = _checked(code, frequencies_hz, axis, contrast, within_bin, calibration, me)
@@ -280,7 +342,7 @@ def _checked(
     calibration: ItofCalibration | None,
     me: str,
 ) -> tuple[CorrelationCode, Tensor]:
-    """The code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
+    """Return the code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
     check_number(contrast, "contrast", me, high=1.0)
     check_time_axis(axis, me)
     if not isinstance(within_bin, str) or within_bin not in ("uniform", "center"):
@@ -293,7 +355,16 @@ def _checked(
 
 
 def check_code(code: object, where: str) -> CorrelationCode:
-    """`code` when it tells phase, amplitude and offset apart. Raises UnitError, ShapeError for two taps."""
+    """Return `code` if it tells phase, amplitude and offset apart.
+
+    Args:
+        code: anything.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for anything that is no code.
+        ShapeError: for two taps.
+    """
     if not isinstance(code, CorrelationCode):
         raise UnitError(f"{where}: expected a code such as sine_code(4), got {code!r}.")
     if code.num_taps < 3:
@@ -306,9 +377,17 @@ def check_code(code: object, where: str) -> CorrelationCode:
 
 @in_single
 def correlate(transient: Tensor, weights: Tensor) -> Tensor:
-    """(..., C, M, H, W): every row of ``weights`` (M, T) times the time axis of a transient (..., C, T, H, W).
+    """Multiply rows of weights with the time axis of a transient.
 
-    Raises ShapeError when the numbers of bins differ.
+    Args:
+        transient: (..., C, T, H, W).
+        weights: (M, T).
+
+    Returns:
+        (..., C, M, H, W).
+
+    Raises:
+        ShapeError: when the numbers of bins differ.
     """
     check_transient(transient, "correlate")
     (weights,) = reals("correlate", weights=weights)
@@ -332,15 +411,29 @@ def taps_from_phasor(
     contrast: float = 1.0,
     calibration: ItofCalibration | None = None,
 ) -> Tensor:
-    """Taps (..., C, F N, H, W) straight from a phasor image (..., C, K, H, W), no histogram in between.
+    """Taps straight from a phasor image, no histogram in between.
 
-    ``phasor``: complex photoelectrons at the K frequencies of ``phasor_axis``; needed are zero (or ``steady`` (..., C,
-    H, W) instead) and every harmonic of every modulation frequency, to a relative 1e-6; negative ones do as well.
-    ``harmonics``: those of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
-    that has infinitely many, refuses. What is left out is lost: a square code kept to the harmonic h misses wiggles
-    of about ``1 / h^2`` rad. ``calibration``: with maps of pixels too, (H, W) those of the phasor.
+    Needed are zero (or ``steady`` instead) and every harmonic of every modulation frequency, to a relative 1e-6;
+    negative ones do as well. Harmonics that are left out are lost: a square code kept to the harmonic h misses wiggles
+    of about ``1 / h^2`` rad.
 
-    Raises ShapeError for a phasor that does not fit its axis, UnitError for a missing frequency.
+    Args:
+        phasor: complex photoelectrons (..., C, K, H, W).
+        phasor_axis: its K frequencies.
+        code: N taps.
+        frequencies_hz: F modulation frequencies in hertz.
+        steady: all light, (..., C, H, W).
+        harmonics: those of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
+            that has infinitely many, refuses.
+        contrast: demodulation contrast in [0, 1].
+        calibration: with maps of pixels too, (H, W) those of the phasor.
+
+    Returns:
+        (..., C, F N, H, W).
+
+    Raises:
+        ShapeError: for a phasor that does not fit its axis.
+        UnitError: for a missing frequency.
     """
     check_tensors("taps_from_phasor", phasor=phasor)
     me = "taps_from_phasor"
@@ -390,7 +483,7 @@ def _mixed(
 
 
 def _fitting(phases: Tensor, x: Tensor, where: str) -> Tensor:
-    """Phases (F, H, W) for the pixels of ``x``. Raises ShapeError for a map of other pixels."""
+    """Return phases (F, H, W) if they are those of the pixels of ``x``, else raise ShapeError."""
     size = tuple(phases.shape[-2:])
     if size != (1, 1) and size != tuple(x.shape[-2:]):
         raise ShapeError(f"{where}: expected light of {size} pixels, as the calibration's, got {tuple(x.shape)}.")
@@ -398,7 +491,7 @@ def _fitting(phases: Tensor, x: Tensor, where: str) -> Tensor:
 
 
 def _component(phasor: Tensor, axis: FrequencyAxis, frequency_hz: float, where: str) -> Tensor:
-    """(..., C, H, W) complex: the phasor at one frequency, referred to t = 0."""
+    """Phasor at one frequency, referred to t = 0: (..., C, H, W) complex."""
     have = axis.hertz
     tolerance = 1e-6 * abs(frequency_hz) + 1e-3
     for sign in (1.0, -1.0):
@@ -418,16 +511,27 @@ def _component(phasor: Tensor, axis: FrequencyAxis, frequency_hz: float, where: 
 class ItofCorrelation(Sensor):
     """Photoelectrons per bin (..., C, T, H, W) to the mean electrons of the taps (..., C, F N, H, W).
 
-    ``code``, ``frequencies_hz`` (F of them), ``axis`` (of the transient), ``contrast`` and ``within_bin`` as in
-    `tap_weights`. Light and ``background_e``, electrons of unmodulated light, are those of *all* N phase steps of a
-    frequency and all taps together, which share them equally. ``electrons_per_unit`` scales a radiance to electrons;
-    ``calibration``: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
-    `FourierCode`. Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
-    `PixelElectronics`, the difference of two taps in `TapDifference`; phase and depth in `read_itof`.
+    Linear but for the background, hence exact in the mean. Noise, saturation and converter follow in
+    `PixelElectronics`, the difference of two taps in `TapDifference`; phase and depth in `read_itof`. A map of pixels
+    costs one pass over the transient for each harmonic of a sine code; a code with corners needs weights of N T numbers
+    for every pixel, made anew in every call.
 
-    A map of pixels costs one pass over the transient for each harmonic of a sine code; a code with corners needs
-    weights of N T numbers for every pixel, made anew in every call. Errors as `tap_weights`; ShapeError for light of
-    other pixels than those of the map.
+    Args:
+        code: N taps.
+        frequencies_hz: F modulation frequencies in hertz.
+        axis: axis of the light.
+        contrast: as of `tap_weights`.
+        background_e: electrons of unmodulated light. Light and background are those of *all* N phase steps of a
+            frequency and all taps together, which share them equally.
+        electrons_per_unit: scales a radiance to electrons.
+        within_bin: as of `tap_weights`.
+        calibration: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
+            `FourierCode`.
+
+    Raises:
+        UnitError: for numbers out of range.
+        ShapeError: for a code of two taps that is no `TwoTapCode`, and for light of other pixels than those of the map.
+        GradientError: for a calibration that requires a gradient otherwise.
     """
 
     takes, gives = ("electrons", "counts"), "electrons"
@@ -474,7 +578,7 @@ class ItofCorrelation(Sensor):
         self.num_bins = axis.num_bins
 
     def _of_one(self, phases: Tensor) -> bool:
-        """Whether all pixels have the same phases, which are then in the weights."""
+        """Return True if all pixels have the same phases, which are then in the weights."""
         return not self._learnt and phases.shape[1:] == (1, 1)
 
     def _weights_for(self, phases: Tensor) -> Tensor:
@@ -488,14 +592,14 @@ class ItofCorrelation(Sensor):
         return torch.zeros(0, self.axis.num_bins, dtype=torch.float64)
 
     def _with(self, phases: Tensor) -> ItofCalibration:
-        """The calibration that has these phases."""
+        """Return the calibration that has these phases."""
         direction = 1 if self.calibration is None else self.calibration.direction
         if phases.shape[1:] == (1, 1):
             return ItofCalibration(phase_offset_rad=phases.flatten().tolist(), direction=direction)
         return ItofCalibration(direction=direction, phase_map_rad=phases)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        """Phases of another size come with the state; what else is another camera's is an error."""
+        """Take phases of another size with the state; refuse the weights of another camera."""
         phases, weights = state_dict.get(f"{prefix}phases_rad"), state_dict.get(f"{prefix}weights")
         if isinstance(phases, Tensor) and isinstance(weights, Tensor) and not self._learnt:
             if phases.ndim != 3 or phases.shape[0] != len(self.frequencies_hz):
@@ -516,13 +620,13 @@ class ItofCorrelation(Sensor):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def _known(self) -> ItofCalibration:
-        """The calibration with the parameters and phases as they are now."""
+        """Return the calibration with the parameters and phases as they are now."""
         if self.calibration is None or not self._learnt:
             return self._with(self.phases_rad)
         return replace(self.calibration, **{name: getattr(self, name) for name in self._learnt})
 
     def _phases(self) -> Tensor | None:
-        """Of pixels that differ."""
+        """Return phases of pixels that differ, else None."""
         if self._learnt:
             return self._known().phases_rad(self.frequencies_hz)
         return None if self._of_one(self.phases_rad) else self.phases_rad
@@ -559,7 +663,17 @@ class ItofCorrelation(Sensor):
         steady: Tensor | None = None,
         harmonics: Sequence[int] | None = None,
     ) -> Tensor:
-        """The same taps from a phasor image; arguments and errors as in `taps_from_phasor`."""
+        """Taps from a phasor image in place of a transient; see `taps_from_phasor`.
+
+        Args:
+            phasor: complex (..., C, K, H, W).
+            phasor_axis: its K frequencies.
+            steady: all light, (..., C, H, W), where the phasor does not hold zero.
+            harmonics: those of the code to keep; None for all.
+
+        Returns:
+            (..., C, F N, H, W).
+        """
         taps = taps_from_phasor(
             phasor,
             phasor_axis,
@@ -585,8 +699,8 @@ class TapDifference(Sensor):
     Stands behind the `PixelElectronics` that draw the noise of both taps. A camera that digitizes the difference has
     its converter in a second one behind it, of signed codes, `PixelElectronics(shot_noise=False, gain_e_per_dn=...,
     bits=..., signed=True)`, or with a black level in the middle of its range: `Compose` refuses one without room below
-    zero, which would clip every negative difference, and shot noise of a difference, which has none of its own. Raises
-    ShapeError for an odd number of taps.
+    zero, which would clip every negative difference, and shot noise of a difference, which has none of its own. An odd
+    number of taps is a ShapeError.
     """
 
     gives = "the same"
