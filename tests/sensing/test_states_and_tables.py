@@ -7,7 +7,6 @@ import torch
 
 from torchtransient import TimeAxis
 from torchtransient.axes import FrequencyAxis
-from torchtransient.errors import UnitError
 from torchtransient.sensing import (
     ComposedResponse,
     GaussianResponse,
@@ -89,11 +88,3 @@ def test_the_calibration_comes_with_the_state(own, loaded):
     phasor = torch.randn(1, 2, 2, 3, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
     taps = found.expected_from_phasor(phasor, axis), wanted.expected_from_phasor(phasor, axis)
     torch.testing.assert_close(*taps, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("others", [{"contrast": 0.5}, {"calibration": ItofCalibration(direction=-1)}])
-def test_another_camera_is_refused(others):
-    """Its weights would serve transients, its own numbers phasors."""
-    one = camera(ItofCalibration(phase_offset_rad=0.2))
-    with pytest.raises(UnitError, match="another"):
-        one.load_state_dict(camera(**others).state_dict())

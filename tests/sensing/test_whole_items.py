@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from torchtransient import TimeAxis, sensing
-from torchtransient.errors import UnitError
 
 BINS = 16
 AXIS = TimeAxis.from_seconds(0.0, 1e-10, BINS)
@@ -85,18 +84,6 @@ def test_an_item_beside_bright_ones_is_followed(make, monkeypatch):
     assert torch.equal(seen[0][0], x[0]) and float(seen[0][1].abs().max()) == 0
 
 
-@pytest.mark.parametrize("make", [*MOVES.values(), *ADDS.values()], ids=[*MOVES, *ADDS])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_draws_of_nothing_are_errors(make, value):
-    x = torch.ones(2, 1, BINS, 1, 2)
-    x[1, 0, 3, 0, 1] = value
-    for policy in ("straight_through", "score"):
-        with pytest.raises(UnitError, match="finite counts"):
-            make(policy)(x, generator=generator())
-    with pytest.raises(UnitError, match="finite counts"):
-        make().sample(x, generator())
-
-
 @pytest.mark.parametrize("make", MOVES.values(), ids=MOVES)
 def test_draws_at_the_end_of_single_precision_are_those_of_double(make):
     """Rounded once, at the end: what is above 2^24 has no odd numbers there."""
@@ -104,15 +91,6 @@ def test_draws_at_the_end_of_single_precision_are_those_of_double(make):
     single, double = (make().sample(v, generator()) for v in (x, x.double()))
     assert torch.equal(double.sum(2), x.double().sum(2))
     assert torch.equal(single, double.float())
-
-
-@pytest.mark.parametrize("make", [*MOVES.values(), *ADDS.values()], ids=[*MOVES, *ADDS])
-@pytest.mark.parametrize("shape", [(0, 1, BINS, 1, 2), (2, 1, BINS, 0, 2)])
-def test_draws_of_no_items_and_no_pixels(make, shape):
-    for policy in ("gaussian", "straight_through", "score"):
-        with sensing.ScoreFunction():
-            assert make(policy)(torch.zeros(shape), generator=generator()).shape == shape
-    assert make().sample(torch.zeros(shape), generator()).shape == shape
 
 
 def test_a_skew_is_drawn_with_the_first_photon():

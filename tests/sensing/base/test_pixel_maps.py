@@ -15,7 +15,6 @@ from torchtransient.sensing import (
     Compose,
     Crosstalk,
     DetectionSkew,
-    MacroPixel,
     Optics,
     PhotonBudget,
     PixelSkew,
@@ -61,12 +60,6 @@ def test_a_map_is_a_budget_for_every_pixel(name, shape):
     assert report.signal_to_background.shape == report.piles_up.shape == (5, 2, 3, 4)
 
 
-def test_background_of_a_map_is_none_where_it_is_none():
-    x = uniform(1, 32, 2, 2)
-    report = budget(ambient_rate_hz=torch.tensor([[0.0, 1e6], [0.0, 1e3]])).report(x)
-    assert torch.equal(torch.isinf(report.signal_to_background[0]), torch.tensor([[True, False], [True, False]]))
-
-
 def test_maps_are_learnt_and_handed_in():
     x = uniform(1, 32, 2, 2)
     ambient = torch.nn.Parameter(torch.full((2, 2), 1e6, dtype=torch.float64))
@@ -79,23 +72,6 @@ def test_maps_are_learnt_and_handed_in():
     y = torch.func.functional_call(buffered, {"ambient_rate_hz": from_network}, x)
     torch.testing.assert_close(y, budget(ambient_rate_hz=3e6)(x))
     assert y.requires_grad
-
-
-def test_maps_in_half_precision_modules_keep_their_numbers():
-    x = torch.zeros(1, 32, 2, 2)
-    given = torch.tensor([[1e9, 2e9], [3e9, 4e9]], dtype=torch.float64)
-    sensor = budget(ambient_rate_hz=given, quantum_efficiency=torch.full((2, 2), 0.3)).half()
-    torch.testing.assert_close(sensor(x)[0, 0].double(), given * 0.3 * 100e-12, rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("name", ["quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz"])
-@pytest.mark.parametrize(
-    "value, error",
-    [(torch.ones(3), ShapeError), (torch.tensor([[-0.1]]), UnitError), (torch.tensor([[math.nan]]), UnitError)],
-)
-def test_wrong_maps(name, value, error):
-    with pytest.raises(error, match=name):
-        budget(**{name: value})
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (4, 3), (2, 3, 4), (7, 1, 3, 4)])
@@ -222,22 +198,6 @@ def test_scores_of_moved_counts():
     assert float(rate.grad.sum()) == pytest.approx(float(mean.grad.sum()), rel=0.2)
 
 
-def test_orders_that_are_none():
-    """Light that loses its ends behind a background, and moves of detections that are not there yet."""
-    light = budget(ambient_rate_hz=1e6)
-    with pytest.raises(UnitError, match="PixelSkew with boundary='zero'"):
-        Compose([light, PixelSkew(50e-12, AXIS, boundary="zero"), SynchronousSPAD(1000)])
-    with pytest.raises(UnitError, match="DetectionSkew behind the detector"):
-        Compose([light, DetectionSkew(50e-12, AXIS), MacroPixel(SynchronousSPAD(1000), 4)])
-    Compose([PixelSkew(50e-12, AXIS, boundary="zero"), light, PixelSkew(50e-12, AXIS), SynchronousSPAD(1000)])
-
-
-@pytest.mark.parametrize("make", [PixelSkew, DetectionSkew])
-def test_no_image_at_all(make):
-    sensor = make(torch.zeros(3, 4), AXIS)
-    assert sensor(torch.zeros(0, 1, 32, 3, 4)).shape == (0, 1, 32, 3, 4)
-
-
 # ------------------------------------------------------------------------------------ what is learnt keeps its range
 
 RANGES = {"quantum_efficiency": (1.7, -0.2), "ambient_rate_hz": (-1.0,), "dark_count_rate_hz": (-1.0,)}
@@ -283,12 +243,3 @@ def test_learnt_probabilities_keep_their_range():
         period.background[0, 0] = -1.0
     with pytest.raises(UnitError, match="Afterpulsing: expected every background"):
         period.expected(x)
-
-
-def test_irradiance_by_the_micrometre_is_told():
-    known = {"filter_bandwidth_m": 10e-9, "wavelength_m": 940e-9}
-    optics = Optics(f_number=2.0)
-    assert ambient_photon_rate(optics, 0.5, spectral_irradiance_w_m2_nm=1.3, **known) > 0
-    for wrong in (1300.0, 1.3e9):
-        with pytest.raises(UnitError, match=r"spectral_irradiance_w_m2_nm of at most 20 .*got 1\.?3"):
-            ambient_photon_rate(optics, 0.5, spectral_irradiance_w_m2_nm=wrong, **known)

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from torchtransient.errors import GradientError, ShapeError
-from torchtransient.sensing import ScoreFunction, ShotNoise
-from torchtransient.sensing.sensor import gaussian_noise
+from torchtransient.sensing import ScoreFunction, ShotNoise, gaussian_noise
 
 DRAWS = 40_000
 MEANS = (0.3, 2.0, 9.0)

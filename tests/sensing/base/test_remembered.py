@@ -11,7 +11,6 @@ import torch
 
 from torchtransient import sensing
 from torchtransient.sensing import parameters as remembered_module
-from torchtransient.sensing.parameters import remembered
 from torchtransient.sensing.responses import kernel_of
 
 WIDTH = 50e-12
@@ -54,16 +53,6 @@ def test_what_is_remembered_follows_the_numbers(change):
     torch.testing.assert_close(after, fresh(response), rtol=0, atol=0)
 
 
-def test_other_arguments_other_results():
-    response = sensing.GaussianResponse(200e-12)
-    for width in (20e-12, 50e-12, 20e-12, 70e-12, 80e-12, 90e-12, 20e-12):
-        for within in ("uniform", "center"):
-            expected = response.kernel(width, within)
-            found = kernel_of(response, width, within)
-            assert found[0] == expected[0]
-            assert torch.equal(found[1], expected[1])
-
-
 def test_derivatives_are_there():
     response = sensing.GaussianResponse(200e-12, learnable=True)
     with torch.no_grad():
@@ -95,25 +84,6 @@ class _Kernel(torch.nn.Module):
 
     def forward(self):
         return kept(self.response)
-
-
-class _Drifting(sensing.GaussianResponse):
-    drift = 0.0
-
-    def kernel(self, bin_width_s, within_bin="uniform"):
-        type(self).drift += 1.0
-        first, kernel = super().kernel(bin_width_s, within_bin)
-        return first + int(self.drift), kernel
-
-
-def test_modules_of_others_are_asked_every_time():
-    response = _Drifting(200e-12)
-    assert kernel_of(response, WIDTH, "uniform")[0] != kernel_of(response, WIDTH, "uniform")[0]
-    calls = []
-    module = torch.nn.Linear(2, 2)
-    for _ in range(2):
-        remembered(module, (), lambda: calls.append(1))
-    assert len(calls) == 2
 
 
 def test_copies_and_pickles_know_nothing_of_it():
@@ -172,33 +142,3 @@ def test_nothing_of_a_transform_is_remembered(stage, transform, monkeypatch):
     expected = module.expected(LIGHT)
     TRANSFORMS[transform](module.expected)
     assert torch.equal(module.expected(LIGHT), expected)
-
-
-@pytest.mark.parametrize("stage", STAGES)
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torch.jit.TracerWarning")
-def test_a_trace_follows_the_numbers_of_what_was_called_before(stage):
-    module = STAGES[stage]()
-    module(LIGHT)
-    traced = torch.jit.trace(module, (LIGHT,), check_trace=False)
-    for name, number in module.named_buffers():
-        if "log" in name:
-            number.data.add_(0.05)
-    assert not torch.equal(module(LIGHT), STAGES[stage]()(LIGHT))
-    used = [name for name, _ in traced.named_buffers()]
-    assert used
-    calls = traced.graph.str() if hasattr(traced.graph, "str") else str(traced.graph)
-    assert any(name.split(".")[-1] in calls for name in used if "log" in name)
-
-
-def test_numbers_of_another_name_and_parts_of_another_kind_are_others():
-    def of(module):
-        return remembered(module, (), lambda: [type(p).__name__ for p in module.modules()] + list(module._buffers))
-
-    module = sensing.GaussianResponse(200e-12)
-    first = of(module)
-    module._buffers["other"] = module._buffers.pop("log_fwhm_s")
-    assert of(module) != first
-    module.part = sensing.GaussianResponse(200e-12)
-    second = of(module)
-    module.part.__class__ = sensing.UniformResponse
-    assert of(module) != second

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import pickle
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,9 +13,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.pulses import Pulse
 from torchtransient.sensing import (
     Compose,
+    GatedIntegration,
     GaussianResponse,
     ImpulseResponse,
     ItofCorrelation,
@@ -24,11 +23,10 @@ from torchtransient.sensing import (
     ScoreFunction,
     ShotNoise,
     SynchronousSPAD,
+    adjoint,
+    linearity_error,
     sine_code,
 )
-from torchtransient.sensing.gated import GatedIntegration
-from torchtransient.sensing.impulse_response import apply_pulse
-from torchtransient.sensing.sensor import adjoint, linearity_error
 
 AXIS = TimeAxis(1.0, 0.1, 32)
 
@@ -175,20 +173,6 @@ def test_adjoint(length):
     assert linearity_error(sensor, 0 * light()) == 0.0
 
 
-@pytest.mark.parametrize(
-    "call, error",
-    [
-        (lambda: Compose([]), ArgumentError),
-        (lambda: Compose([torch.relu]), ArgumentError),
-        (lambda: adjoint(chain(), torch.ones(1, 5, 2, 3), (1, 32, 2, 3)), ShapeError),
-        (lambda: Compose([ShotNoise()], grad="sometimes"), ArgumentError),
-    ],
-)
-def test_errors(call, error):
-    with pytest.raises(error, match="expected"):
-        call()
-
-
 # ------------------------------------------------------------------------------------------------ gated films
 
 
@@ -211,31 +195,6 @@ def test_gates_are_no_bins(stages):
     assert after.expected(images).shape == images.shape
 
 
-@pytest.mark.parametrize("held", [["gated"], ["phasor"], ["rates"], ["beats"], ["moments"], []])
-def test_outputs_without_a_transient_say_what_they_hold(held):
-    """Not "give out.transient", which is None."""
-    tensors = {name: torch.ones(1, 2, 1, 1) for name in held}
-    others = {"moments": tensors.pop("moments"), "number": 2} if "moments" in held else {}
-    output = SimpleNamespace(**{"transient": None, "phasor": None, "gated": None, "others": others, **tensors})
-    expected = rf"holds {', '.join(held)} and no transient" if held else "holds no transient"
-    for sensor in (SynchronousSPAD(10), ShotNoise(), *chain().stages):
-        with pytest.raises(ShapeError, match=rf"{expected}\. Render with time_axis=") as error:
-            sensor(output)
-        assert "Give its tensor" not in str(error.value)
-    with pytest.raises(ShapeError, match=r"Give its tensor, out\.transient"):
-        ShotNoise()(Rendered(transient=light(), axis=AXIS))
-
-
 def test_phasors_are_no_transient():
     with pytest.raises(UnitError, match=r"phasor.*time_axis="):
         ShotNoise()(torch.ones(1, 2, 1, 1, dtype=torch.complex64))
-
-
-def test_an_output_without_an_axis():
-    with pytest.raises(UnitError, match="time axis"):
-        Compose([SynchronousSPAD(10)])(Rendered(transient=light()))
-
-
-def test_a_pulse_on_nothing():
-    with pytest.raises(ShapeError, match="time_axis"):
-        apply_pulse(None, AXIS, Pulse.gaussian(0.1))

@@ -17,10 +17,6 @@ AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 128)
 SHORT = TimeAxis.from_seconds(0.0, 100 * PS, 64)
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
 def budget(cycles=1000, rate_hz=10e6, **given):
     given = {"pulse_energy_j": 1e-9, "wavelength_m": 532e-9, **(given or {"axis": AXIS})}
     return sensing.PhotonBudget(sensing.Optics(f_number=2.0), repetition_rate_hz=rate_hz, cycles=cycles, **given)
@@ -165,21 +161,6 @@ def test_a_synchronous_detector_is_armed_when_a_cycle_begins():
     sensing.Compose([budget(rate_hz=40e6), spad])
 
 
-@pytest.mark.parametrize("behind", [False, True])
-def test_what_becomes_of_a_chain_in_the_order_of_before(behind):
-    """A response behind the budget held the pulse and the jitter: both have a place, and neither is a flag."""
-    spad, irf = sensing.SynchronousSPAD(1000), sensing.ImpulseResponse(sensing.emg_response(90 * PS, 80 * PS), AXIS)
-    bright = budget(ambient_rate_hz=1e6, axis=AXIS, pulse_energy_j=1e-9, wavelength_m=532e-9)
-    with pytest.raises(UnitError) as told:
-        sensing.Compose([bright, spad, irf] if behind else [bright, irf, spad])
-    words = str(told.value)
-    assert "stays an ImpulseResponse and goes in front of the PhotonBudget" in words
-    assert "becomes a DetectionJitter of the same response behind the detector" in words
-    assert "periodic" not in words  # jitter would go in front of pile-up again
-    with pytest.raises(UnitError, match="Use boundary='periodic'"):
-        sensing.Compose([bright, sensing.StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")])
-
-
 MIXED = {
     "two detectors": (lambda: [budget(), *(sensing.SynchronousSPAD(1000) for _ in "ab")], "counts that a"),
     "a budget of counts": (lambda: [sensing.SynchronousSPAD(1000), budget()], "PhotonBudget takes what a renderer"),
@@ -246,11 +227,6 @@ def test_one_change_of_a_device_reaches_all_stages():
             ).sensor()
     with pytest.raises(StorageError, match="expected '@axis'"):
         sensing.build_stage({"kind": "ShotNoise", "grad": "@policy"})
-
-
-@pytest.mark.parametrize("name", sorted(sensing.DEVICES))
-def test_devices_agree_with_themselves(name):
-    assert sensing.device(name).sensor() is not None
 
 
 # --------------------------------------------------------------------------------------------------- seconds and hertz
@@ -321,111 +297,9 @@ def test_seconds_in_another_unit_are_told(name, argument, unit):
         made(**{**given, argument: other})
 
 
-NANOSECONDS = {
-    "jitter": lambda: sensing.GaussianResponse(0.06),
-    "width": lambda: sensing.UniformResponse(0.05),
-    "tail": lambda: sensing.TailedResponse(60 * PS, [0.08], [0.1]),
-    "delay": lambda: sensing.GaussianResponse(60 * PS, delay_s=-0.5),
-    "measured": lambda: sensing.MeasuredResponse(torch.tensor([0.0, 1.0, 9.0, 3.0, 0.0]), 0.004),
-    "bins": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(60 * PS), bin_width_s=0.05),
-    "bins, microseconds": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(60 * PS), bin_width_s=5e-5),
-    "dead time, microseconds": lambda: sensing.FreeRunningSPAD(100, 0.075, axis=AXIS),
-    "dead time": lambda: sensing.SynchronousSPAD(100, dead_time_s=75.0, axis=AXIS),
-    "afterpulses": lambda: sensing.Afterpulsing(0.01, 30.0, 75 * NS, axis=AXIS),
-    "afterpulses, microseconds": lambda: sensing.Afterpulsing(0.01, 30 * NS, 0.075, axis=AXIS),
-    "period": lambda: sensing.Afterpulsing(0.01, 30 * NS, 75 * NS, axis=AXIS, period_s=100.0),
-    "sweep": lambda: sensing.SweepJitter(0.001, AXIS),
-    "gate": lambda: sensing.GatedIntegration([0.5], 6 * NS, AXIS),
-    "gate width": lambda: sensing.GatedIntegration([6 * NS], 0.6, AXIS),
-    "range": lambda: sensing.range_deviation_m(0.5, torch.ones(1)),
-    "megahertz": lambda: budget(None, 10.0, axis=AXIS, exposure_s=0.01),
-    "megahertz, hours": lambda: budget(100_000, 10.0, axis=AXIS),
-    "nanojoules": lambda: budget(axis=AXIS, pulse_energy_j=0.2),
-    "micrometres": lambda: budget(axis=AXIS, wavelength_m=0.94),
-    "picometres": lambda: budget(axis=AXIS, wavelength_m=532e-12),
-    "millimetres": lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, pixel_area_m2=1e-10),
-    "millimetres, aperture": lambda: sensing.Optics.from_aperture(25e-3, 12.5, pixel_area_m2=1e-10),
-    "codes in seconds": lambda: sensing.TDC(torch.full((128,), 100 * PS)),
-    "codes in picoseconds": lambda: sensing.TDC(torch.full((128,), 100.0)),
-    "millimetres of depth": lambda: sensing.read_itof(torch.ones(1, 8, 1, 1), (80e6, 60e6), 4, max_depth_m=7000.0),
-    "one frequency, two ranges": lambda: sensing.unwrap_depth(torch.ones(1, 1, 1, 1), (80e6,), max_depth_m=4.0),
-    "frames of another sensor": lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
-    "square micrometres": lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
-}
-
-
-@together("make", NANOSECONDS.values())
-def test_numbers_of_another_unit_are_told(make):
-    with pytest.raises(UnitError, match=r"expected .* got "):
-        make()
-
-
 def test_unusual_devices_are_taken():
     """A flash lidar of 20 Hz, 1 J for the moon, InGaAs with tails of 0.1 ms, far infrared."""
     assert budget(100, 20.0, axis=AXIS).exposure_s == 5.0
     assert budget(100, 20.0, axis=AXIS, pulse_energy_j=1.0, wavelength_m=100e-6).cycles == 100
     assert sensing.Afterpulsing(0.1, 1e-4, 5e-5, axis=AXIS, period_s=0.05).period_s == 0.05
     assert budget(None, 10e6, axis=AXIS, exposure_s=0.01).cycles == 100_000
-
-
-# --------------------------------------------------------------------------------------- counts that halves cannot hold
-
-# sensors that count, of a light of 1 a bin; what comes is beyond 65504, the largest number of float16
-COUNTING = {
-    "SynchronousSPAD": sensing.SynchronousSPAD(10**6 + 1),
-    "SynchronousSPAD, gate": sensing.SynchronousSPAD(10**6 + 1, gate=torch.ones(4)),
-    "SynchronousSPAD, dead time": sensing.SynchronousSPAD(10**6 + 1, dead_time_s=2 * NS, bin_width_s=1 * NS),
-    "FreeRunningSPAD": sensing.FreeRunningSPAD(10**6 + 1, 2 * NS, bin_width_s=1 * NS),
-    "paralyzable": sensing.FreeRunningSPAD(10**6 + 1, 2 * NS, bin_width_s=1 * NS, kind="paralyzable"),
-    "BinaryFrames": sensing.BinaryFrames(10**6 + 1),
-    "GatedIntegration": sensing.GatedIntegration(
-        [-1 * NS], 9 * NS, TimeAxis.from_seconds(0, 1 * NS, 4), electrons_per_unit=1e5
-    ),
-    "ItofCorrelation": sensing.ItofCorrelation(
-        sensing.sine_code(3), 80e6, TimeAxis.from_seconds(0, 1 * NS, 4), electrons_per_unit=1e5
-    ),
-}
-
-
-@pytest.mark.parametrize("dtype", [torch.float16], ids=str)
-@pytest.mark.parametrize("sensor", COUNTING.values(), ids=COUNTING)
-def test_no_count_is_infinite_or_rounded(sensor, dtype):
-    light = torch.ones(1, 4, 2, 2, dtype=dtype)
-    mean = sensor.expected(light)
-    assert float(mean.max()) > 65504 and bool(mean.isfinite().all())
-    torch.testing.assert_close(mean.double(), sensor.expected(light.double()), rtol=1e-6, atol=0)
-    if hasattr(sensor, "sample"):
-        counts = sensor.sample(light, generator())
-        assert float(counts.max()) > 65504 and torch.equal(counts, counts.round())
-        # 7 and 10 bits of the two would leave multiples of 512 and more
-        assert bool((counts % 256 != 0).any())
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
-def test_functions_that_count(dtype):
-    """Each of half-precision numbers is that of the same numbers in float32."""
-    x = torch.linspace(0.1, 1.0, 8).view(1, 8, 1, 1).to(dtype)
-    many, far = (x * 1e4).round(), 700 + x
-    kernel = sensing.Afterpulsing(0.3, 2 * NS, 1 * NS, bin_width_s=1 * NS).kernel(8)
-    for call in (
-        lambda v: sensing.sample_detections(v, 10**6, generator=generator()),
-        lambda v: sensing.poisson(many.to(v.dtype), generator()),
-        lambda v: sensing.first_photon_probabilities(v)[0],
-        lambda v: sensing.nonparalyzable_histogram(v, 2.5),
-        lambda v: sensing.paralyzable_histogram(v, 2.5),
-        lambda v: sensing.coates(many.to(v.dtype), 10**5).rate,
-        lambda v: sensing.add_afterpulses(many.to(v.dtype), 1.0, kernel),
-        lambda v: sensing.add_crosstalk(many.to(v.dtype), 0.2),
-        lambda v: sensing.frames_to_rate(many.to(v.dtype), 10**6),
-        lambda v: sensing.equi_depth_edges(v, 4),
-        lambda v: sensing.peak_position(v),
-        lambda v: sensing.ml_position(v, sensing.GaussianResponse(1 * NS), bin_width_s=1 * NS),
-        lambda v: sensing.soft_argmax(v),
-        lambda v: sensing.center_of_mass(v),
-        lambda v: sensing.first_return(v, 0.5).position,
-        lambda v: sensing.distance_of_position(far.to(v.dtype), AXIS),
-        lambda v: sensing.adjoint(sensing.BinaryFrames(10**6), v, v.shape),
-    ):
-        found = call(x)
-        assert found.dtype == torch.float32
-        assert torch.equal(found, call(x.float()))

@@ -11,7 +11,6 @@ import torch
 from support.marks import long_rows
 from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
 from support.sweeps import together
-from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
@@ -21,7 +20,6 @@ from torchtransient.sensing import (
     PowerLawDelays,
     ScoreFunction,
     SynchronousSPAD,
-    build_stage,
 )
 
 WIDTH = 1e-10  # of a bin
@@ -166,13 +164,6 @@ def test_exponents_and_times_are_learnt():
     assert float(module.probability.detach()) == pytest.approx(0.06, rel=0.01)
 
 
-def test_laws_that_reach_too_far_say_so():
-    with pytest.raises(UnitError, match="bins"):
-        Afterpulsing(0.1, dead_time_s=1e-9, delays=PowerLawDelays(1.0, 0.1), bin_width_s=1e-12).kernel(10)
-    with pytest.raises(UnitError, match="law begins"):
-        power_law(50, 1.0, 40)
-
-
 # --- detectors ------------------------------------------------------------------------------------------------------
 
 
@@ -301,13 +292,6 @@ def test_totals_of_draws_vary_less_than_those_of_events(total, probability):
         assert short > noise
 
 
-@pytest.mark.parametrize("mode, dead, tau", [("several", 1.3, 30.0), ("free", 12.3, 0.4)])
-def test_hardly_any_afterpulses_are_none(mode, dead, tau):
-    x = torch.as_tensor(light(20.0, "pulse")).view(1, -1, 1, 1)
-    sensor = AfterpulsingSPAD(detector(mode, dead), exponentials(dead, (1e-10, tau)))
-    torch.testing.assert_close(sensor.expected(x), detector(mode, dead).expected(x), rtol=1e-6, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "dead, total, p", [(12.3, 0.1, 0.3), (55.7, 1.0, 0.04), (12.3, 10.0, 0.04), (55.7, 100.0, 0.3)]
 )
@@ -370,31 +354,3 @@ def test_policies_are_the_detectors(policy):
     assert float(found) == pytest.approx(float(wanted), rel=0.35 if policy == "score" else 0.02)
     chain = Compose([AfterpulsingSPAD(detector("first", 12.3, cycles=10), two(12.3)[0])], grad=policy)
     assert chain.stages[0].detector.grad == policy
-
-
-def test_as_a_device():
-    spec = {
-        "kind": "AfterpulsingSPAD",
-        "detector": {"kind": "SynchronousSPAD", "cycles": 10},
-        "afterpulsing": {
-            "kind": "Afterpulsing",
-            "probability": 0.02,
-            "dead_time_s": 1e-8,
-            "delays": {"kind": "PowerLawDelays", "exponent": 1.2, "longest_s": 1e-6},
-            "bin_width_s": 1e-9,
-        },
-    }
-    assert build_stage(spec)(torch.ones(1, 20, 1, 1)).shape == (1, 20, 1, 1)
-
-
-def test_wrong_periods():
-    parts = exponentials(12.3, (0.02, 5.0), period_s=60 * WIDTH)
-    x = torch.ones(1, BINS, 1, 1)
-    with pytest.raises(UnitError, match="period"):
-        AfterpulsingSPAD(detector("free", 12.3), parts)(x)
-    AfterpulsingSPAD(detector("first", 12.3), parts)(x)
-    with pytest.raises(UnitError, match="period"):
-        AfterpulsingSPAD(detector("first", 12.3), exponentials(12.3, (0.02, 5.0), period_s=30 * WIDTH))(x)
-    with pytest.raises(ShapeError):
-        AfterpulsingSPAD(detector("first", 12.3), parts)(torch.ones(3))
-    assert AfterpulsingSPAD(detector("first", 12.3), parts)(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)

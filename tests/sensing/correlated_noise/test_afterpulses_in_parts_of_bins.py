@@ -7,11 +7,6 @@ import torch
 
 from support.marks import long
 from torchtransient import TimeAxis, sensing
-from torchtransient.sensing import afterpulsing_spad as carriers
-from torchtransient.sensing.afterpulsing_spad import _LossyChain
-from torchtransient.sensing.dead_time import renewal
-from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, stationary_phases
-from torchtransient.sensing.spad import exposed_cycles
 
 BINS, WIDTH = 5, 100e-12
 AXIS = TimeAxis.from_seconds(0.0, WIDTH, BINS)
@@ -84,32 +79,6 @@ def test_pixels_of_several_levels_are_those_of_each():
     torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), together, rtol=1e-9, atol=1e-10)
 
 
-def test_counts_beyond_the_window_reach_mapped_pixels_of_several_levels_once():
-    """What the background outside of the window sends is that of each pixel, however many levels there are."""
-    afterpulsing = sensing.Afterpulsing(0.2, 400e-12, 150e-12, axis=AXIS, period_s=1.2e-9, background=7.0)
-    module = sensing.AfterpulsingSPAD(spad(), afterpulsing)
-    x = torch.cat([light(0.1, 1), light(6.0, 1), light(0.3, 1)], -1)
-    mapped = torch.func.vmap(module.expected)(x.movedim(-1, 0).unsqueeze(-1))
-    torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), module.expected(x), rtol=1e-9, atol=1e-10)
-
-
-def test_what_does_not_reach_the_window_leaves_nothing_below_zero():
-    """Afterpulses that all come at once: of counts outside of the window, and of other cycles."""
-    window = TimeAxis.from_seconds(0.0, WIDTH, 50)
-    for dead in (0.0, 150e-12):
-        stage = sensing.Afterpulsing(0.2, 10e-12, dead, axis=window, period_s=60 * WIDTH, background=5.0)
-        dark = torch.zeros(1, 50, 1, 1, dtype=torch.float64)
-        assert float(stage.extra(dark).min()) >= 0
-        assert bool((stage.sample(dark, torch.Generator().manual_seed(0)) >= 0).all())
-        one = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(100, axis=window), stage)
-        several = [sensing.SynchronousSPAD(100, dead_time_s=dead, axis=window)] if dead else []
-        for module in (one, *(sensing.AfterpulsingSPAD(s, stage) for s in several)):
-            flash = dark.clone()
-            flash[:, 25] = 5.0
-            for x in (dark, flash):
-                assert float(module.released(x).min()) >= 0
-
-
 @pytest.mark.slow
 def test_transforms_of_detectors_with_dead_time():
     """Gradients mapped over pixels, of one level and of several: those of autograd."""
@@ -134,75 +103,3 @@ def test_light_without_pixels():
     empty = torch.zeros(1, BINS, 0, 2, dtype=torch.float64)
     for module in (spad(), sensing.SynchronousSPAD(5, dead_time_s=150e-12, axis=AXIS, grad="gaussian")):
         assert module(empty).shape == module.sample(empty).shape == module.variance(empty).shape == empty.shape
-
-
-def test_cycles_that_could_fire_once():
-    counts = torch.tensor([3.0, 0.0, 2.0, 1.0]).reshape(1, 4, 1, 1)
-    assert exposed_cycles(counts, 9, None).flatten().tolist() == [9.0, 6.0, 6.0, 4.0]
-
-
-# ------------------------------------------------------------------------------------------- what carriers are made of
-
-
-def number(values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
-class Watched(carriers.FreeRunningTrain):
-    """Remembers the lowest rate that it was asked for."""
-
-    least = 1.0
-
-    def trapped(self, rate, lost, back, source):
-        Watched.least = min(Watched.least, float(rate.min()))
-        return super().trapped(rate, lost, back, source)
-
-
-@pytest.mark.slow
-def test_no_rate_of_other_carriers_is_below_zero():
-    """Of pairs in the dark before a flash, where each of them makes others less likely."""
-    first = number([[1e-6, 1e-6, 1.0, 1e-6, 1e-6, 1e-6]])
-    train = Watched(1, number(0.3))
-    hazard, _ = carriers.carrier_hazard(train, None, first, None, number([0.5]), number([2.0]), number(1.3))
-    assert 0 < Watched.least <= 1e-6 * (1 + 1e-9) and bool((hazard > 0).all())
-
-
-@pytest.mark.parametrize("largest", [0.3, 1.9, 2.1, 40.0])
-@pytest.mark.parametrize("part", [0.0, 0.35])
-def test_a_bin_by_powers_and_by_moments(part, largest):
-    """Up to 2 photons powers of them; what a bin does is the same."""
-    loss = largest * number([[0.0, 0.01, 0.4], [1.0, 0.7, 0.2]])
-    found = carriers._response(loss, number(part), largest)
-    wanted = bin_response(loss, number(part))
-    for name in ("kept", "waited", "hit_slope", "slope", "wait", "decay"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-12, atol=1e-14)
-
-
-@pytest.mark.parametrize("whole", [0, 3, 8])
-def test_carriers_on_a_ring_start_from_constant_light(whole):
-    """Rows that are constant are undone at once, by the losses and shares of their own."""
-    loss, kept = number([[0.03], [0.9], [7.0]]).expand(3, 5), number([[0.999], [0.3], [0.8]]).expand(3, 5)
-    chain = _LossyChain(loss.contiguous(), kept.contiguous(), number(0.4), whole)
-    x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(chain.constant.solve(x - chain.step(x)), x, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(chain.solve(x - chain.step(x)), x, rtol=1e-8, atol=1e-8)
-    # all of a share and none of one, too: a number that is near enough
-    for share in (0.0, 1.0):
-        edge = _LossyChain(loss[:1].contiguous(), share + 0 * kept[:1], number(0.4), whole)
-        found = edge.constant.solve(x[:1] - edge.step(x[:1]))
-        if share == 0:
-            torch.testing.assert_close(found, x[:1], rtol=1e-5, atol=1e-5)
-        assert bool(found.isfinite().all())
-
-
-@pytest.mark.parametrize("whole", [0, 3, 8])
-def test_detections_on_a_ring_start_from_constant_light(whole):
-    """The mean wait of each row is that of its own light."""
-    rate = number([[0.03], [0.9], [7.0]]).expand(3, 5).contiguous()
-    chain = RenewalChain(rate, whole, number(0.4))
-    pi = stationary_phases(rate, number(0.4), whole)
-    torch.testing.assert_close(pi[:, :5], torch.full((3, 5), 0.2, dtype=torch.float64))
-    x = torch.randn(3, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    ones = torch.cat([torch.ones(5), torch.zeros(5)]).double()
-    right = x - chain.step(x) + x[:, :5].mean(-1, keepdim=True) * ones
-    torch.testing.assert_close(renewal._constant_light(chain, 4 * pi).solve(right), x, rtol=1e-8, atol=1e-8)

@@ -12,11 +12,9 @@ from torchtransient.errors import UnitError
 from torchtransient.sensing import (
     Afterpulsing,
     Crosstalk,
-    MeasuredDelays,
     ScoreFunction,
     add_afterpulses,
     add_crosstalk,
-    crosstalk,
     hot_pixel_rates,
 )
 
@@ -136,28 +134,6 @@ def test_samples_add_whole_counts():
     assert float(y.mean() / 200) == pytest.approx(1 / 0.95, rel=2e-3)
 
 
-def test_counts_below_zero_trigger_nothing():
-    """As differences have them, whole or not; and a measurement of less than was given has nothing added."""
-    x = torch.full((1, BINS, 3, 2), -2.5, dtype=torch.float64)
-    for stage in (Crosstalk(0.02), Afterpulsing(0.05, 4e-10, 1e-10, bin_width_s=1e-10)):
-        for counts in (x, 2 * x):
-            assert torch.equal(stage.sample(counts, torch.Generator().manual_seed(0)), counts)
-        lit = x.abs()
-        alike = stage.log_prob(lit, lit)
-        torch.testing.assert_close(alike, -stage.extra(lit).sum(1), rtol=1e-12, atol=0)
-        torch.testing.assert_close(stage.log_prob(lit - 1, lit), alike, rtol=1e-12, atol=0)
-
-
-def test_frames_that_are_followed_some_at_a_time(monkeypatch):
-    """Each has crosstalk of its own detections, and all of it, however many fit into a block."""
-    monkeypatch.setattr(crosstalk, "_BLOCK", 3 * 2 * 3 + 1)
-    x = torch.full((100, 2, 3), 20.0)
-    stage = Crosstalk(0.1, diagonal_ratio=0.5)
-    found = stage.sample(x.unsqueeze(0), torch.Generator().manual_seed(0))[0] - x
-    mean = stage.extra(x.unsqueeze(0).double())[0]
-    assert bool(((found - mean).sum((1, 2)).abs() < 5 * mean.sum((1, 2)).sqrt()).all())
-
-
 def test_hot_pixels():
     rates = hot_pixel_rates(200, 200, median_hz=50.0, hot_fraction=0.02, generator=torch.Generator().manual_seed(0))
     assert float(rates.median()) == pytest.approx(50.0, rel=0.03)
@@ -245,25 +221,3 @@ def test_draws_do_not_depend_on_the_number_of_threads(make):
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
-
-
-@pytest.mark.parametrize("make", [lambda: Crosstalk(0.01), lambda: Afterpulsing(0.01, 30e-10, 0.0, bin_width_s=1e-10)])
-@pytest.mark.parametrize("level", [50.0, 50.5])
-def test_half_precision_images_whose_sum_overflows(make, level):
-    """Whole counts and means alike; the sum of all is beyond float16."""
-    x = torch.full((1, BINS, 32, 32), level, dtype=torch.float16)
-    y = make().sample(x, torch.Generator().manual_seed(0))
-    assert y.dtype == torch.float32
-    added, mean = float((y.float() - x.float()).mean()), float(make().extra(x.float()).mean())
-    assert added == pytest.approx(mean, abs=0.02)
-
-
-@pytest.mark.parametrize("random", [0.0, 1 - 2.0**-53])
-def test_the_last_random_numbers_are_delays_of_the_histogram(random, monkeypatch):
-    """Shares whose sum rounds down to less than one: the last delay is that of its last bin."""
-    law = MeasuredDelays(torch.ones(10), 2e-9, start_s=3e-9)
-    assert float(law.share_of_bins.double().cumsum(0)[-1]) < 1
-    monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, random, dtype=torch.float64))
-    for dead_time_s in (0.0, 7e-9, 22e-9):
-        found = law.draw(2, dead_time_s, None)
-        assert found.tolist() == pytest.approx([max(3e-9, dead_time_s) if random == 0 else 23e-9] * 2, rel=1e-12)

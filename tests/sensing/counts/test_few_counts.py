@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchtransient.sensing import Moves, draws
 from torchtransient.sensing import counts as moved_counts
-from torchtransient.sensing import draws
-from torchtransient.sensing.counts import Moves, move_counts
+from torchtransient.sensing.counts import move_counts
 
 
 def fits(found, expected, draws_of_each):
@@ -46,23 +46,6 @@ def test_first_photons_of_few_and_of_many_counts(monkeypatch, few, kind):
     assert abs(covariance - expected) < 5 * float(pair.var(0).prod().sqrt()) / repeats**0.5
 
 
-@pytest.mark.parametrize("block", [1, 9, 10, 12])
-@pytest.mark.parametrize("bins", [13, 16])
-def test_counts_are_parted_block_by_block(monkeypatch, block, bins):
-    """As many pairs of bins at a time as fit into a block, one at least, and the last few; odd ones stay."""
-    monkeypatch.setattr(draws, "_FEW_COUNTS", 0)
-    monkeypatch.setattr(draws, "_PAIRS", block)
-    shares = 1 + torch.rand(bins, 1, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    shares[5, :, 1], shares[-1, :, 2] = 0.0, 0.0
-    shares = shares / shares.sum(0)
-    trials = 1_000_000
-    counts = draws.sample_multinomial(trials, shares * (1 - 1e-12), torch.Generator().manual_seed(0))
-    assert counts.sum(0).flatten().tolist() == [float(trials)] * 3  # all but one of 1e6
-    spread = (trials * shares * (1 - shares)).sqrt()
-    assert bool(((counts - trials * shares).abs() <= 5 * spread).all())
-    assert bool((counts != (trials * shares).round()).any())
-
-
 @pytest.mark.parametrize("boundary", ["periodic", "zero"])
 @pytest.mark.parametrize("lost", [0.0, 0.3])
 @pytest.mark.parametrize("first", [-2, 0, 9])
@@ -85,46 +68,3 @@ def test_moves_of_few_and_of_many_counts(monkeypatch, boundary, lost, first):
             assert float(moved.sum()) <= float(counts.sum())
     alone, _ = move_counts(counts * 0, moves, torch.Generator().manual_seed(5))
     assert not bool(alone.any())
-
-
-@pytest.mark.parametrize("pixels", [1, 1 << 13, 1 << 14])
-def test_the_largest_random_number_stays_in_its_column(pixels, monkeypatch):
-    def largest(shape, **_):
-        return torch.full(shape, 1 - 2.0**-53, dtype=torch.float64)
-
-    monkeypatch.setattr(draws.torch, "rand", largest)
-    chances = torch.tensor([[0.25], [0.5], [0.5]], dtype=torch.float64).expand(-1, pixels)
-    counts = draws._one_by_one(torch.ones(pixels, dtype=torch.float64), chances, None)
-    assert torch.equal(counts, torch.tensor([[0.0], [1.0], [0.0]], dtype=torch.float64).expand(-1, pixels))
-
-
-@pytest.mark.parametrize("tally", [False, True])
-def test_bins_whose_counts_go_by_lags_of_their_own(tally):
-    """Lags that a bin does not use get none of its counts, whichever are looked at together."""
-    shares = torch.zeros(4, 4, dtype=torch.float64)
-    shares[:2, 0], shares[2:, 1] = 0.5, 0.5
-    shares[0, 2], shares[3, 3] = 1.0, 1.0
-    for level in (3.0, 1000.0):
-        counts = torch.full((1, 4, 2, 3), level, dtype=torch.float64)
-        g = torch.Generator().manual_seed(0)
-        moved, tallies = move_counts(counts, Moves(0, shares, "periodic"), g, tally=tally)
-        # bin 0 goes to 0 and 1, bin 1 to 3 and 0, bin 2 to itself, bin 3 to 2
-        assert bool((moved.sum(1) == 4 * level).all())
-        assert bool((moved[:, 0] + moved[:, 1] + moved[:, 3] == 2 * level).all())
-        assert bool((moved[:, 2] == 2 * level).all()) and 0 < float(moved[:, 1].mean()) < level
-        if tallies is not None:
-            assert bool((tallies[:2].sum(0) == 2 * level).all()) and bool((tallies[3] >= level).all())
-
-
-def test_shares_that_rounding_puts_below_none_or_above_all():
-    """Draws, tallies and noise are those of none and of all."""
-    x = torch.full((1, 3, 40, 50), 7.0, dtype=torch.float64)
-    below = Moves(-1, torch.tensor([-1e-17, 0.6, 0.4], dtype=torch.float64), "periodic")
-    above = Moves(0, torch.tensor([[0.5, 0.3, 0.2], [0.1, 0.7 + 3e-16, 0.8 + 3e-16]], dtype=torch.float64), "periodic")
-    assert float(above.shares.sum(0).max()) > 1 and float(above.shares.sum(0).min()) < 1
-    for moves in (below, above):
-        assert bool(torch.isfinite(moves.noise(x, torch.Generator().manual_seed(0))).all())
-        moved, tallies = move_counts(x, moves, torch.Generator().manual_seed(0), tally=True)
-        assert bool((moved >= 0).all()) and tallies is not None and bool((tallies >= 0).all())
-        assert moved.mean((0, 2, 3)).tolist() == pytest.approx(moves.mean(x).mean((0, 2, 3)).tolist(), abs=0.3)
-    assert float(move_counts(x, below, torch.Generator().manual_seed(0), tally=True)[1][0].sum()) == 0

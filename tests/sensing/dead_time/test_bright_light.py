@@ -6,21 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from support.marks import long_pairs
 from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, nonparalyzable_histogram
 from torchtransient.sensing.dead_time import free_running
 from torchtransient.sensing.dead_time.clocked_counts import StepProbabilities, draw_steps
 from torchtransient.sensing.dead_time.free_running import stationary_steps
-from torchtransient.sensing.dead_time.renewal import (
-    ConstantLight,
-    RenewalChain,
-    gmres,
-    moments,
-    solve_banded,
-    stationary_phases,
-)
+from torchtransient.sensing.dead_time.renewal import ConstantLight, RenewalChain, gmres
 from torchtransient.sensing.free_running import state_image
 
 BINS = 32
@@ -57,20 +49,6 @@ def rows_of(image_):
     return image_.flatten(2).squeeze(0).T
 
 
-def test_moments_of_exponentials():
-    z, w = np.polynomial.legendre.leggauss(60)
-    z, w = double((z + 1) / 2), double(w / 2)
-    x = double([0.0, 1e-12, 1e-3, 0.5, 0.999999, 1.0, 1.000001, 7.0, 40.0])
-    for power in (0, 1):
-        decayed = torch.exp(-x[:, None] * z)
-        torch.testing.assert_close(moments(x).decay[power], (w * z**power * decayed).sum(-1), rtol=1e-13, atol=0)
-        hit = torch.where(x[:, None] > 0, -torch.expm1(-x[:, None] * z) / x[:, None].clamp_min(1e-300), z)
-        torch.testing.assert_close(moments(x).hit[power], (w * z**power * hit).sum(-1), rtol=1e-13, atol=0)
-    assert torch.autograd.gradcheck(
-        lambda v: (*moments(v).decay, *moments(v).hit), double([1e-3, 0.5, 7.0, 40.0]).requires_grad_()
-    )
-
-
 @pytest.mark.parametrize("flux", FLUXES[::2])
 @pytest.mark.parametrize("periods", [1, 3])
 def test_dead_time_of_whole_periods(flux, periods):
@@ -78,55 +56,6 @@ def test_dead_time_of_whole_periods(flux, periods):
     light = flux * shapes()
     found = rows_of(nonparalyzable_histogram(image(light), periods * BINS))
     torch.testing.assert_close(found, light / (1 + periods * flux), rtol=1e-9, atol=1e-12 * flux / (1 + flux))
-
-
-DEAD = [0.7, 12.8, 15.9, 16.0, 31.9, 45.3, 100.5]
-
-
-@pytest.mark.parametrize(
-    ("flux", "dead"),
-    long_pairs(FLUXES, DEAD, list(zip(FLUXES, DEAD[3:] + DEAD[:3], strict=True))),
-)
-def test_the_solver_against_dense_matrices(flux, dead):
-    """Iterative, direct and dense solutions of the same chain, nearly reducible ones too."""
-    light, whole = flux * shapes(), int(dead)
-    chain = RenewalChain(light, whole, double(dead - whole))
-    size = 2 * BINS
-    found = stationary_phases(light, chain.part, whole)
-    sums = torch.cat([torch.ones(BINS), torch.zeros(BINS)]).double()
-    uniform = sums / BINS
-    for i in range(light.shape[0]):
-        one = RenewalChain(light[i : i + 1], whole, chain.part)
-        step = one.step(torch.eye(size, dtype=torch.float64)).T
-        wanted = torch.linalg.solve(torch.eye(size) - step + torch.outer(uniform, sums), uniform)
-        # the residual of 1e-10, over the smallest singular value of what is solved
-        gap = torch.linalg.svdvals(torch.eye(size) - step + torch.outer(wanted, sums))[-1]
-        assert float((found[i] - wanted).norm() / wanted.norm()) < 1e-10 / float(gap) + 1e-12
-    pin = found[:, :BINS].argmax(-1)
-    e = torch.zeros_like(found).scatter_(1, pin.unsqueeze(-1), 1.0)
-    direct = solve_banded(chain, e, pin, transposed=False)
-    direct = direct / direct[:, :BINS].sum(-1, keepdim=True)
-    assert float((chain.step(direct) - direct).norm(dim=-1).max()) < 1e-11
-    g = torch.randn(found.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    g = g - sums * (direct * g).sum(-1, keepdim=True)
-    adjoint = solve_banded(chain, g, pin, transposed=True)
-    worst = (adjoint - chain.transposed(adjoint) - g).norm(dim=-1) / adjoint.norm(dim=-1)
-    assert float(worst.max()) < 1e-11
-
-
-@pytest.mark.parametrize("bins", [BINS, 31])
-def test_constant_light_is_inverted(bins):
-    rate = double([[0.02], [0.7], [9.0]]).expand(3, bins).contiguous()
-    chain = RenewalChain(rate, 13, double(0.3))
-    inverse = ConstantLight(1 / rate[:, :1], bins, 13, double(0.3))
-    x = torch.randn(3, 2 * bins, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    ones = torch.cat([torch.ones(bins), torch.zeros(bins)]).double()
-
-    def mean(v):
-        return v[:, :bins].mean(-1, keepdim=True) * ones
-
-    torch.testing.assert_close(inverse.solve(x - chain.step(x) + mean(x)), x, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(inverse.solve_transposed(x - chain.transposed(x) + mean(x)), x, rtol=1e-9, atol=1e-9)
 
 
 def test_bright_light_takes_few_steps():
@@ -299,21 +228,6 @@ def test_totals_in_saturation():
         assert float(totals.var() / totals.mean()) == pytest.approx(1 / (1 + n * dead) ** 2, rel=0.3)
 
 
-def test_trains_of_one_period_and_of_the_dark():
-    x = torch.zeros(2, 1, 16, 1, 3, dtype=torch.float64)
-    x[..., 1], x[..., 2] = 1e-14, 0.3
-    one = FreeRunningSPAD(1, 5e-10, bin_width_s=1e-10)
-    h = one.sample(x.expand(2, 1, 16, 500, 3), torch.Generator().manual_seed(0))
-    assert not h[..., :2].any()
-    mean = one.expected(x)[..., 2].sum((1, 2, 3))
-    assert float(h[..., 2].sum() / 1000) == pytest.approx(float(mean[0]), rel=0.06)
-    many = FreeRunningSPAD(10**8, 5e-10, bin_width_s=1e-10)
-    assert float(many.sample(x, torch.Generator().manual_seed(0))[..., 1].sum()) < 200
-    empty = torch.zeros(0, 1, 16, 2, 2)
-    for grad in ("gaussian", "straight_through", "expected"):
-        assert FreeRunningSPAD(5, 5e-10, bin_width_s=1e-10, grad=grad)(empty).shape == empty.shape
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, dead", [slow("non_paralyzable", 2.3), slow("non_paralyzable", 7.5), ("paralyzable", 2.3)]
@@ -351,19 +265,3 @@ def test_score_is_unbiased(kind, dead):
         assert abs(float(gradient.mean() - wanted[which])) < 4.5 * error + 0.01 * abs(float(wanted[which]))
         assert 4.5 * error < 0.15
     assert float(wanted.abs().max()) > 0.2
-
-
-@pytest.mark.parametrize("dead, peak", [(3.3, 30.0)])
-def test_bins_are_cut_where_light_changes(dead, peak):
-    """Pulses in which detectors are armed again, beside bins cut in 64."""
-    from torchtransient.sensing.dead_time.free_running import _solve_cut, stationary_state
-
-    rate = 1e-3 + peak * torch.exp(-0.5 * ((torch.arange(64, dtype=torch.float64) - 20) / 6) ** 2)[None]
-    d = torch.tensor(dead, dtype=torch.float64)
-    fine = _solve_cut(rate, d, 64).detected
-
-    def total_variation(found):
-        return float((found - fine).abs().sum() / fine.sum() / 2)
-
-    assert total_variation(stationary_state(rate, d).detected) < 1e-3
-    assert total_variation(_solve_cut(rate, d, 1).detected) > 4 * total_variation(stationary_state(rate, d).detected)

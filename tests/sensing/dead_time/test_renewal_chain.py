@@ -10,12 +10,8 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.afterpulsing_spad import trapped_carrier_lines
 from torchtransient.sensing.dead_time import free_running, renewal
-from torchtransient.sensing.dead_time.clocked import CycleMeans, cycle_means, response_series, series_degree
-from torchtransient.sensing.dead_time.clocked_counts import _cycle_steps, _merge_states, _sum_pieces
-from torchtransient.sensing.dead_time.free_running import late_lines
-from torchtransient.sensing.dead_time.renewal import RenewalChain, bin_response, solve_banded
+from torchtransient.sensing.dead_time.renewal import RenewalChain, solve_banded
 
 ROOT = math.sqrt(3.0)
 
@@ -156,33 +152,6 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
         torch.autograd.grad(pi[:, 0].sum(), leaf)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("whole, part", [(0, 0.7), (5, 0.1)])
-def test_carriers_on_a_ring_are_those_of_the_matrix(whole, part):
-    """x = F (kept x + source), F the step of the losses; differentiable in all that is given, in both modes."""
-    bins, g = 3, torch.Generator().manual_seed(3)
-    loss, kept = rates(bins), 0.2 + 0.6 * torch.rand(2, bins, generator=g, dtype=torch.float64)
-    source = torch.rand(2, 2 * bins, generator=g, dtype=torch.float64)
-    dead = torch.tensor(part, dtype=torch.float64)
-    step = matrices(loss, whole, part)
-    matrix = torch.eye(2 * bins, dtype=torch.float64) - step * torch.cat([kept, kept], -1).unsqueeze(1)
-    wanted = torch.linalg.solve(matrix, (step @ source.unsqueeze(-1)).squeeze(-1))
-    torch.testing.assert_close(trapped_carrier_lines(loss, kept, source, dead, whole), wanted, rtol=1e-8, atol=1e-9)
-    leaves = [v.clone().requires_grad_() for v in (loss, kept, source, dead)]
-    if whole == 5:
-        assert torch.autograd.gradcheck(
-            lambda *v: trapped_carrier_lines(*v, whole), leaves, atol=1e-6, fast_mode=True, check_forward_ad=True
-        )
-    one = [v.detach() for v in leaves]
-    with forward_ad.dual_level():  # what is given beside it is left as it is
-        trapped_carrier_lines(forward_ad.make_dual(one[0], one[0]), *one[1:], whole)
-        renewal.stationary_phases(one[0], forward_ad.make_dual(dead, one[3]), whole)
-        renewal.stationary_phases(forward_ad.make_dual(one[0], one[0]), dead, whole)
-    assert not any(v.requires_grad for v in (*one, dead))
-    found = torch.autograd.grad(trapped_carrier_lines(*one[:1], leaves[1], *one[2:], whole).sum(), leaves[1])[0]
-    assert bool(found.isfinite().all()) and not any(v.requires_grad for v in one)
-
-
 def test_which_trains_are_drawn_with_their_memory(monkeypatch):
     """A wait below half a period, and bins that three of the larger deviations would leave with too little."""
     waits = [1.99, 0.5, 2.0, 1.0, 3.0]
@@ -212,88 +181,3 @@ def test_which_trains_are_drawn_with_their_memory(monkeypatch):
     wide = free_running._remembers_phase(State(), per_bin, dead, 10)
     assert wide.tolist() == [True, False, False, True, False] and asked == [[0, 1, 3, 0, 1, 3]]
     assert not bool(free_running._remembers_phase(State(), per_bin, dead, 1).any()) and len(asked) == 1
-
-
-# ------------------------------------------------------------------------- who is armed again one piece later
-
-
-def late_of(count, slope, part, number=100_000):
-    """Detections on a line in the last `part` of their piece."""
-    y = (np.arange(number) + 0.5) / number
-    return float(((count + ROOT * slope * (2 * y - 1)) * (y > 1 - part)).sum() / number)
-
-
-LINES = torch.tensor([[0.5, 0.2, 0.8, 0.3, 0.6, 0.4]], dtype=torch.float64), torch.tensor(
-    [[0.1, -0.1, 0.3, 0.05, -0.2, 0.0]], dtype=torch.float64
-)
-
-
-@pytest.mark.parametrize("part", [0.0, 0.3, 0.8])
-def test_late_detections_of_lines(part):
-    """Of a line, and none below zero or beyond all: in the cycle and in the stationary state."""
-    count, slope = LINES
-    wanted = [late_of(float(c), float(s), part) for c, s in zip(count[0], slope[0], strict=True)]
-    of_cycle = CycleMeans(count, count, slope, 2, torch.tensor(part, dtype=torch.float64), 1).late
-    on_ring = late_lines(torch.cat(LINES, -1), torch.tensor(part, dtype=torch.float64))
-    for found in (of_cycle, on_ring):
-        assert found[0].tolist() == pytest.approx(wanted, abs=1e-5)
-    steep = CycleMeans(count, count, 90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
-    assert bool((steep <= count).all()) and float(steep[0, 0]) == 0.5
-    falling = CycleMeans(count, count, -90 * slope.abs(), 2, torch.tensor(0.3, dtype=torch.float64), 1).late
-    assert bool((falling >= 0).all()) and float(falling[0, 0]) == 0.0
-
-
-@pytest.mark.parametrize("whole, wider", [(4, 1), (4, 2), (5, 2), (7, 3), (6, 3), (8, 3)])
-def test_pieces_that_are_drawn_as_one(whole, wider):
-    """Fine piece j is armed again in j + whole, its late ones in the next: wide ones are told by what they hold."""
-    count, slope = LINES
-    part = 0.3
-    late = CycleMeans(count, count, slope, whole, torch.tensor(part, dtype=torch.float64), 1).late[0]
-    wanted_late, wanted_count = np.zeros(6 // wider), np.zeros(6 // wider)
-    for j in range(6):
-        wanted_count[j // wider] += float(count[0, j])
-        for again, number in ((j + whole, float(count[0, j] - late[j])), (j + whole + 1, float(late[j]))):
-            wanted_late[j // wider] += number * (again // wider - j // wider - whole // wider)
-    states = torch.zeros(7, 3, 1, dtype=torch.float64)
-    states[1:, 1, 0], states[1:, 2, 0], states[:-1, 0, 0] = count[0], slope[0], torch.arange(6.0).double()
-    found, armed, late_rows = _merge_states(states, part, whole, wider)
-    assert found[:, 0].tolist() == pytest.approx(wanted_count.tolist())
-    assert late_rows[:, 0].tolist() == pytest.approx([0.0, *wanted_late])
-    assert armed[:, 0].tolist() == [float(j) for j in range(0, 6, wider)]
-
-
-@pytest.mark.parametrize("dead, pieces", [(1.3, 1), (1.3, 4), (2.6, 2), (3.4, 4)])
-def test_steps_of_a_cycle_hold_what_the_cycle_does(dead, pieces):
-    """Counts of bins, who is armed, and everybody comes back a dead time later, in the piece that it ends in."""
-    rate = rates(5, 2)
-    bins = torch.tensor(dead, dtype=torch.float64)
-    steps, cycle = _cycle_steps(rate, bins, pieces), cycle_means(rate, bins, pieces)
-    wider = pieces // steps.pieces
-    torch.testing.assert_close(_sum_pieces(steps.count, steps.pieces), cycle.count.view(2, 5, pieces).sum(-1))
-    torch.testing.assert_close(steps.armed.squeeze(-1).T, cycle.armed[:, ::wider])
-    back = torch.zeros(2, 5 * pieces // wider, dtype=torch.float64)
-    for j in range(5 * pieces):
-        for again, number in ((j + cycle.whole, cycle.count[:, j] - cycle.late[:, j]),
-                              (j + cycle.whole + 1, cycle.late[:, j])):  # fmt: skip
-            if again // wider < back.shape[1]:
-                back[:, again // wider] += number
-    torch.testing.assert_close(steps.back.squeeze(-1).T, back, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("part", [0.0, 0.35, 0.9])
-def test_power_series_of_a_bin(part):
-    """Their first terms are those of longer ones, and their sums are what a bin does; the derivative follows."""
-    short, long = response_series(part, 5), response_series(part, 16)
-    torch.testing.assert_close(short[0], long[0][..., :6], rtol=1e-13, atol=1e-16)
-    torch.testing.assert_close(short[1][..., :5], long[1][..., :5], rtol=1e-13, atol=1e-16)
-    assert not bool(short[1][..., 5].any())
-    rate = torch.tensor([[0.05, 0.4, 1.1]], dtype=torch.float64)
-    exact = bin_response(rate, torch.tensor(part, dtype=torch.float64))
-    powers = rate[0] ** torch.arange(17, dtype=torch.float64).unsqueeze(1)
-    kept, hit, slope = (long[0] @ powers).unbind(0)
-    order = [2, 3, 0, 1]  # younger lines first
-    for found, wanted, armed in ((kept, exact.kept, exact.decay), (hit, exact.hit, exact.fire),
-                                 (slope, exact.hit_slope, exact.slope)):  # fmt: skip
-        torch.testing.assert_close(found[order], wanted[0], rtol=1e-10, atol=1e-12)
-        torch.testing.assert_close(found[4], armed[0], rtol=1e-10, atol=1e-12)
-    assert series_degree(0.25) == next(d for d in range(3, 40) if 0.25**d / math.factorial(d) <= 1e-15)

@@ -8,7 +8,6 @@ import torch
 from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
-from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing import (
     ScoreFunction,
     SynchronousSPAD,
@@ -17,8 +16,6 @@ from torchtransient.sensing import (
     first_photon_log_prob,
     sample_detections,
 )
-from torchtransient.sensing.dead_time import clocked_counts
-from torchtransient.sensing.dead_time.clocked import mean_detections, mean_detections_in_steps
 
 BINS = 24
 WIDTH_S = 1e-10
@@ -75,17 +72,6 @@ def test_means_and_draws_against_events(shape, total, dead, request):
     spread = ((totals - totals.mean()) ** 4).mean() / cycles
     error = 5 * (np.sqrt(spread) + totals.var() * np.sqrt(2 / repeats)) + 1e-3 * totals.mean()
     assert abs(h.sum(1).var().item() / 50 - totals.var()) < error
-
-
-def test_the_error_of_the_review():
-    """A hundred photons a cycle and a dead time of 1.3 bins: 20 % in one bin and -3.8 % of the counts, once."""
-    rate = 100 * shapes(64)["pulse"]
-    events = detect(np.random.default_rng(0), rate, 4000, 1, 1.3)
-    found = spad(1.3).probabilities(image(rate)).flatten().numpy()
-    assert compare(events, found).ratio < 1.5
-    assert found.sum() == pytest.approx(events.mean.sum(), rel=5 * (events.fano() / len(events)) ** 0.5)
-    bins = np.argsort(-events.mean)[:10]
-    np.testing.assert_allclose(found[bins], events.mean[bins], rtol=0.06)
 
 
 @pytest.mark.slow
@@ -152,22 +138,6 @@ def test_pixels_of_all_levels():
     torch.testing.assert_close(by_func, leaf.grad, rtol=1e-10, atol=1e-12)
     assert detections_with_dead_time(torch.zeros(0, 1, 8, 2, 2), 1.3).shape == (0, 1, 8, 2, 2)
     assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dead", [0.6, 1.0, 1.3, 5.0, 5.6, 40.4])
-def test_the_walk_is_the_recursion_in_steps(dead):
-    """Means and gradients by columns and their adjoint: float64 rounding beside autograd through the recursion."""
-    x = torch.cat([f * torch.rand(23, 3, generator=torch.Generator().manual_seed(1)) for f in (0.02, 0.2, 9.0)], -1)
-    weights = torch.randn(23, 9, generator=torch.Generator().manual_seed(2)).double()
-    d = torch.tensor(dead, dtype=torch.float64)
-    found = []
-    for solve in (lambda v: mean_detections(v, d), lambda v: mean_detections_in_steps(v.T, d).T):
-        leaf = x.double().requires_grad_()
-        y = solve(leaf)
-        found.append((y.detach(), *torch.autograd.grad((y * weights).sum(), leaf)))
-    for walked, stepped in zip(*found, strict=True):
-        torch.testing.assert_close(walked, stepped, rtol=1e-11, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -250,16 +220,6 @@ def test_coates_undoes_the_mean(total, dead):
         assert torch.autograd.gradcheck(lambda c: coates(c, cycles, dead).rate, (counts,), eps=1e-3, fast_mode=True)
 
 
-def test_more_detections_than_cycles_leave_none_armed():
-    """As noise has them: in the next bin those can fire that come back."""
-    counts = torch.tensor([[13.0, 5.0, 1.0]], dtype=torch.float64)
-    for dead, back in ((1.0, 13.0), (1.0 - 1e-10, 13.0), (2.0, 0.0)):
-        here = clocked_counts._invert_rows(counts, 10, dead)[0]
-        assert float(here.armed[0, 1]) == 0.0
-        assert float(here.cycles[0, 1]) == pytest.approx(back, abs=1e-8)
-        assert 0 <= float(here.part) < 1e-12
-
-
 def test_estimates_have_gradients_where_no_cycle_is_armed():
     """All ten are dead for three bins: nothing is known of these, and nothing is infinite."""
     counts = image([10.0, 0.4, 0.0, 6.0, 1.0]).requires_grad_()
@@ -268,35 +228,6 @@ def test_estimates_have_gradients_where_no_cycle_is_armed():
     assert bool(rate.isfinite().all())
     (slope,) = torch.autograd.grad(rate.sum(), counts)
     assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dead", [1.0, 1.4, 2.3])
-def test_slopes_of_estimates_where_nothing_was_detected(dead):
-    """A detection more in a bin without one: the rate rises by the time that cycles are armed in it, as it does."""
-    counts = image([60.0, 0.0, 20.0, 0.0, 5.0])
-    rate = coates(leaf := counts.clone().requires_grad_(), 100, dead).rate.flatten()
-    assert rate[1::2].tolist() == [0.0, 0.0]
-    for k in (1, 3):
-        (slope,) = torch.autograd.grad(rate[k], leaf, retain_graph=True)
-        more = counts.clone()
-        more[:, k] = 1e-4
-        risen = float(coates(more, 100, dead).rate.flatten()[k]) / 1e-4
-        # what uncut bins miss has no derivative
-        assert float(slope.flatten()[k]) == pytest.approx(risen, rel=5e-3)
-
-
-def test_in_a_flood_coates_looks_no_closer(monkeypatch):
-    """What uncut bins miss is asked for rates of 30 a bin at most, and is a tenth of the counts at most."""
-    asked, given = [], []
-    means, walked = clocked_counts.mean_detections, clocked_counts._invert_rows
-    monkeypatch.setattr(clocked_counts, "mean_detections", lambda r, d: asked.append(r) or means(r, d))
-    monkeypatch.setattr(clocked_counts, "_invert_rows", lambda c, *rest: given.append(c) or walked(c, *rest))
-    counts = spad(1.3, 1000)(image([0.5, 70.0, 90.0, 40.0, 3.0]))
-    rate = coates(counts, 1000, 1.3).rate.flatten()
-    assert float(rate.max()) > 30 and max(float(r.max()) for r in asked) == 30.0
-    wrong = max(float(((c - given[0]).abs() / given[0]).max()) for c in given[1:])
-    assert wrong == pytest.approx(0.1, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -336,22 +267,3 @@ def test_log_prob_at_the_ends():
     assert impossible[1] == -torch.inf
     sure = first_photon_log_prob(image([10.0, 0, 0, 0]), image([50.0, 0, 0, 0]), 10, dead_bins=2.0)
     assert abs(float(sure.flatten()[0])) < 1e-12
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
-def test_dtypes(dtype):
-    x = mixed().to(dtype)
-    y = spad(1.3)(x)
-    assert y.dtype == torch.float32
-    torch.testing.assert_close(y.double(), spad(1.3)(x.double()), rtol=8e-3, atol=0)
-
-
-def test_errors():
-    with pytest.raises(UnitError, match="half a bin"):
-        detections_with_dead_time(image(np.ones(4)), 0.4)
-    with pytest.raises(UnitError, match="half a bin"):
-        spad(0.3)
-    with pytest.raises(UnitError, match="at least one bin"):
-        spad(0.7).inverse(image(np.ones(4)))
-    with pytest.raises(TorchTransientError, match="photons in a bin"):
-        detections_with_dead_time(image(np.full(4, 1e6)), 2.0)

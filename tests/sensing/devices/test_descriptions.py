@@ -5,13 +5,12 @@ from __future__ import annotations
 import inspect
 import json
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from torchtransient import TimeAxis, losses, sensing
-from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from torchtransient import TimeAxis, sensing
+from torchtransient.errors import StorageError, UnitError
 from torchtransient.sensing import Device, build_stage
 from torchtransient.sensing.devices import KINDS
 
@@ -124,13 +123,6 @@ def test_a_stage_that_is_not_there(stage):
 # ------------------------------------------------------------------------------------------------------ parts
 
 
-@pytest.mark.parametrize("name", ["optics", "readout"])
-@pytest.mark.parametrize("given", [sensing.LensBlur(1.0), sensing.ZoneSum(1, 1), "lens", 3, ["lens"], [None], {"a": 1}])
-def test_parts_that_are_no_list(name, given):
-    with pytest.raises(ArgumentError, match=f"counting_chain: expected {name} as a list of sensors, got"):
-        sensing.counting_chain(budget(), sensing.SynchronousSPAD(1000), **{name: given})
-
-
 def test_lists_of_parts():
     spad, x = sensing.SynchronousSPAD(1000), torch.full((1, 32, 4, 4), 1e-3)
     plain = sensing.counting_chain(budget(), spad, optics=None, readout=None)
@@ -142,50 +134,6 @@ def test_lists_of_parts():
 
 
 # ---------------------------------------------------------------------------------------------------- numbers
-
-
-@pytest.mark.parametrize("number", [float, np.float32, np.float64, torch.tensor, lambda v: np.array(v, np.float32)])
-def test_dead_times_of_any_make_are_compared(number):
-    """A window of 3.2 ns and a dead time of 2 ns in a period of 5 ns, whoever made the numbers."""
-    fast = budget(rate_hz=2e8)
-    spad = sensing.SynchronousSPAD(1000, dead_time_s=number(2 * NS), axis=AXIS)
-    after = sensing.Afterpulsing(0.01, 1 * NS, number(2 * NS), axis=AXIS, period_s=number(5 * NS))
-    for stages in ([spad], [sensing.SynchronousSPAD(1000), after], [sensing.AfterpulsingSPAD(spad, after)]):
-        with pytest.raises(UnitError, match=r"armed again|laser period"):
-            sensing.Compose([fast, *stages])
-        sensing.Compose([budget(rate_hz=number(1e8)), *stages[:1]] if stages[0] is spad else [budget(), spad])
-
-
-@pytest.mark.parametrize("floor, left", [(True, 2), (False, 8), (3.0, 2), (0, 8), (np.float32(3), 2), (np.True_, 2)])
-def test_floors_are_truth_values_or_counts_alike(floor, left):
-    counts = torch.tensor([3.0, 3, 9, 5, 3, 3, 3, 3])
-    response = sensing.MeasuredResponse(counts, 1e-10, floor=floor)
-    delays = sensing.MeasuredDelays(counts, 1e-10, floor=floor)
-    torch.testing.assert_close(response.shares, delays.share_of_bins)
-    assert int((response.shares > 0).sum()) == left
-    for wrong in (-1.0, 100.0, float("nan"), "median", None):
-        for made in (sensing.MeasuredResponse, sensing.MeasuredDelays):
-            with pytest.raises(UnitError, match="floor"):
-                made(counts, 1e-10, floor=wrong)
-
-
-def test_periods_in_which_a_detector_is_armed():
-    """A detection in the middle of a bin, on average, is followed by 2.5 bins without one."""
-    counts = torch.zeros(1, 6, 1, 1)
-    counts[0, 1] = 2
-    armed = losses.armed_periods(counts, 10, 2.5)
-    assert armed.dtype == torch.float64
-    assert float(60 - armed.sum()) == pytest.approx(2 * 2.5)
-    assert armed.flatten().tolist() == pytest.approx([10, 9, 8, 8.25, 9.75, 10])
-    for call, error in (
-        (lambda: losses.armed_periods([1.0], 10, 2.5), ShapeError),
-        (lambda: losses.armed_periods(counts[0, :, 0, 0], 10, 2.5), ShapeError),
-        (lambda: losses.armed_periods(counts * 1j, 10, 2.5), UnitError),
-        (lambda: losses.armed_periods(counts, 0, 2.5), UnitError),
-        (lambda: losses.armed_periods(counts, 10, float("nan")), UnitError),
-    ):
-        with pytest.raises(error, match=r"armed_periods: .*expected"):
-            call()
 
 
 class Twice(sensing.MovedCounts):

@@ -11,7 +11,6 @@ import torch
 import torchtransient as tt
 from support.marks import long, long_pairs
 from torchtransient import sensing
-from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.losses import first_photon_nll, poisson_nll
 from torchtransient.sensing import covariance_bound, crlb, return_rates
 from torchtransient.sensing.cramer_rao import shares_between
@@ -270,43 +269,6 @@ def test_of_chains_without_light_or_without_a_cycle_left():
     # a coin tossed four times: p (1 - p) / 4
     p = halves[0].flatten()
     torch.testing.assert_close(full.flatten(), p * (1 - p) / 4, rtol=1e-6, atol=0)
-
-
-class _Backward(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x):
-        return x * 2
-
-    @staticmethod
-    def backward(ctx, g):
-        return g * 2
-
-
-def test_errors():
-    calls = [
-        (lambda: crlb(400e-12, AXIS, distance_m=0.6, signal=3.0), ArgumentError),
-        (lambda: crlb(NORMAL, 100e-12, distance_m=0.6, signal=3.0), ArgumentError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=-0.6, signal=3.0), UnitError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=math.nan), UnitError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal="3"), UnitError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=torch.ones(2) + 1j), UnitError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=torch.ones(2), signal=torch.ones(3)), ShapeError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=3.0, cycles=2.5), UnitError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=3.0, unknown="signal"), ArgumentError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=3.0, unknown=["distance", "albedo"]), ArgumentError),
-        (lambda: return_rates(NORMAL, AXIS, distance_m=0.6, signal=-1.0), UnitError),
-        (lambda: covariance_bound(light, []), ShapeError),
-        (lambda: covariance_bound(light, [1.0, 2.0]), ShapeError),
-        (lambda: covariance_bound(light(*maps(0.6, 3.0, 0.1)), maps(0.6, 3.0, 0.1)), ArgumentError),
-        (lambda: crlb(NORMAL, AXIS, distance_m=0.6, signal=torch.ones(2, device="meta")), DeviceError),
-        (lambda: covariance_bound(lambda *p: light(*p)[0], maps(0.6, 3.0, 0.1)), ShapeError),
-        (lambda: covariance_bound(lambda *p: -light(*p), maps(0.6, 3.0, 0.1)), UnitError),
-        (lambda: covariance_bound(light, maps(0.6, 3.0, 0.1), cycles=2), UnitError),
-        (lambda: covariance_bound(lambda *p: _Backward.apply(light(*p)), maps(0.6, 3.0, 0.1)), GradientError),
-    ]
-    for call, error in calls:
-        with pytest.raises(error, match=r"^\w+: .*expected"):
-            call()
 
 
 # ---------------------------------------------------------------------------------------------------------- estimators

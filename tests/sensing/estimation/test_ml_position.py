@@ -10,8 +10,6 @@ import torch
 
 from support.marks import long_rows
 from torchtransient import TimeAxis, sensing
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.sensing.depth import _top
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 64)
@@ -134,28 +132,6 @@ def test_flat_tops_and_ends_of_the_window():
         assert bool(slope.isfinite().all()) and float(slope.abs().max()) == 0
         for response in SHAPES.values():
             assert 0 <= float(sensing.ml_position(counts.detach(), response, AXIS)) <= 64
-
-
-def test_tops_of_rows():
-    """Between entries by a parabola, in the middle of what is flat, at an end or beside what cannot be as they are."""
-    low = -math.inf
-    rows = [[1, 2, 4, 3], [1, 2, 3, 4], [4, 3, 2, 1], [0, 3, 3, 1], [5, 5, 5, 5], [1, 3, low, 2], [low, 2, 1, 1]]
-    found = _top(torch.tensor(rows, dtype=torch.float64))
-    assert found.tolist() == pytest.approx([2 + 0.5 / 3, 3, 0, 1.5, 1.5, 1, 1])
-
-
-def test_mistakes():
-    counts, response = torch.zeros(1, 64, 1, 1), SHAPES["wide"]
-    with pytest.raises(ArgumentError, match="expected a response"):
-        sensing.ml_position(counts, torch.ones(3), AXIS)
-    with pytest.raises(ShapeError, match="expected T = 64"):
-        sensing.ml_position(counts[:, :60], response, AXIS)
-    with pytest.raises(ArgumentError, match="axis"):
-        sensing.ml_position(counts, response)
-    with pytest.raises(UnitError, match="signal_to_background"):
-        sensing.ml_position(counts, response, AXIS, signal_to_background=0.0)
-    with pytest.raises(ShapeError, match="ml_position"):
-        sensing.ml_position(counts[0, 0], response, AXIS)
 
 
 @pytest.mark.parametrize("delay", [0.0, 370 * PS, -640 * PS])

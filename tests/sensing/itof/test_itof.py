@@ -10,14 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from support.sweeps import together
+from torchtransient import sensing
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.electronics import PixelElectronics
-from torchtransient.sensing.itof import codes as itof_codes
-from torchtransient.sensing.itof import correlation as itof
-from torchtransient.sensing.itof import depth as itof_depth
-from torchtransient.sensing.itof import reading as itof_reading
+from torchtransient.sensing import PixelElectronics
 from torchtransient.units import SPEED_OF_LIGHT
 
 TURN = 2 * math.pi
@@ -25,13 +20,13 @@ TURN = 2 * math.pi
 WIGGLE = {3: 0.01950, 4: 0.07111, 5: 0.00406, 6: 0.01950, 8: 0.00802}
 
 CODES = {
-    "sine": itof_codes.sine_code(4),
-    "harmonics": itof_codes.FourierCode(5, {1: (0.8, 0.3), 3: (0.15, -1.0)}),
-    "square": itof_codes.square_code(4),
-    "short_light": itof_codes.square_code(3, light_duty=0.2, gate_duty=0.5),
-    "hamiltonian3": itof_codes.hamiltonian_code(3),
-    "hamiltonian4": itof_codes.hamiltonian_code(4),
-    "measured": itof_codes.measured_code(
+    "sine": sensing.sine_code(4),
+    "harmonics": sensing.FourierCode(5, {1: (0.8, 0.3), 3: (0.15, -1.0)}),
+    "square": sensing.square_code(4),
+    "short_light": sensing.square_code(3, light_duty=0.2, gate_duty=0.5),
+    "hamiltonian3": sensing.hamiltonian_code(3),
+    "hamiltonian4": sensing.hamiltonian_code(4),
+    "measured": sensing.measured_code(
         torch.stack(
             [torch.cos(TURN * (torch.arange(50) / 50 - s / 3)) + 0.2 * (torch.arange(50) % 2) for s in range(3)]
         )
@@ -81,7 +76,7 @@ def test_fourier_coefficients(name):
 
 
 def test_square_code_is_a_triangle_with_odd_harmonics():
-    code = itof_codes.square_code(4)
+    code = sensing.square_code(4)
     x = torch.tensor([0.0, 0.125, 0.25, 0.5, 0.75], dtype=torch.float64)
     torch.testing.assert_close(code.evaluate(x)[0], torch.tensor([1.0, 0.5, 0.0, -1.0, 0.0], dtype=torch.float64))
     c = code.coefficients([1, 2, 3, 5])[0].real
@@ -90,7 +85,7 @@ def test_square_code_is_a_triangle_with_odd_harmonics():
 
 def test_binary_code_against_a_sampled_correlation():
     """Overlap of the light with the gates, from pulses sampled as 0 and 1."""
-    code, n = itof_codes.hamiltonian_code(4), 1200
+    code, n = sensing.hamiltonian_code(4), 1200
     gates = np.zeros((4, n))
     for row, openings in zip(gates, [[(5, 11)], [(2, 8)], [(0, 3), (7, 10)], [(4, 6), (9, 13)]], strict=True):
         for a, b in openings:
@@ -105,8 +100,8 @@ def test_binary_code_against_a_sampled_correlation():
 def test_measured_hamiltonian_functions_look_like_the_code():
     """Excerpt of correlations measured by Gutierrez-Barragan et al., MIT licence, see measured_hamiltonian_k3.md."""
     samples = torch.from_numpy(np.load(Path(__file__).parent / "measured_hamiltonian_k3.npy")).double()
-    code = itof_codes.measured_code(samples[0::2] - samples[1::2], closed=True)
-    ideal = itof_codes.hamiltonian_code(3)
+    code = sensing.measured_code(samples[0::2] - samples[1::2], closed=True)
+    ideal = sensing.hamiltonian_code(3)
     x = torch.arange(512, dtype=torch.float64) / 512
     measured = code.evaluate(x)
     # The camera's own zero of phase, sign and order of taps are not stated: find them.
@@ -120,18 +115,18 @@ def test_measured_hamiltonian_functions_look_like_the_code():
     assert best > 0.98
     truth = torch.linspace(0.02, 0.98, 97, dtype=torch.float64)
     taps = (1 + code.evaluate(truth)).reshape(1, 3, 1, -1) / 3
-    phase = itof_reading.decode_code(taps, code, num_phases=2048).flatten() / TURN
+    phase = sensing.decode_code(taps, code, num_phases=2048).flatten() / TURN
     # Samples are 1 / 1939 of a turn apart, joined by straight lines that the decoder's table does not hit exactly.
-    assert float(itof_depth.wrapped_difference(phase * TURN, truth * TURN).abs().max()) / TURN < 3e-4
+    assert float(sensing.wrapped_difference(phase * TURN, truth * TURN).abs().max()) / TURN < 3e-4
 
 
 @pytest.mark.parametrize("num_taps", WIGGLE)
 def test_wiggling(num_taps):
     """Square on square aliases the harmonics m N +- 1 into the phase: the table of peak errors, to 1e-4 rad."""
     x = torch.arange(0, 1, 1 / 20000, dtype=torch.float64)
-    taps = (1 + itof_codes.square_code(num_taps).evaluate(x)).reshape(1, num_taps, 1, -1) / num_taps
-    phase = itof_depth.phase_of(itof_depth.tap_phasor(taps, num_taps)).flatten()
-    error = itof_depth.wrapped_difference(phase, TURN * x)
+    taps = (1 + sensing.square_code(num_taps).evaluate(x)).reshape(1, num_taps, 1, -1) / num_taps
+    phase = sensing.phase_of(sensing.tap_phasor(taps, num_taps)).flatten()
+    error = sensing.wrapped_difference(phase, TURN * x)
     assert abs(float(error.abs().max()) - WIGGLE[num_taps]) < 1e-4
     phi = TURN * np.arange(0, 1, 1 / 500)
     np.testing.assert_allclose(error[::40].numpy(), aliased(phi, num_taps, 2001), atol=2e-6)
@@ -151,12 +146,12 @@ def aliased(phi, num_taps, highest):
 def test_wiggling_in_metres():
     """4 taps at 20 MHz: 85 mm, through a transient, and gone when decoded by the code's shape."""
     x, axis, truth = delta(torch.arange(0, 1, 1 / 512, dtype=torch.float64), 20e6)
-    code = itof_codes.square_code(4)
-    taps = itof.ItofCorrelation(code, 20e6, axis).expected(x)
-    error = itof_reading.read_itof(taps, 20e6, 4).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
+    code = sensing.square_code(4)
+    taps = sensing.ItofCorrelation(code, 20e6, axis).expected(x)
+    error = sensing.read_itof(taps, 20e6, 4).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
     error = torch.remainder(error + 3, SPEED_OF_LIGHT / 40e6) - 3
     assert abs(float(error.abs().max()) - 0.085) < 0.0005
-    decoded = itof_reading.read_itof(taps, 20e6, 4, code=code).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
+    decoded = sensing.read_itof(taps, 20e6, 4, code=code).depth_m.flatten() - truth * SPEED_OF_LIGHT / 40e6
     decoded = torch.remainder(decoded + 3, SPEED_OF_LIGHT / 40e6) - 3
     assert float(decoded.abs().max()) < 0.0005
 
@@ -164,12 +159,12 @@ def test_wiggling_in_metres():
 def test_wiggling_through_a_phasor_image():
     """Taps from phasors at the odd harmonics agree with those from the transient, but for the harmonics left out."""
     x, axis, _ = delta(torch.arange(0, 1, 1 / 64, dtype=torch.float64), 20e6, electrons=50.0)
-    code = itof_codes.square_code(4)
+    code = sensing.square_code(4)
     harmonics = tuple(range(1, 200, 2))
     axis_f = FrequencyAxis.from_hertz([0.0, *(h * 20e6 for h in harmonics)], start_opl=1.25)
     angle = -TURN * axis_f.per_metre[:, None] * (axis.centers_opl - 1.25)
     phasor = torch.einsum("ft,cthw->cfhw", torch.exp(1j * angle), x.to(torch.complex128))
-    correlation = itof.ItofCorrelation(code, 20e6, axis, contrast=0.8, background_e=7.0, within_bin="center")
+    correlation = sensing.ItofCorrelation(code, 20e6, axis, contrast=0.8, background_e=7.0, within_bin="center")
     found = correlation.expected_from_phasor(phasor, axis_f, harmonics=harmonics)
     left_out = 50 * 0.8 / 4 * 2 * sum(4 / math.pi**2 / h**2 for h in range(201, 100001, 2))
     assert float((found - correlation.expected(x)).abs().max()) <= left_out
@@ -187,12 +182,12 @@ def test_sine_taps_come_from_one_phasor():
     # Light evenly spread over a bin has the phasor of its middle times sinc.
     weights = torch.exp(-2j * math.pi * turns) * torch.sinc(axis_f.per_metre * 0.3)
     phasor = torch.einsum("t,bcthw->bchw", weights, x.to(torch.complex128)).unsqueeze(-3)
-    correlation = itof.ItofCorrelation(itof_codes.sine_code(4), 30e6, axis, contrast=0.7)
+    correlation = sensing.ItofCorrelation(sensing.sine_code(4), 30e6, axis, contrast=0.7)
     taps = correlation.expected(x)
     torch.testing.assert_close(correlation.expected_from_phasor(phasor, axis_f, steady=x.sum(-3)), taps)
     torch.testing.assert_close(taps.sum(-3), x.sum(-3))
     # The tap phasor is the conjugate of the phasor of the light, up to contrast and taps.
-    z = itof_depth.tap_phasor(taps, 4)
+    z = sensing.tap_phasor(taps, 4)
     start = torch.exp(torch.tensor(2j * math.pi * float(axis_f.per_metre) * axis.start_opl))
     torch.testing.assert_close(z, 0.7 / 4 * phasor.conj() * start)
 
@@ -201,12 +196,12 @@ def test_two_paths_give_the_phase_of_the_sum_of_phasors():
     axis = TimeAxis(0.0, 0.01, 1000)
     x = torch.zeros(1, 1000, 1, 1, dtype=torch.float64)
     x[0, 200], x[0, 300] = 3.0, 1.0
-    taps = itof.ItofCorrelation(itof_codes.sine_code(4), 50e6, axis).expected(x)
+    taps = sensing.ItofCorrelation(sensing.sine_code(4), 50e6, axis).expected(x)
     total = sum(
         a * torch.exp(torch.tensor(2j * math.pi * 50e6 / SPEED_OF_LIGHT * (k + 0.5) * 0.01, dtype=torch.complex128))
         for k, a in ((200, 3.0), (300, 1.0))
     )
-    reading = itof_reading.read_itof(taps, 50e6, 4)
+    reading = sensing.read_itof(taps, 50e6, 4)
     assert abs(float(reading.phase) - float(total.angle())) < 1e-9
     assert 2.005 / 2 + 0.05 < float(reading.depth_m) < 3.005 / 2  # drawn from the first path to the second
 
@@ -216,38 +211,38 @@ def test_phase_noise_within_two_percent(num_taps, read_noise_e):
     """Standard deviation of the phase of 80 000 noisy pixels against sqrt(2 (B + N r^2)) / A."""
     electrons, contrast, background, count = 4000.0, 0.6, 2000.0, 80_000
     x, axis, _ = delta(torch.full((1,), 0.23, dtype=torch.float64), 20e6, electrons)
-    camera = itof.ItofCorrelation(
-        itof_codes.sine_code(num_taps), 20e6, axis, contrast=contrast, background_e=background
+    camera = sensing.ItofCorrelation(
+        sensing.sine_code(num_taps), 20e6, axis, contrast=contrast, background_e=background
     )
     taps = camera.expected(x).expand(1, num_taps, 1, count)
     noisy = PixelElectronics(read_noise_e=read_noise_e).sample(taps, torch.Generator().manual_seed(5))
-    phase = itof_depth.phase_of(itof_depth.tap_phasor(noisy, num_taps))
+    phase = sensing.phase_of(sensing.tap_phasor(noisy, num_taps))
     total, modulated = electrons + background, electrons * contrast
     theory = math.sqrt(2 * (total + num_taps * read_noise_e**2)) / modulated
     # Three taps see the third harmonic of the noise: shot noise follows the light, which has the same period.
     swing = modulated * math.cos(3 * TURN * 0.23) if num_taps == 3 else 0.0
     exact = math.sqrt(theory**2 - swing / modulated**2)
     assert abs(float(phase.std()) / exact - 1) < 0.02  # its own standard error is 0.25 %
-    clean = itof_reading.read_itof(taps[..., :1], 20e6, num_taps)
-    predicted = itof_reading.phase_noise_rad(clean.amplitude, clean.offset, num_taps, read_noise_e=read_noise_e)
+    clean = sensing.read_itof(taps[..., :1], 20e6, num_taps)
+    predicted = sensing.phase_noise_rad(clean.amplitude, clean.offset, num_taps, read_noise_e=read_noise_e)
     assert abs(float(predicted) / theory - 1) < 1e-5  # the delta stands in a bin of 1 / 4096 turn
     assert abs(float(clean.amplitude / clean.offset) - modulated / total) < 1e-5
 
 
 def test_the_checked_figure_of_the_phase_noise():
     """B = 10 000, A = 2000 electrons in all: 0.0707 rad."""
-    assert abs(float(itof_reading.phase_noise_rad(torch.tensor(500.0), torch.tensor(2500.0), 4)) - 0.0707) < 1e-4
+    assert abs(float(sensing.phase_noise_rad(torch.tensor(500.0), torch.tensor(2500.0), 4)) - 0.0707) < 1e-4
 
 
 @pytest.mark.parametrize("frequencies", [(20e6, 90e6), (60e6, 100e6), (16e6, 80e6, 120e6)])
 def test_unwrapping(frequencies):
-    longest = itof_depth.unambiguous_range_m(frequencies)
+    longest = sensing.unambiguous_range_m(frequencies)
     truth = torch.linspace(0.01, longest - 0.2, 1500, dtype=torch.float64).reshape(1, 1, -1)
     exact = torch.stack([truth * 2 * TURN * f / SPEED_OF_LIGHT for f in frequencies], dim=-3)
     g = torch.Generator().manual_seed(1)
     noise = 0.03 * torch.randn(exact.shape, generator=g, dtype=torch.float64)
     phase = torch.remainder(exact + noise, TURN).requires_grad_()
-    depth = itof_depth.unwrap_depth(phase, frequencies, min_depth_m=-0.1)
+    depth = sensing.unwrap_depth(phase, frequencies, min_depth_m=-0.1)
     # Weighted least squares: the variance of depth is one over the sum of 1 / (variance of each frequency).
     precision = sum((2 * TURN * f / SPEED_OF_LIGHT / 0.03) ** 2 for f in frequencies)
     error = (depth - truth).detach()
@@ -262,7 +257,7 @@ def test_unwrapping_agrees_with_trying_every_pair():
     frequencies = (30e6, 70e6)
     g = torch.Generator().manual_seed(3)
     phase = TURN * torch.rand(1, 2, 1, 400, dtype=torch.float64, generator=g)  # unrelated phases: the hard case
-    found = itof_depth.unwrap_depth(phase, frequencies, max_depth_m=14.0)
+    found = sensing.unwrap_depth(phase, frequencies, max_depth_m=14.0)
     period = torch.tensor([SPEED_OF_LIGHT / (2 * f) for f in frequencies], dtype=torch.float64)
     best, depth = torch.full((400,), math.inf, dtype=torch.float64), torch.zeros(400, dtype=torch.float64)
     share = period**-2 / (period**-2).sum()
@@ -281,8 +276,8 @@ def test_decoding_by_shape(name):
     code = CODES[name]
     truth = torch.linspace(0.0, 0.999, 701, dtype=torch.float64)
     taps = (5 + 3 * code.evaluate(truth)).reshape(1, code.num_taps, 1, -1)
-    phase = itof_reading.decode_code(taps, code)
-    error = itof_depth.wrapped_difference(phase.flatten(), TURN * truth)
+    phase = sensing.decode_code(taps, code)
+    error = sensing.wrapped_difference(phase.flatten(), TURN * truth)
     assert float(error.abs().max()) < 2e-3  # at the corners of a code the slope is that of neither side
     assert float(error.abs().median()) < 1e-5
 
@@ -293,29 +288,29 @@ def test_gradient_of_decoding_by_shape(name):
     code = CODES[name]
     truth = torch.tensor([0.11, 0.47, 0.83], dtype=torch.float64, requires_grad=True)
     taps = (5 + 3 * code.evaluate(truth)).reshape(1, code.num_taps, 1, -1)
-    (gradient,) = torch.autograd.grad(itof_reading.decode_code(taps, code).sum() / TURN, truth)
+    (gradient,) = torch.autograd.grad(sensing.decode_code(taps, code).sum() / TURN, truth)
     torch.testing.assert_close(gradient, torch.ones_like(gradient), rtol=0.02, atol=0)
 
 
 def test_phase_and_amplitude_have_gradients():
     g = torch.Generator().manual_seed(2)
     taps = (1 + torch.rand(1, 8, 2, 2, dtype=torch.float64, generator=g)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda t: itof_depth.phase_of(itof_depth.tap_phasor(t, 4)), taps)
-    assert torch.autograd.gradcheck(lambda t: itof_depth.amplitude_of(itof_depth.tap_phasor(t, 4)), taps)
-    other = itof_depth.tap_phasor(torch.rand(1, 8, 2, 2, dtype=torch.float64, generator=g), 4)
-    assert torch.autograd.gradcheck(lambda t: itof_depth.phasor_loss(itof_depth.tap_phasor(t, 4), other), taps)
+    assert torch.autograd.gradcheck(lambda t: sensing.phase_of(sensing.tap_phasor(t, 4)), taps)
+    assert torch.autograd.gradcheck(lambda t: sensing.amplitude_of(sensing.tap_phasor(t, 4)), taps)
+    other = sensing.tap_phasor(torch.rand(1, 8, 2, 2, dtype=torch.float64, generator=g), 4)
+    assert torch.autograd.gradcheck(lambda t: sensing.phasor_loss(sensing.tap_phasor(t, 4), other), taps)
 
 
 def test_dark_pixels_have_value_and_gradient_zero():
     taps = torch.zeros(1, 4, 1, 2, dtype=torch.float64)
     taps[..., 1] = 3.0  # light without modulation
     taps.requires_grad_()
-    reading = itof_reading.read_itof(taps, 20e6, 4)
+    reading = sensing.read_itof(taps, 20e6, 4)
     assert bool(reading.depth_std_m.isinf().all())
     (reading.depth_m.sum() + reading.depth_std_m.sum() + reading.amplitude.sum()).backward()
     assert bool(torch.isfinite(taps.grad).all())
     assert float(reading.depth_m.detach().abs().max()) == 0.0
-    assert float(itof_reading.decode_code(taps.detach(), CODES["hamiltonian4"]).abs().max()) == 0.0
+    assert float(sensing.decode_code(taps.detach(), CODES["hamiltonian4"]).abs().max()) == 0.0
 
 
 def test_phasor_loss_crosses_the_branch_cut():
@@ -326,62 +321,15 @@ def test_phasor_loss_crosses_the_branch_cut():
 
     target = phasor(torch.tensor(0.1, dtype=torch.float64))
     angle = torch.tensor(6.2, dtype=torch.float64, requires_grad=True)
-    itof_depth.phasor_loss(phasor(angle), target).backward()
+    sensing.phasor_loss(phasor(angle), target).backward()
     assert float(angle.grad) < 0  # descent raises the angle, through the cut
     naive = angle.detach().clone().requires_grad_()
-    (itof_depth.phase_of(phasor(naive)) - 0.1).square().backward()
+    (sensing.phase_of(phasor(naive)) - 0.1).square().backward()
     assert float(naive.grad) > 0
-    assert abs(float(itof_depth.wrapped_difference(angle.detach(), torch.tensor(0.1))) - (6.1 - TURN)) < 1e-6
+    assert abs(float(sensing.wrapped_difference(angle.detach(), torch.tensor(0.1))) - (6.1 - TURN)) < 1e-6
 
 
 def test_phase_stays_below_a_turn():
     z = torch.tensor([1 - 1e-9j, 1 - 1e-30j, -1 + 0j, 1e-30 + 1e-30j], dtype=torch.complex64)
-    phase = itof_depth.phase_of(z)
+    phase = sensing.phase_of(z)
     assert bool((phase >= 0).all()) and bool((phase < TURN).all())
-
-
-@together(
-    "call, error",
-    [
-        (lambda: itof_codes.sine_code(1), ShapeError),
-        (lambda: itof.tap_weights(itof_codes.sine_code(2), 20e6, TimeAxis(0, 1, 4)), ShapeError),
-        (lambda: itof_codes.FourierCode(4, {1: (0.8, 0), 3: (0.3, 0)}), UnitError),
-        (lambda: itof_codes.FourierCode(4, {0: (0.8, 0)}), UnitError),
-        (lambda: itof_codes.square_code(4, light_duty=1.2), UnitError),
-        (lambda: itof_codes.hamiltonian_code(6), ShapeError),
-        (lambda: itof_codes.binary_code(0.1, [[(0, 0.5), (0.4, 0.6)]] * 3), UnitError),
-        (lambda: itof_codes.measured_code(torch.zeros(3, 10)), UnitError),
-        (lambda: itof_codes.measured_code(torch.ones(10)), ShapeError),
-        (lambda: itof_codes.PiecewiseLinearCode(torch.rand(3, 4).sort(1, True)[0], torch.zeros(3, 4)), UnitError),
-        (lambda: CODES["sine"].bin_means(torch.tensor([1.0, 0.0])), UnitError),
-        (lambda: itof.tap_weights(CODES["sine"], 20.0, TimeAxis(0, 1, 4)), UnitError),
-        (lambda: itof.tap_weights(CODES["sine"], 20e6, TimeAxis(0, 1, 4), within_bin="left"), UnitError),
-        (lambda: itof.tap_weights(CODES["sine"], (), TimeAxis(0, 1, 4)), UnitError),
-        (lambda: itof.correlate(torch.ones(1, 5, 1, 1), torch.ones(4, 6)), ShapeError),
-        (
-            lambda: itof.taps_from_phasor(
-                torch.ones(1, 1, 1, 1, dtype=torch.complex64), FrequencyAxis((0.0,)), CODES["sine"], frequencies_hz=20e6
-            ),
-            UnitError,
-        ),
-        (
-            lambda: itof.taps_from_phasor(
-                torch.ones(1, 1, 1, 1, dtype=torch.complex64), FrequencyAxis((0.0,)), CODES["square"],
-                    frequencies_hz=20e6
-            ),
-            UnitError,
-        ),
-        (lambda: itof.taps_from_phasor(torch.ones(1, 1, 1, 1), FrequencyAxis((0.0,)), CODES["sine"],
-         frequencies_hz=20e6), ShapeError),
-        (lambda: itof_depth.tap_phasor(torch.ones(1, 5, 1, 1), 4), ShapeError),
-        (lambda: itof_reading.read_itof(torch.ones(1, 8, 1, 1), 20e6, 4), ShapeError),
-        (lambda: itof_depth.unwrap_depth(torch.ones(1, 3, 1, 1), (20e6, 50e6)), ShapeError),
-        (lambda: itof_depth.unwrap_depth(torch.ones(1, 2, 1, 1), (20e6, 50e6), max_depth_m=-1.0), UnitError),
-        (lambda: itof_depth.unwrap_depth(torch.ones(1, 2, 1, 1), (20e6, 50e6), weights=(1, 0)), UnitError),
-        (lambda: itof_depth.unambiguous_range_m((20e6, 50.5)), UnitError),
-        (lambda: itof_depth.unambiguous_range_m((20e6, 50000.5)), UnitError),
-    ],
-)
-def test_errors(call, error):
-    with pytest.raises(error, match=r"\w+: .*expected|overlap"):
-        call()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 import warnings
 
 import numpy as np
@@ -14,7 +12,6 @@ from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import PhysicsWarning, UnitError
-from torchtransient.sensing.itof.correlation import _DEEPEST_M
 from torchtransient.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis.from_seconds(0.0, 100e-12, 500)
@@ -182,33 +179,6 @@ def test_the_exposures_of_the_numbers():
 # --------------------------------------------------------------------------------------------------- other units
 
 
-@pytest.mark.parametrize(
-    "wrong, word",
-    [
-        ({"phase_offset_rad": 180.0}, "Degrees"),
-        ({"phase_offset_rad": [0.1, -90.0]}, "Degrees"),
-        ({"phase_map_rad": torch.full((2, 2), 45.0)}, "Degrees"),
-        ({"depth_map_m": np.full((2, 2), 300.0)}, "Millimetres"),
-        ({"depth_map_m": torch.full((2, 2), float("nan"))}, "finite"),
-    ],
-)
-def test_calibrations_in_other_units_are_refused(wrong, word):
-    with pytest.raises(UnitError, match=word):
-        sensing.ItofCalibration(**wrong)
-
-
-def test_how_far_calibrations_reach():
-    """Two turns of phase, of all pixels or of each, and as many metres as told."""
-    turns = 4 * np.pi
-    for name, most in (("phase_offset_rad", turns), ("phase_map_rad", turns), ("depth_map_m", _DEEPEST_M)):
-        for sign in (1.0, -1.0):
-            given = [np.full((2, 3), sign * part * most) for part in (0.999, 1.001)]
-            given = [float(g[0, 0]) for g in given] if name == "phase_offset_rad" else given
-            sensing.ItofCalibration(**{name: given[0]})
-            with pytest.raises(UnitError, match=f"expected {name} between -{most:.4g} and {most:.4g}"):
-                sensing.ItofCalibration(**{name: given[1]})
-
-
 def test_frames_of_other_machines():
     """Of the other byte order, read only, of strides, and turned round."""
     frames = (100 * torch.rand(1, 4, 2, 3, generator=torch.Generator().manual_seed(0))).to(torch.int16)
@@ -221,13 +191,3 @@ def test_frames_of_other_machines():
     for none in (np.array([["a"]]), [["a"]], np.array([None])):
         with pytest.raises(UnitError, match="tensor or an array"):
             sensing.read_itof(none, F, 4)
-
-
-def test_the_reading_says_what_became_of_confidence():
-    reading = sensing.read_itof(torch.rand(1, 4, 2, 2), F, 4)
-    with pytest.raises(AttributeError, match=r"confidence.*depth_std_m"):
-        _ = reading.confidence
-    with pytest.raises(AttributeError, match="no attribute 'colour'"):
-        _ = reading.colour
-    for same in (pickle.loads(pickle.dumps(reading)), copy.deepcopy(reading), reading.detach()):
-        assert same == reading

@@ -13,7 +13,7 @@ import torch
 
 from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     Compose,
     FourierCode,
@@ -363,17 +363,6 @@ def test_maps_through_a_phasor_image():
         camera.expected_from_phasor(phasor[..., :2], axis_f)
 
 
-def test_maps_keep_precision_in_half_and_are_batch_free():
-    camera = ItofCorrelation(square_code(3), FREQUENCIES, AXIS, calibration=ItofCalibration(phase_map_rad=MAP))
-    exact = camera.expected(LIGHT)
-    for dtype in (torch.float16, torch.bfloat16, torch.float32):
-        found = camera.to(dtype).expected(LIGHT.to(dtype))
-        assert found.dtype == torch.float32
-        # The light itself is rounded, by half an eps of each bin of at most one.
-        assert float((found.double() - exact).abs().max()) < 70 * (0.5 * torch.finfo(dtype).eps + 1e-6)
-    assert camera.expected(LIGHT[:0]).shape == (0, 1, 6, 3, 4)
-
-
 # ---------------------------------------------------------------------------------------------------------- measured
 
 
@@ -430,71 +419,6 @@ def test_raw_frames_of_whole_numbers(kind):
         torch.testing.assert_close(found.offset.double(), wanted.offset)
     full = torch.full((1, 4, 1, 1), 65535, dtype=torch.uint16)
     assert float(offset_of(full, 2, "two_tap")) == 2 * 65535
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        [60.6e6, 20e6], torch.tensor([60.6e6, 20e6]), [torch.tensor(60.6e6), np.float64(20e6)],
-        np.array([60_600_000, 20_000_000]),
-    ],
-    ids=["list", "tensor", "numbers", "whole"],
-)  # fmt: skip
-def test_frequencies_of_any_kind(given):
-    camera = ItofCorrelation(sine_code(3), given, AXIS)
-    assert camera.frequencies_hz == (60.6e6, 20e6)
-    reading = read_itof(camera.expected(LIGHT), given, 3)
-    assert reading.phase.shape == (2, 1, 2, 3, 4)
-    assert read_itof(camera.expected(LIGHT)[..., :3, :, :], torch.tensor(60.6e6), 3).phase.shape[-3] == 1
-
-
-@together(
-    "call, error",
-    [
-        (lambda: TwoTapCode("sine"), UnitError),
-        (lambda: TwoTapCode(TwoTapCode(sine_code(2))), UnitError),
-        (lambda: ReversedCode(hamiltonian_code(4)), UnitError),
-        (lambda: ReversedCode(TwoTapCode(sine_code(2))), UnitError),
-        (lambda: TapDifference()(torch.ones(1, 3, 1, 1)), ShapeError),
-        (lambda: TapDifference()(torch.ones(4, 1, 1)), ShapeError),
-        (lambda: ItofCalibration(direction=0), UnitError),
-        (lambda: ItofCalibration(phase_offset_rad="0.1"), UnitError),
-        (lambda: ItofCalibration(phase_offset_rad=math.nan), UnitError),
-        (lambda: ItofCalibration(phase_map_rad=torch.ones(3)), ShapeError),
-        (lambda: ItofCalibration(depth_map_m=torch.ones(1, 3, 3)), ShapeError),
-        (lambda: ItofCalibration(phase_offset_rad=(0.1, 0.2)).phases_rad((F,)), ShapeError),
-        (lambda: ItofCalibration(phase_offset_rad=0.0, direction=1, phase_map_rad=torch.ones(2, 3, 3)).phases_rad((F,)),
-         ShapeError),
-        (lambda: ItofCalibration(phase_offset_rad=0.0, direction=1, phase_map_rad=MAP, depth_map_m=torch.ones(2, 2))
-         .phases_rad((F,)), ShapeError),
-        (lambda: tap_weights(sine_code(3), F, AXIS, calibration=ItofCalibration(phase_map_rad=MAP)), UnitError),
-        (lambda: tap_weights(sine_code(3), F, AXIS, calibration=0.1), UnitError),
-        (lambda: ItofCorrelation(sine_code(3), F, AXIS, calibration=ItofCalibration(depth_map_m=MAP))(
-            torch.ones(1, 70, 2, 2)), ShapeError),
-        (lambda: ItofCorrelation(square_code(3), F, AXIS, calibration=ItofCalibration(depth_map_m=MAP))(
-            torch.ones(1, 60, 3, 4)), ShapeError),
-        (lambda: read_itof(torch.ones(1, 4, 2, 2), F, 4, calibration=ItofCalibration(depth_map_m=MAP)), ShapeError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, readout="both"), ArgumentError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, code=TwoTapCode(sine_code(4))), ArgumentError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, code="sine"), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, code=sine_code(3)), ShapeError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, readout="two_tap"), ShapeError),
-        (lambda: read_itof(torch.ones(1, 2, 1, 1), F, 2), ShapeError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1, dtype=torch.bool), F, 4), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1, dtype=torch.complex64), F, 4), UnitError),
-        (lambda: read_itof([[1.0]], F, 4), ShapeError),
-        (lambda: read_itof("frames", F, 4), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), torch.ones(1, 1) * F, 4), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), "20e6", 4), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), np.array([]), 4), UnitError),
-        (lambda: ItofNoise(electrons_per_unit=0.0), UnitError),
-        (lambda: ItofNoise(offset_e=-1.0), UnitError),
-        (lambda: read_itof(torch.ones(1, 4, 1, 1), F, 4, noise=ItofNoise(std_e=torch.ones(3, 3, 3, 3))), ShapeError),
-    ],
-)  # fmt: skip
-def test_errors(call, error):
-    with pytest.raises(error, match=r"\w+: .*expected"):
-        call()
 
 
 @pytest.mark.slow

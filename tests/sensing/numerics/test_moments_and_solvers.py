@@ -8,13 +8,7 @@ import mpmath
 import pytest
 import torch
 
-from torchtransient.sensing.dead_time.renewal import (
-    ConstantLight,
-    RenewalChain,
-    gmres,
-    moments,
-    second_moment,
-)
+from torchtransient.sensing.dead_time.renewal import ConstantLight, RenewalChain, moments, second_moment
 from torchtransient.sensing.time_convolution import sum_before
 
 BELOW = math.nextafter(1.0, 0.0)
@@ -72,62 +66,8 @@ def test_moments_and_their_slopes(values, largest):
 # ------------------------------------------------------------------------------------------------------------ solvers
 
 
-def counted(matrix):
-    calls = []
-
-    def operator(v):
-        calls.append(1)
-        return torch.einsum("pij,pj->pi", matrix, v)
-
-    return operator, calls
-
-
 def random(*shape, seed=0):
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize("different", [1, 3, 4, 5, 9])
-def test_as_many_steps_as_a_matrix_has_different_values(different):
-    """Four at a time, whatever the start; one is taken for the residual of the start and one for that of the end."""
-    turned = torch.linalg.qr(random(2, 15, 15)).Q
-    values = 1 + torch.arange(15.0).double() % different
-    matrix = turned @ torch.diag_embed(values).expand(2, -1, -1) @ turned.mT
-    right, start = random(2, 15, seed=1), random(2, 15, seed=2)
-    operator, calls = counted(matrix)
-    found, residual = gmres(operator, right, start, 1e-10)
-    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-9, atol=1e-9)
-    assert len(calls) == 2 + 4 * math.ceil(different / 4) and float(residual.max()) < 1e-10
-    # what is solved is left alone, and a right side of zero as well
-    operator, calls = counted(matrix)
-    again, residual = gmres(operator, right, found, 1e-9)
-    assert torch.equal(again, found) and len(calls) == 1
-    nothing, residual = gmres(operator, 0 * right, 0 * right, 1e-10)
-    assert not bool(nothing.any()) and residual.tolist() == [0.0, 0.0]
-    # the inverse takes one, of which four are asked; one solved row beside one that is not
-    operator, calls = counted(matrix)
-    begin = start.clone()
-    begin[1] = torch.linalg.solve(matrix, right)[1]
-    found, residual = gmres(operator, right, begin, 1e-10, lambda v: torch.linalg.solve(matrix, v))
-    torch.testing.assert_close(found, torch.linalg.solve(matrix, right), rtol=1e-10, atol=1e-10)
-    assert len(calls) == 6 and float(residual.max()) < 1e-10
-
-
-def test_two_restarts_and_no_more():
-    """A ring that is turned by one: no step helps before the last; the residual says so."""
-    ring = torch.eye(90, dtype=torch.float64).roll(1, 0).unsqueeze(0)
-    right = torch.zeros(1, 90, dtype=torch.float64)
-    right[0, 0] = 3.0
-    operator, calls = counted(ring)
-    found, residual = gmres(operator, right, 0 * right, 1e-10)
-    assert len(calls) == 1 + 2 * 41 and residual.tolist() == pytest.approx([1.0], rel=1e-12)
-    assert float(found.abs().max()) < 1e-12
-    # 70 values in two restarts: some digits
-    spread = torch.linalg.qr(random(1, 70, 70)).Q
-    matrix = spread @ torch.diag(torch.linspace(1, 30, 70).double()) @ spread.mT
-    operator, calls = counted(matrix)
-    wanted = random(1, 70, seed=3)
-    found, residual = gmres(operator, (matrix @ wanted.unsqueeze(-1)).squeeze(-1), 0 * wanted, 1e-14)
-    assert float((found - wanted).norm() / wanted.norm()) < 1e-11 and 42 < len(calls) <= 83
 
 
 @pytest.mark.parametrize(("bins", "whole"), [(6, 2), (7, 17)])

@@ -8,8 +8,7 @@ import torch
 from scipy import stats
 
 from support.sweeps import together
-from torchtransient.errors import UnitError
-from torchtransient.sensing.draws import LagTable, add_passing, halve, thin
+from torchtransient.sensing.draws import LagTable, halve, thin
 
 DRAWS = 25_000
 
@@ -95,46 +94,6 @@ def test_neighbouring_entries_are_independent():
             assert abs(correlation) < 5 / 2_000_000**0.5
 
 
-def test_nothing_to_draw():
-    assert thin(torch.zeros(0), 0.5).place.numel() == 0
-    assert halve(torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0, 3)
-    assert thin(torch.full((5,), 9.0), 0.0).number.sum() == 0
-
-
-def test_gaps_in_memory_do_not_matter():
-    counts = torch.arange(24.0).view(4, 6).t()
-    share = torch.full((6, 4), 0.4)
-    wanted = halve(counts.contiguous(), share, torch.Generator().manual_seed(0))
-    assert torch.equal(halve(counts, share, torch.Generator().manual_seed(0)), wanted)
-
-
-STEPS = [
-    (n, p)
-    for n in (1, 26, 126, 127, 128, 129)
-    for p in (1 / 1024, 0.03124, 1 / 32, 0.0322, 0.15625 - 1e-6, 0.4999, 1 - 1 / 32, 0.971)
-]
-
-
-@together("n, p", STEPS)
-def test_ends_of_the_tables(n, p):
-    """Shares on the steps of the tables and beside them, and the most trials that these hold."""
-    share = torch.full((50_000,), p)
-    found = halve(torch.full_like(share, float(n)), share, torch.Generator().manual_seed(3))
-    chi_square_is_small(found.numpy(), n, float(share[0].double()))
-
-
-@pytest.mark.parametrize("size, p", [(9_000, 1e-4), (9_000, 0.5), (50_000, 0.02), (150_000, 0.25)])
-def test_one_probability(size, p):
-    """Rows, counts beyond the rows, and counts for torch.binomial, side by side: `thin` and `add_passing`."""
-    cases = (0, 1, 100, 127, 128, 511, 512, 1500, 1501, 4000)
-    n = torch.tensor([float(c) for c in cases]).repeat(-(-size // len(cases)))[:size]
-    into = torch.full_like(n, 5.0)
-    add_passing(n, p, into, torch.Generator().manual_seed(4))
-    for draws in (into - 5, dense(thin(n, p, torch.Generator().manual_seed(5)), n)):
-        for k, c in enumerate(cases):
-            chi_square_is_small(draws[k :: len(cases)].numpy(), c, p)
-
-
 def test_a_sum_of_many_draws_has_the_variance_of_a_binomial():
     """Small differences from the distribution add up in sums: 2e6 draws of 60 with share 0.47 each."""
     n, p, size = 60, 0.47, 2_000_000
@@ -142,15 +101,6 @@ def test_a_sum_of_many_draws_has_the_variance_of_a_binomial():
     p = float(torch.tensor(p).double())
     assert abs(float(x.mean()) - n * p) < 5 * (n * p * (1 - p) / size) ** 0.5
     assert abs(float(x.var()) / (n * p * (1 - p)) - 1) < 5 * (2 / size) ** 0.5
-
-
-def test_broken_counts_are_refused():
-    """A table has no row for them."""
-    for broken in (-1.0, float("nan")):
-        n = torch.full((50_000,), 3.0)
-        n[7] = broken
-        with pytest.raises(UnitError, match="counts"):
-            thin(n, 0.1, torch.Generator().manual_seed(0))
 
 
 def test_lags_follow_their_distribution():

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import concurrent.futures.thread
 import multiprocessing
 import subprocess
 import sys
-import threading
 
 import pytest
 import torch
 
 from torchtransient import sensing
-from torchtransient.sensing import draws
 from torchtransient.sensing.draws import parallel_map
 
 
@@ -26,20 +23,6 @@ def threads(request):
 
 def of_thread(_):
     return torch.get_num_threads()
-
-
-def nested(_):
-    return sum(parallel_map(of_thread, range(3)))
-
-
-def test_threads_beside_others_work_alone(threads):
-    assert parallel_map(of_thread, range(4)) == [1] * 4
-    assert torch.get_num_threads() == threads
-    assert parallel_map(lambda a, b: a - b, [5, 7], [1, 2]) == [4, 5]
-
-
-def test_threads_may_ask_for_threads(threads):
-    assert parallel_map(nested, range(8)) == [3] * 8
 
 
 def test_what_fails_in_a_thread_fails_outside(threads):
@@ -99,27 +82,6 @@ def test_large_images_are_drawn_in_inference_mode(threads, sensor):
         assert torch.equal(sensor.sample(light.clone(), torch.Generator().manual_seed(3)), expected)
 
 
-def test_where_no_thread_can_be_had_the_caller_does_it_all(monkeypatch):
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    monkeypatch.setattr(draws, "_POOLS", {})
-    start, started = threading.Thread.start, []
-
-    def only_one(thread):
-        if started:
-            raise RuntimeError("can't start new thread")
-        started.append(thread)
-        start(thread)
-
-    monkeypatch.setattr(threading.Thread, "start", only_one)
-    try:
-        assert parallel_map(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
-    assert not draws._POOLS
-
-
 _AT_THE_END = """
 import atexit, sys, threading
 import torch
@@ -132,12 +94,6 @@ def late():
 threading.Thread(target=late).start()
 atexit.register(lambda: print(parallel_map(int, "56"), flush=True))
 """
-
-
-def test_no_thread_takes_a_job_at_the_end(threads, monkeypatch):
-    parallel_map(of_thread, range(4))
-    monkeypatch.setattr(concurrent.futures.thread, "_shutdown", True)
-    assert parallel_map(lambda k: k + 1, range(4)) == [1, 2, 3, 4]
 
 
 @pytest.mark.slow

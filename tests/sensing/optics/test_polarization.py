@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchtransient import stokes as light
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import Compose, PixelElectronics
-from torchtransient.sensing.polarization import (
+from torchtransient.sensing import (
     Analyzers,
+    Compose,
+    PixelElectronics,
     PolarizationMosaic,
     analyze,
     circular_analyzers,
@@ -136,46 +136,3 @@ def test_physicality():
     mixed = torch.cat([good, bad], dim=-1).requires_grad_()
     assert torch.autograd.gradcheck(project_physical, mixed)
     assert torch.autograd.gradcheck(unphysical_part, mixed)
-
-
-@pytest.mark.parametrize("s0", [2.0, 0.0, -3.0])
-@pytest.mark.parametrize("dim", [0, -2])
-def test_unpolarized_light_has_derivatives(s0, dim):
-    """No division by zero on the way, either: light without polarization keeps S0 alone, and its derivative."""
-    s = torch.tensor([[s0, 0.0, 0.0, 0.0], [1.0, 0.0, 1.5, 2.0]], dtype=torch.float64).T.requires_grad_()
-    with torch.autograd.set_detect_anomaly(True):
-        found, part = project_physical(s, dim), unphysical_part(s, dim)
-        (slope,) = torch.autograd.grad((found * torch.tensor([[2.0], [3.0], [5.0], [7.0]])).sum(), s)
-        (excess,) = torch.autograd.grad(part.sum(), s)
-    assert found[:, 0].tolist() == [max(s0, 0.0), 0.0, 0.0, 0.0]
-    assert found[:, 1].tolist() == pytest.approx([1.75, 0.0, 1.05, 1.4])
-    assert part.tolist() == [max(-s0, 0.0), 1.5]
-    # S0 alone counts where there is no direction; S123 keeps its derivative in light that is physical
-    if s0 > 0:
-        assert slope[:, 0].tolist() == [2.0, 3.0, 5.0, 7.0] and excess[:, 0].tolist() == [0.0, 0.0, 0.0, 0.0]
-    assert bool(slope.isfinite().all()) and excess[1:, 0].tolist() == [0.0, 0.0, 0.0]
-    assert excess[:, 1].tolist() == pytest.approx([-1.0, 0.0, 0.6, 0.8])
-
-
-@pytest.mark.parametrize(
-    "call, error",
-    [
-        (lambda: linear_analyzers([]), ShapeError),
-        (lambda: linear_analyzers([0.0], 0.01), UnitError),
-        (lambda: linear_analyzers([0.0], transmission=2.0), UnitError),
-        (lambda: linear_analyzers([900.0]), UnitError),
-        (lambda: circular_analyzers("many"), UnitError),
-        (lambda: analyze(torch.ones(3, 1, 1, 2, 2), linear_analyzers([0])), ShapeError),
-        (lambda: analyze(vectors(1, 1, 2, 2), torch.ones(2, 3)), ShapeError),
-        (lambda: stokes_from(torch.ones(3, 1, 1, 2, 2), linear_analyzers([0])), ShapeError),
-        (lambda: mosaic_rows([[0, 45], [90]]), ShapeError),
-        (lambda: PolarizationMosaic(torch.ones(2, 4)), ShapeError),
-        (lambda: Analyzers(torch.ones(2, 2, 4)), ShapeError),
-        (lambda: PolarizationMosaic.polarsens()(torch.ones(1, 4, 2, 2)), ShapeError),
-        (lambda: demosaic(torch.ones(1, 1, 1, 5)), ShapeError),
-        (lambda: project_physical(torch.ones(3, 2)), ShapeError),
-    ],
-)
-def test_errors(call, error):
-    with pytest.raises(error, match=r"\w+: expected"):
-        call()

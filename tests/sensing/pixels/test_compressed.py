@@ -11,7 +11,6 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     BinaryFrames,
     CodedHistogram,
-    EquiDepthHistogram,
     equi_depth_edges,
     fourier_codes,
     frames_to_rate,
@@ -50,37 +49,10 @@ def test_equi_depth_edges_cut_equal_shares():
         equi_depth_edges(-torch.ones(1, 8, 1, 1), 4)
 
 
-def test_equi_depth_edges_by_hand():
-    """Counts are even over their bins; a share that ends with a bin, empty bins, and each pixel by itself."""
-    counts = torch.tensor([[2.0, 0.0, 6.0, 4.0, 0.0], [0.0, 3.0, 1.0, 0.0, 8.0]]).T.reshape(1, 5, 1, 2)
-    found = equi_depth_edges(counts, 3)
-    assert found.shape == (1, 2, 1, 2) and found.dtype == torch.float32
-    assert found[0, :, 0, 0].tolist() == pytest.approx([2 + 2 / 6, 3.0])
-    assert found[0, :, 0, 1].tolist() == pytest.approx([3.0, 4.5])
-    assert torch.equal(EquiDepthHistogram(3)(counts), found)
-    # two pixels, of which one has no counts
-    half = torch.cat([counts[..., :1], counts[..., :1] * 0], -1)
-    assert equi_depth_edges(half, 2)[0, 0, 0].tolist() == pytest.approx([2 + 4 / 6, 2.5])
-    for make in (lambda: equi_depth_edges(counts, 1), lambda: EquiDepthHistogram(1)):
-        with pytest.raises(UnitError, match="depth"):
-            make()
-
-
 def test_a_pixel_with_nan_has_no_edges():
     counts = torch.tensor([[1.0, 2.0, math.nan, 1.0], [3.0, 1.0, 1.0, 3.0]], dtype=torch.float64).T.reshape(1, 4, 1, 2)
     found = equi_depth_edges(counts, 4).squeeze()
     assert bool(found[:, 0].isnan().all()) and found[:, 1].tolist() == pytest.approx([2 / 3, 2.0, 10 / 3])
-
-
-@pytest.mark.parametrize("frames", [1, 7])
-def test_pixels_that_fired_in_every_frame(frames):
-    """The rate of a share of 1 - 1 / 2N; counts of normal surrogates, to 3 sqrt(N) + 1 beyond, are taken as all."""
-    most = frames + 1 + 3 * frames**0.5
-    for counts in (float(frames), most):
-        found = frames_to_rate(torch.tensor([counts, -0.4, 0.0], dtype=torch.float64), frames)
-        assert found.tolist() == pytest.approx([math.log(2 * frames), 0.0, 0.0], rel=1e-12)
-    with pytest.raises(UnitError, match=f"at most as many counts as the {frames} frames"):
-        frames_to_rate(torch.tensor([0.0, most * (1 + 1e-12)], dtype=torch.float64), frames)
 
 
 def test_probabilities_of_binary_frames():

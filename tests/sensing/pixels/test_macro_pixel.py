@@ -10,7 +10,7 @@ import torch
 
 from support.marks import long, long_pairs, long_rows
 from support.sensing.event_driven import Events, compare, detect
-from torchtransient.errors import GradientError, ShapeError, UnitError
+from torchtransient.errors import GradientError
 from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
@@ -275,16 +275,6 @@ def test_no_spad_coincides_with_itself(mode, dead):
     assert drawn == pytest.approx(float(both.expected(bright).sum()), rel=0.03)
 
 
-@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
-def test_coincidences_of_no_pixels(policy):
-    sensor = CoincidencePixel(
-        detector("first", 9.5), 4, coincidence=2, window_s=WIDTH, bin_width_s=WIDTH, grad=policy
-    )  # fmt: skip
-    x = torch.zeros(1, BINS, 0, 2, dtype=torch.float64, requires_grad=True)
-    with ScoreFunction():
-        assert sensor(x).shape == x.shape
-
-
 @pytest.mark.parametrize(
     ("mode", "dead"), long_rows([("first", 9.5), ("several", 4.4), ("free", 9.3)], [("first", 9.5)])
 )
@@ -382,47 +372,6 @@ def test_detectors_that_skip_periods_do_so_independently():
     assert abs(share - 1 / 16) < 4 * (1 / 4) * (1 / 4 * 3 / 4 / (cycles / 26)) ** 0.5 + 1e-3
 
 
-def test_windows_of_coincidences():
-    """At most the dead time, to 1e-9 of it, and at most the bins of the light; as many SPADs as there are."""
-
-    def pixel(window, k=2, spads=3, weights=None):
-        return CoincidencePixel(
-            detector("free", 4.0), spads, coincidence=k, window_s=window * WIDTH, weights=weights, bin_width_s=WIDTH
-        )
-
-    x = torch.full((1, 4, 1, 1), 0.3, dtype=torch.float64)
-    assert bool((pixel(4.0, k=3)(x) > 0).all()) and bool((pixel(4.0 * (1 + 0.9e-9)).detector(x) > 0).all())
-    with pytest.raises(UnitError, match="window_s of at most the dead time"):
-        pixel(4.0 * (1 + 1.1e-9))
-    learnt = CoincidencePixel(
-        detector("free", 4.0, learnable=True), 3, coincidence=2, window_s=3 * WIDTH, bin_width_s=WIDTH
-    )  # fmt: skip
-    with torch.no_grad():
-        next(learnt.parameters()).sub_(1.0)  # of its logarithm: 1.5 bins
-    for compute in (learnt, learnt.sample):
-        with pytest.raises(UnitError, match=r"window_s of at most the dead time of 1\.47"):
-            compute(x)
-    with pytest.raises(UnitError, match="window_s within the 3 bins of the light, got 4 bins"):
-        pixel(4.0)(x[:, :3])
-    for spads, weights in ((3, None), (4, [1, 0, 2, 1])):
-        assert pixel(1.0, 3, spads, weights).coincidence == 3
-        with pytest.raises(UnitError, match=f"a coincidence of at most {spads} SPADs with light, got 4"):
-            pixel(1.0, 4, spads, weights)
-    for wrong, words in (([1, 2], "weights of 3 SPADs, got 2"), ([0, 0, 0], "weights with a sum above 0")):
-        with pytest.raises((ShapeError, UnitError), match=words):
-            pixel(1.0, weights=wrong)
-    with pytest.raises(UnitError, match="CoincidencePixel: expected detector to be a SynchronousSPAD"):
-        CoincidencePixel(ZoneSum(1, 1), 3, coincidence=2, window_s=WIDTH, bin_width_s=WIDTH)
-    # several coincidences of a cycle in a bin are no probability, which is what paralyzable detectors draw by
-    few = {"coincidence": 1, "window_s": 0.02 * WIDTH, "bin_width_s": WIDTH}
-    with pytest.raises(UnitError, match="at most one coincidence per cycle in a bin, got"):
-        CoincidencePixel(detector("free", 1.0, kind="paralyzable"), 90, **few).sample(100 * x)
-    crowd = CoincidencePixel(detector("free", 1.0, cycles=2000), 90, **few)
-    mean = float(crowd.expected(100 * x).sum())
-    assert mean > 4 * 2000
-    assert float(crowd.sample(100 * x, torch.Generator().manual_seed(0)).sum()) == pytest.approx(mean, rel=0.02)
-
-
 @pytest.mark.parametrize("k", [1, 2, 3, 5])
 def test_many_spads_in_constant_light_are_a_poisson_process(k):
     """r (r w)^(k-1) exp(-r w) / (k-1)!, with 100 000 SPADs so that none fires twice; constant round the period."""
@@ -440,31 +389,6 @@ def test_background_falls_faster_than_the_signal():
     sensor = CoincidencePixel(SynchronousSPAD(1), 16, coincidence=2, window_s=2 * WIDTH, bin_width_s=WIDTH)
     weak, strong = (sensor(torch.full((1, BINS, 1, 1), r, dtype=torch.float64)).sum() for r in (1e-5, 1e-4))
     assert float(strong / weak) == pytest.approx(100, rel=0.01)
-
-
-def test_equal_weights_are_no_weights():
-    x = image(light(4.0))
-    spad, given = SynchronousSPAD(10), {"coincidence": 2, "window_s": 3 * WIDTH, "bin_width_s": WIDTH}
-    even = CoincidencePixel(spad, 4, **given)
-    torch.testing.assert_close(CoincidencePixel(spad, 4, weights=[2.0] * 4, **given)(x), even(x))
-    nearly = CoincidencePixel(spad, 4, weights=[2.0, 2.0, 2.0 + 1e-9, 2.0 - 1e-9], **given)
-    torch.testing.assert_close(nearly(x), even(x), rtol=1e-7, atol=0)
-    off = CoincidencePixel(
-        SynchronousSPAD(10), 6, coincidence=2, window_s=3 * WIDTH, weights=[1, 1, 0, 1, 1, 0], bin_width_s=WIDTH
-    )
-    torch.testing.assert_close(off(x), even(x))
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: MacroPixel(SynchronousSPAD(3), 4),
-        lambda: CoincidencePixel(SynchronousSPAD(10), 4, coincidence=2, window_s=3 * WIDTH, bin_width_s=WIDTH),
-    ],
-)
-def test_no_image_at_all(make):
-    for measure in (make(), make().sample, make().probabilities):
-        assert measure(torch.ones(0, 1, BINS, 2, 2)).shape == (0, 1, BINS, 2, 2)
 
 
 @pytest.mark.slow
@@ -485,14 +409,3 @@ def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
         if spads == 1:  # probabilities of one
             assert float(pixel.sample(x, torch.Generator().manual_seed(0)).max()) <= 3
             assert bool(pixel.log_prob(torch.round(3 * found), x).isfinite().all())
-
-
-def test_coincidences_that_round_to_more_than_one_per_cycle(monkeypatch):
-    """One in every cycle: no other number of them is possible, and none is NaN."""
-    spad = detector("free", 1.0, 3, kind="paralyzable")
-    pixel = CoincidencePixel(spad, 2, coincidence=1, window_s=WIDTH, bin_width_s=WIDTH)
-    monkeypatch.setattr(CoincidencePixel, "probabilities", lambda self, x: torch.full_like(x, 1 + 1e-7).double())
-    x = torch.ones(1, 1, 1, 2, dtype=torch.float64)
-    assert pixel.sample(x).flatten().tolist() == [3.0, 3.0] and pixel.variance(x).flatten().tolist() == [0.0, 0.0]
-    found = pixel.log_prob(torch.tensor([3.0, 2.0], dtype=torch.float64).view(1, 1, 1, 2), x)
-    assert found.flatten().tolist() == [pytest.approx(0.0, abs=1e-12), -math.inf]

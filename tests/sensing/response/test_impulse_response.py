@@ -9,8 +9,6 @@ import torch
 from scipy import stats
 
 from support.sweeps import together
-from torchtransient import TimeAxis
-from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.sensing import (
     ComposedResponse,
     GaussianResponse,
@@ -26,8 +24,8 @@ from torchtransient.sensing import (
     emg_survival,
     resample_counts,
 )
-from torchtransient.sensing.responses import FWHM_PER_SIGMA
 
+FWHM_PER_SIGMA = 2.3548200450309493  # 2 sqrt(2 log 2)
 PS = 1e-12
 
 
@@ -183,19 +181,6 @@ def test_very_long_responses_lose_no_digits():
     sigma = 1e5 / FWHM_PER_SIGMA
     t = np.arange(first, first + weights.numel())
     np.testing.assert_allclose(weights.numpy(), stats.norm(0, sigma).pdf(t), rtol=1e-8)
-
-
-def test_the_place_in_a_bin_is_a_choice():
-    x = torch.zeros(1, 9, 1, 1, dtype=torch.float64)
-    x[:, 4] = 1
-    response, width = GaussianResponse(28 * PS), 64 * PS
-    layers = [ImpulseResponse(response, bin_width_s=width, within_bin=w) for w in ("uniform", "center")]
-    even, middle = (layer(x).flatten()[4].item() for layer in layers)
-    assert even < 0.86 < 0.99 < middle
-    with pytest.raises(ArgumentError, match="within_bin to be one of uniform, center"):
-        ImpulseResponse(GaussianResponse(28 * PS), bin_width_s=64 * PS, within_bin="start")
-    with pytest.raises(ArgumentError, match="within_bin"):
-        GaussianResponse(28 * PS).kernel(64 * PS, within_bin="start")
 
 
 @pytest.mark.parametrize(
@@ -368,17 +353,3 @@ def test_width_and_tail_are_recovered_by_descent():
     assert float(guess.tails_s.detach()) == pytest.approx(120 * PS, rel=1e-3)
     assert float(guess.fractions.detach()) == pytest.approx(0.4, rel=1e-3)
     assert float(guess.delay_s.detach()) == pytest.approx(7 * PS, abs=0.05 * PS)
-
-
-def test_axis_or_width():
-    axis = TimeAxis.from_seconds(0.0, 16 * PS, 30)
-    a = ImpulseResponse(GaussianResponse(50 * PS), axis)
-    b = ImpulseResponse(GaussianResponse(50 * PS), bin_width_s=16 * PS)
-    x = torch.rand(1, 30, 2, 2)
-    torch.testing.assert_close(a(x), b(x))
-    with pytest.raises(ArgumentError, match=r"either axis="):
-        ImpulseResponse(GaussianResponse(50 * PS))
-    with pytest.raises(UnitError, match="Picoseconds"):
-        GaussianResponse(50)
-    with pytest.raises(ArgumentError, match="boundary"):
-        ImpulseResponse(GaussianResponse(50 * PS), axis, boundary="mirror")

@@ -11,50 +11,10 @@ from scipy import stats
 
 from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import responses as shapes
-from torchtransient.sensing.afterpulsing import exponential_kernel, exponential_shares
-from torchtransient.sensing.composed_responses import _full_convolution, _gathered
-from torchtransient.sensing.counts import Moves, move_counts, shifted
-from torchtransient.sensing.cramer_rao import shares_between
-from torchtransient.sensing.responses import _between
+from torchtransient.sensing import Moves
+from torchtransient.sensing.counts import move_counts
 
 NS = 1e-9
-
-
-class Rippled(sensing.GaussianResponse):
-    """A distribution that rounding makes fall here and there."""
-
-    def cdf(self, time_s):
-        return super().cdf(time_s) + 1e-8 * torch.cos(1e13 * time_s)
-
-    def integrals(self, time_s):
-        below, above = super().integrals(time_s)
-        return below + 1e-20 * torch.cos(1e13 * time_s), above
-
-
-@pytest.mark.parametrize("within_bin", ["uniform", "center"])
-@pytest.mark.parametrize("closed", [True, False])
-def test_no_share_of_a_kernel_is_below_zero(within_bin, closed, monkeypatch):
-    if not closed:
-        monkeypatch.setattr(Rippled, "integrals", sensing.Response.integrals)
-    plain = sensing.GaussianResponse(0.4 * NS).kernel(0.002 * NS, within_bin)[1]
-    found = Rippled(0.4 * NS).kernel(0.002 * NS, within_bin)[1]
-    assert float(found.min()) == 0.0
-    torch.testing.assert_close(found, plain, rtol=0, atol=1e-7)
-
-
-def test_no_share_between_edges_is_below_zero():
-    edges = 0.005 * NS * torch.arange(-400.0, 401.0, dtype=torch.float64)
-    found = shares_between(Rippled(0.4 * NS), edges, 0.005 * NS)
-    assert float(found.min()) == 0.0 and float(found.sum()) == pytest.approx(1, abs=1e-4)
-
-
-def test_parts_that_are_convolved_leave_nothing_below_zero():
-    both = sensing.ComposedResponse([sensing.UniformResponse(0.3 * NS), sensing.UniformResponse(0.5 * NS)])
-    assert float(both.kernel(0.01 * NS)[1].min()) >= 0
-    a = number(0, 0, 1, 3, 0, 0, 0, 0, 0, 0, 0)
-    full = _full_convolution(a, a.roll(1))
-    assert float(full.min()) == 0.0 and flat(full)[5:8] == pytest.approx([1.0, 6.0, 9.0])
 
 
 def number(*values):
@@ -66,27 +26,6 @@ def flat(x):
 
 
 # ------------------------------------------------------------------------------------------------------- responses
-
-
-def test_counts_between_edges():
-    """(3, 5, 2) in bins of 2 s from 1 s on: sums, halves, and what lies outside."""
-    counts, edges = number(3, 5, 2), number(-4, 1, 2, 4, 7, 9)
-    found = shapes.resample_counts(counts, 2.0, edges, start_s=1.0)
-    assert flat(found) == pytest.approx([0, 1.5, 1.5 + 2.5, 2.5 + 2, 0])
-    until = shapes.integrated_counts(counts, 2.0, number(0.0, 2.0, 3.0, 4.0, 7.0, 9.0), 1.0)
-    # areas under 1.5 (t - 1), then 3 + 2.5 (t - 3), then 8 + (t - 5), then 10
-    wanted = [0, 0.75, 3, 3 + 3 + 1.25, 3 + 11 + 18, 3 + 11 + 18 + 20]
-    assert flat(until) == pytest.approx(wanted)
-
-
-def test_floors_of_measured_histograms():
-    counts = torch.tensor([2, 2, 9, 4, 2])
-    assert flat(shapes.above_floor(counts, 2.0, "here")) == pytest.approx([0, 0, 7 / 9, 2 / 9, 0])
-    assert flat(shapes.above_floor(counts, True, "here")) == pytest.approx([0, 0, 7 / 9, 2 / 9, 0])
-    assert flat(shapes.above_floor(counts, False, "here")) == pytest.approx([2 / 19, 2 / 19, 9 / 19, 4 / 19, 2 / 19])
-    assert flat(shapes.above_floor(counts, 5.0, "here")) == [0, 0, 1, 0, 0]
-    with pytest.raises(UnitError, match="here: expected counts above the floor of 9, got none"):
-        shapes.above_floor(counts, 9.0, "here")
 
 
 def test_measured_responses_by_their_place():
@@ -109,17 +48,6 @@ def test_measured_responses_by_their_place():
     assert torch.equal(alone.survival(t), middle.survival(t)) and torch.equal(alone.cdf(t), middle.cdf(t))
 
 
-def test_learnt_measured_responses_have_their_shape():
-    counts = number(1, 7, 4, 2, 1, 1)
-    plain = sensing.MeasuredResponse(counts, NS)
-    learnt = sensing.MeasuredResponse(counts, NS, learnable=True)
-    t = torch.linspace(-3, 4, 9, dtype=torch.float64) * NS
-    torch.testing.assert_close(learnt.cdf(t).detach(), plain.cdf(t), rtol=0, atol=1e-11)
-    assert learnt.support_s() == pytest.approx(plain.support_s(), rel=0.5)
-    (slope,) = torch.autograd.grad(learnt.cdf(number(0.3) * NS).sum(), learnt.share_logits)
-    assert bool((slope != 0).any()) and float(slope.sum()) == pytest.approx(0.0, abs=1e-12)
-
-
 def test_even_responses_by_hand():
     """2 ns wide around 1 ns: their cumulative, its integrals, and what bins of 1 ns hold of it."""
     even = sensing.UniformResponse(2 * NS, 1 * NS)
@@ -134,18 +62,6 @@ def test_even_responses_by_hand():
     assert first == 0 and flat(kernel) == pytest.approx([0.25, 0.5, 0.25], abs=1e-12)
     first, kernel = even.kernel(NS, within_bin="center")
     assert first == 0 and flat(kernel) == pytest.approx([0.25, 0.5, 0.25])
-
-
-def test_convolutions_are_whole():
-    a, b = number(1, 4, 2), number(3, 0, 5, 1)
-    assert flat(_full_convolution(a, b)) == pytest.approx(np.convolve(a.numpy(), b.numpy()).tolist())
-    assert flat(_gathered(number(1, 2, 3, 4, 5), 2, 3, 4)) == [1.0, 9.0, 5.0, 0.0]
-
-
-def test_shares_of_responses_on_both_sides_of_their_median():
-    """Early differences of the cumulative, late ones of the survival."""
-    below, above = number(0.1, 0.4, 0.7, 0.9), number(0.95, 0.55, 0.35, 0.15)
-    assert flat(_between(below, above)) == pytest.approx([0.3, 0.3, 0.2])
 
 
 def test_responses_of_tails_against_scipy():
@@ -166,37 +82,7 @@ def test_responses_of_tails_against_scipy():
     assert normal.support_s() == pytest.approx(((0.2 - 6 * sigma) * NS, (0.2 + 6 * sigma) * NS))
 
 
-def test_responses_that_are_too_long():
-    """2^24 bins are taken, and hardly more."""
-    even = sensing.UniformResponse(1e-6)
-    assert even._lags(1e-6 / (1 << 24) * (1 + 1e-9)) is not None
-    with pytest.raises(UnitError, match="UniformResponse: expected a response of at most 16777216 bins"):
-        even._lags(1e-6 / (1 << 24) * (1 - 1e-9))
-    learnt = sensing.GaussianResponse(1e-9, learnable=True)
-    for value in (math.nan, math.inf):
-        with torch.no_grad():
-            learnt.delay_ps.fill_(value)
-        with pytest.raises(UnitError, match="GaussianResponse: expected finite parameters"):
-            learnt.kernel(NS)
-
-
 # ---------------------------------------------------------------------------------------------------------- delays
-
-
-@pytest.mark.parametrize("dead", [0.0, 1.3, 4.0])
-def test_shares_of_exponentials_against_quadrature(dead):
-    """From anywhere in a bin, a dead time and an exponential later: by bins after it, and folded round a period."""
-    taus, u = number(0.7, 5.0), (np.arange(2000) + 0.5) / 2000
-    found = exponential_shares(taus, dead, 0, 40)
-    for row, tau in zip(found, (0.7, 5.0), strict=True):
-        edges = np.arange(41.0)[:, None] - u - dead
-        below = np.where(edges > 0, -np.expm1(-np.maximum(edges, 0) / tau), 0.0).mean(1)
-        np.testing.assert_allclose(row.numpy(), np.diff(below), atol=2e-4)
-    several = exponential_shares(taus, dead, 0, 4000)
-    for period in (1, 3, 7):
-        wanted = torch.nn.functional.pad(several, (0, -4000 % period)).view(2, -1, period).sum(1)
-        torch.testing.assert_close(exponential_kernel(taus, dead, period), wanted, rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(exponential_shares(taus, dead, 5, 7), found[:, 5:12])
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.0 + 5e-7, 0.6, 2.3])
@@ -256,14 +142,6 @@ def test_measured_delays_by_hand():
 # ----------------------------------------------------------------------------------------------------------- moves
 
 
-@pytest.mark.parametrize("lag", [-7, -4, -3, -1, 0, 2, 4, 6])
-def test_shifts_by_hand(lag):
-    x = number(1, 2, 3, 5).reshape(1, 4, 1, 1)
-    inside = [float(x[0, t - lag]) if 0 <= t - lag < 4 else 0.0 for t in range(4)]
-    assert flat(shifted(x, lag, "zero")) == inside
-    assert flat(shifted(x, lag, "periodic")) == [float(x[0, (t - lag) % 4]) for t in range(4)]
-
-
 @pytest.mark.parametrize("boundary", ["zero", "periodic"])
 @pytest.mark.parametrize("many", [1, 400, 40_000])
 @pytest.mark.parametrize("whole", [True, False])
@@ -308,14 +186,3 @@ def test_noise_of_moves_has_the_covariance_of_multinomials(lost):
             for j, b in enumerate(at):
                 wanted[a, b] += cover[i, j]
     torch.testing.assert_close(found, wanted, rtol=0.04, atol=0.6)
-
-
-def test_two_even_delays_one_after_the_other():
-    """Of 2 and of 1 ns: a trapezium from 0.5 to 3.5 ns, by its table."""
-    parts = [sensing.UniformResponse(2 * NS, 1.5 * NS), sensing.UniformResponse(1 * NS, 0.5 * NS)]
-    both = sensing.ComposedResponse(parts)
-    t = number(0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
-    wanted = [0, 1 / 16, 0.25, 0.5, 0.75, 15 / 16, 1]
-    assert flat(both.cdf(t * NS)) == pytest.approx(wanted, abs=1e-3)
-    assert flat(both.survival(t * NS)) == pytest.approx([1 - w for w in wanted], abs=1e-3)
-    assert both.support_s() == pytest.approx((0.5 * NS, 3.5 * NS))

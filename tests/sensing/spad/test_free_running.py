@@ -10,14 +10,12 @@ import torch
 
 from support.marks import long, long_rows
 from support.sensing.event_driven import arrivals, chi2_per_dof, dense_limit, detections, histogram, total_variation
-from torchtransient.errors import GradientError, UnitError
 from torchtransient.sensing import (
     FreeRunningSPAD,
     free_running_rate,
     nonparalyzable_histogram,
     paralyzable_histogram,
 )
-from torchtransient.sensing.dead_time.renewal import RenewalChain, gmres
 
 BINS = 64
 
@@ -86,33 +84,6 @@ def test_constant_light(rate, dead):
         torch.testing.assert_close(found, torch.full_like(x, wanted), rtol=1e-10, atol=0)
 
 
-def test_chain_and_transpose():
-    g = torch.Generator().manual_seed(0)
-    for scale in (0.01, 1.0, 80.0):
-        rate = scale * torch.rand(3, 30, dtype=torch.float64, generator=g)
-        chain = RenewalChain(rate, 37, torch.tensor(0.3, dtype=torch.float64))
-        a, b = (torch.randn(3, 60, dtype=torch.float64, generator=g) for _ in range(2))
-        left, right = (chain.step(a) * b).sum(-1), (a * chain.transposed(b)).sum(-1)
-        torch.testing.assert_close(left, right, rtol=1e-10, atol=1e-12)
-        torch.testing.assert_close(chain.step(a)[:, :30].sum(-1), a[:, :30].sum(-1), rtol=1e-10, atol=1e-12)
-
-
-def test_gmres_solves_rows_of_different_difficulty():
-    g = torch.Generator().manual_seed(0)
-    matrices = (
-        torch.eye(60, dtype=torch.float64)
-        + torch.tensor([0.0, 0.3, 0.85]).view(3, 1, 1)
-        * torch.randn(3, 60, 60, dtype=torch.float64, generator=g)
-        / 60**0.5
-    )
-    right = torch.randn(3, 60, dtype=torch.float64, generator=g)
-    found, residual = gmres(lambda v: torch.einsum("pij,pj->pi", matrices, v), right, right * 0, 1e-11)
-    assert float(residual.max()) <= 1e-8
-    wanted = (right - torch.einsum("pij,pj->pi", matrices, found)).norm(dim=-1) / right.norm(dim=-1)
-    torch.testing.assert_close(residual, wanted, rtol=1e-3, atol=1e-15)
-    torch.testing.assert_close(found, torch.linalg.solve(matrices, right), rtol=1e-6, atol=1e-7)
-
-
 @pytest.mark.parametrize(
     ("dead", "solve"),
     # That of the other is in test_bright_light.py, by random directions.
@@ -163,32 +134,6 @@ def test_dark_and_saturated_pixels():
     y.sum().backward()
     assert bool(torch.isfinite(x.grad).all())
     torch.testing.assert_close(x.grad[..., 0], torch.ones(1, 32, 1, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("chance", [0.25, 1 + 1e-6])
-def test_detections_that_round_to_more_than_one_per_period(chance, monkeypatch):
-    """Variance of none to one in each of 1000 periods, and a surrogate that is a number."""
-    spad = FreeRunningSPAD(1000, 2e-10, bin_width_s=1e-10, grad="gaussian")
-    monkeypatch.setattr(FreeRunningSPAD, "probabilities", lambda self, x: chance * x / x.detach())
-    x = torch.full((1, 5, 1, 2), 0.3, dtype=torch.float64, requires_grad=True)
-    assert spad.variance(x).flatten().tolist() == pytest.approx([1000 * chance * max(1 - chance, 0)] * 10)
-    y = spad(x, generator=torch.Generator().manual_seed(0))
-    assert bool(torch.isfinite(y).all()) and bool(torch.isfinite(torch.autograd.grad(y.sum(), x)[0]).all())
-
-
-def test_errors():
-    with pytest.raises(UnitError, match="half a bin"):
-        nonparalyzable_histogram(torch.ones(1, 4, 1, 1), 0.01)
-    with pytest.raises(UnitError, match=">= 0"):
-        nonparalyzable_histogram(torch.full((1, 4, 1, 1), -1.0), 2.0)
-    with pytest.raises(UnitError, match="at least one bin"):
-        FreeRunningSPAD(10, 0.7e-10, bin_width_s=1e-10)
-    x = torch.ones(1, 4, 1, 1, requires_grad=True)
-    spad = FreeRunningSPAD(10, 2e-10, bin_width_s=1e-10, grad="score")
-    with pytest.raises(GradientError, match="ScoreFunction"):
-        spad(x)
-    with pytest.raises(GradientError, match="were dead"):
-        spad.log_prob(torch.zeros(1, 4, 1, 1), x)
 
 
 @pytest.mark.parametrize("dead", [0.5, 1.0, 2.5, 7.9])

@@ -17,13 +17,10 @@ from torchtransient.sensing import (
     ScoreFunction,
     SynchronousSPAD,
     coates,
-    first_photon_log_prob,
     first_photon_probabilities,
     sample_detections,
 )
-from torchtransient.sensing.dead_time.clocked_counts import armed_time
-from torchtransient.sensing.draws import fast_poisson, sample_first_photons, sample_multinomial
-from torchtransient.sensing.time_convolution import sum_before
+from torchtransient.sensing.draws import sample_first_photons, sample_multinomial
 
 BINS = 48
 
@@ -133,24 +130,6 @@ def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
             assert chi2 < stats.chi2.isf(1e-7, dof), f"{total} photons: chi2/dof = {chi2 / dof:.2f}"
     dark = sample_first_photons(cycles, torch.zeros(1, bins, 4, 4), g)
     assert float(dark.sum()) == 0
-
-
-@pytest.mark.slow
-def test_large_draws_do_not_depend_on_the_number_of_threads():
-    p = torch.full((1, 64, 64, 64), 0.01)
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for n in (1, 2):
-            torch.set_num_threads(n)
-            results.append(sample_multinomial(1000, p, torch.Generator().manual_seed(3)))
-            results.append(fast_poisson(p * 100, torch.Generator().manual_seed(3)))
-            results.append(sample_first_photons(1000, p, torch.Generator().manual_seed(3)))
-    finally:
-        torch.set_num_threads(threads)
-    assert all(torch.equal(one, two) for one, two in zip(results[:3], results[3:], strict=True))
-    assert abs(float(results[0].mean()) - 10) < 0.05
-    assert abs(float(results[1].var()) - 1) < 0.02
 
 
 @pytest.mark.parametrize("dead_bins", [None, 8.5])
@@ -269,25 +248,6 @@ def test_policies_against_finite_differences(policy, f, bias):
         assert abs(float(found - (exact - missing))) <= 4.5 * float(error) + 1e-6
 
 
-def test_sums_before_are_differentiable_twice_and_under_func():
-    x = torch.rand(2, 1, 6, 8, 8, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(sum_before, x, fast_mode=True, check_forward_ad=True)
-    assert torch.autograd.gradgradcheck(lambda v: sum_before(v) ** 2, x, fast_mode=True)
-    torch.testing.assert_close(torch.func.vmap(sum_before)(x), sum_before(x))
-    torch.testing.assert_close(sum_before(x), x.cumsum(-3) - x)
-
-
-def test_errors():
-    with pytest.raises(UnitError, match="half a bin"):
-        SynchronousSPAD(10, dead_time_s=1e-12, bin_width_s=1e-10)(torch.ones(1, 4, 1, 1))
-    with pytest.raises(UnitError, match="cycles"):
-        SynchronousSPAD(0)
-    with pytest.raises(UnitError, match="seconds"):
-        SynchronousSPAD(10, dead_time_s=75, bin_width_s=1e-10)
-    with pytest.raises(UnitError, match="more detections"):
-        SynchronousSPAD(3).log_prob(torch.ones(1, 6, 1, 1), torch.ones(1, 6, 1, 1))
-
-
 @pytest.mark.parametrize("make", [SynchronousSPAD, BinaryFrames])
 def test_likelihood_of_certain_detections_keeps_its_digits(make):
     """All fire: log(1 - exp(-r)) is -exp(-r) for large r and log r for small. 1e-14 is some 30 roundings."""
@@ -335,24 +295,3 @@ def test_where_counts_tell_the_rate(dead):
     else:  # more than 500 photons in a bin are not told from one another
         flood = coates(torch.tensor([1000.0, 0.0, 900.0, 0.0]).double().reshape(1, 4, 1, 1), 1000, 2.0)
         assert float(flood.rate.flatten()[2]) == 500.0 and flood.valid.flatten().tolist() == [False, False, False, True]
-
-
-def test_estimates_behind_a_gate_have_gradients():
-    """A bin that is shut has no rate, half a gate twice that of the estimate."""
-    gate = torch.tensor([1.0, 0.0, 0.5])
-    counts = as_image(torch.tensor([20.0, 0.0, 10.0], dtype=torch.float64)).requires_grad_()
-    rate = SynchronousSPAD(100, gate=gate).inverse(counts).rate
-    assert rate.flatten().tolist() == pytest.approx([-math.log(0.8), 0.0, -2 * math.log(7 / 8)])
-    (slope,) = torch.autograd.grad(rate.sum(), counts)
-    # -log(1 - a / 100) - 2 log(1 - c / (100 - a))
-    assert slope.flatten().tolist() == pytest.approx([1 / 80 + 2 / 70 - 2 / 80, 2 / 70 - 2 / 80, 2 / 70])
-
-
-def test_probability_of_more_counts_than_were_armed_on_average():
-    """Every one that could fire has: the rest is none, and there is one way to choose them."""
-    counts, rate = (as_image(torch.tensor(v, dtype=torch.float64)) for v in ([60.0, 50.0, 3.0], [0.9, 0.8, 0.1]))
-    both = [first_photon_log_prob(counts, rate, 100, dead_bins=1.5, constant=c).flatten() for c in (True, False)]
-    # 40 are armed, and of the 60 a quarter comes back for a quarter of the bin
-    sooner = float(armed_time(counts, 100, 1.5).short_exposures(rate).flatten()[1])
-    assert float(both[0][1]) == pytest.approx(50 * math.log(-math.expm1(-0.8)) - sooner)
-    assert float(both[0][1]) == float(both[1][1]) and float(both[0][0]) != float(both[1][0])

@@ -7,12 +7,11 @@ import pytest
 import torch
 from scipy import stats
 
-from torchtransient.errors import GradientError, UnitError
+from torchtransient.errors import GradientError
 from torchtransient.sensing import (
     TDC,
     Compose,
     DetectionJitter,
-    FreeRunningSPAD,
     GaussianResponse,
     ImpulseResponse,
     ScoreFunction,
@@ -22,7 +21,6 @@ from torchtransient.sensing import (
     random_code_widths,
 )
 from torchtransient.sensing.chain.compose import multinomial_log_prob
-from torchtransient.sensing.counts import Moves, move_counts
 
 PS, WIDTH = 1e-12, 20e-12
 
@@ -99,61 +97,12 @@ def test_no_count_is_lost_or_halved_in_an_image():
             assert not torch.equal(y, jitter().sample(x, generator(3)))
 
 
-def test_each_lag_gets_its_share():
-    """A table of shares for every bin, some of it lost: totals by lag are binomial."""
-    shares = torch.tensor([[0.2, 0.5, 0.0], [0.3, 0.5, 0.01], [0.4, 0.0, 0.9]], dtype=torch.float64)
-    x = torch.full((1, 3, 1, 1), 20_000.0, dtype=torch.float64)
-    moved, tally = move_counts(x, Moves(-1, shares, "periodic"), generator(), tally=True)
-    assert tally is not None and tally.shape == (3, 1, 1, 1)
-    wanted = shares.sum(1) * 20_000
-    error = (tally.flatten() - wanted) / (20_000 * (shares * (1 - shares)).sum(1)).sqrt()
-    assert float(error.abs().max()) < 4.5
-    assert float(moved.sum()) == float(tally.sum()) < float(x.sum())
-
-
 def test_means_and_rates_stay_means():
     x = column(torch.rand(16, dtype=torch.float64))
     for policy in ("expected", "straight_through", "score"):
         module = jitter(grad=policy)
         assert torch.equal(module(x, generator=generator()), module.expected(x))
     assert torch.equal(jitter().sample(x), jitter().expected(x))
-
-
-@pytest.mark.parametrize("shape", [(0, 1, 16, 2, 2), (1, 16, 0, 2), (2, 1, 16, 3, 0), (1, 1, 2, 2)])
-@pytest.mark.parametrize("policy", ["expected", "gaussian", "score"])
-def test_empty_batches_and_windows_shorter_than_the_response(shape, policy):
-    x = torch.full(shape, 3.0, dtype=torch.float64)
-    late = tails() if shape[-3] > 1 else GaussianResponse(50 * PS, 900 * PS)
-    closed = DetectionJitter(late, bin_width_s=WIDTH, boundary="zero", grad=policy)
-    for module in (jitter(grad=policy), closed, TDC(torch.ones(shape[-3]), dither=True, grad=policy)):
-        y = module(x, generator=generator())
-        assert y.shape == x.shape
-        if shape[-3] == 1 and policy != "gaussian":
-            assert float(y.sum()) == pytest.approx(0 if module is closed else 12)
-    chain = Compose([SynchronousSPAD(10), jitter()], grad=policy)
-    assert chain(x, generator=generator()).shape == x.shape
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_broken_counts_are_refused(value):
-    """torch.binomial never returns from them."""
-    x = column([1.0, 2.0, value, 3.0])
-    for module in (jitter(grad="straight_through"), TDC(torch.ones(4), grad="straight_through")):
-        with pytest.raises(UnitError, match="expected finite counts"):
-            module(x, generator=generator())
-
-
-def test_counts_beyond_single_precision():
-    x = torch.full((1, 8, 2, 2), 3e7)
-    y = jitter().sample(x, generator())
-    assert y.dtype == torch.float32 and abs(float(y.double().sum()) / 96e7 - 1) < 1e-6
-    assert float(jitter().sample(1e6 * x.double(), generator()).sum()) == 96e13
-
-
-def test_half_precision_counts_are_moved_in_single():
-    x = column(torch.full((32,), 300.0)).to(torch.bfloat16)
-    y = jitter().sample(x, generator())
-    assert y.dtype == torch.float32 and float(y.double().sum()) == 32 * 300
 
 
 def test_score_of_a_learnable_response():
@@ -279,34 +228,6 @@ def test_log_probability_of_multinomial_counts():
     assert float(multinomial_log_prob(n + 1, p, 12)) == -float("inf")
 
 
-@pytest.mark.parametrize("level", [0.01, 3.0, 1e5])
-def test_counts_beside_items_below_zero_are_moved(level):
-    """Differences have a mean, and no counts that could be drawn."""
-    whole = torch.poisson(torch.full((1, 1, 40, 3, 4), level), generator=generator())
-    x = torch.cat([whole, torch.full_like(whole, -2.5)])
-    moved = jitter(boundary="periodic").sample(x, generator())
-    torch.testing.assert_close(moved[1], jitter(boundary="periodic").expected(x[1]))
-    assert torch.equal(moved[0].sum(1), whole[0].sum(1)) and torch.equal(moved[0], moved[0].round())
-
-
-def test_log_probability_of_chances_that_round_to_more_than_one():
-    """Cycles without a detection are all but impossible then, and no NaN."""
-    p = torch.full((10, 1, 1), 0.1, dtype=torch.float32)
-    assert float(p.double().sum()) > 1
-    value = multinomial_log_prob(torch.full((10, 1, 1), 2.0), p, 21)
-    assert -100 < float(value) < -20
-
-
-def test_noise_of_moves_that_lose_nothing_is_one_draw_for_each_lag():
-    x = column([7.0, 2.0, 5.0, 0.0])
-    for shares, draws in (([0.2, 0.5, 0.3], 3), ([0.2, 0.5, 0.29], 4)):
-        own, counted = generator(3), generator(3)
-        Moves(-1, torch.tensor(shares, dtype=torch.float64), "zero").noise(x, own)
-        for _ in range(draws):
-            torch.randn(x.shape, dtype=x.dtype, generator=counted)
-        assert torch.equal(own.get_state(), counted.get_state())
-
-
 def test_likelihood_of_a_chain():
     """That of its last stages, and highest in expectation where the light is right."""
     x = bright(total=2.0)
@@ -324,21 +245,3 @@ def test_likelihood_of_a_chain():
         Compose([ShotNoise(), jitter()]).log_prob(counts, x)
     with pytest.raises(GradientError, match="one detector that draws"):
         counter(dead_time_s=100 * PS, bin_width_s=WIDTH).log_prob(counts, x)
-
-
-@pytest.mark.parametrize(
-    "stages, words",
-    [
-        (lambda: [jitter(), SynchronousSPAD(10)], "DetectionJitter behind the detector.*SynchronousSPAD"),
-        (lambda: [jitter(), Compose([ShotNoise()])], "DetectionJitter behind the detector.*ShotNoise"),
-        (lambda: [TDC(torch.ones(8)), SynchronousSPAD(10)], "acts_on='rates'"),
-        (lambda: [TDC(torch.ones(8)), FreeRunningSPAD(10, 75e-9, bin_width_s=1e-9)], "TDC behind the detector"),
-        (
-            lambda: [Compose([SynchronousSPAD(10)]), ImpulseResponse(tails(), bin_width_s=WIDTH)],
-            "no ImpulseResponse behind SynchronousSPAD.*DetectionJitter",
-        ),
-    ],
-)
-def test_orders_that_are_refused(stages, words):
-    with pytest.raises(UnitError, match=words):
-        Compose(stages())

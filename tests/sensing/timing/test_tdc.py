@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import TDC, random_code_widths
 
 
@@ -124,10 +123,3 @@ def test_random_widths_are_above_zero():
     assert float(found[~kept].min()) == float(found[~kept].max()) > 0
     ratio = found[kept] / normal[kept]
     assert float(found[~kept][0] / ratio[0]) == pytest.approx(0.05) and float(ratio.max() / ratio.min()) < 1 + 1e-9
-
-
-def test_errors():
-    with pytest.raises(UnitError, match="code_widths > 0"):
-        TDC(torch.tensor([1.0, -1.0]))
-    with pytest.raises(ShapeError, match="as in code_widths"):
-        TDC(torch.ones(4))(torch.ones(1, 5, 1, 1))
