@@ -11,6 +11,7 @@ import torch
 from support.sweeps import together
 from torchtransient import Chirps, TimeAxis, sensing
 from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.sensing import ScoreFunction
 
 PS, NS = 1e-12, 1e-9
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 128)
@@ -303,3 +304,132 @@ def test_unusual_devices_are_taken():
     assert budget(100, 20.0, axis=AXIS, pulse_energy_j=1.0, wavelength_m=100e-6).cycles == 100
     assert sensing.Afterpulsing(0.1, 1e-4, 5e-5, axis=AXIS, period_s=0.05).period_s == 0.05
     assert budget(None, 10e6, axis=AXIS, exposure_s=0.01).cycles == 100_000
+
+
+AXIS_64 = TimeAxis.from_seconds(0.0, 100 * PS, 64)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+# ---------------------------------------------------------------------------------------------------------- layouts
+
+
+def jitter():
+    return sensing.DetectionJitter(sensing.GaussianResponse(200 * PS), AXIS_64)
+
+
+# ------------------------------------------------------------------------------------------------------------- parts
+
+FINE = {"bin_width_s": 50 * PS}
+DEAD = {"dead_time_s": 1 * NS}
+OF_OTHER_BINS = {
+    "coincidence": lambda: sensing.CoincidencePixel(
+        sensing.SynchronousSPAD(9, **DEAD, bin_width_s=100 * PS), 4, coincidence=2, window_s=1 * NS, **FINE
+    ),
+    "coincidence, other T": lambda: sensing.CoincidencePixel(
+        sensing.SynchronousSPAD(9, **DEAD, axis=AXIS_64), 4, coincidence=2, window_s=1 * NS,
+            axis=TimeAxis.from_seconds(0.0, 100 * PS, 32)
+    ),
+    "afterpulses": lambda: sensing.AfterpulsingSPAD(
+        sensing.SynchronousSPAD(9, **DEAD, axis=AXIS_64), sensing.Afterpulsing(0.3, 5 * NS, 1 * NS, bin_width_s=10 * PS)
+    ),
+    "groups": lambda: sensing.PixelGroups(
+        [sensing.SynchronousSPAD(9, **DEAD, axis=AXIS_64), sensing.SynchronousSPAD(9, **DEAD, **FINE)],
+        torch.tensor([[0, 1]]),
+    ),
+    "groups of chains": lambda: sensing.PixelGroups(
+        [sensing.Compose([sensing.SynchronousSPAD(9, **DEAD, **bins)]) for bins in ({"axis": AXIS_64}, FINE)],
+        torch.tensor([[0, 1]]),
+    ),
+    "macro-pixel in a chain": lambda: sensing.Compose(
+        [sensing.MacroPixel(sensing.SynchronousSPAD(9, **DEAD, **FINE), 3), jitter()]
+    ),
+    "groups in a chain": lambda: sensing.Compose(
+        [sensing.PixelGroups([sensing.SynchronousSPAD(9, **DEAD, **FINE)], torch.tensor([[0]])), jitter()]
+    ),
+}
+
+
+@pytest.mark.parametrize("make", OF_OTHER_BINS.values(), ids=OF_OTHER_BINS)
+def test_parts_of_other_bins_are_refused(make):
+    with pytest.raises(UnitError, match="one time axis"):
+        make()
+
+
+# ------------------------------------------------------------------------------------------------------------ delays
+
+
+@pytest.mark.parametrize("delay_s", [-1e-30, -1e-27, 0.0, 1e-30, -300 * PS - 1e-27])
+def test_a_delay_next_to_a_whole_bin_has_a_score(delay_s):
+    """1 - 1e-30 is 1: the share that stays was 0, and its logarithm's slope times no count NaN."""
+    skew = sensing.DetectionSkew(delay_s, AXIS_64, learnable=True, grad="score")
+    x = torch.full((1, 64, 1, 1), 10.0)
+    with ScoreFunction() as score:
+        moved = skew(x, generator())
+    (gradient,) = torch.autograd.grad(score.surrogate(moved.square().sum()), skew.delays.delay_ps)
+    assert bool(torch.isfinite(gradient))
+    assert torch.equal(moved, sensing.shift_time(x, delay_s / (100 * PS)))
+
+
+def fast_budget(rate_hz=10e6, **given):
+    given = {"pulse_energy_j": 1e-9, "wavelength_m": 532e-9, **(given or {"axis": AXIS})}
+    return sensing.PhotonBudget(sensing.Optics(f_number=2.0), repetition_rate_hz=rate_hz, cycles=1000, **given)
+
+
+def module(dead_ns, period_s=100 * NS, **bins):
+    return sensing.Afterpulsing(0.01, 30 * NS, dead_ns * NS, period_s=period_s, **(bins or {"axis": AXIS}))
+
+
+def test_the_dead_time_of_afterpulses_is_the_detectors():
+    """A module that is dead for longer than a period misses cycles: a detector of one detection per cycle cannot."""
+    spad, again = sensing.SynchronousSPAD(1000), "armed again before the next cycle"
+    for dead_ns in (88, 150, 1000):
+        with pytest.raises(UnitError, match=rf"'2' \(Afterpulsing\).*{again}.*FreeRunningSPAD"):
+            sensing.Compose([fast_budget(), spad, module(dead_ns)])
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):  # without a fast_budget
+            sensing.Compose([spad, module(dead_ns)])
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):
+            sensing.counting_chain(fast_budget(), sensing.AfterpulsingSPAD(spad, module(dead_ns)))
+        with pytest.raises(UnitError, match=rf"Afterpulsing.*{again}"):
+            sensing.Compose([fast_budget(), sensing.MacroPixel(spad, 4), module(dead_ns)])
+    # the window of light is not known before there is some
+    open_window = sensing.Compose([fast_budget(bin_width_s=100 * PS, pulse_energy_j=1e-9, wavelength_m=532e-9), spad,
+                                   module(88, bin_width_s=100 * PS)])  # fmt: skip
+    assert open_window.expected(torch.zeros(1, 120, 1, 1)).isfinite().all()  # 12 and 88 ns are a period
+    with pytest.raises(UnitError, match=again):
+        open_window.expected(torch.zeros(1, 121, 1, 1))
+    assert len(sensing.Compose([fast_budget(), spad, module(87.2)]).stages) == 3
+    free = sensing.FreeRunningSPAD(1000, 150 * NS, axis=AXIS)
+    sensing.Compose([fast_budget(rate_hz=1 / 12.8e-9), free, module(150, 12.8 * NS)])
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_one_detector_has_one_dead_time(nested):
+    def wrapped(detector):
+        return sensing.MacroPixel(detector, 4) if nested else detector
+
+    synchronous = wrapped(sensing.SynchronousSPAD(1000, dead_time_s=5 * NS, axis=AXIS))
+    free = wrapped(sensing.FreeRunningSPAD(1000, 5 * NS, axis=AXIS))
+    for detector, rate_hz, period in ((synchronous, 10e6, 100 * NS), (free, 1 / 12.8e-9, 12.8 * NS)):
+        for dead_ns in (0, 4.9, 30):
+            with pytest.raises(UnitError, match=r"expected the dead time of .*5e-09 s, in stage '2' \(Afterpulsing\)"):
+                sensing.Compose([fast_budget(rate_hz=rate_hz), detector, module(dead_ns, period)])
+        assert len(sensing.Compose([fast_budget(rate_hz=rate_hz), detector, module(5, period)]).stages) == 3
+
+
+def test_pixels_with_dead_times_of_their_own():
+    dead = torch.tensor([[5.0, 7.0]])
+
+    def spads(d):
+        return sensing.SynchronousSPAD(1000, dead_time_s=d * NS, axis=AXIS)
+
+    groups = sensing.PixelGroups.by_value(dead, spads)
+    own = sensing.PixelGroups.by_value(dead, lambda d: module(d))
+    assert len(sensing.Compose([fast_budget(), groups, own]).stages) == 3
+    both = sensing.PixelGroups.by_value(dead, lambda d: sensing.AfterpulsingSPAD(spads(d), module(d)))
+    assert len(sensing.Compose([fast_budget(), both]).stages) == 2
+    for wrong in (module(5), sensing.PixelGroups.by_value(dead, lambda d: module(d + 1))):
+        with pytest.raises(UnitError, match="One detector has one dead time"):
+            sensing.Compose([fast_budget(), groups, wrong])
