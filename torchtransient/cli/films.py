@@ -147,7 +147,7 @@ def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -
         ArgumentError: for films without a video.
     """
     from torchtransient.vis.phasors import phasor_video
-    from torchtransient.vis.video import video
+    from torchtransient.vis.videos import video
 
     if isinstance(film, Phasors):
         phasor_video(output, path, progress=progress)

@@ -51,8 +51,8 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
     """Raise StorageError when one of the pictures of `picture_options` could not be written, UsageError when it does
     not show what the film measures. None: it is not known yet.
     """
-    from torchtransient.vis.overview import check_picture
-    from torchtransient.vis.video_file import check_video
+    from torchtransient.vis.files import check_picture
+    from torchtransient.vis.videos import check_video
 
     for name in PICTURES:
         if not options[name]:
