@@ -334,7 +334,7 @@ BARE = {
     "losses/loss_module.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "vis/video.py": {"IndexError"},  # the protocol of sequences
+    "vis/videos.py": {"IndexError"},  # the protocol of sequences
 }
 
 
