@@ -223,7 +223,7 @@ def test_renders_of_the_library():
     from torchtransient.capture import Capture, Scan, Wall
     from torchtransient.files.result_file import Result
     from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
-    from torchtransient.sensing.itof.itof_reading import ItofReading
+    from torchtransient.sensing import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)
     scan = Scan.grid(Wall.plane(1.0, 1.0), (2, 2), kind="confocal")

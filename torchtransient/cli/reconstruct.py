@@ -202,7 +202,7 @@ def _choice(capture: Any, method: str | None) -> Any:
 
 
 def _picture(options: dict[str, Any], target: Path) -> Path | None:
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     if options["no_picture"]:
         return None

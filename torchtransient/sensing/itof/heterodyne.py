@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.sensing.base.layout import check_broadcast, check_count, check_number, complex_tensor
-from torchtransient.sensing.itof.itof import Frequencies, check_frequencies
+from torchtransient.sensing.checks import check_broadcast, check_count, check_number, complex_tensor
+from torchtransient.sensing.itof.correlation import Frequencies, check_frequencies
 from torchtransient.units import SPEED_OF_LIGHT
 
 
