@@ -108,7 +108,11 @@ class PlannedFilm:
 
 
 def planned(outputs: Sequence[str]) -> PlannedFilm:
-    """Return the film of a plan for some outputs."""
+    """Return the film of a plan for some outputs.
+
+    Args:
+        outputs: names of outputs, such as "transient".
+    """
     kind = next((kind for kind in FILMS if kind.output in outputs), Histogram)
     if kind is not Histogram:
         note = "; no time axis is stored" if kind is Phasors else ""
