@@ -13,6 +13,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.histogram import TransientHDRFilm
 from torchtransient.plugins.films.phasor import PhasorHDRFilm
+from torchtransient.plugins.films.splined import SplinedHDRFilm
 from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 from torchtransient.plugins.properties import number, whole_number
 
@@ -177,7 +178,7 @@ class RateHDRFilm(film_of_rows(TransientHDRFilm)):
         return rows
 
 
-class BeatHDRFilm(film_of_rows(TransientHDRFilm)):
+class BeatHDRFilm(film_of_rows(SplinedHDRFilm)):
     r"""Film of the beats of frequency-modulated light (:monosp:`beat_hdr_film`): two spectra a pixel.
 
     ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps
