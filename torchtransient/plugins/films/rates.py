@@ -184,8 +184,8 @@ class BeatHDRFilm(film_of_rows(SplinedHDRFilm)):
     ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps
     up and down, see :class:`torchtransient.Chirps`. The axis of the film is that of a target at rest: the beat of an
     arrival on the up chirp is that of a length ``opl + k rate``, on the down chirp of ``opl - k rate``, with ``k`` the
-    frequency of the light times duration over bandwidth, and spread by the line shape of the window. Layout ``(H, W, 2,
-    T, C)``.
+    frequency of the light times duration over bandwidth, and spread by the line shape of the window, to 1e-3 of its
+    peak (:mod:`.splined`). Layout ``(H, W, 2, T, C)``.
 
     Not supported: exhaustive scans, ``steady`` = false, a further impulse response.
     """

@@ -32,8 +32,8 @@ MOST_PARTS = 8
 MOST_WEIGHTS = 256
 # Values of all nodes (2 GiB), beyond which arrivals are added to the bins.
 MOST_VALUES = 2**29
-# Values of which all threads together may have copies of their own (512 MiB), so that they need no atomic additions.
-MOST_COPIES = 2**27
+# Values of which all threads together may have copies of their own (1 GiB), so that they need no atomic additions.
+MOST_COPIES = 2**28
 # Channels that are written or read at once.
 PACKET = 4
 _Z = 2 * math.sqrt(2) - 3
