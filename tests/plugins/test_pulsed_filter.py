@@ -211,9 +211,9 @@ def box_of(bins, **settings):
     return PulsedFilter(BoxFilter(), [Pulse.rectangular(bins * 0.5, **settings)], 0.5)
 
 
-@pytest.mark.parametrize(("bins", "nodes"), [(3, 1024), (4, 512), (4000, 8), (300, 8), (0.01, 16384), (0.125, 16384)])
+@pytest.mark.parametrize(("bins", "nodes"), [(3, 1024), (4, 512), (4000, 32), (300, 32), (0.01, 16384), (0.125, 16384)])
 def test_nodes_of_a_bin(bins, nodes):
-    """2048 or more over the kernel, a power of two; 8 at least and 16384 at most."""
+    """2048 or more over the kernel, a power of two; 32 at least and 16384 at most."""
     assert box_of(bins).nodes_per_bin == nodes
 
 
