@@ -144,6 +144,14 @@ def test_outlines_that_poses_move(where, key):
     compare(renderer_of(loaded, [key], spp=8192), directions, seeds=range(12))
 
 
+@pytest.mark.slow
+def test_outlines_in_beats():
+    loaded = tt.load(room(fov=20, plate=PLATES["in view"]), variant=VARIANT)
+    loaded = loaded.moving({"plate": MOTIONS["back"], "side": MOTIONS["side"]})
+    renderer = renderer_of(loaded, ["plate.to_world"], beats=True, spp=8192)
+    compare(renderer, {"plate.to_world": SIDEWAYS}, seeds=range(12))
+
+
 # ------------------------------------------------------------------------------------------- glass, meshes, copies, fog
 
 
