@@ -212,6 +212,17 @@ OBLIQUE = np.array([[7, -4, 4, 0], [1, 8, 4, 0], [-8, -4, 1, 0], [0, 0, 0, 9]]) 
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
 DISTANT = {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}
+STEEP = np.array([[[0.95, 0.5, 0.72], [0.05, 0.5, 0.72]]] * 2, np.float32)  # normals at 64 degrees to both sides
+TILT = np.array([[0.6, 0, 0.8, 0], [0, 1, 0, 0], [-0.8, 0, 0.6, 0], [0, 0, 0, 1]])
+
+
+def mapped(normals, tilt):
+    """A plate with a normal map."""
+    texture = {"type": "bitmap", "data": normals, "raw": True}
+    bsdf = {"type": "normalmap", "normalmap": texture, "b": {"type": "diffuse", "reflectance": 0.4}}
+    return {"type": "rectangle", "to_world": pose(0, 0, 0.8) @ tilt @ np.diag([0.45, 0.35, 1, 1]), "bsdf": bsdf}
+
+
 SPOT = {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20}
 SHORT = {"type": "perspective", "fov": 40, "far_clip": 2.5, "to_world": CAMERA, "film": FILM}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
@@ -238,6 +249,9 @@ def box(z, tilt=UPRIGHT):
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
+    ({"body": mapped(STEEP, TILT)}, BODY, "normals away from the camera"),
+    ({"body": mapped(STEEP, TILT)}, "body.bsdf.normalmap.data", "normals away from the camera"),
+    ({"body": mapped(STEEP, TILT)}, "sensor.to_world", "normals away from the camera"),
     ({"box": box(0.1)}, "box.vertex_positions", "where 'box' and 'wall' run into each other"),
 ])  # fmt: skip
 def test_edges_that_are_not_followed(more, key, words):
@@ -261,6 +275,10 @@ def test_what_is_called_correct(tmp_path):
     smooth = SPOT | {"texture": STEPS | {"filter_type": "bilinear"}}
     for key in ("ball.to_world", BODY, "light.to_world", "sensor.to_world"):
         assert plate(sensor=SHORT, ball=beside, light=smooth).parameters()[key].edges_missing == ()
+    # Normals of which none turns away, whether flat or seen from the front.
+    for body in (mapped(STEEP, np.eye(4)), mapped(0.3 * STEEP + np.float32([0.35, 0.35, 0.7]), TILT)):
+        table = plate(body=body).parameters()
+        assert table[BODY].edges_missing == table["body.bsdf.normalmap.data"].edges_missing == ()
     off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
     assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
     (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")

@@ -27,8 +27,9 @@ from torchtransient.plugins.mitsuba_compat import (
     mesh_faces,
     mesh_positions,
     near_clip,
+    normal_texture,
 )
-from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
+from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, objects_of, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
@@ -90,7 +91,8 @@ class MovingEdges:
     Args:
         always: gaps of every parameter that moves edges.
         bent: gaps of what bends light alone.
-        scene: scene that is searched for textures with steps and for bodies that run into each other, or None.
+        scene: scene that is searched for textures with steps, for bodies that run into each other, for what clip planes
+            cut and for normals that turn away, or None.
         words: gaps that only the table of parameters names, whatever the scene.
         has_term: there is a boundary term.
         sensors: sensors of the scene that see the edges.
@@ -127,6 +129,8 @@ class MovingEdges:
             # Mitsuba does not show the members of an instance; relative to a moving sensor all shapes move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
+        if (moves and effect.role in ("shape", "sensor")) or effect.role == "value":
+            found += self._turned_away(None if effect.role == "sensor" or is_instance(node) else node)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
             moving = None if effect.role == "sensor" else node
             found += self._crossings(moving) + self._clipped(moving)
@@ -174,6 +178,20 @@ class MovingEdges:
         where = f"where {_listed([_named_pair(*pair) for pair in pairs])} run into each other"
         return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
 
+
+    @cached_property
+    def _turned_away_shapes(self) -> list[Any]:
+        return [] if self._scene is None else _shapes_turned_away(self._scene, self._sensors)
+
+    def _turned_away(self, node: Any) -> tuple[Gap, ...]:
+        """Return the gap of normal maps on a shape, or in a texture, that turn away from a sensor; of any for None."""
+        shapes = self._turned_away_shapes
+        if node is not None:
+            shapes = [one for one in shapes if node.ptr in _addresses(one)]
+        if not shapes:
+            return ()
+        where = f"where the normal maps of {_listed_shapes(shapes)} turn normals away from the camera"
+        return (Gap(where, "Take flatter normals, or look at them less obliquely."),)
 
     @cached_property
     def _clipped_shapes(self) -> list[Any]:
@@ -345,6 +363,45 @@ def has_delta_lobe(shape: Any) -> bool:
     """Return True if a shape has a BSDF with a delta lobe."""
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
+
+
+def _addresses(shape: Any) -> set[int]:
+    """Return the addresses of a shape and of the textures of its BSDF."""
+    return {shape.ptr, *(texture.ptr for texture in objects_below(shape.bsdf(), mi.Texture))}
+
+
+def _normal_maps(shape: Any) -> list[Any]:
+    """Return the textures of normals of a shape's BSDF."""
+    if not has_surface(shape) or shape.bsdf() is None:
+        return []
+    bsdfs = [one for one in (shape.bsdf(), *objects_below(shape.bsdf(), mi.BSDF)) if isinstance(one, mi.BSDF)]
+    names = [(bsdf, normal_texture(bsdf)) for bsdf in bsdfs if not is_bump_map(bsdf)]
+    return [dict(objects_of(bsdf))[name] for bsdf, name in names if name is not None]
+
+
+def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> list[Any]:
+    """Return the shapes of which a sensor sees places where a normal map turns the normal away from it.
+
+    Mitsuba draws such places with another normal, or black: the light jumps there.
+    """
+    mapped = [(shape, maps) for shape in shapes_of_scene(scene) if (maps := _normal_maps(shape))]
+    if not mapped:
+        return []
+    found = {}
+    with dr.suspend_grad():
+        for sensor in sensors:
+            random = mi.PCG32(size=_PROBES * _PROBES)
+            uniform = lambda random=random: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
+            ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, uniform(), uniform())
+            si = scene.ray_intersect(ray)
+            wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
+            for shape, maps in mapped:
+                hit = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+                for texture in maps:
+                    n = mi.Vector3f(texture.eval_3(si, hit)) * 2 - 1
+                    if bool(dr.any(hit & (dr.dot(n, wi) < 0))):
+                        found[shape.ptr] = shape
+    return list(found.values())
 
 
 def _is_stepped(shape: Any) -> bool:
