@@ -18,7 +18,9 @@ from torchtransient.plugins.mitsuba_compat import (
     TEXCOORDS,
     attribute_name,
     has_limb,
+    has_normals,
     has_surface,
+    has_vertices,
     is_bump_map,
     is_flat,
     is_instance,
@@ -131,6 +133,9 @@ class MovingEdges:
             found += self._jumps(node if alone else None)
         if (moves and effect.role in ("shape", "sensor")) or effect.role == "value":
             found += self._turned_away(None if effect.role == "sensor" or is_instance(node) else node)
+        if name == NORMALS and any(node.ptr == shape.ptr for shape in self._turned_away_shapes[1]):
+            where = f"at the rim of {_name(node)}, where normals of its vertices turn away from the camera"
+            found += (Gap(where, "Move its vertices, or take finer faces, of which the rim is narrower."),)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
             moving = None if effect.role == "sensor" else node
             found += self._crossings(moving) + self._clipped(moving)
@@ -180,12 +185,12 @@ class MovingEdges:
 
 
     @cached_property
-    def _turned_away_shapes(self) -> list[Any]:
-        return [] if self._scene is None else _shapes_turned_away(self._scene, self._sensors)
+    def _turned_away_shapes(self) -> tuple[list[Any], list[Any]]:
+        return ([], []) if self._scene is None else _shapes_turned_away(self._scene, self._sensors)
 
     def _turned_away(self, node: Any) -> tuple[Gap, ...]:
         """Return the gap of normal maps on a shape, or in a texture, that turn away from a sensor; of any for None."""
-        shapes = self._turned_away_shapes
+        shapes, _ = self._turned_away_shapes
         if node is not None:
             shapes = [one for one in shapes if node.ptr in _addresses(one)]
         if not shapes:
@@ -379,15 +384,18 @@ def _normal_maps(shape: Any) -> list[Any]:
     return [dict(objects_of(bsdf))[name] for bsdf, name in names if name is not None]
 
 
-def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> list[Any]:
-    """Return the shapes of which a sensor sees places where a normal map turns the normal away from it.
+def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Return the shapes of which a sensor sees places where a normal map turns the normal away from it, and those where
+    normals at vertices do.
 
     Mitsuba draws such places with another normal, or black: the light jumps there.
     """
-    mapped = [(shape, maps) for shape in shapes_of_scene(scene) if (maps := _normal_maps(shape))]
-    if not mapped:
-        return []
-    found = {}
+    shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape)]
+    mapped = [(shape, maps) for shape in shapes if (maps := _normal_maps(shape))]
+    smooth = [shape for shape in shapes if has_vertices(shape) and has_normals(shape)]
+    found: tuple[dict[int, Any], dict[int, Any]] = {}, {}
+    if not (mapped or smooth):
+        return [], []
     with dr.suspend_grad():
         for sensor in sensors:
             random = mi.PCG32(size=_PROBES * _PROBES)
@@ -400,8 +408,12 @@ def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> list[Any]:
                 for texture in maps:
                     n = mi.Vector3f(texture.eval_3(si, hit)) * 2 - 1
                     if bool(dr.any(hit & (dr.dot(n, wi) < 0))):
-                        found[shape.ptr] = shape
-    return list(found.values())
+                        found[0][shape.ptr] = shape
+            away = si.is_valid() & (dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d) < 0)
+            for shape in smooth:
+                if bool(dr.any(away & (si.shape == mi.ShapePtr(shape)))):
+                    found[1][shape.ptr] = shape
+    return list(found[0].values()), list(found[1].values())
 
 
 def _is_stepped(shape: Any) -> bool:
