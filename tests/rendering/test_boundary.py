@@ -83,6 +83,24 @@ def test_both_modes_agree(depth):
     assert float(tangent) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("boundary", [True, False])
+def test_what_moves_as_one_has_no_derivative(boundary):
+    """Scene, light and camera shifted together: zero at each seed, not on average alone."""
+    facing_down = pose(0.5, 0.3, 3, 0.2) @ np.diag([1.0, -1, -1, 1])
+    lamp = {"type": "rectangle", "to_world": facing_down, "emitter": {"type": "area", "radiance": 20.0}}
+    facing_right = np.array([[0, 0, 1, -1.5], [0, 1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    side = {"type": "rectangle", "to_world": facing_right}
+    keys = [f"{name}.to_world" for name in ("body", "wall", "side", "light", "sensor")]
+    scene = plate(light=lamp, side=side, integrator={"type": "transient_path", "max_depth": 4})
+    renderer = tt.TransientRenderer(scene, keys, spp=64, boundary=boundary)
+    for seed in range(3):
+        renderer.zero_grad()
+        said(lambda seed=seed: weighed(renderer(seed=seed)).backward())
+        shifts = torch.stack([renderer.values[key].grad[:3, 3] for key in keys])
+        assert (shifts.abs().amax(0) > 0.01).all()
+        assert (shifts.sum(0).abs() < 1e-4 * shifts.abs().sum(0)).all()
+
+
 @pytest.mark.slow
 def test_every_entry_of_a_batch_has_the_term():
     renderer = tt.TransientRenderer(plate(), [BODY, PAINT], spp=16)
