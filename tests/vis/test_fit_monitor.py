@@ -15,7 +15,6 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
-from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 AXIS = tt.TimeAxis(2.0, 0.5, 4)
 TARGET = torch.rand(3, 4, 5, 6, generator=torch.Generator().manual_seed(0)) + 0.1
@@ -186,8 +185,7 @@ def test_a_figure_shows_the_state(tmp_path):
     pictures = [axes for axes in figure.axes if axes.images]
     expected = ["start", "target", "step 20"]
     assert [axes.get_title() for axes in pictures][:3] == expected
-    exposure = exposure_of(TARGET.sum(1))
-    np.testing.assert_allclose(pictures[1].images[0].get_array() / 255, tone_map(TARGET.sum(1), exposure), atol=0.003)
+    np.testing.assert_allclose(pictures[1].images[0].get_array() / 255, tt.vis.tone_map(TARGET.sum(1)), atol=0.003)
     titles = [axes.get_title() for axes in figure.axes[4:]]
     assert titles == ["row 1, column 2", "loss", "noise of the gradient (1: random)", "colour"]
     monitor.save(tmp_path / "fit.png")

@@ -102,7 +102,13 @@ class Table:
 
 
 def light_table(name: str, top: float, lowest: float) -> Table:
-    """Return the table of numbers from zero to ``top``, of which ``lowest`` is the smallest above zero."""
+    """Return the table of numbers from zero up, in logarithmic steps.
+
+    Args:
+        name: quantity.
+        top: largest number.
+        lowest: smallest number above zero.
+    """
     top = top if top > 0 else 1.0
     decades = min(MOST_DECADES, max(0.5, math.log10(top / lowest) if lowest > 0 else 1.0))
     values = np.full(256, np.nan, np.float32)
@@ -113,7 +119,12 @@ def light_table(name: str, top: float, lowest: float) -> Table:
 
 
 def signed_table(name: str, top: float) -> Table:
-    """Return the table of numbers between ``-top`` and ``top``."""
+    """Return the table of numbers of both signs, in logarithmic steps.
+
+    Args:
+        name: quantity.
+        top: largest size.
+    """
     top = top if top > 0 else 1.0
     values = np.full(256, np.nan, np.float32)
     values[0] = 0.0
@@ -138,7 +149,12 @@ RATIO = _linear("ratio", "ratio", np.arange(255) / 127 - 1.0, 0.5 / 127)
 
 
 def table_of(name: str, cubes: list[Tensor]) -> Table:
-    """Return the table that fits real numbers of several cubes: whole, light, or of both signs."""
+    """Return the table that fits real numbers of several cubes: whole numbers, light, or numbers of both signs.
+
+    Args:
+        name: quantity.
+        cubes: tensors of any shape.
+    """
     top, bottom, lowest = 0.0, 0.0, math.inf
     for cube in cubes:
         for part in cube.float().reshape(-1).split(_ENTRIES_AT_ONCE):  # type: ignore[no-untyped-call]

@@ -119,7 +119,13 @@ class Encoded:
 
 
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
-    """Return the page of a content, binned until it has at most ``max_bytes``."""
+    """Return the page of a content, binned until it fits.
+
+    Args:
+        content: the content.
+        title: heading.
+        max_bytes: most bytes of the page.
+    """
     import_bokeh()
     not_finite = _not_finite_said(content)
     room = max_bytes - 1_800_000
