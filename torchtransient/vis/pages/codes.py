@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,11 +73,7 @@ class Table:
 
     def _looked_up(self, x: Tensor) -> NDArray[np.uint8]:
         """Codes by the upper bits of each number: a logarithm of each is thirty times slower."""
-        every = (np.arange(2**_BITS, dtype=np.uint32) << (32 - _BITS)).view(np.float32)
-        with np.errstate(all="ignore"):
-            # Whole numbers begin an interval of equal bits, others are taken for its middle.
-            middle = every if self.kind == "whole" else every * np.float32(1 + _SAME_BITS)
-            codes = self._codes(middle)
+        codes = self._codes_of_bits
         numbers = np.ascontiguousarray(x.float().numpy())
         out = np.empty(numbers.shape, np.uint8)
         bits, flat = numbers.reshape(-1).view(np.uint32), out.reshape(-1)
@@ -84,6 +81,13 @@ class Table:
             part = slice(first, first + _ENTRIES_AT_ONCE)
             np.take(codes, bits[part] >> (32 - _BITS), out=flat[part], mode="clip")
         return out
+
+    @cached_property
+    def _codes_of_bits(self) -> NDArray[np.uint8]:
+        every = (np.arange(2**_BITS, dtype=np.uint32) << (32 - _BITS)).view(np.float32)
+        with np.errstate(all="ignore"):
+            # Whole numbers begin an interval of equal bits, others are taken for its middle.
+            return self._codes(every if self.kind == "whole" else every * np.float32(1 + _SAME_BITS))
 
     def _codes(self, x: NDArray[np.float32]) -> NDArray[np.uint8]:
         size = np.abs(x.astype(np.float64))
