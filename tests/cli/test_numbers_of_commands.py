@@ -311,7 +311,7 @@ def test_samples_of_the_demo(monkeypatch, tmp_path):
         tt, "render", lambda scene, spp, **more: asked.append(("truth", spp)) or made(scene, spp=2, **more)
     )
     monkeypatch.setattr(tt.vis.FitMonitor, "save", lambda *_: None)
-    monkeypatch.setattr("torchtransient.vis.overview.plot_overview", lambda *_, **__: None)
+    monkeypatch.setattr("torchtransient.vis.pictures.plot_overview", lambda *_, **__: None)
     arguments = ["demo", "-o", str(tmp_path / "demo"), "--resolution", "8", "--spp", "3", "--steps", "2"]
     with active_variant("llvm_ad_mono"):  # in which the box has no colours
         result = CliRunner().invoke(main, arguments)
