@@ -324,18 +324,17 @@ ALWAYS = {"NotImplementedError", "AttributeError", "SystemExit"}
 BARE = {
     "checks.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
-    "capture/metadata.py": {"TypeError"},  # caught by its callers, who know the file
-    "data/reading/sample_draws.py": {"IndexError"},  # the protocol of sequences, which ends loops
-    "data/storage/shard_file.py": {"ValueError"},  # caught where files are opened, and told with their names
-    "data/storage/web_dataset.py": {"ValueError"},  # likewise
-    "files/captures/mat5.py": {"ValueError"},  # likewise
-    "files/entries.py": {"ValueError"},  # likewise
+    "data/sample.py": {"IndexError"},  # the protocol of sequences, which ends loops
+    "data/shards.py": {"ValueError"},  # caught where files are opened, and told with their names
+    "data/exports.py": {"ValueError"},  # likewise
+    "files/captures/matlab.py": {"ValueError"},  # likewise
+    "files/plain_data.py": {"ValueError"},  # likewise
     "files/result_file.py": {"ValueError"},  # likewise
     "nlos/part_file.py": {"ValueError"},  # caught in the same function
     "losses/loss_module.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "vis/video.py": {"IndexError"},  # the protocol of sequences
+    "vis/videos.py": {"IndexError"},  # the protocol of sequences
 }
 
 

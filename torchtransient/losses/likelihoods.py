@@ -499,7 +499,12 @@ def _dark_level(
 
 @contextmanager
 def parts_of(input: object, averaged: Tensor | float) -> Iterator[None]:
-    """Context in which likelihoods compare parts of a prediction `input`, averaged over that many bins."""
+    """Context in which likelihoods compare parts of a prediction.
+
+    Args:
+        input: the prediction.
+        averaged: number of bins that each part averages.
+    """
     token = _OF_HALF.set(averaged if isinstance(input, Tensor) and input.dtype == torch.float16 else None)
     try:
         yield
@@ -508,7 +513,13 @@ def parts_of(input: object, averaged: Tensor | float) -> Iterator[None]:
 
 
 def divisor(value: Tensor, mask: Tensor | None, reduction: Reduction) -> Tensor | float:
-    """Return the number that the reduction of these values divides by."""
+    """Return the number that the reduction of values divides by.
+
+    Args:
+        value: of each element.
+        mask: of the same shape, None for all.
+        reduction: "none", "sum" or "mean".
+    """
     if reduction != "mean":
         return 1
     return max(value.numel(), 1) if mask is None else mask.sum().clamp_min(1)
