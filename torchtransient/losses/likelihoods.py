@@ -48,7 +48,7 @@ from torchtransient.losses.layouts import as_columns, bins_dim, item_dims, time_
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, TRANSIENT, Light, Transient, reads
 from torchtransient.sensing.dead_time.renewal import check_dead_bins
-from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
+from torchtransient.sensing.spad import exposed_cycles, first_photon_log_prob
 
 # Mean, relative to the counts of a bin, below which its logarithm is continued by the tangent. Bins of so small a mean
 # hold less than one count in 1e9, and a slope of 1e9 has a square that single precision holds.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.arithmetic import precision_of, summed
+from torchtransient.capture.capture import precision_of, summed
 from torchtransient.checks import Numbers, count, finite, positive, real_array, shown
 from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError
 from torchtransient.nlos.methods import (

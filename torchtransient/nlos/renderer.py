@@ -39,7 +39,7 @@ from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Compose, Device, GradPolicy, Sensor
-from torchtransient.sensing.chain.compose import check_axis
+from torchtransient.sensing.chain.stages import check_axis
 
 
 def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy = "expected") -> nn.Module:

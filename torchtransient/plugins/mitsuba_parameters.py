@@ -25,6 +25,7 @@ from torchtransient.plugins.mitsuba_compat import (
     is_dark,
     loses_slope_of_metal,
     lost_at,
+    moved_by,
     normal_texture,
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
@@ -98,7 +99,8 @@ DARK = ParameterEffect(
     supported=False,
     reason="directionalarea shines in one direction, which no path from the sensor meets: it stays dark",
 )
-# Texture coordinates move no point, and what they move is smooth but for the steps of what a texture shows.
+# Texture coordinates and normals move no point, and what they move is smooth but for the steps of what a texture shows
+# and where normals turn away from the viewer.
 COORDINATES = ParameterEffect(moves_silhouette=True)
 PATTERN = replace(COORDINATES, role="shape")
 PATTERN_AND_NORMALS = replace(NORMAL, role="shape")
@@ -168,6 +170,14 @@ def _is_normal(site: Site) -> bool:
     """Return True if a texture holds normals or heights of a delta lobe."""
     return any(
         isinstance(holder, mi.BSDF) and normal_texture(holder) == name and _turns_delta_lobes(holder)
+        for holder, name in site.owners
+    )
+
+
+def _is_other_normal(site: Site) -> bool:
+    """Return True if a texture holds normals of a BSDF without a delta lobe."""
+    return any(
+        isinstance(holder, mi.BSDF) and normal_texture(holder) == name and not is_bump_map(holder)
         for holder, name in site.owners
     )
 
@@ -260,14 +270,20 @@ def _lies_in_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
+def _is_wind(site: Site) -> bool:
+    return moved_by(site.node) is not None
+
+
+WIND = Row(ParameterEffect(moves_length=True, role="velocity"), _is_wind, "the velocity of a medium")
 IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
+IN_OTHER_NORMALS = Row(COORDINATES, _is_other_normal, "normals of another BSDF")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
 IN_DARK_LIGHT = Row(DARK, _lies_in_dark_light, "the radiance of a directionalarea")
 
 # Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
-NUMBER_ROWS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
+NUMBER_ROWS = (IN_NORMALS, IN_OTHER_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 
@@ -326,6 +342,6 @@ declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
 declare_effects("Texture", {ANY_KEY: NUMBER_ROWS})
 declare_effects("IrregularSpectrum", {"wavelengths": WAVELENGTHS})
-declare_effects("Volume", {ANY_KEY: NUMBER_ROWS})
+declare_effects("Volume", {ANY_KEY: (WIND, *NUMBER_ROWS)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

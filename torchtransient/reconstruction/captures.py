@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.arithmetic import computed
+from torchtransient.capture.capture import computed
 from torchtransient.checks import finite, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import checked_capture

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
-from torchtransient.capture.arithmetic import summed
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text, summed
 from torchtransient.capture.scan import bounds_of
 from torchtransient.checks import Numbers, count, of_class, positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError

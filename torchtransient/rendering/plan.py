@@ -108,7 +108,11 @@ class PlannedFilm:
 
 
 def planned(outputs: Sequence[str]) -> PlannedFilm:
-    """Return the film of a plan for some outputs."""
+    """Return the film of a plan for some outputs.
+
+    Args:
+        outputs: names of outputs, such as "transient".
+    """
     kind = next((kind for kind in FILMS if kind.output in outputs), Histogram)
     if kind is not Histogram:
         note = "; no time axis is stored" if kind is Phasors else ""
@@ -224,7 +228,7 @@ class Plan(Effects):
 @opaque
 def plan(
     scene: Any,
-    outputs: Sequence[str] | str = ("transient",),
+    outputs: Sequence[str] | str | None = None,
     *,
     parameters: Sequence[str] = (),
     time_axis: TimeAxis | str | None = None,
@@ -256,7 +260,8 @@ def plan(
 
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
-        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands".
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for what
+            the settings of a film that are given call for, or else "transient".
         parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
@@ -311,10 +316,10 @@ def plan(
     if temporal_filter is not None:
         checked_filter(temporal_filter)
     loaded = load(scene)
-    wanted = _checked_outputs(outputs)
-    inventory = scene_inventory(loaded, sensor)
     named = {"frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
     given = requested_film(film, named)
+    wanted = _checked_outputs(outputs, given)
+    inventory = scene_inventory(loaded, sensor)
     own_axis = None if given is None else given.attributes().get("axis")
     if own_axis is not None:
         if time_axis is not None:
@@ -436,7 +441,10 @@ def known_outputs() -> tuple[str, ...]:
     return (*(kind.output for kind in FILMS), *_ANY_FILM)
 
 
-def _checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
+def _checked_outputs(outputs: Sequence[str] | str | None, given: FilmLayout | None) -> tuple[str, ...]:
+    """Return the outputs of a plan; ``given``: film that the call asks for, None without one."""
+    if outputs is None:
+        return ("transient" if given is None else given.output,)
     wanted = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
     films, known = tuple(kind.output for kind in FILMS), known_outputs()
     if not wanted or not all(is_one_of(name, known) for name in wanted):

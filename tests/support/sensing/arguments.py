@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from support.sensing.all_entries import ENTRIES
 from torchtransient import sensing
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.chirps import Chirps
@@ -158,6 +159,9 @@ CALLS = {
         {"response": RESPONSE}),
     "mosaic_rows": (
         {"angles_deg": 90 * rand(2, 2), "extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
+    "heterodyne_speed": (
+        {"beat": 0.1 * PHASOR, "plain": PHASOR, "frequencies_hz": number(60e6), "duration_s": number(5e-3)},
+        {"beats": 2}),
     "multi_return": ({"scores": LIGHT, "threshold": number(0.5)}, {"max_returns": 2}),
     "nonparalyzable_histogram": ({"rate": LIGHT, "dead_bins": number(2.5)}, {}),
     "offset_of": ({"taps": TAPS}, {"num_taps": 4}),
@@ -201,6 +205,8 @@ CALLS = {
          "max_depth_m": number(7.0), "min_depth_m": number(0.0)}, {}),
     "wrapped_difference": ({"a": 6 * rand(3), "b": 6 * rand(3, seed=1)}, {}),
 }  # fmt: skip
+
+CALLS |= {type(entry.make()).__name__: entry.call for entry in ENTRIES if entry.call is not None}
 
 # What takes no real numbers of its own, or takes modules, records and names.
 OTHERS = {
