@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at
+from torchtransient.scenes import look_at
 
 BOXES, COLOURS = ("small-box", "large-box"), ("red", "green", "white")
 VARIANT = "llvm_ad_mono"

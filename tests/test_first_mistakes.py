@@ -23,7 +23,7 @@ from torchtransient.errors import (
     UnitError,
     UnknownKeyError,
 )  # fmt: skip
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 
 AXIS = tt.TimeAxis(0.0, 0.05, 40)
 LIGHT = torch.rand(1, 40, 4, 4, generator=torch.Generator().manual_seed(0))

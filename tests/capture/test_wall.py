@@ -14,7 +14,7 @@ from support.sweeps import together
 from torchtransient.capture import Wall
 from torchtransient.capture.wall import first_hits, triangle_normals
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 TRANSFORMS = {
     "plain": np.eye(4),

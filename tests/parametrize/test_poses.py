@@ -19,7 +19,7 @@ from torchtransient.parametrize import (
     pose_from_twist,
     twist_from_pose,
 )  # fmt: skip
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 AXIS = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
 SHIFT = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
