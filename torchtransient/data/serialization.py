@@ -176,7 +176,7 @@ def read_record(kind: type[Record], data: Any) -> Record | None:
     """Restore a record from its fields.
 
     Args:
-        kind: `Pulse` or `Gate`.
+        kind: ``Pulse`` or ``Gate``.
         data: fields by name, a record, or None.
 
     Returns:

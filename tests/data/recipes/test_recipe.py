@@ -359,9 +359,7 @@ WRONG = {
     "whole node": (lambda: small(vary={"red": D.Uniform(0, 1)}), SceneError, "whole 'diffuse'"),
     "unknown plugin": (lambda: small(vary={"small-box.type": D.Choice(["cube", "nonsense"])}), SceneError, "nonsense"),
     "label": (lambda: small(labels=("depht",)), SceneError, "unknown label 'depht'"),
-    "labels": (lambda: small(labels="depth"), SceneError, "list of names"),
     "what is kept": (lambda: small(keep=["depth"]), ArgumentError, "expected some of transient, steady, got .'depth'"),
-    "keep": (lambda: small(keep="steady"), SceneError, "list of names"),
     "nothing kept": (lambda: small(keep=[]), ArgumentError, "expected some of transient"),
     "device": (lambda: small(device="vl53l9"), SceneError, "vl53l8_like"),
     "device key": (lambda: small(vary={CYCLES: D.Uniform(1, 2)}), SceneError, "give device="),
@@ -369,8 +367,6 @@ WRONG = {
         lambda: small(vary={CYCLES[:-1]: D.Choice([1])}, device="vl53l8_like"), TorchTransientError, "cycle"
     ),
     "device of phasors": (lambda: small(frequencies=[0.0], device="vl53l8_like"), SceneError, "transients"),
-    "not a distribution": (lambda: small(vary={RED: 3}), SceneError, "expected a distribution"),
-    "seed": (lambda: small(seed=-1), SceneError, "seed"),
     "films of two sizes": (two_sizes, ShapeError, "size"),
     "two axes": (lambda: small(D.OneOf([box(), shifted()])), ShapeError, "axis"),
     "two numbers of samples": (
@@ -386,10 +382,6 @@ WRONG = {
         lambda: small(vary={"small-box": D.Choice([box()["small-box"], nested()])}, labels=["material"]),
         SceneError, "would stand for another",
     ),
-    "gates": (lambda: small(gates=3), ArgumentError, "tt.Gate"),
-    "frequencies": (lambda: small(frequencies=3), ArgumentError, "cycles per metre"),
-    "vary": (lambda: small(vary=[1]), ArgumentError, "vary"),
-    "sensors": (lambda: small(sensors=1.5), SceneError, "sensors"),
     "key of one scene": (lambda: small(D.OneOf([box(), without_small_box()])), SceneError, "small-box"),
 }  # fmt: skip
 
