@@ -1,9 +1,9 @@
 """Checks of arguments: numbers, flags, rows, mappings, functions, names and paths, and values as messages show them.
 
 Each check returns the value, or raises a typed error with what was expected and what came. Their common arguments:
-``name`` begins the message ("simulate: tiles"), ``error`` is the type that is raised. Numbers are those of Python,
-numpy and torch; truth values, texts and dates are refused, although Python or numpy convert them. Nothing here imports
-torch: the command line and the plugins use these checks.
+``name`` begins the message ("simulate: tiles"), ``what`` is the subject of messages about files, ``error`` is the type
+that is raised. Numbers are those of Python, numpy and torch; truth values, texts and dates are refused, although Python
+or numpy convert them. Nothing here imports torch: the command line and the plugins use these checks.
 """
 
 from __future__ import annotations
@@ -66,7 +66,15 @@ _LONGEST = 600
 
 
 def finite(name: str, value: Any) -> float:
-    """Return ``value`` as a float. Raises UnitError unless it is one finite number."""
+    """Return a finite number as a float.
+
+    Args:
+        name: name in the message.
+        value: number of any library.
+
+    Raises:
+        UnitError: for anything else.
+    """
     number = _number(value)
     if not math.isfinite(number):
         raise UnitError(f"{name}: expected a finite number, got {shown(value)}.")
@@ -74,7 +82,15 @@ def finite(name: str, value: Any) -> float:
 
 
 def positive(name: str, value: Any) -> float:
-    """Return ``value`` as a float. Raises UnitError unless it is finite and greater than zero."""
+    """Return a finite number greater than zero as a float.
+
+    Args:
+        name: name in the message.
+        value: number of any library.
+
+    Raises:
+        UnitError: for anything else.
+    """
     number = _number(value)
     if not math.isfinite(number) or number <= 0:
         raise UnitError(f"{name}: expected a finite number greater than zero, got {shown(value)}.")
@@ -82,7 +98,15 @@ def positive(name: str, value: Any) -> float:
 
 
 def share(name: str, value: Any) -> float:
-    """Return ``value`` as a float, an albedo for instance. Raises UnitError unless it lies in [0, 1]."""
+    """Return a number in [0, 1] as a float, an albedo for instance.
+
+    Args:
+        name: name in the message.
+        value: number of any library.
+
+    Raises:
+        UnitError: for anything else.
+    """
     number = _number(value)
     if not 0.0 <= number <= 1.0:
         raise UnitError(f"{name}: expected a number between 0 and 1, got {shown(value)}.")
@@ -90,7 +114,15 @@ def share(name: str, value: Any) -> float:
 
 
 def shares(name: str, values: Any) -> float | tuple[float, float, float]:
-    """Return one share, or three of a linear sRGB colour from a sequence or an array of three. Raises UnitError."""
+    """Return one share, or three of a linear sRGB colour.
+
+    Args:
+        name: name in the message.
+        values: number, or sequence or array of three.
+
+    Raises:
+        UnitError: for anything else.
+    """
     if not isinstance(values, (list, tuple)) and getattr(values, "ndim", None) != 1:
         return share(name, values)
     plain = list(values)
@@ -129,7 +161,17 @@ def count(
 
 
 def index(name: str, value: Any, size: int, error: type[TorchTransientError] = ArgumentError) -> int:
-    """Return an index among ``size`` entries, from 0 on; negative ones count from the end. Raises ``error``."""
+    """Return an index from 0 on.
+
+    Args:
+        name: name in the message.
+        value: index; negative ones count from the end.
+        size: number of entries.
+        error: type of the error.
+
+    Raises:
+        error: for an index out of range.
+    """
     number = as_whole(value)
     if number is None or not -size <= number < size:
         raise error(f"{name}: expected a whole number from {-size} to {size - 1}, got {shown(value)}.")
@@ -137,7 +179,11 @@ def index(name: str, value: Any, size: int, error: type[TorchTransientError] = A
 
 
 def as_whole(value: Any) -> int | None:
-    """Return ``value`` as an int, from any library that has whole numbers; None for 2.0, texts, truth values."""
+    """Return a whole number as an int; None for 2.0, texts, truth values.
+
+    Args:
+        value: of any library that has whole numbers.
+    """
     if _is_no_number(value) or getattr(value, "ndim", None):
         return None
     try:
@@ -151,16 +197,28 @@ def as_whole(value: Any) -> int | None:
 
 
 def flag(name: str, value: Any) -> bool:
-    """Return ``value`` as a bool. Raises ArgumentError for other types: the text "False" would count as true."""
+    """Return a truth value as a bool.
+
+    Args:
+        name: name in the message.
+        value: truth value of any library.
+
+    Raises:
+        ArgumentError: for other types: the text "False" would count as true.
+    """
     if not _is_truth(value) or getattr(value, "ndim", None):
         raise ArgumentError(f"{name}: expected True or False, got {shown(value)}.")
     return bool(value)
 
 
 def real_array(values: Any) -> NDArray[np.float64] | None:
-    """Return real numbers of any library as a detached float64 array.
+    """Return real numbers as a detached float64 array.
 
-    None for texts, None, truth values, rows of different lengths and numbers that float64 cannot hold.
+    Args:
+        values: numbers of any library and shape.
+
+    Returns:
+        The array; None for texts, None, truth values, rows of different lengths and numbers that float64 cannot hold.
     """
     try:
         if _has_no_number(values):
@@ -175,7 +233,15 @@ def real_array(values: Any) -> NDArray[np.float64] | None:
 
 
 def numbers(name: str, values: Any) -> NDArray[np.float64]:
-    """Return numbers of any shape as :func:`real_array` does. Raises UnitError for anything else."""
+    """Return numbers as :func:`real_array` does.
+
+    Args:
+        name: name in the message.
+        values: numbers of any library and shape.
+
+    Raises:
+        UnitError: for anything else.
+    """
     array = real_array(values)
     if array is None:
         raise UnitError(f"{name}: expected real numbers, got {shown(values)}.")
@@ -194,7 +260,15 @@ def _are_numbers(objects: NDArray[Any]) -> bool:
 
 
 def transform(name: str, given: Any) -> NDArray[np.float64]:
-    """Return a transform (4, 4), Mitsuba's included. Raises ShapeError unless it has as many finite numbers."""
+    """Return a transform (4, 4).
+
+    Args:
+        name: name in the message.
+        given: numbers of any library, or a transform of Mitsuba.
+
+    Raises:
+        ShapeError: unless it has as many finite numbers.
+    """
     matrix = real_array(getattr(given, "matrix", given))
     if matrix is not None and matrix.ndim == 3:  # Dr.Jit's, of one entry
         matrix = matrix[..., 0]
@@ -204,7 +278,11 @@ def transform(name: str, given: Any) -> NDArray[np.float64]:
 
 
 def shown(value: Any) -> str:
-    """Return a value as a message shows it, at most 60 characters; large arrays and tensors as their shape."""
+    """Return a value as a message shows it, at most 60 characters; large arrays and tensors as their shape.
+
+    Args:
+        value: any object.
+    """
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and not isinstance(value, type) and math.prod(shape) > _WRITTEN:
         return f"{with_article(type(value).__name__)} {tuple(shape)}"
@@ -217,18 +295,30 @@ def shown(value: Any) -> str:
 
 
 def unit_of(name: str) -> str:
-    """Return the unit that a name ends in, as it follows a range in a message; empty for names without one."""
+    """Return the unit that a name ends in, as it follows a range in a message; empty for names without one.
+
+    Args:
+        name: of an argument, "delay_s".
+    """
     unit = _UNITS.get(name.rpartition("_")[2]) if "_" in name else None
     return f" {unit}" if unit else ""
 
 
 def with_article(word: str) -> str:
-    """Return "a confocal", "an exhaustive"."""
+    """Return "a confocal", "an exhaustive".
+
+    Args:
+        word: any word.
+    """
     return f"{'an' if word[:1] in 'aeiou' else 'a'} {word}"
 
 
 def as_number(value: Any) -> float | None:
-    """Return ``value`` as a float, infinities and NaN included; None for anything but a real number."""
+    """Return a real number as a float, infinities and NaN included; None for anything else.
+
+    Args:
+        value: number of any library.
+    """
     if _is_no_number(value) or getattr(value, "ndim", None):
         return None
     try:
@@ -264,7 +354,18 @@ def _is_truth(value: Any) -> bool:
 def of_class(
     name: str, value: Any, kind: type[Kind], hint: str = "", error: type[TorchTransientError] = ArgumentError
 ) -> Kind:
-    """Return ``value``, an instance of ``kind``. Raises ``error`` for others; ``hint`` ends its message."""
+    """Return an instance of a class.
+
+    Args:
+        name: name in the message.
+        value: any object.
+        kind: the class.
+        hint: end of the message.
+        error: type of the error.
+
+    Raises:
+        error: for other objects.
+    """
     if not isinstance(value, kind):
         raise error(f"{name}: expected {with_article(kind.__name__)}, got {shown(value)}{hint}.")
     return value
@@ -295,7 +396,17 @@ def several(
 def one_by_one(
     name: str, values: Any, what: str, error: type[TorchTransientError] = ShapeError
 ) -> Iterator[Any]:
-    """Return an iterator over ``values``; arguments and errors as of :func:`several`."""
+    """Return an iterator over values, as :func:`several`.
+
+    Args:
+        name: name in the message.
+        values: any iterable but a text and a mapping.
+        what: plural of the values in the message.
+        error: type of the error.
+
+    Raises:
+        error: for other objects.
+    """
     with contextlib.suppress(TypeError):
         if not isinstance(values, (str, bytes, Mapping)):
             return iter(values)
@@ -303,14 +414,34 @@ def one_by_one(
 
 
 def mapping(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Mapping[Any, Any]:
-    """Return ``value``, a mapping. Raises ``error`` for others; ``what`` is its form, "{title: image}"."""
+    """Return a mapping.
+
+    Args:
+        name: name in the message.
+        value: any object.
+        what: form of the mapping in the message, "{title: image}".
+        error: type of the error.
+
+    Raises:
+        error: for other objects.
+    """
     if not isinstance(value, Mapping):
         raise error(f"{name}: expected a dictionary {what}, got {shown(value)}.")
     return value
 
 
 def function(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> Callable[..., Any]:
-    """Return ``value``, a callable. Raises ``error`` for others; ``what`` are its arguments, "images (N, 1, H, W)"."""
+    """Return a callable.
+
+    Args:
+        name: name in the message.
+        value: any object.
+        what: its arguments in the message, "images (N, 1, H, W)".
+        error: type of the error.
+
+    Raises:
+        error: for other objects.
+    """
     if not callable(value):
         raise error(f"{name}: expected a function of {what}, got {shown(value)}.")
     called: Callable[..., Any] = value
@@ -318,7 +449,16 @@ def function(name: str, value: Any, what: str, error: type[TorchTransientError] 
 
 
 def a_recipe(name: str, value: Any, *methods: str) -> Any:
-    """Return ``value``, a recipe with ``methods``. Raises ArgumentError, with the reader of files of recipes."""
+    """Return a recipe.
+
+    Args:
+        name: name in the message.
+        value: any object.
+        methods: names of the methods that it needs.
+
+    Raises:
+        ArgumentError: for other objects, with the reader of files of recipes.
+    """
     missing = [method for method in methods if isinstance(value, type) or not callable(getattr(value, method, None))]
     if not missing:
         return value
@@ -331,7 +471,15 @@ def a_recipe(name: str, value: Any, *methods: str) -> Any:
 
 
 def by_number(name: str, value: Any) -> Any:
-    """Return ``value``, a data set or list with samples by number. Raises ArgumentError for others."""
+    """Return a data set or list with samples by number.
+
+    Args:
+        name: name in the message.
+        value: any object.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     is_none = isinstance(value, (type, str, bytes)) or getattr(value, "ndim", None) == 0
     if is_none or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
         raise ArgumentError(f"{name}: expected a data set of samples by number, got {shown(value)}.")
@@ -339,14 +487,29 @@ def by_number(name: str, value: Any) -> Any:
 
 
 def text(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> str:
-    """Return ``value``, a text. Raises ``error`` for others; ``what`` is its meaning, "the name of a sampler"."""
+    """Return a text.
+
+    Args:
+        name: name in the message.
+        value: any object.
+        what: its meaning in the message, "the name of a sampler".
+        error: type of the error.
+
+    Raises:
+        error: for other objects.
+    """
     if not isinstance(value, str):
         raise error(f"{name}: expected {what}, got {shown(value)}.")
     return value
 
 
 def is_one_of(value: Any, names: Collection[str]) -> bool:
-    """Return True if ``value`` is one of the texts ``names``; arrays never are."""
+    """Return True for one of some texts; arrays never are.
+
+    Args:
+        value: any object.
+        names: the texts.
+    """
     return isinstance(value, str) and value in names
 
 
@@ -354,7 +517,12 @@ def is_one_of(value: Any, names: Collection[str]) -> bool:
 
 
 def some_of(names: Any, letters: int = 240) -> str:
-    """Return names as text for a message, cut to ``letters`` characters, with the number of names left out."""
+    """Return names as text for a message, with the number of names left out.
+
+    Args:
+        names: any iterable.
+        letters: most characters.
+    """
     names = [name if len(name) <= 60 else f"{name[:57]}..." for name in map(str, names)]
     text = ", ".join(names)
     if len(text) <= letters:
@@ -365,19 +533,31 @@ def some_of(names: Any, letters: int = 240) -> str:
 
 
 def short_message(error: BaseException) -> str:
-    """Return the message of an error of another package, at most 160 characters in one line."""
+    """Return the message of an error of another package, at most 160 characters in one line.
+
+    Args:
+        error: the error.
+    """
     message = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return message if len(message) <= _SHORT else f"{message[: _SHORT - 3]}..."
 
 
 def one_line(error: BaseException) -> str:
-    """Return the message of an error of Mitsuba in one line, without tracebacks and places in its sources."""
+    """Return the message of an error of Mitsuba in one line, without tracebacks and places in its sources.
+
+    Args:
+        error: the error.
+    """
     words = " ".join(_PLACE_IN_SOURCE.sub("", _TRACEBACK.sub("", str(error))).split())
     return words if len(words) <= _LONGEST else f"{words[: _LONGEST - 3]}..."
 
 
 def cut_line(text: str) -> str:
-    """Return a text in one line, of a long one its beginning and its end."""
+    """Return a text in one line, of a long one its beginning and its end.
+
+    Args:
+        text: the text.
+    """
     line = " ".join(text.split())
     return line if len(line) <= _MOST else f"{line[:_BEGINNING]} ... {line[-_END:]}"
 
@@ -385,6 +565,9 @@ def cut_line(text: str) -> str:
 @contextlib.contextmanager
 def short_errors(what: str) -> Iterator[None]:
     """Shorten messages of this library's errors that quote a file to one line.
+
+    Args:
+        what: subject of the message.
 
     Raises:
         StorageError: in place of an OSError, for a file that ``what`` names.
@@ -433,7 +616,11 @@ def arguments_of(name: str, function: Callable[..., Any], given: Collection[str]
 
 
 def path_of(path: Any, what: str) -> Path:
-    """Return ``path`` as a Path; ``what`` begins the message.
+    """Return a path.
+
+    Args:
+        path: any object.
+        what: subject of the message.
 
     Raises:
         StorageError: for names that this file system cannot have.
@@ -450,7 +637,11 @@ def path_of(path: Any, what: str) -> Path:
 
 
 def is_special(path: str | os.PathLike[str]) -> bool:
-    """Return True for a device, a pipe or a socket: a device has no end, a pipe may have no writer."""
+    """Return True for a device, a pipe or a socket: a device has no end, a pipe may have no writer.
+
+    Args:
+        path: any path.
+    """
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -459,13 +650,30 @@ def is_special(path: str | os.PathLike[str]) -> bool:
 
 
 def check_special(path: str | os.PathLike[str], what: str, error: type[TorchTransientError] = StorageError) -> None:
-    """Raise ``error`` for a device, a pipe or a socket. Missing files pass: opening them fails with its own error."""
+    """Refuse a device, a pipe or a socket. Missing files pass: opening them fails with its own error.
+
+    Args:
+        path: any path.
+        what: subject of the message.
+        error: type of the error.
+
+    Raises:
+        error: for these.
+    """
     if is_special(path):
         raise error(f"{what}: '{path}' is no file on a disk (a device or a pipe). Give the name of a file.")
 
 
 def check_source(path: Any, what: str) -> Path:
-    """Return the path of a file to read. Raises StorageError for nothing, a folder, a device or a pipe."""
+    """Return the path of a file to read.
+
+    Args:
+        path: any object.
+        what: subject of the message.
+
+    Raises:
+        StorageError: for a missing file, a folder, a device or a pipe.
+    """
     source = path_of(path, what)
     if source.is_file():
         return source
@@ -476,8 +684,13 @@ def check_source(path: Any, what: str) -> Path:
 def check_folder(path: Any, what: str) -> Path:
     """Return the path of a file to write or replace.
 
-    Raises StorageError if its folder is missing or not writable, or if the path is a folder, a device, a pipe or a
-    file without permission.
+    Args:
+        path: any object.
+        what: subject of the message.
+
+    Raises:
+        StorageError: for a folder that is missing or not writable, and for a path that is a folder, a device, a pipe or
+            a file without permission.
     """
     target = path_of(path, what)
     # What a link points to is replaced, not the link.
@@ -492,7 +705,17 @@ def check_folder(path: Any, what: str) -> Path:
 
 
 def checked_mesh(who: str, vertices: Any, faces: Any) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return a triangle mesh as float64 (V, 3), metres, and int64 (F, 3). Raises ShapeError and UnitError."""
+    """Return a triangle mesh as float64 (V, 3), metres, and int64 (F, 3).
+
+    Args:
+        who: subject of the message.
+        vertices: numbers of any library.
+        faces: whole numbers of any library.
+
+    Raises:
+        ShapeError: for other shapes and indices.
+        UnitError: for vertices that are not finite or 1e9 m away.
+    """
     points, given = real_array(vertices), real_array(faces)
     if points is None or given is None:
         raise ShapeError(

@@ -21,6 +21,9 @@ def without_autocast(function: Callable[Arguments, Result]) -> Callable[Argument
 
     Autocast makes bfloat16 or float16 of the operands of matrix products and convolutions. A network bears that; a
     measurement loses 3e-3 of its value by it, phases their millimetres, and poses their centimetres.
+
+    Args:
+        function: of tensors, positional or by name.
     """
 
     @functools.wraps(function)
@@ -70,10 +73,14 @@ class _Product(torch.autograd.Function):
 
 
 def product(matrix: Tensor, x: Tensor) -> Tensor:
-    """Multiply ``matrix`` (M, K) and ``x`` (..., K, P) in their dtype, in derivatives of any order too.
+    """Multiply ``matrix`` and ``x`` in their dtype, in derivatives of any order too.
 
     `without_autocast` covers the forward pass. The derivative of a product is made of products, and inside
     `torch.autocast` a backward pass would round those to half precision, by up to 1e-2 of a gradient.
+
+    Args:
+        matrix: (M, K).
+        x: (..., K, P).
 
     Returns:
         (..., M, P).
@@ -85,7 +92,15 @@ def product(matrix: Tensor, x: Tensor) -> Tensor:
 
 
 def floating(x: Any, where: str) -> Tensor:
-    """Return a tensor of floating numbers. Raises ShapeError for anything else."""
+    """Return a tensor of floating numbers.
+
+    Args:
+        x: tensor of any shape.
+        where: subject of messages.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     if not isinstance(x, Tensor) or not x.is_floating_point():
         got = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
         raise ShapeError(f"{where}: expected a floating tensor, got {got}. Convert it with .float().")
@@ -93,7 +108,16 @@ def floating(x: Any, where: str) -> Tensor:
 
 
 def number_tensor(given: Any, expected: str, error: type[TorchTransientError] = ShapeError) -> Tensor:
-    """Return a floating tensor with its gradient, or float64 of other numbers. Raises `error` with `expected`."""
+    """Return a floating tensor with its gradient, or float64 of other numbers.
+
+    Args:
+        given: numbers of any library and shape.
+        expected: beginning of the message.
+        error: type of the error.
+
+    Raises:
+        error: for anything but numbers.
+    """
     if isinstance(given, Tensor) and given.is_floating_point():
         return given
     array = real_array(given)
@@ -103,7 +127,11 @@ def number_tensor(given: Any, expected: str, error: type[TorchTransientError] = 
 
 
 def single(x: Tensor) -> Tensor:
-    """Return a tensor in float32 or better: half precision has no linear algebra on the CPU, and loses digits."""
+    """Return a tensor in float32 or better: half precision has no linear algebra on the CPU, and loses digits.
+
+    Args:
+        x: tensor of any shape.
+    """
     return x.float() if x.is_floating_point() and x.element_size() < 4 else x
 
 
@@ -112,6 +140,9 @@ def in_single(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
 
     Counts are whole in bfloat16 up to 256 and in float16 up to 2048, which ends at 65504; positions in bins and rates
     per cycle fare no better. Gradients arrive in the precision of the tensors that were given.
+
+    Args:
+        function: of tensors, positional or by name.
     """
 
     @functools.wraps(function)
@@ -128,12 +159,19 @@ def holds(condition: Tensor) -> bool:
 
     Checks of values are left out inside `torch.func.vmap`, in `torch.compile` (the graph would break), and for
     tensors on "meta".
+
+    Args:
+        condition: truth values of any shape.
     """
     return torch.compiler.is_compiling() or is_true(condition)
 
 
 def is_true(condition: Tensor) -> bool:
-    """Return as :func:`holds`, but read the values in `torch.compile` too, which breaks the graph."""
+    """Return as :func:`holds`, but read the values in `torch.compile` too, which breaks the graph.
+
+    Args:
+        condition: truth values of any shape.
+    """
     if condition.is_meta:
         return True
     try:

@@ -42,12 +42,20 @@ class IntegratorInterface(abc.ABC):
 
 
 def is_time_resolved(film: object) -> TypeGuard[FilmInterface]:
-    """Return whether transient integrators can write to a film, of whichever variant it was made."""
+    """Return True for a film that transient integrators can write to, of any variant.
+
+    Args:
+        film: any object.
+    """
     return isinstance(film, FilmInterface)
 
 
 def missing_members(plugin: type) -> list[str]:
-    """Return the abstract members of its bases and its kind that a plugin class does not define."""
+    """Return the abstract members of its bases and its kind that a plugin class does not define.
+
+    Args:
+        plugin: class of a film or an integrator.
+    """
     abstract = {name for name in dir(plugin) if getattr(getattr(plugin, name), "__isabstractmethod__", False)}
     kinds: tuple[type, ...] = (FilmInterface, IntegratorInterface)
     declared = {name for kind in kinds if issubclass(plugin, kind) for name in getattr(kind, "__abstractmethods__", ())}

@@ -19,8 +19,8 @@ _CONTAINERS = ("_parameters", "_buffers", "_modules")
 
 
 class ScalarState(nn.Module):
-    """Base of modules with numbers in their state. Torch 2.6 takes the first number of several for one number, in
-    silence; later versions report it. Loading reports it here, of the numbers of modules inside too.
+    """Base of modules with numbers in their state. Torch 2.6 loads the first number of several for one number without a
+    word; later versions report it. Loading reports it here, for the numbers of inner modules too.
     """
 
     def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
@@ -47,7 +47,7 @@ def _loads_first_of_several() -> bool:
 
 
 class CopiesParametrized(ScalarState):
-    """A module whose copies and pickles keep their parametrizations, each with a class of its own. Modules inherit from
+    """Module whose copies and pickles keep their parametrizations, each with a class of its own. Modules inherit from
     it in place of `nn.Module`, or are given their parametrizations by `register`.
 
     `copy.copy` shares tensors, as copies of all modules do: parametrizations that one of both takes away stay in the
@@ -67,7 +67,11 @@ class CopiesParametrized(ScalarState):
 
 
 def let_copy(module: nn.Module) -> None:
-    """Copies and pickles of a parametrized module as of `CopiesParametrized`, unless its class has its own."""
+    """Make copies and pickles of a parametrized module as those of `CopiesParametrized`, unless its class has its own.
+
+    Args:
+        module: with or without parametrizations.
+    """
     own: Any = parametrize.type_before_parametrizations(module)
     made: Any = type(module)
     if made is own or isinstance(module, CopiesParametrized) or copyreg._slotnames(own):  # type: ignore[attr-defined]
@@ -113,7 +117,7 @@ def _shallow(module: nn.Module) -> Any:
 
 
 def _own_containers(module: nn.Module) -> None:
-    """The same tensors and modules in dictionaries of its own."""
+    """Give a module dictionaries of its own, with the same tensors and modules."""
     module.__dict__.update({name: module.__dict__[name].copy() for name in _CONTAINERS})
 
 
@@ -125,13 +129,13 @@ def _with_own_containers(module: Any) -> Any:
 
 
 def _origin(module: nn.Module) -> tuple[type, tuple[str, ...]]:
-    """The class before parametrizations, and their names."""
+    """Return the class before parametrizations, and their names."""
     names = tuple(module.parametrizations) if parametrize.is_parametrized(module) else ()  # type: ignore[arg-type]
     return parametrize.type_before_parametrizations(module), names
 
 
 def _shell(cls: Any, names: tuple[str, ...]) -> Any:
-    """A module of `cls` with properties for `names`, whose entries are still to come."""
+    """Return a module of `cls` with properties for `names`, without entries."""
     module = cls.__new__(cls)
     if names:
         nn.Module.__init__(module)

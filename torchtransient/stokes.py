@@ -51,14 +51,35 @@ def degree_of_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tens
 
 
 def degree_of_linear_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
-    """Return ``|(S1, S2)| / S0``. Arguments, shape and errors as :func:`degree_of_polarization`."""
+    """Return ``|(S1, S2)| / S0``.
+
+    Args:
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+        floor: the result is zero where ``S0 <= floor``.
+
+    Returns:
+        The shape of ``stokes`` without ``dim``.
+
+    Raises:
+        ShapeError, UnitError: as :func:`degree_of_polarization`.
+    """
     return _degree(stokes, dim, (1, 2), floor)
 
 
 def degree_of_circular_polarization(stokes: Tensor, dim: int, floor: float = 0.0) -> Tensor:
     """Return ``S3 / S0`` in [-1, 1], positive for right circular light.
 
-    Arguments, shape and errors as :func:`degree_of_polarization`.
+    Args:
+        stokes: light with four components along ``dim``.
+        dim: axis of the components.
+        floor: the result is zero where ``S0 <= floor``.
+
+    Returns:
+        The shape of ``stokes`` without ``dim``.
+
+    Raises:
+        ShapeError, UnitError: as :func:`degree_of_polarization`.
     """
     return normalized_components(stokes, dim, floor).select(_axis(stokes, dim), 2)
 
@@ -255,7 +276,11 @@ def linear_retarder(angle: Tensor | float, delay: Tensor | float) -> Tensor:
 
 
 def circular_polarizer(left_handed: bool = False) -> Tensor:
-    """Return the Mueller matrix (4, 4) of an ideal polarizer for right (or left) circular light."""
+    """Return the Mueller matrix (4, 4) of an ideal polarizer for circular light.
+
+    Args:
+        left_handed: pass left circular light, otherwise right circular light.
+    """
     sign = -0.5 if left_handed else 0.5
     matrix = torch.zeros(4, 4)
     matrix[0, 0] = matrix[3, 3] = 0.5

@@ -1,6 +1,5 @@
 """Captures: layouts, parts of exhaustive ones, what is computed of them, and records as torch knows them."""
 
-import json
 import pickle
 import warnings
 from dataclasses import replace
@@ -10,9 +9,10 @@ import pytest
 import torch
 from torch.utils import _pytree
 
+from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.errors import SceneError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError
 
 WALL = Wall.plane(2.0, 1.6)
 AXIS = TimeAxis(1.0, 0.1, 8)
@@ -32,23 +32,6 @@ def capture(name, channels=2, **changes):
     generator = torch.Generator().manual_seed(1)
     transient = torch.rand(channels, AXIS.num_bins, *scan.shape, generator=generator)
     return Capture(**{"transient": transient, "axis": AXIS, "scan": scan, **changes})
-
-
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("single", (2, 8, 3, 4)),
-        ("confocal", (2, 8, 3, 4)),
-        ("exhaustive", (2, 8, 3, 4, 3, 4)),
-        ("list", (2, 8, 3)),
-        ("lists", (2, 8, 3, 3)),
-    ],
-)
-def test_layouts(name, shape):
-    made = capture(name)
-    assert tuple(made.transient.shape) == shape
-    torch.testing.assert_close(made.total(), made.transient.sum(1))
-    assert made.total().shape == (2, *SCANS[name].shape)
 
 
 @pytest.mark.parametrize("name", ["exhaustive", "lists"])
@@ -90,61 +73,18 @@ def test_peak_time():
     assert int(peaks.isnan().sum()) == 11
 
 
-def test_polarized_captures_have_their_components_first():
-    transient = torch.zeros(4, 1, 8, 3, 4)
-    transient[0, 0, 3], transient[1, 0, 6] = 1.0, 5.0
-    made = Capture(transient, AXIS, SCANS["single"], polarized=True)
-    assert bool((made.peak_time() == AXIS.centers_opl[3]).all())
-    with pytest.raises(ShapeError, match=r"\(4, C, 8, 3, 4\)"):
-        Capture(transient[:3], AXIS, SCANS["single"], polarized=True)
-
-
-def test_crop():
-    made = capture("exhaustive")
-    part = made.crop(1.2, 1.5)
-    assert part.axis.num_bins == 3 and part.axis.start_opl == pytest.approx(1.2)
-    assert torch.equal(part.transient, made.transient[:, 2:5])
-    assert part.transient.data_ptr() == made.transient[:, 2:].data_ptr()
-    assert made.crop(1.21, 1.49).axis.num_bins == 3
-    assert made.crop(0.0, 100.0).axis == AXIS
-    for start, end in ((3.0, 4.0), (1.5, 1.5), (1.5, 1.2), (float("nan"), 2.0)):
-        with pytest.raises(UnitError, match="crop"):
-            made.crop(start, end)
-
-
 def test_phasors():
     axis = FrequencyAxis.uniform(1.0, 0.5, 5)
     phasor = torch.zeros(1, 5, 3, 4, dtype=torch.complex64)
     made = Capture(None, None, SCANS["single"], phasor=phasor, frequencies=axis)
     assert made.to(torch.float64).phasor.dtype == torch.complex128
     for method in ("total", "peak_time"):
-        with pytest.raises(ShapeError, match="phasors alone"):
+        with pytest.raises(ShapeError):
             getattr(made, method)()
-    with pytest.raises(ShapeError, match="without frequencies"):
+    with pytest.raises(ShapeError):
         Capture(None, None, SCANS["single"], phasor=phasor)
-    with pytest.raises(ShapeError, match="complex numbers"):
+    with pytest.raises(ShapeError):
         Capture(None, None, SCANS["single"], phasor=phasor.real, frequencies=axis)
-
-
-@pytest.mark.parametrize(
-    ("transient", "axis", "message"),
-    [
-        (torch.zeros(1, 7, 3, 4), AXIS, r"\(C, 8, 3, 4\).*single"),
-        (torch.zeros(1, 8, 4, 3), AXIS, r"\(C, 8, 3, 4\)"),
-        (torch.zeros(8, 3, 4), AXIS, r"\(C, 8, 3, 4\)"),
-        (torch.zeros(0, 8, 3, 4), AXIS, r"\(0, 8, 3, 4\)"),
-        (torch.zeros(1, 8, 3, 4), None, "without axis"),
-        (torch.zeros(1, 8, 3, 4, dtype=torch.complex64), AXIS, "real numbers"),
-    ],
-)
-def test_shapes_are_checked(transient, axis, message):
-    with pytest.raises(ShapeError, match=message):
-        Capture(transient, axis, SCANS["single"])
-
-
-def test_steady_has_the_shape_of_the_scan():
-    with pytest.raises(ShapeError, match="steady"):
-        capture("single", steady=torch.zeros(2, 4, 3))
 
 
 @pytest.mark.parametrize(
@@ -167,18 +107,6 @@ def test_arrays_and_lists_are_measured_too(given):
     assert phasor.dtype == torch.complex64 and bool((phasor == 1).all())
 
 
-@pytest.mark.parametrize("given", ["x", {}, object(), np.array(["a"]), [[1.0, 2.0], [3.0]], [torch.zeros(2)], 10**400])
-def test_what_is_no_tensor(given):
-    with pytest.raises(ShapeError, match="expected transient"):
-        Capture(given, AXIS, SCANS["single"])
-
-
-def test_a_capture_holds_what_was_measured():
-    for settings in ({}, {"steady": torch.zeros(1, 3, 4)}):
-        with pytest.raises(ShapeError, match=r"expected a transient \(with axis=\).*got neither"):
-            Capture(None, None, SCANS["single"], **settings)
-
-
 def test_captures_are_compared():
     made = capture("single", steady=torch.rand(2, 3, 4), metadata={"seconds": 1.0})
     assert made == pickle.loads(pickle.dumps(made)) == replace(made, metadata={}) and made in [capture("list"), made]
@@ -191,14 +119,6 @@ def test_captures_are_compared():
     assert all(made != other for other in unlike)
     holes = made.map(lambda t: torch.where(t > 0.5, t, torch.nan))
     assert holes == holes.clone() != made
-
-
-def test_metadata_is_plain():
-    made = capture("single", metadata={"spp": 64, "name": "Z"})
-    assert json.loads(json.dumps(made.metadata))["spp"] == 64
-    assert "spp, name" in repr(made)
-    with pytest.raises(StorageError, match="Tensor is not plain"):
-        capture("single", metadata={"t": torch.zeros(2)})
 
 
 def test_captures_are_records():
@@ -240,8 +160,11 @@ def test_edges_of_a_crop_are_meant_to_a_millionth_of_a_bin():
     assert bins(2.0 - far, 3.0 + far) == ([1.0, 2.0, 3.0, 4.0], 1.5)
     assert bins(2.0 + far, 3.0 - far) == ([2.0, 3.0], 2.0)
     assert bins(2.25, 2.26) == ([2.0], 2.0) and bins(-9.0, 1.25) == ([0.0], 1.0) and bins(4.75, 9.0) == ([7.0], 4.5)
-    for start, end in ((5.0, 6.0), (0.0, 1.0), (0.0, 1.0 + near), (5.0 - near, 6.0)):
-        with pytest.raises(UnitError, match=r"lengths between 1 and 5 m, got .* which hold no bin"):
+    part = capture.crop(1.5, 3.0)
+    assert part.transient.data_ptr() == capture.transient[:, 1:].data_ptr() and capture.crop(0, 9).axis == capture.axis
+    wrong = ((5.0, 6.0), (0.0, 1.0), (0.0, 1.0 + near), (5.0 - near, 6.0), (2.0, 2.0), (2.0, 1.5), (float("nan"), 2.0))
+    for start, end in wrong:
+        with pytest.raises(UnitError):
             capture.crop(start, end)
 
 
@@ -250,14 +173,14 @@ def test_leading_dimensions_are_channels_polarization_and_a_batch():
     cube = torch.rand(5, 2, 8, 3, 4)
     assert Capture(cube, AXIS, scan).total().shape == (5, 2, 3, 4)
     for shape in ((8, 3, 4), (2, 9, 3, 4), (2, 8, 4, 3), (2, 0, 8, 3, 4), (2, 8, 3, 4, 1)):
-        with pytest.raises(ShapeError, match=r"expected transient \(C, 8, 3, 4\)"):
+        with pytest.raises(ShapeError):
             Capture(torch.zeros(shape), AXIS, scan)
     polarized = Capture(torch.rand(5, 4, 2, 8, 3, 4), AXIS, scan, polarized=True, steady=torch.rand(5, 4, 2, 3, 4))
     # Of the first Stokes component alone, all channels together.
     light = polarized.transient[:, 0].sum(1)
     assert torch.equal(polarized.peak_time(), AXIS.centers_opl[light.argmax(1)])
     for steady in (torch.zeros(5, 3, 2, 3, 4), torch.zeros(2, 3, 4), torch.zeros(5, 4, 2, 4, 3)):
-        with pytest.raises(ShapeError, match=r"expected steady \(4, C, 3, 4\)"):
+        with pytest.raises(ShapeError):
             replace(polarized, steady=steady)
 
 
@@ -267,3 +190,19 @@ def test_one_spot_of_a_batch_of_grids():
     assert torch.equal(batch.single((1, 2)).transient, batch.transient[:, :, :, 1, 2])
     expected = torch.stack([batch.transient[..., r, c, r, c] for r in range(3) for c in range(4)], -1)
     assert torch.equal(batch.confocal().transient.flatten(-2), expected)
+
+
+@together("changes, error", [
+    *(({"transient": torch.zeros(shape)}, ShapeError) for shape in ((1, 7, 3, 4), (1, 8, 4, 3), (0, 8, 3, 4))),
+    ({"transient": torch.zeros(1, 8, 3, 4, dtype=torch.complex64)}, ShapeError), ({"transient": None}, ShapeError),
+    ({"transient": np.ma.masked_array(np.zeros((1, 8, 3, 4)), mask=False)}, ShapeError), ({"axis": None}, ShapeError),
+    *(({"transient": wrong}, ShapeError)
+      for wrong in ("x", {}, object(), np.array(["a"]), [[1.0], [2.0, 3.0]], 10**400)),
+    ({"steady": torch.zeros(2, 4, 3)}, ShapeError), ({"scan": None}, ArgumentError),
+    ({"axis": (0.0, 0.1, 8)}, ArgumentError), ({"frequencies": AXIS}, ArgumentError),
+    ({"channels": ["a"]}, ArgumentError), ({"channels": (1,)}, ArgumentError), ({"metadata": [1]}, StorageError),
+    ({"metadata": {"t": torch.zeros(2)}}, StorageError), ({"polarized": "False"}, ArgumentError),
+])  # fmt: skip
+def test_what_is_no_capture(changes, error):
+    with pytest.raises(error):
+        replace(capture("single"), **changes)

@@ -1,5 +1,8 @@
-"""Walls: coordinates against Mitsuba's own rectangle, points of curved ones against the surface they were made of."""
+"""Walls: coordinates against Mitsuba's own rectangle, points of curved ones against the surface they were made of,
+and rays against all triangles.
+"""
 
+import math
 import pickle
 
 import mitsuba as mi
@@ -9,7 +12,7 @@ import torch
 
 from support.sweeps import together
 from torchtransient.capture import Wall
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits, triangle_normals
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.scenes.transforms import rotate, scale, translate
 
@@ -63,8 +66,8 @@ def test_a_plane_lies_as_it_is_told():
     assert "2 x 1 m" in repr(wall)
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 7, (5, 1), (1, 4), (64, 33), 128])
-@pytest.mark.parametrize("centers", [True, False])
+@together("size", [1, 2, 7, (5, 1), (64, 33)])
+@together("centers", [True, False])
 def test_all_points_of_a_grid_are_distinct_and_evenly_spaced(size, centers):
     points, normals = Wall.plane(1.9, 1.3, center=(0.1, 0.2, 0.0)).grid(size, cell_centers=centers)
     nx, ny = size if isinstance(size, tuple) else (size, size)
@@ -77,12 +80,6 @@ def test_all_points_of_a_grid_are_distinct_and_evenly_spaced(size, centers):
         np.testing.assert_allclose(places, expected, atol=1e-14 if centers or count == 1 else 3e-6)
     # also in the single precision that a renderer works in
     assert len(np.unique(points.reshape(-1, 3).astype(np.float32), axis=0)) == nx * ny
-
-
-def test_extent_is_a_part_of_the_wall():
-    points, _ = Wall.plane(2.0, 2.0).grid((2, 2), (0.5, 0.0, 1.0, 0.5))
-    np.testing.assert_allclose(points[..., 0], [[0.25, 0.75]] * 2)
-    np.testing.assert_allclose(points[..., 1], [[-0.75] * 2, [-0.25] * 2])
 
 
 def test_points_of_a_curved_wall_lie_on_it():
@@ -135,14 +132,6 @@ def test_hits_are_those_of_a_search_over_all_triangles(seed):
     assert ((index >= 0) == np.isfinite(expected)).all()
 
 
-def test_the_first_triangle_counts():
-    plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]])
-    corners = np.stack([plate, plate + np.array([0, 0, 0.5]), plate - np.array([0, 0, 1.0])])
-    distance, index = first_hits(np.array([[0.5, -0.5, 2.0], [-0.5, 0.5, 2.0]]), np.array([0.0, 0, -1]), corners)
-    assert index.tolist() == [1, -1]
-    assert distance.tolist() == [1.5, np.inf]
-
-
 def test_a_mesh_of_a_scene_dictionary_is_placed():
     vertices, faces = bump(4)
     given = {"type": "mesh_arrays", "vertices": vertices, "faces": faces, "to_world": translate([0, 0, 2.0])}
@@ -165,42 +154,155 @@ BALL = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]])
 TETRAHEDRON = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 
 
-@together(
-    "make, error, message",
-    [
-        (lambda: Wall.plane(0.0, 1.0), UnitError, "width: expected a finite number greater than zero"),
-        (lambda: Wall.plane(1.0, float("nan")), UnitError, "height: expected a finite number greater than zero"),
-        (lambda: Wall.plane(normal=(0, 0, 0)), SceneError, "normal with a direction"),
-        (lambda: Wall.plane(normal=(0, 1, 0)), SceneError, "parallel"),
-        (lambda: Wall.plane(center=(0, 1)), ShapeError, "three numbers"),
-        (lambda: Wall.plane(center=(0, 1, float("inf"))), UnitError, "finite"),
-        (lambda: Wall.plane(albedo=1.5), UnitError, "between 0 and 1"),
-        (lambda: Wall.of({"type": "sphere"}), SceneError, "'sphere'"),
-        (lambda: Wall.of(3), ArgumentError, "got int"),
-        (lambda: Wall.of({"type": "rectangle", "to_world": np.zeros((4, 4))}), SceneError, "inverse"),
-        (lambda: Wall.of({"type": "rectangle", "to_world": np.eye(3)}), ShapeError, r"\(4, 4\)"),
-        (lambda: Wall.mesh(BALL, TETRAHEDRON), SceneError, "faces one side"),
-        (lambda: Wall.mesh(BALL, [[0, 1, 7]]), ShapeError, "from 0 to 3"),
-        (lambda: Wall.mesh(BALL, [[0, 1, 1.5]]), ShapeError, "whole numbers"),
-        (lambda: Wall.mesh(BALL[:, :2], [[0, 1, 2]]), ShapeError, r"\(V, 3\)"),
-        (lambda: Wall.mesh(BALL * np.nan, [[0, 1, 2]]), UnitError, "finite"),
-        (lambda: Wall.plane().grid(0), ShapeError, "at least 1"),
-        (lambda: Wall.plane().grid((2, 2.5)), ShapeError, "whole number"),
-        (lambda: Wall.plane().grid(2, (0, 0, 1)), ShapeError, "four"),
-        (lambda: Wall.plane().grid(2, (0, 0, 1, 1.1)), SceneError, "u0 < u1"),
-        (lambda: Wall.plane().at(0.5, 1.1), SceneError, "between 0 and 1"),
-        (lambda: Wall.mesh(BALL[:3], [[0, 1, 2]]).grid(3), SceneError, "do not meet the mesh"),
-        (lambda: Wall.plane().normals_at(np.array([[0, 0, 0], [0, 0, 0.01]]), "x"), SceneError, "0.01 m off"),
-        (lambda: Wall.plane().normals_at(np.array([[1.1, 0, 0.0]]), "x"), SceneError, "beside"),
-    ],
-)
-def test_what_is_no_wall(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
-
-
 def test_triangles_that_turn_their_back():
     vertices, faces = bump(4)
     faces[::9] = faces[::9, ::-1]
     with pytest.raises(SceneError, match="turn their back"):
         Wall.mesh(vertices, faces).grid(16)
+
+
+# A parallelogram: half sides (3, 0, 0) and (1, 2, 0), diagonals of (8, 4) and (4, -4).
+SKEW = Wall.of({"type": "rectangle", "to_world": np.array(
+    [[3.0, 1.0, 0.0, 10.0], [0.0, 2.0, 0.0, -20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]]
+)})  # fmt: skip
+# A roof over 4 x 2 m, of which the ridge runs along y at a third of its width, 0.5 m high; against the clock from +z.
+ROOF = (
+    np.array([[0.0, 0, 0], [1.0, 0, 0.5], [4.0, 0, 0], [0.0, 2, 0], [1.0, 2, 0.5], [4.0, 2, 0]]),
+    np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]]),
+)
+
+
+def test_sides_and_diagonals_of_a_parallelogram():
+    assert SKEW.width == 6.0 and SKEW.height == pytest.approx(2 * math.sqrt(5))
+    assert SKEW.diagonal == pytest.approx(math.sqrt(80))
+    other = Wall(SKEW.center, SKEW.half_u, -SKEW.half_v, normal=SKEW.normal, shape=SKEW.shape)
+    assert other.diagonal == pytest.approx(math.sqrt(80))
+    points, normals = SKEW.at([0.5, 0.75, 0.25], [0.5, 0.5, 0.75])
+    np.testing.assert_allclose(points, [[10, -20, 5], [11.5, -20, 5], [9, -19, 5]])
+    np.testing.assert_allclose(normals, [[0, 0, 1]] * 3)
+    assert SKEW.is_planar and repr(SKEW) == "Wall(plane, 6 x 4.472 m, center=[ 10., -20.,   5.])"
+
+
+def test_points_are_on_a_wall_to_a_share_of_its_diagonal():
+    tolerance = 1e-4 * math.sqrt(80)
+    across = np.array([0.0, 0.0, 1.0])
+    for part, half in ((SKEW.half_u, 3.0), (SKEW.half_v, math.sqrt(5))):
+        for side in (-1, 1):
+            # Beside it: as far as it may be before it, along its own sides.
+            edge = SKEW.center + side * part
+            SKEW.normals_at((edge + 0.99 * side * tolerance * part / half)[None], "points")
+            with pytest.raises(SceneError):
+                SKEW.normals_at((edge + 1.01 * side * tolerance * part / half)[None], "points")
+            inner = SKEW.center + side * 0.9 * part
+            normals = SKEW.normals_at(np.stack([inner + 0.99 * side * tolerance * across, inner]), "points")
+            np.testing.assert_allclose(normals, [[0, 0, 1]] * 2)
+            with pytest.raises(SceneError, match="1 of 2"):
+                SKEW.normals_at(np.stack([inner, inner + 1.01 * side * tolerance * across]), "points")
+
+
+def test_points_of_a_roof_have_the_normals_of_its_sides():
+    wall = Wall.mesh(*ROOF)
+    np.testing.assert_allclose(wall.normal, [0, 0, 1], atol=1e-12)
+    assert (wall.width, wall.height) == pytest.approx((4.0, 2.0))
+    np.testing.assert_allclose(wall.center, [2, 1, 0.25], atol=1e-12)
+    steep, flat = np.array([-0.5, 0, 1]) / math.sqrt(1.25), np.array([0.5 / 3, 0, 1]) / math.sqrt(1 + 0.25 / 9)
+    points, normals = wall.at([0.125, 0.625], [0.25, 0.9])
+    np.testing.assert_allclose(points, [[0.5, 0.5, 0.25], [2.5, 1.8, 0.25]], atol=1e-9)
+    np.testing.assert_allclose(normals, [steep, flat], atol=1e-12)
+    np.testing.assert_allclose(wall.normals_at(points, "points"), [steep, flat], atol=1e-12)
+    tolerance = 1e-4 * wall.diagonal
+    for off, taken in ((0.99, True), (-0.99, True), (1.01, False), (-1.01, False)):
+        moved = points + off * tolerance * np.array([0, 0, 1])
+        if taken:
+            np.testing.assert_allclose(wall.normals_at(moved, "points"), [steep, flat], atol=1e-12)
+            continue
+        with pytest.raises(SceneError):
+            wall.normals_at(moved, "points")
+    assert not wall.is_planar and "4 triangles" in repr(wall)
+
+
+def test_the_frame_of_a_mesh_is_the_smallest_rectangle_around_it():
+    vertices, faces = ROOF
+    # A vertex that no triangle has does not count.
+    loose = Wall.mesh(np.concatenate([vertices, [[99.0, 99, 99]]]), faces)
+    np.testing.assert_allclose(loose.center, [2, 1, 0.25], atol=1e-12)
+    sideways = Wall.mesh(vertices, faces, up=(1.0, 0.0, 0.0))
+    # u runs along up x normal: -y.
+    np.testing.assert_allclose(sideways.half_u, [0, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(sideways.half_v, [2, 0, 0], atol=1e-12)
+    placed = Wall.of({"type": "mesh_arrays", "vertices": vertices, "faces": faces,
+                      "to_world": [[0, 0, 1, 10], [1, 0, 0, 20], [0, 1, 0, 30], [0, 0, 0, 1]]})  # fmt: skip
+    np.testing.assert_allclose(placed.center, [10.25, 22, 31], atol=1e-12)
+    np.testing.assert_allclose(placed.normal, [1, 0, 0], atol=1e-12)
+
+
+def test_grids_run_along_their_own_sides():
+    points, _ = Wall.plane(4.0, 2.0).grid((2, 3), (0.25, 0.5, 0.75, 1.0), cell_centers=False)
+    # Rows along v from the middle to the upper edge, columns along u.
+    np.testing.assert_allclose(points[..., 0], [[-1, 1]] * 3, atol=1e-5)
+    np.testing.assert_allclose(points[..., 1], [[0, 0], [0.5, 0.5], [1, 1]], atol=1e-5)
+    alone, _ = Wall.plane(4.0, 2.0).grid((1, 2), (0.25, 0.5, 0.75, 1.0), cell_centers=False)
+    np.testing.assert_allclose(alone[..., 0], [[0], [0]], atol=1e-12)
+
+
+def test_normals_of_triangles_are_of_length_one_or_zero():
+    corners = np.array([[[0.0, 0, 0], [2, 0, 0], [0, 3, 0]], [[0, 0, 0], [0, 3, 0], [2, 0, 0]], [[0, 0, 0]] * 3,
+                        [[0, 0, 0], [0, 0, 2], [0, 5, 0]]])  # fmt: skip
+    np.testing.assert_array_equal(triangle_normals(corners), [[0, 0, 1], [0, 0, -1], [0, 0, 0], [-1, 0, 0]])
+
+
+def test_rays_meet_what_is_before_them_up_to_the_edges():
+    corners = np.array([[[0.0, 0, 0], [2, 0, 0], [0, 4, 0]]])
+    down = np.array([0.0, 0, -1])
+    hits = {
+        (0.5, 1.0, 3.0): 3.0, (0.0, 0.0, 1.0): 1.0, (2.0, 0.0, 1.0): 1.0, (0.0, 4.0, 1.0): 1.0, (1.0, 2.0, 1.0): 1.0,
+        # Beside it, behind it, in it.
+        (-0.01, 1.0, 1.0): np.inf, (1.0, -0.01, 1.0): np.inf, (1.01, 2.01, 1.0): np.inf, (0.5, 1.0, -1.0): np.inf,
+        (0.5, 1.0, 0.0): np.inf,
+    }  # fmt: skip
+    found, index = first_hits(np.array(list(hits)), down, corners)
+    np.testing.assert_allclose(found, list(hits.values()))
+    assert index.tolist() == [0 if np.isfinite(t) else -1 for t in hits.values()]
+    # From behind as well; a triangle along the rays is none.
+    found, _ = first_hits(np.array([[0.5, 1.0, -2.0]]), -down, corners)
+    assert found.tolist() == [2.0]
+    assert np.isinf(first_hits(np.array([[0.5, 1.0, -2.0]]), np.array([1.0, 0, 0]), corners)[0]).all()
+
+
+def test_of_equally_near_triangles_the_first_counts():
+    plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]])
+    corners = np.stack([plate - np.array([0, 0, 1.0]), plate, plate[::-1], plate])
+    assert first_hits(np.array([[0.5, -0.5, 2.0]]), np.array([0.0, 0, -1]), corners)[1].tolist() == [1]
+
+
+def split(share):
+    """Two triangles of areas 1 and 1 - share, wound both ways: share / (2 - share) is left of them."""
+    side = math.sqrt(2 * (1 - share))
+    one = [[0, 0, 0], [math.sqrt(2), 0, 0], [0, math.sqrt(2), 0]]
+    return Wall.mesh([*one, [9, 0, 0], [9, side, 0], [9 + side, 0, 0]], [[0, 1, 2], [3, 4, 5]])
+
+
+@together("make, error", [
+    (lambda: Wall.plane(0.0, 1.0), UnitError), (lambda: Wall.plane(1.0, math.nan), UnitError),
+    (lambda: Wall.plane(normal=(0, 0, 0)), SceneError), (lambda: Wall.plane(normal=(0, 1, 0)), SceneError),
+    (lambda: Wall.plane(center=(0, 1)), ShapeError), (lambda: Wall.plane(center=(0, 1, math.inf)), UnitError),
+    (lambda: Wall.plane(albedo=1.5), UnitError), (lambda: Wall.of({"type": "sphere"}), SceneError),
+    (lambda: Wall.of(3), ArgumentError), (lambda: split(0.0015), SceneError),
+    (lambda: Wall.of({"type": "rectangle", "to_world": np.zeros((4, 4))}), SceneError),
+    (lambda: Wall.of({"type": "rectangle", "to_world": np.eye(3)}), ShapeError),
+    (lambda: Wall.mesh(BALL, TETRAHEDRON), SceneError), (lambda: Wall.mesh(BALL, [[0, 1, 7]]), ShapeError),
+    (lambda: Wall.mesh(BALL, [[0, 1, -1]]), ShapeError), (lambda: Wall.mesh(BALL, [[0, 1, 1.5]]), ShapeError),
+    (lambda: Wall.mesh(BALL[:, :2], [[0, 1, 2]]), ShapeError), (lambda: Wall.mesh(BALL, np.zeros((0, 3))), ShapeError),
+    (lambda: Wall.mesh(BALL * np.nan, [[0, 1, 2]]), UnitError), (lambda: Wall.mesh(1e9 * BALL, [[0, 1, 2]]), UnitError),
+    (lambda: Wall.plane().grid(0), ShapeError), (lambda: Wall.plane().grid((2, 2.5)), ShapeError),
+    (lambda: Wall.plane().grid((2**16, 2**16)), ShapeError), (lambda: Wall.plane().grid((2, 2, 2)), ShapeError),
+    (lambda: Wall.plane().grid(2, (0, 0, 1)), ShapeError), (lambda: Wall.plane().grid(2, (0, 0, 1, 1.1)), SceneError),
+    (lambda: Wall.plane().grid(2, (0.6, 0, 0.5, 1)), SceneError), (lambda: Wall.plane().at(0.5, 1.1), SceneError),
+    (lambda: Wall.plane().at(0.5, math.nan), SceneError), (lambda: Wall.plane().at("a", 0.5), ShapeError),
+    (lambda: Wall.plane().at([0.1, 0.2], [0.1, 0.2, 0.3]), ShapeError),
+    (lambda: Wall.mesh(BALL[:3], [[0, 1, 2]]).grid(3), SceneError),
+])  # fmt: skip
+def test_what_is_no_wall(make, error):
+    with pytest.raises(error):
+        make()
+    split(0.0025)

@@ -14,8 +14,9 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.cli.main import COMMANDS, main
-from torchtransient.files.result_file import read_result
+from support.sweeps import together
+from torchtransient.__main__ import main
+from torchtransient.files import read_result
 
 VARIANT = "llvm_ad_rgb"  # what the commands take when none is active, as in a process of their own
 SCENE = """<scene version="3.0.0">
@@ -78,7 +79,7 @@ def test_render_of_a_plan(folder):
     assert stored.metadata["stats"]["variant"] == plan.variant == "llvm_ad_mono"
 
 
-@pytest.mark.parametrize("described", [True, False])
+@pytest.mark.parametrize("described", long([True, False], [False]))
 def test_render_of_a_plan_for_gates(folder, described):
     """The film of the options, or else that of the scene, says what is planned; with --rtol until its error is met."""
     gates = "rectangular 6 6.5"
@@ -87,20 +88,14 @@ def test_render_of_a_plan_for_gates(folder, described):
     film += '<integer name="width" value="8"/><integer name="height" value="8"/>'
     (folder / "gated.xml").write_text(SCENE.replace(histogram, film) if described else SCENE, encoding="utf-8")
     options = () if described else ("--gates", gates)
-    result = run("render", "gated.xml", "-o", "out.npz", "--plan", "--error", "relative", "--rtol", 0.2, "--seed", 3,
+    result = run("render", "gated.xml", "-o", "out.npz", "--plan", "--error", "relative", "--rtol", 0.5, "--seed", 3,
                  "--quiet", *options)  # fmt: skip
     assert result.exit_code == 0, result.output
     given = None if described else tt.Gate.rectangular(6.0, 6.5)
     plan = tt.plan("gated.xml", "gates", gates=given, error="relative", seed=3)
-    expected = plan.renderer().to_tolerance(rtol=0.2, seed=3, progress=False)
+    expected = plan.renderer().to_tolerance(rtol=0.5, seed=3, progress=False)
     torch.testing.assert_close(read_result(folder / "out.npz").gated, expected.output.gated)
     assert "Russian roulette: none" in result.stdout and "reached" in result.stdout
-
-
-def test_pictures_that_a_plan_does_not_show_are_refused_before_the_render(folder):
-    result = run("render", "box.xml", "--plan", "--gates", "rectangular 6 7", "--overview", "a.png", "--quiet")
-    assert result.exit_code == 2 and "leave it out for gates" in result.stderr and not (folder / "box.h5").exists()
-    assert "--plan" in run("render", "box.xml", "--error", "relative").stderr
 
 
 def test_render_with_error_bars(folder):
@@ -191,54 +186,23 @@ def test_plan_of_rates_and_beats(moving):
     result = run("plan", "moving.xml", "--outputs", "rates", "--json")
     told = json.loads(result.stdout)
     assert told["film"] == "rates" and told["rates"]["rates_num_bins"] == 64
-    result = run("plan", "moving.xml", "--outputs", "beats", "--chirps", "1e9:1e-5:1550e-9")
+    result = run("plan", "moving.xml", "--chirps", "1e9:1e-5:1550e-9")
     assert result.exit_code == 0 and "a bin for each line of the chirps" in result.stdout
     result = run("plan", "moving.xml", "--outputs", "beats")
     assert result.exit_code == 2 and "Give --chirps" in result.output
     assert "nothing moves" in run("plan", "box.xml", "--outputs", "rates").stdout
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (("--gates", "rectangular 1 2", "--overview", "a.png"), "leave it out for gates"),
-        (("--gates", "rectangular 2 1"), "finite start before"),
-        (("--gates", "rectangular 1 2", "--temporal-filter", "tent"), "a gated film has none"),
-        (("--frequencies", "1,fast"), "numbers with commas"),
-        (("--frequencies", "1,nan"), "numbers with commas"),
-        (("--frequencies", "1", "--start-opl", 0, "--bin-width-opl", 1, "--num-bins", 2), "leave out one"),
-        (("--frequencies", "1", "--overview", "a.png"), "--overview"),
-    ],
-)
-def test_frequencies_that_cannot_be_rendered(folder, arguments, message):
-    result = run("render", "box.xml", *arguments, "--quiet")
-    assert result.exit_code == 2 and message in result.output and not (folder / "box.h5").exists()
-
-
 def test_options_of_render(folder):
-    options = (
-        "--param",
-        "res=6",
-        "--spp",
-        4,
-        "--set",
-        "grey.reflectance.value=0.1,0.2,0.4",
-        "--variant",
-        "llvm_ad_rgb",
-    )
+    options = ("--param", "res=6", "--spp", 4, "--set", "grey.reflectance.value=0.1,0.2,0.4", "--variant", VARIANT)
     axis = ("--start-opl", 4, "--bin-width-opl", 0.5, "--num-bins", 8, "--temporal-filter", "tent", "--max-depth", 2)
     result = run("render", "box.xml", *options, *axis, "--quiet")
     assert result.exit_code == 0, result.output
     stored = read_result(folder / "box.h5")
     expected = tt.render(
-        tt.load("box.xml", res=6),
-        {"grey.reflectance.value": torch.tensor([0.1, 0.2, 0.4])},
-        spp=4,
-        seed=0,
-        time_axis=tt.TimeAxis(4.0, 0.5, 8),
-        temporal_filter="tent",
-        max_depth=2,
-    )
+        tt.load("box.xml", res=6), {"grey.reflectance.value": torch.tensor([0.1, 0.2, 0.4])}, spp=4, seed=0,
+        time_axis=tt.TimeAxis(4.0, 0.5, 8), temporal_filter="tent", max_depth=2,
+    )  # fmt: skip
     assert stored.transient.shape == (3, 8, 6, 6)
     assert torch.equal(stored.transient, expected.transient)
     assert stored.metadata["set"] == ["grey.reflectance.value=0.1,0.2,0.4"]
@@ -257,57 +221,6 @@ def test_list_of_parameters(folder):
     assert result.exit_code == 0, result.output
     assert "grey.reflectance.value" in result.stdout
     assert not (folder / "box.h5").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("missing.xml",), "missing.xml"),
-        (("broken.xml",), "line 2"),
-        (("unknown.xml",), "no_such_film"),
-        (("box.xml", "--param", "resx=3"), "resx"),
-        (("box.xml", "--set", "gray.reflectance.value=0.1"), "Did you mean 'grey.reflectance.value'"),
-        (("box.xml", "--set", "grey.reflectance.value=0.1"), "expected shape (3,)"),
-        (("box.xml", "--variant", "scalar_rgb"), "llvm_ad_rgb"),
-        (("box.xml", "--sensor", "2"), "--sensor"),
-        (("box.xml", "--param", "res=60000", "--quiet"), "TiB"),
-        (("box.xml", "-o", "out.exr"), ".npz"),
-        (("box.xml", "-o", "nowhere/out.h5"), "'nowhere' does not exist"),
-        (("box.xml", "--overview", "nowhere/out.png"), "'nowhere' does not exist"),
-        (("box.xml", "--overview", "out.docx"), ".png"),
-        (("box.xml", "--rainbow", "nowhere/out.png"), "'nowhere' does not exist"),
-        (("box.xml", "--video", "out.avi"), ".mp4 or .gif"),
-        (("box.xml", "--start-opl", "0", "--bin-width-opl", "-1", "--num-bins", "3"), "bin_width_opl > 0"),
-    ],
-)
-def test_errors_are_one_message_and_status_2(folder, arguments, message):
-    (folder / "broken.xml").write_text("<scene version='3.0.0'>\n<film", encoding="utf-8")
-    unknown = SCENE.replace("transient_hdr_film", "no_such_film")
-    (folder / "unknown.xml").write_text(unknown, encoding="utf-8")
-    result = run("render", *arguments)
-    assert result.exit_code == 2, result.output
-    assert message in result.stderr
-    assert "error: " in result.stderr
-    assert "Traceback" not in result.stderr
-    assert isinstance(result.exception, SystemExit)
-    assert not list(folder.glob("*.h5"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("render", "box.xml", "--num-bins", "3"), "give all"),
-        (("render", "box.xml", "--param", "res"), "NAME=VALUE"),
-        (("render", "box.xml", "--param", "res=1", "--param", "res=2"), "given twice"),
-        (("render", "box.xml", "--set", "a=b"), "expected a number"),
-        (("cost", "box.xml", "--spp", "4,x"), "expected whole numbers"),
-        (("polish",), "No such command"),
-    ],
-)
-def test_usage_errors(folder, arguments, message):
-    result = run(*arguments)
-    assert result.exit_code == 2
-    assert message in result.stderr
 
 
 def test_debug_shows_where_an_error_comes_from(folder):
@@ -366,11 +279,10 @@ def test_demo_where_nothing_can_be_written(folder):
     assert "cannot be made" in result.stderr
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@together("name", main.list_commands(None))
 def test_help_of_every_command(name):
     result = run(name, "--help")
-    assert result.exit_code == 0
-    assert "Usage" in result.stdout
+    assert result.exit_code == 0 and "Usage" in result.stdout
 
 
 def test_help_needs_no_torch():
@@ -383,38 +295,50 @@ def test_help_needs_no_torch():
     assert "doctor" in result.stdout
 
 
-def test_the_command_as_a_module(folder):
-    place = {**os.environ, "PYTHONPATH": str(Path(tt.__file__).parents[1])}
-    command = [sys.executable, "-m", "torchtransient", "--version"]
-    done = subprocess.run(command, capture_output=True, text=True, env=place)
-    assert done.returncode == 0 and done.stdout.startswith("torchtransient, version")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ("render", "box.xml", "--set", "wrong.key=1"),
-            "`torchtransient render SCENE --list-parameters` lists all keys",
-        ),
-        (("plan", "box.xml", "--gradient", "wrong.key"), "`torchtransient render SCENE --list-parameters` lists"),
-        (("plan", "box.xml", "--outputs", "gates"), "nor the command line has gates. Give --gates, or make the film"),
-        (("plan", "box.xml", "--outputs", "phasor"), "Give --frequencies, or make the film"),
-        (("plan", "box.xml", "--outputs", "sound"), "--outputs takes some of transient, phasor"),
-        (("render", "box.xml", "--sensor", 4), "--sensor: the scene has 1"),
-        (("render", "box.xml", "--plan", "--error", "relative", "--frequencies", 1), "--error relative is about bins"),
-    ],
-)
-def test_errors_speak_of_options(folder, arguments, message):
-    result = run(*arguments)
-    assert result.exit_code == 2 and message in result.stderr
-    for python in ("tt.", "print(", "=["):
-        assert python not in result.stderr
-
-
 def test_warnings_are_lines(folder):
     result = run("render", "box.xml", "--quiet", "--spp", 2, "--set", "grey.reflectance.value=1.5,0.5,0.5")
     assert result.exit_code == 0, result.output
     lines = [line for line in result.stderr.splitlines() if line]
     assert len(lines) == 1 and lines[0].startswith("warning: 'grey.reflectance.value' is a share of the light")
     assert ".clamp" not in lines[0]
+
+
+WRONG = [
+    (("missing.xml",), "missing.xml"), (("broken.xml",), "line 2"), (("unknown.xml",), "no_such_film"),
+    (("box.xml", "--param", "resx=3"), "resx"), (("box.xml", "--param", "res"), "--param"),
+    (("box.xml", "--param", "res=1", "--param", "res=2"), "--param"), (("box.xml", "--set", "a=b"), "--set"),
+    (("box.xml", "--set", "gray.reflectance.value=0.1"), "Did you mean 'grey.reflectance.value'"),
+    (("box.xml", "--set", "wrong.key=1"), "--list-parameters"), (("box.xml", "--sensor", "2"), "--sensor"),
+    (("box.xml", "--set", "grey.reflectance.value=0.1"), "(3,)"), (("box.xml", "--variant", "scalar_rgb"), "llvm"),
+    (("box.xml", "--param", "res=60000", "--quiet"), "TiB"), (("box.xml", "-o", "out.exr"), ".npz"),
+    (("box.xml", "-o", "nowhere/out.h5"), "nowhere"), (("box.xml", "--overview", "nowhere/out.png"), "nowhere"),
+    (("box.xml", "--overview", "out.docx"), ".png"), (("box.xml", "--video", "out.avi"), ".mp4"),
+    (("box.xml", "--start-opl", "0", "--bin-width-opl", "-1", "--num-bins", "3"), "bin_width_opl"),
+    (("box.xml", "--num-bins", "3"), "--num-bins"), (("box.xml", "--gates", "rectangular 2 1"), "start"),
+    (("box.xml", "--gates", "rectangular 1 2", "--overview", "a.png"), "--overview"),
+    (("box.xml", "--gates", "rectangular 1 2", "--temporal-filter", "tent"), "gated film"),
+    (("box.xml", "--frequencies", "1", "--start-opl", 0, "--bin-width-opl", 1, "--num-bins", 2), "--frequencies"),
+    (("box.xml", "--frequencies", "1", "--overview", "a.png"), "--overview"),
+    (("box.xml", "--plan", "--gates", "rectangular 6 7", "--overview", "a.png"), "--overview"),
+    (("box.xml", "--error", "relative"), "--plan"),
+    (("box.xml", "--plan", "--error", "relative", "--frequencies", 1), "--error relative"),
+]  # fmt: skip
+OTHERS = [
+    (("plan", "box.xml", "--gradient", "wrong.key"), "--list-parameters"),
+    (("plan", "box.xml", "--outputs", "gates"), "--gates"),
+    (("plan", "box.xml", "--outputs", "phasor"), "--frequencies"),
+    (("plan", "box.xml", "--outputs", "sound"), "--outputs"), (("cost", "box.xml", "--spp", "4,x"), "whole numbers"),
+    (("cost", "box.xml", "--spp", "0,4"), "whole numbers"), (("polish",), "No such command"),
+]  # fmt: skip
+
+
+@together("arguments, word", [*((("render", *arguments), word) for arguments, word in WRONG), *OTHERS])
+def test_errors_are_one_message_and_status_2(folder, arguments, word):
+    """In the words of the command line, before anything is rendered."""
+    (folder / "broken.xml").write_text("<scene version='3.0.0'>\n<film", encoding="utf-8")
+    (folder / "unknown.xml").write_text(SCENE.replace("transient_hdr_film", "no_such_film"), encoding="utf-8")
+    result = run(*arguments)
+    assert result.exit_code == 2 and word in result.stderr, result.output
+    assert isinstance(result.exception, SystemExit) and not list(folder.glob("*.h5"))
+    for python in ("Traceback", "tt.", "print(", "=["):
+        assert python not in result.stderr

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from support.generation_runs import data_files, finish, start_command, wait_until, workers_of
-from torchtransient.cli.main import main
+from torchtransient.__main__ import main
 from torchtransient.data import read_web_dataset
 
 VARIANT = "llvm_ad_rgb"

@@ -15,8 +15,8 @@ import pytest
 from click.testing import CliRunner
 
 from support import view_cases as cases
+from torchtransient.__main__ import main
 from torchtransient.cli import view
-from torchtransient.cli.main import main
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_refusals(files, arguments, words):
 def test_a_large_file_is_served_until_it_is_interrupted(files):
     code = (
         "import sys; from torchtransient.cli import view; view._PAGE_BYTES = 1000;"
-        "from torchtransient.cli.main import main; sys.argv = ['torchtransient', 'view', 'a.h5']; main()"
+        "from torchtransient.__main__ import main; sys.argv = ['torchtransient', 'view', 'a.h5']; main()"
     )
     assert view._PAGE_BYTES > 1e8
     # Commands of a shell may ignore interrupts, which processes hand on.

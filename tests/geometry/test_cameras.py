@@ -193,15 +193,6 @@ def test_a_path_that_is_too_short():
     assert not geometry.distance_from_opl(torch.full((2, 2), 5.0), **setting, index=1.6).isnan().any()
 
 
-@pytest.mark.parametrize("light", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
-def test_slopes_of_a_short_path_to_any_light(light):
-    """A metre across the ray, a metre ahead, at the pinhole."""
-    place = torch.tensor(light, requires_grad=True)
-    opl = torch.full((1, 1), -0.1, requires_grad=True)
-    geometry.distance_from_opl(opl, torch.eye(3), np.eye(4), light=place).nansum().backward()
-    assert place.grad.tolist() == [0, 0, 0] and opl.grad.item() == 0
-
-
 @pytest.mark.parametrize("light", [None, [0.0, 1.0, 0.0]])
 def test_nothing_flows_back_from_a_path_that_is_too_short(light):
     """Also of what the camera and the light depend on; elsewhere as if those pixels were not there."""
@@ -275,9 +266,6 @@ def test_an_index_with_a_gradient():
             assert torch.autograd.gradcheck(lambda n, there=there: there(index=n), one)
             opl = there(index=one)
             assert torch.allclose(geometry.distance_from_opl(opl, **given, index=one), depth)
-    for wrong, error in ((torch.zeros(()), UnitError), (torch.ones(5), ShapeError), (torch.tensor(1j), UnitError)):
-        with pytest.raises(error, match="index"):
-            geometry.opl_from_distance(depth, index=wrong)
 
 
 def test_camera_of_takes_values_and_their_gradients(seen):
@@ -294,54 +282,18 @@ def test_camera_of_takes_values_and_their_gradients(seen):
 
 def test_camera_of_refuses(seen):
     renderer, *_ = seen
-    with pytest.raises(ArgumentError, match="without a batch"):
+    with pytest.raises(ArgumentError):
         camera_of(renderer, {"sensor.x_fov": torch.tensor([40.0, 41.0])})
-    with pytest.raises(ArgumentError, match="a sensor from 0 to 0"):
+    with pytest.raises(ArgumentError):
         camera_of(renderer, sensor=1)
     scene = make_room()
     scene["sensor"]["type"] = "orthographic"
     del scene["sensor"]["fov"]
-    with pytest.raises(SceneError, match="OrthographicCamera"):
+    with pytest.raises(SceneError):
         camera_of(tt.TransientRenderer(tt.load(scene, variant=VARIANT)))
 
 
-MATRIX, IMAGE = torch.eye(3), torch.ones(4, 5)
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: geometry.intrinsics(180.0, (4, 5)), UnitError, "between 0 and 180 degrees"),
-        (lambda: geometry.intrinsics("wide", (4, 5)), ShapeError, "fov_deg as numbers"),
-        (lambda: geometry.intrinsics(40.0, 4), ShapeError, r"size as \(height, width\)"),
-        (lambda: geometry.intrinsics(40.0, (4, 0)), ShapeError, "whole number"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="z"), ArgumentError, "fov_axis"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", principal_point_offset=(0.1,)), ShapeError,
-         "two finite numbers"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset=(1,)), ShapeError, "crop_offset"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset=3), ShapeError, "crop_offset"),
-        (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="x", crop_offset="ab"), ShapeError, "crop_offset"),
-        (lambda: geometry.extrinsics(np.eye(3)), ShapeError, r"\(\.\.\., 4, 4\)"),
-        (lambda: geometry.extrinsics(np.diag([2.0, 2.0, 2.0, 1.0])), UnitError, "a rigid motion"),
-        (lambda: geometry.extrinsics(np.diag([-1.0, 1.0, 1.0, 1.0])), UnitError, "a rigid motion"),
-        (lambda: geometry.extrinsics(torch.full((4, 4), torch.nan)), UnitError, "a rigid motion"),
-        (lambda: geometry.to_world_from_extrinsics(np.eye(4) + np.eye(4, k=1) / 9), UnitError, "a rigid motion"),
-        (lambda: geometry.to_world_from_extrinsics(np.eye(4) + np.eye(4, k=-3)), UnitError, "a rigid motion"),
-        (lambda: geometry.ray_directions(MATRIX, 5), ShapeError, r"size as \(height, width\)"),
-        (lambda: geometry.normals_from_distance([[1.0, 2.0], [3.0, 4.0]], MATRIX), ShapeError, "floating image"),
-        (lambda: geometry.opl_from_distance([1.0, 2.0]), ShapeError, "floating image"),
-        (lambda: geometry.z_depth_from_distance(IMAGE, torch.eye(4)), ShapeError, r"\(\.\.\., 3, 3\)"),
-        (lambda: geometry.z_depth_from_distance(IMAGE, torch.zeros(3, 3)), ShapeError, "with an inverse"),
-        (lambda: geometry.z_depth_from_distance(IMAGE.long(), MATRIX), ShapeError, "floating image"),
-        (lambda: geometry.opl_from_distance(IMAGE, light=[0, 0, 1.0]), UnitError, "camera_matrix= and to_world="),
-        (lambda: geometry.opl_from_distance(IMAGE, MATRIX, np.eye(4), light=[0.0, 1.0]), ShapeError, "points"),
-        (lambda: geometry.distance_from_opl(IMAGE, index=0.0), UnitError, "index"),
-        (lambda: geometry.normals_from_distance(IMAGE[:1], MATRIX), ShapeError, "two rows"),
-    ],
-)
-def test_what_is_refused(call, error, message):
-    with pytest.raises(error, match=message):
-        call()
+IMAGE = torch.ones(4, 5)
 
 
 def test_batches():
@@ -365,5 +317,31 @@ def test_motions_are_rigid_to_the_precision_they_have(dtype, near, far):
     """Axes longer than one by 1e-4 of their square, or by four steps of the precision where that is more."""
     for length in (near, far):
         matrix = torch.diag(torch.tensor([1 + length, 1.0, 1.0, 1.0], dtype=torch.float64)).to(dtype)
-        with contextlib.nullcontext() if length == near else pytest.raises(UnitError, match="a rigid motion"):
+        with contextlib.nullcontext() if length == near else pytest.raises(UnitError):
             geometry.extrinsics(matrix)
+
+
+@together("call, error", [
+    (lambda: geometry.intrinsics(180.0, (4, 5)), UnitError), (lambda: geometry.intrinsics("wide", (4, 5)), ShapeError),
+    (lambda: geometry.intrinsics(40.0, 4), ShapeError), (lambda: geometry.intrinsics(40.0, (4, 0)), ShapeError),
+    (lambda: geometry.intrinsics(40.0, (4, 5), fov_axis="z"), ArgumentError),
+    (lambda: geometry.intrinsics(40.0, (4, 5), principal_point_offset=(0.1,)), ShapeError),
+    *((lambda crop=crop: geometry.intrinsics(40.0, (4, 5), crop_offset=crop), ShapeError) for crop in ((1,), 3, "ab")),
+    (lambda: geometry.extrinsics(np.eye(3)), ShapeError), (lambda: geometry.extrinsics(np.eye(4) / 0.5), UnitError),
+    (lambda: geometry.extrinsics(np.diag([-1.0, 1.0, 1.0, 1.0])), UnitError),
+    (lambda: geometry.extrinsics(torch.full((4, 4), torch.nan)), UnitError),
+    (lambda: geometry.to_world_from_extrinsics(np.eye(4) + np.eye(4, k=1) / 9), UnitError),
+    (lambda: geometry.ray_directions(torch.eye(3), 5), ShapeError),
+    (lambda: geometry.normals_from_distance([[1.0, 2.0], [3.0, 4.0]], torch.eye(3)), ShapeError),
+    (lambda: geometry.normals_from_distance(IMAGE[:1], torch.eye(3)), ShapeError),
+    (lambda: geometry.z_depth_from_distance(IMAGE, torch.eye(4)), ShapeError),
+    (lambda: geometry.z_depth_from_distance(IMAGE, torch.zeros(3, 3)), ShapeError),
+    (lambda: geometry.z_depth_from_distance(IMAGE.long(), torch.eye(3)), ShapeError),
+    (lambda: geometry.opl_from_distance(IMAGE, light=[0, 0, 1.0]), UnitError),
+    (lambda: geometry.opl_from_distance(IMAGE, torch.eye(3), np.eye(4), light=[0.0, 1.0]), ShapeError),
+    *((lambda index=index: geometry.opl_from_distance(IMAGE, index=index), error) for index, error in (
+        (0.0, UnitError), (torch.zeros(()), UnitError), (torch.ones(7), ShapeError), (torch.tensor(1j), UnitError))),
+])  # fmt: skip
+def test_what_is_refused(call, error):
+    with pytest.raises(error):
+        call()

@@ -1,4 +1,4 @@
-"""Hidden scenes: plain data that Mitsuba builds, meshes that are closed where they say so and face the wall."""
+"""Hidden scenes: plain data that Mitsuba builds, which faces the wall and hides parts of itself."""
 
 import pickle
 
@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.sweeps import together
 from torchtransient import scenes
 from torchtransient.capture import Wall
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.scenes import meshes
-from torchtransient.scenes.letters import OUTLINES, outline
 from torchtransient.scenes.transforms import rotate, scale, translate
 
 ALL = {
@@ -24,28 +23,16 @@ ALL = {
     "nlos_mannequin": scenes.nlos_mannequin,
     "nlos_room": scenes.nlos_room,
 }
-CLOSED = {
-    "ellipsoid": lambda: meshes.ellipsoid([1, 2, 3], [0.3, 0.2, 0.1], 2),
-    "mannequin": lambda: scenes.nlos.mannequin(1.7, 2),
-    **{letter: lambda letter=letter: meshes.solid(outline(letter), 1.0, 0.2) for letter in OUTLINES},
-    "subdivided": lambda: meshes.subdivided(meshes.solid(outline("T"), 1.0, 0.2), 2),
-}
 
 
-def volume(vertices, faces):
-    """Of a closed mesh, by the divergence theorem; positive when its normals point out."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return (np.cross(a, b) * c).sum() / 6
-
-
-def normals(vertices, faces):
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+def faces_of(shape):
+    """Areas of triangles along their normals."""
+    a, b, c = (shape["vertices"][shape["faces"][:, k]] for k in range(3))
     return np.cross(b - a, c - a) / 2
 
 
-def area_of(corners):
-    x, y = corners.T
-    return (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2
+def box(vertices):
+    return [vertices.min(0), vertices.max(0)]
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -73,74 +60,15 @@ def test_mitsuba_builds_them_where_they_are_told(name):
             np.testing.assert_allclose(table[f"{key}.vertex_positions"].value, shape["vertices"], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", CLOSED)
-def test_bodies_are_closed_and_their_normals_point_out(name):
-    vertices, faces = CLOSED[name]()
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    forward = {tuple(edge) for edge in edges.tolist()}
-    assert len(forward) == len(edges), "an edge runs one way once"
-    assert {(b, a) for a, b in forward} == forward, "and once the other way"
-    assert volume(vertices, faces) > 0
-
-
-@pytest.mark.parametrize("letter", OUTLINES)
-def test_letters_are_tiled_by_their_triangles(letter):
-    corners = outline(letter, 2.0)
-    vertices, faces = meshes.sheet(corners, 1.5)
-    assert (vertices[:, 2] == 1.5).all() and len(faces) == len(corners) - 2
-    towards = normals(vertices, faces)
-    assert (towards[:, 2] < 0).all(), "all triangles face the wall"
-    assert -towards[:, 2].sum() == pytest.approx(area_of(corners), rel=1e-12)
-    # triangles of the right total area that overlap nowhere cover the polygon
-    points = np.random.default_rng(1).uniform(-1, 1, (4000, 2))
-    a, b, c = (vertices[faces[:, k], :2] for k in (2, 1, 0))
-
-    def left_of(p, q):
-        e, d = q - p, points[:, None] - p
-        return e[:, 0] * d[..., 1] - e[:, 1] * d[..., 0] > 0
-
-    covered = (left_of(a, b) & left_of(b, c) & left_of(c, a)).sum(1)
-    assert covered.max() == 1
-    # a share of n points has the standard error sqrt(p (1 - p) / n) <= 0.0079
-    assert covered.mean() == pytest.approx(area_of(corners) / 4, abs=4 * 0.0079)
-    assert np.abs(corners).max() <= 1
-
-
-def test_the_volume_of_a_solid_letter():
-    vertices, faces = meshes.solid(outline("E"), 1.0, 0.25)
-    assert volume(vertices, faces) == pytest.approx(0.25 * area_of(outline("E")), rel=1e-12)
-    assert vertices[:, 2].min() == 1.0 and vertices[:, 2].max() == 1.25
-
-
-def test_ellipsoids():
-    radii = np.array([0.3, 0.2, 0.1])
-    for level in (0, 1, 3):
-        vertices, faces = meshes.ellipsoid([1, 2, 3], radii, level)
-        assert len(faces) == 20 * 4**level
-        np.testing.assert_allclose((((vertices - [1, 2, 3]) / radii) ** 2).sum(1), 1, atol=1e-12)
-    # what is lost to flat triangles falls by 4 with every level
-    full = 4 / 3 * np.pi * radii.prod()
-    lost = [1 - volume(*meshes.ellipsoid([0, 0, 0], radii, level)) / full for level in (2, 3, 4)]
-    assert lost[0] / lost[1] == pytest.approx(4, rel=0.05) and lost[1] / lost[2] == pytest.approx(4, rel=0.02)
-
-
-def test_subdivision_keeps_the_surface():
-    mesh = meshes.sheet(outline("K"))
-    fine = meshes.subdivided(mesh, 2)
-    assert len(fine[1]) == 16 * len(mesh[1])
-    np.testing.assert_allclose(normals(*fine).sum(0), normals(*mesh).sum(0), atol=1e-12)
-    np.testing.assert_array_equal(fine[0][: len(mesh[0])], mesh[0])
-
-
 @pytest.mark.parametrize("name", ["nlos_z", "nlos_plates", "nlos_corner"])
 def test_flat_parts_face_the_wall(name):
     for shape in ALL[name]().values():
-        assert (normals(shape["vertices"], shape["faces"])[:, 2] < 0).all()
+        assert (faces_of(shape)[:, 2] < 0).all()
 
 
 def test_the_corner_is_a_right_angle_and_partly_hidden():
     shapes = scenes.nlos_corner(1.0, 1.0)
-    left, right = (normals(shapes[k]["vertices"], shapes[k]["faces"]).sum(0) for k in ("left", "right"))
+    left, right = (faces_of(shapes[k]).sum(0) for k in ("left", "right"))
     assert left @ right == pytest.approx(0, abs=1e-12)
     corners = np.concatenate([s["vertices"][s["faces"]] for s in shapes.values()])
     _, index = first_hits(np.array([[0.3, 0.2, 0.0], [0.3, -0.2, 0.0]]), np.array([0.0, 0, 1.0]), corners)
@@ -159,8 +87,6 @@ def test_the_mannequin_hides_parts_of_itself():
     _, behind = first_hits(shoulder, ahead, without)
     assert behind[0] // count == 1, "and hides the trunk"
     assert np.ptp(body["vertices"][:, 1]) == pytest.approx(1.45, rel=2e-3)
-    with pytest.raises(SceneError, match="reach of the arm"):
-        scenes.nlos_mannequin(depth=0.4)
 
 
 @pytest.mark.parametrize("size", [{}, {"width": 2.4, "height": 2.2, "depth": 2.4}, {"width": 6.0, "depth": 8.0}])
@@ -205,26 +131,61 @@ def test_bounds_are_those_of_mitsuba():
     np.testing.assert_allclose(scenes.bounds({"d": shapes["disk"]}), [rim.min(0), rim.max(0)], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: scenes.nlos_letter("A"), ArgumentError, "expected one of C, E"),
-        (lambda: scenes.nlos_letter(size=0.0), UnitError, "size"),
-        (lambda: scenes.nlos_letter(thickness=-1.0), UnitError, "thickness"),
-        (lambda: scenes.nlos_plates(gap=0.0), UnitError, "gap"),
-        (lambda: scenes.nlos_z(albedo=1.2), UnitError, "albedo"),
-        (lambda: scenes.nlos_room(depth=1.0), UnitError, "depth beyond the 2.4 m"),
-        (lambda: scenes.relay_wall(-1.0), UnitError, "width"),
-        (lambda: scenes.triangle_mesh(np.zeros((3, 2)), [[0, 1, 2]]), ShapeError, r"\(V, 3\)"),
-        (lambda: scenes.triangle_mesh(np.zeros((3, 3)), [[0, 1, 3]]), ShapeError, "whole numbers from 0 to 2"),
-        (lambda: scenes.bounds({}), SceneError, "without any"),
-        (lambda: scenes.bounds({"a": {"type": "obj"}}), SceneError, "'obj' at a"),
-        (lambda: meshes.sheet(outline("T")[::-1]), SceneError, "against the clock"),
-        (lambda: meshes.sheet([[0, 0], [1, 0]]), ShapeError, "three corners"),
-        (lambda: meshes.sheet([[0, 0], [2, 0], [2, 2], [1, -1], [0, 2]]), SceneError, "cross or touch"),
-        (lambda: meshes.sheet([[0, 0], [2, 0], [2, 2], [1, 0], [0, 2]]), SceneError, "cross or touch"),
-    ],
-)
-def test_what_is_refused(make, error, message):
-    with pytest.raises(error, match=message):
+def test_boxes_of_shapes():
+    moved = translate([1, 2, 3]) @ rotate([0, 0, 1], 90) @ scale([2.0, 3.0, 4.0])
+    for shape, expected in (
+        ({"type": "rectangle"}, [[-3, -2, 0], [3, 2, 0]]), ({"type": "cube"}, [[-3, -2, -4], [3, 2, 4]]),
+        ({"type": "disk"}, [[-3, -2, 0], [3, 2, 0]]),
+        ({"type": "sphere", "radius": 0.5}, [[-1.5, -1, -2], [1.5, 1, 2]]),
+        ({"type": "sphere", "center": [1, 0, 2]}, [[-3, 0, 4], [3, 4, 12]]),
+        ({"type": "mesh_arrays", "vertices": [[1, 0, 0], [0, 1, 1], [1, 1, 0]]}, [[-3, 0, 0], [0, 2, 4]]),
+    ):  # fmt: skip
+        found = scenes.bounds({"a": {**shape, "to_world": moved}})
+        np.testing.assert_allclose(found, np.add(expected, [1, 2, 3]), atol=1e-12)
+    both = scenes.bounds({"a": {"type": "cube"}, "b": {"type": "sphere", "center": [5, -3, 0]}, "name": "text"})
+    np.testing.assert_allclose(both, [[-1, -4, -1], [6, 1, 1]])
+
+
+def test_plates_and_corners():
+    plates = scenes.nlos_plates(size=0.5, depth=0.75, gap=0.25, second_size=2.0)
+    np.testing.assert_allclose(box(plates["front"]["vertices"]), [[-0.25, -0.25, 0.75], [0.25, 0.25, 0.75]])
+    np.testing.assert_allclose(box(plates["back"]["vertices"]), [[-1, -1, 1], [1, 1, 1]])
+    same = scenes.nlos_plates(size=0.5)
+    assert np.ptp(same["back"]["vertices"][:, 0]) == pytest.approx(0.5)
+    corner = scenes.nlos_corner(2.0, 3.0)
+    np.testing.assert_allclose(box(corner["left"]["vertices"]), [[-1, -1, 3], [0, 1, 4]])
+    np.testing.assert_allclose(box(corner["right"]["vertices"]), [[0, -1, 3], [1, 1, 4]])
+    for name in ("left", "right"):
+        vertices = corner[name]["vertices"]
+        assert set(vertices[vertices[:, 0] == 0][:, 2]) == {4}
+    np.testing.assert_allclose(box(corner["small"]["vertices"]), [[0.35, 0.15, 2.8], [0.85, 0.65, 2.8]], atol=1e-12)
+    letter = scenes.nlos_letter("L", size=2.0, depth=1.5, thickness=0.25)["letter"]["vertices"]
+    np.testing.assert_allclose(box(letter), [[-1, -1, 1.5], [1, 1, 1.75]])
+    wall = scenes.relay_wall(3.0, 2.0)
+    np.testing.assert_allclose(wall["to_world"], np.diag([1.5, 1, 1, 1]))
+
+
+def test_the_arm_reaches_up_to_the_wall():
+    """0.51 m of a body of 1.41 m."""
+    for height in (1.41, 2.82):
+        reach = 0.51 * height / 1.41
+        scenes.nlos_mannequin(depth=reach * (1 + 1e-9), height=height, level=1)
+        with pytest.raises(SceneError):
+            scenes.nlos_mannequin(depth=reach * (1 - 1e-9), height=height, level=1)
+
+
+@together("make, error", [
+    (lambda: scenes.nlos_letter("A"), ArgumentError), (lambda: scenes.nlos_letter(size=0.0), UnitError),
+    (lambda: scenes.nlos_letter(thickness=-1.0), UnitError), (lambda: scenes.nlos_plates(gap=0.0), UnitError),
+    (lambda: scenes.nlos_z(albedo=1.2), UnitError), (lambda: scenes.relay_wall(-1.0), UnitError),
+    *((lambda name=name, least=least: scenes.nlos_room(**{name: least - 1e-6}, level=0), UnitError)
+      for name, least in (("width", 2.4), ("height", 2.2), ("depth", 2.4))),
+    (lambda: scenes.bounds({}), SceneError), (lambda: scenes.bounds({"a": {"type": "obj"}}), SceneError),
+    (lambda: scenes.bounds([{"type": "sphere"}]), SceneError),
+    *((lambda shape=shape: scenes.bounds({"it": shape}), ShapeError) for shape in (
+        {"type": "mesh_arrays"}, {"type": "mesh_arrays", "vertices": np.zeros((3, 2))},
+        {"type": "mesh_arrays", "vertices": np.zeros((0, 3))}, {"type": "sphere", "center": [1.0, 2.0]})),
+])  # fmt: skip
+def test_what_is_refused(make, error):
+    with pytest.raises(error):
         make()

@@ -9,6 +9,12 @@ import torch
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
+from torchtransient.files.captures.formats import LAYOUTS
+from torchtransient.files.captures.matlab import write_mat as write_mat
+
+# Endings of files by layout, and the layouts that are written.
+ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
+WRITTEN = ["torchtransient", *(layout.name for layout in LAYOUTS if layout.write is not None)]
 
 AXIS = TimeAxis(1.1, 0.003, 7)
 FROM_ZERO = TimeAxis(0.0, 0.003, 7)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.array_files import hdf5_writing
+from torchtransient.array_files import hdf5
 from torchtransient.data import Sample
 from torchtransient.errors import SceneError
 
@@ -120,7 +120,7 @@ def _slow_down(seconds):
             time.sleep(seconds)
             return super().write(data)
 
-    hdf5_writing._Sink = Slow
+    hdf5._Sink = Slow
 
 
-_FAST = hdf5_writing._Sink
+_FAST = hdf5._Sink

@@ -10,11 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from support.capture_files import chip_frames, holdable, read_only, zone_frame
-from torchtransient.files.captures.formats import LAYOUTS
-from torchtransient.files.captures.mat_file import write_mat
+from support.capture_files import ENDINGS, chip_frames, holdable, read_only, write_mat, zone_frame
 
-ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )

@@ -132,7 +132,7 @@ def _foreign(layout: str) -> Reader:
 
         from support.capture_files import chip_frames, holdable, read_only, zone_frame
         from support.hostile_captures import ENDINGS, old_mat
-        from torchtransient.files.captures.mat_file import write_mat
+        from torchtransient.files.captures.matlab import write_mat
 
         found = []
         for number, (name, _, capture) in enumerate(holdable()):

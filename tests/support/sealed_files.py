@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.array_files.checksums import CHECKSUMS
+from torchtransient.array_files.array_file import CHECKSUMS
 
 
 def as_first_version(path: Path) -> Path:

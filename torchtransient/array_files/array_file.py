@@ -1,12 +1,19 @@
 """Arrays and entries by name in one file: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Entries are attributes of an HDF5 file and zero-dimensional arrays of an `.npz`. Large arrays are written in parts, so
-that no second copy of them is needed, and a file takes its place once it is whole. It carries a checksum of everything
-that it holds (`checksums.py`); files of the first version, which have none, are read without a word.
+that no second copy of them is needed, and a file takes its place once it is whole.
+
+Every file has a checksum of all that it holds, as one text, JSON: ``{"entries": {name: digest}, "arrays": {name:
+[rows, digest]}}``, digests in hexadecimal. A digest is the SHA-256 of the value's dtype, little-endian, and its shape
+(of texts the text alone), then of its bytes in order; arrays of two and more dimensions are taken ``rows`` of their
+last but one axis at a time, so that large ones are hashed as they are written. Files of the first version have none
+and are read without a warning.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import struct
 import tokenize
@@ -21,9 +28,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.array_files.checksums import CHECKSUMS, Digest, array_digest, check, checksums_text, parts_of
-from torchtransient.array_files.hdf5_limits import check_size, read_attributes, read_dataset
-from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.hdf5 import check_size, hdf5_package, new_hdf5, read_attributes, read_dataset
 from torchtransient.array_files.part_files import replacing as replacing
 from torchtransient.checks import check_folder as check_folder
 from torchtransient.checks import check_source as check_source
@@ -31,6 +36,7 @@ from torchtransient.checks import path_of as path_of
 from torchtransient.checks import short_message, shown
 from torchtransient.errors import StorageError, TorchTransientError
 
+CHECKSUMS = "checksums"
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
 # What reads the library's kinds of files.
@@ -48,9 +54,15 @@ _DAMAGED = (
 
 
 def check_target(path: str | Path, what: str) -> Path:
-    """Return `path`, or raise StorageError when a file could not be written there. For before long computations.
+    """Return the path of a new file after checking that it can be written, for before long computations.
 
-    `what`: what the file is, for messages.
+    Args:
+        path: place of the file, ending in .h5, .hdf5 or .npz.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for another ending, and a folder that is missing or closed.
+        MissingPackageError: for HDF5 without h5py.
     """
     target = path_of(path, what)
     if target.suffix.lower() not in ENDINGS:
@@ -62,8 +74,16 @@ def check_target(path: str | Path, what: str) -> Path:
 
 
 def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping[str, Any], what: str) -> None:
-    """Write a file that was checked. One that is there is replaced once the new one is complete. Raises StorageError
-    for a full disk.
+    """Write arrays and entries; a file that is there is replaced once the new one is complete.
+
+    Args:
+        target: checked path.
+        arrays: arrays by name.
+        entries: numbers and texts by name.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for a full disk.
     """
     with replacing(target, what) as unfinished:
         if target.suffix.lower() in HDF5:
@@ -78,10 +98,19 @@ def write_arrays(target: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapp
 
 
 def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callable[[str], bool]) -> dict[str, Any]:
-    """Arrays and entries by name, of the names that are ``known``, of a file whose entry `format` is one of `forms`.
-    They are compared with their checksums, which files of the first version of a format do not have.
+    """Read a file of this library and compare it with its checksums.
 
-    Raises StorageError for a file that is missing, of another format, or damaged.
+    Args:
+        path: the file.
+        forms: formats that are read, values of its entry `format`, the current one last.
+        what: subject of messages.
+        known: predicate of names that are read; others are left alone.
+
+    Returns:
+        Arrays and entries by name.
+
+    Raises:
+        StorageError: for a file that is missing, of another format, or damaged.
     """
     source = path_of(path, what)
     if source.suffix.lower() not in ENDINGS:
@@ -96,9 +125,19 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
 
 
 def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "a file of arrays") -> dict[str, Any]:
-    """Arrays and entries of the names that are ``known``, of a file of any program. Files of this library that have
-    checksums are compared with them. ``kind``: what is expected, for messages. Raises StorageError for what is missing,
-    damaged or too large.
+    """Read arrays and entries of a file of any program.
+
+    Args:
+        path: the file.
+        what: subject of messages.
+        known: predicate of names that are read.
+        kind: expected kind of file, for messages.
+
+    Returns:
+        Arrays and entries by name, compared with checksums where the file has them.
+
+    Raises:
+        StorageError: for a file that is missing, damaged or too large.
     """
     check_source(path, what)
     with damage_said(path, what, kind):
@@ -106,7 +145,15 @@ def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "
 
 
 def read_npy(path: Path, what: str) -> NDArray[Any]:
-    """The array of a `.npy`. Raises StorageError for what is none, for objects, and for more than the file holds."""
+    """Read the array of a `.npy`.
+
+    Args:
+        path: the file.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for other files, objects, and arrays larger than the file.
+    """
     check_source(path, what)
     with damage_said(path, what, "an array of NumPy"), path.open("rb") as stream:
         _check_array(stream, path.stat().st_size, f"{what}: '{path}'", packed=False)
@@ -116,7 +163,7 @@ def read_npy(path: Path, what: str) -> NDArray[Any]:
 
 
 def _format_of(source: Path, what: str) -> str:
-    """What a file says that it is, "" where it says nothing."""
+    """Return the entry `format` of a file, "" without one."""
     found = _read(source, what, "format".__eq__).get("format", "")
     return str(np.asarray(found).reshape(-1)[0]) if np.size(found) else ""
 
@@ -136,7 +183,12 @@ def _read(source: Path, what: str, known: Callable[[str], bool]) -> dict[str, An
 
 
 def other_kind(found: str, form: str) -> str:
-    """What a file is that is not of the format ``form``, and what reads it: the end of a message."""
+    """Return the end of a message about a file of another format.
+
+    Args:
+        found: format of the file.
+        form: format that was expected.
+    """
     kind = found.rpartition(" ")[0]
     if kind == form.rpartition(" ")[0] or kind not in READERS:
         return f"of format {shown(found)}; this version reads '{form}'."
@@ -145,8 +197,16 @@ def other_kind(found: str, form: str) -> str:
 
 @contextmanager
 def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
-    """Errors of readers, and of what is made of what they read, as StorageError. ``kind``: what was expected of a file
-    of another program, where the library's own errors are repeated as they are: arguments may have been wrong.
+    """Turn errors of readers, and of records made from what they read, into StorageError.
+
+    Args:
+        source: the file.
+        what: subject of messages.
+        kind: expected kind of a file of another program, "" for files of this library. With it, typed errors keep
+            their message, since arguments may have been wrong.
+
+    Raises:
+        StorageError: for damage and for too little memory.
     """
     try:
         yield
@@ -162,8 +222,14 @@ def damage_said(source: Path, what: str, kind: str = "") -> Iterator[None]:
 
 
 def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
-    """A tensor as an array on the CPU. Raises StorageError for dtypes that NumPy does not have, and for tensors whose
-    numbers do not stand in memory one behind another.
+    """Return a tensor as an array on the CPU, on its memory where it lies there.
+
+    Args:
+        tensor: any device, with or without gradient.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for dtypes that NumPy does not have, and for sparse and meta tensors.
     """
     if tensor.layout != torch.strided or tensor.device.type == "meta":
         raise StorageError(
@@ -183,7 +249,11 @@ def _lacking(tensor: torch.Tensor) -> str:
 
 
 def tensor_in(array: Any) -> torch.Tensor:
-    """An array of a file as a tensor, on its memory where its bytes have this machine's order."""
+    """Return an array of a file as a tensor, on its memory if its bytes have this machine's order.
+
+    Args:
+        array: numbers.
+    """
     found = np.asarray(array)
     return torch.from_numpy(found.astype(found.dtype.newbyteorder("="), copy=False))
 
@@ -206,7 +276,7 @@ def _write_hdf5(path: Path, arrays: Mapping[str, NDArray[Any]], entries: Mapping
 
 
 def _rows(array: NDArray[Any]) -> int:
-    """So many rows of an image are written at a time."""
+    """Return the number of rows of an image that are written at a time."""
     return max(1, _PART_BYTES * array.shape[-2] // max(1, array.nbytes)) if array.ndim >= 2 else 1
 
 
@@ -217,8 +287,19 @@ def _read_hdf5(path: Path, what: str, known: Callable[[str], bool]) -> dict[str,
 
 
 def read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
-    """Arrays of the names that are ``known``. Raises StorageError for pickles, for names that stand twice, and for
-    more numbers than a file can hold; and what the packages raise of damage.
+    """Read arrays of an `.npz`.
+
+    Args:
+        path: the file.
+        what: subject of messages.
+        known: predicate of names that are read.
+
+    Returns:
+        Arrays by name.
+
+    Raises:
+        StorageError: for pickles, names that stand twice, and more numbers than the file can hold. Other damage raises
+            the errors of zipfile and NumPy.
     """
     found: dict[str, Any] = {}
     with zipfile.ZipFile(path) as file:
@@ -234,9 +315,17 @@ def read_npz(path: Path, what: str, known: Callable[[str], bool]) -> dict[str, A
 
 
 def npz_shapes(path: Path, what: str) -> dict[str, tuple[int, ...] | None]:
-    """The shape of each array by its name, None for what is none. Pickles have one too, and of names that stand twice
-    it is the last one's. Raises StorageError for arrays of a version that NumPy writes for no numbers, and what the
-    packages raise of damage.
+    """Return the shape of each array of an `.npz` by its name, None for other members.
+
+    Args:
+        path: the file.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for arrays of versions that NumPy does not write for numbers. Other damage raises the errors of
+            zipfile and NumPy.
+
+    Pickles have a shape too; of names that stand twice the last one's is returned.
     """
     found: dict[str, tuple[int, ...] | None] = {}
     with zipfile.ZipFile(path) as file:
@@ -250,7 +339,7 @@ def npz_shapes(path: Path, what: str) -> dict[str, tuple[int, ...] | None]:
 
 
 def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size: int) -> None:
-    """Compare the shape that an array declares with what is stored of it, before there is memory for it."""
+    """Compare the shape that an array declares with its stored bytes, before there is memory for it."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise StorageError(f"{what} is packed as NumPy packs nothing (method {entry.compress_type}). Use np.savez.")
     # What it says of its size, but no more than there is.
@@ -259,7 +348,7 @@ def _check_member(file: zipfile.ZipFile, entry: zipfile.ZipInfo, what: str, size
 
 
 def _head(stream: Any, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and kind of the numbers of an array that begins here."""
+    """Return shape and dtype of the array that begins here."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(stream)
     if version not in read_header:
@@ -269,7 +358,7 @@ def _head(stream: Any, what: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) -> None:
-    """Compare what the head of an array declares with the bytes that are ``stored`` of it."""
+    """Compare the head of an array with the bytes that are ``stored`` of it."""
     shape, dtype = _head(stream, what)
     if dtype.kind not in "biufcU":
         raise StorageError(f"{what} holds {str(dtype)[:60]}; expected numbers or a text. No pickle is read.")
@@ -277,3 +366,107 @@ def _check_array(stream: Any, stored: int, what: str, *, packed: bool = True) ->
     if not packed and declared > stored:
         raise StorageError(f"{what} declares {declared:,} bytes of numbers and stores {stored:,}: it is damaged.")
     check_size(declared, stored, f"{what} {shape}")
+
+
+# ------------------------------------------------------------------------------------------------------------ checksums
+
+
+class Digest:
+    """Checksum of an array that comes in parts."""
+
+    def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        self._found = hashlib.sha256(f"{dtype.newbyteorder('<').str}{tuple(shape)}".encode())
+
+    def add(self, part: NDArray[Any]) -> None:
+        """Add the next part."""
+        little = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
+        self._found.update(little.reshape(-1).view(np.uint8).data)
+
+    def text(self) -> str:
+        """Return the digest of all parts, hexadecimal."""
+        return self._found.hexdigest()
+
+
+def parts_of(shape: tuple[int, ...], rows: int) -> Iterator[Any]:
+    """Yield indices of some rows of an image at a time.
+
+    Films keep H first in memory, so parts are read in order, and they alone are copied.
+
+    Args:
+        shape: shape of the array, (..., H, W).
+        rows: rows of a part.
+    """
+    if len(shape) < 2:
+        yield ...
+        return
+    for row in range(0, shape[-2], rows):
+        yield ..., slice(row, row + rows), slice(None)
+
+
+def array_digest(array: NDArray[Any], rows: int) -> str:
+    """Return the digest of an array.
+
+    Args:
+        array: numbers.
+        rows: rows that are hashed at a time.
+    """
+    found = Digest(array.dtype, array.shape)
+    for part in parts_of(array.shape, rows):
+        found.add(array[part])
+    return found.text()
+
+
+def entry_digest(value: Any) -> str:
+    """Return the digest of a number or a text.
+
+    Args:
+        value: number, text, or array of one.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind in "UO":
+        return hashlib.sha256(b"text" + str(array.reshape(-1)[0]).encode("utf-8", "surrogatepass")).hexdigest()
+    return array_digest(array, max(1, array.size))
+
+
+def checksums_text(entries: Mapping[str, Any], arrays: Mapping[str, tuple[int, str]]) -> str:
+    """Return the text of checksums that stands in a file.
+
+    Args:
+        entries: numbers and texts by name.
+        arrays: rows and digests by name.
+    """
+    digests = {name: entry_digest(value) for name, value in entries.items()}
+    return json.dumps({"entries": digests, "arrays": {name: list(found) for name, found in arrays.items()}})
+
+
+def check(values: Mapping[str, Any], text: Any, what: str, known: Callable[[str], bool]) -> None:
+    """Compare arrays and entries with the checksums of their file.
+
+    Args:
+        values: what was read, by name.
+        text: checksums of the file.
+        what: subject of messages.
+        known: predicate of names that were read.
+
+    Raises:
+        StorageError: for a value that differs, is missing or was added.
+    """
+    try:
+        stored = json.loads(str(np.asarray(text).reshape(-1)[0]))
+        entries, arrays = dict(stored["entries"]), {name: (int(n), str(d)) for name, (n, d) in stored["arrays"].items()}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError, IndexError):
+        raise StorageError(f"{what}: the checksums cannot be read: the file is damaged. Take a copy of it.") from None
+    for name in sorted({name for name in (*entries, *arrays) if known(name)} ^ set(values)):
+        lacking = "is missing" if name not in values else "was put there later: it has no checksum"
+        raise StorageError(f"{what}: '{name[:40]}' {lacking}. The file is damaged, or another program has changed it.")
+    for name, value in values.items():
+        if name in arrays:
+            rows, expected = arrays[name]
+            found = array_digest(np.asarray(value), rows) if rows >= 1 else ""
+        else:
+            expected, found = entries[name], entry_digest(value)
+        if found != expected:
+            raise StorageError(
+                f"{what}: '{name}' is not what was written (its SHA-256 differs): the file is damaged, or another "
+                "program has changed it. Take a copy, or read what is left with h5py or numpy."
+            )

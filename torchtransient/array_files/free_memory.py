@@ -6,8 +6,8 @@ from pathlib import Path
 
 
 def available_memory() -> int | None:
-    """Bytes that this process can still take, within the limit of its container too; None where the system does not
-    say.
+    """Return the bytes that this process can still take, within the limit of its container; None if the system has
+    no figure.
     """
     limits = [limit for limit in (_meminfo_available(), _cgroup_available()) if limit is not None]
     return min(limits) if limits else None

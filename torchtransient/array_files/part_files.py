@@ -1,5 +1,5 @@
-"""Files that appear whole or not at all. What is unfinished lies beside its place, locked by the process that writes
-it, so that what a killed one left can be told from what another one is writing.
+"""Files that appear whole or not at all. An unfinished file lies beside its place, locked by the process that writes
+it, so that leftovers of killed processes can be told from files that are being written.
 """
 
 from __future__ import annotations
@@ -28,19 +28,34 @@ _unfinished: set[Path] = set()
 
 
 def check_system(what: str) -> None:
-    """Raise StorageError where files can be neither locked nor replaced while they are open."""
+    """Check that files can be locked, and replaced while they are open.
+
+    Args:
+        what: subject of messages.
+
+    Raises:
+        StorageError: on Windows.
+    """
     if platform.system() == "Windows":
         raise StorageError(f"{what}: files and data sets are written on Linux and macOS, this is Windows.")
 
 
 @contextmanager
 def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool = True) -> Iterator[Path]:
-    """A locked neighbour of `target`, on the disk and in its place when the block has succeeded, removed when it
-    failed.
+    """Write a locked neighbour of a file, which takes its place when the block succeeds and is removed when it fails.
 
-    ``over``: in place of one that is there; otherwise, that one stays. ``synchronized``: the file and its folder are
-    on the disk before it ends, so that what is in its place survives a loss of power, which takes 10 ms. Raises
-    StorageError for a disk that is full or closed to us and on Windows; errors of the block stay what they are.
+    Args:
+        target: place of the file.
+        what: subject of messages.
+        over: replace a file that is there; otherwise that one stays.
+        synchronized: have file and folder on the disk before it ends, so that they survive a loss of power; takes 10
+            ms.
+
+    Yields:
+        Path of the neighbour.
+
+    Raises:
+        StorageError: for a full or closed disk, and on Windows; errors of the block stay as they are.
     """
     check_system(what)
     with writing_said(target, what):
@@ -62,7 +77,12 @@ def whole_file(target: Path, what: str, *, over: bool = True, synchronized: bool
 
 @contextmanager
 def writing_said(target: Path, what: str) -> Iterator[None]:
-    """Errors of the disk as StorageError."""
+    """Turn errors of the disk into StorageError.
+
+    Args:
+        target: file that is written.
+        what: subject of messages.
+    """
     try:
         yield
     except OSError as error:
@@ -71,8 +91,14 @@ def writing_said(target: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def replacing(target: Path, what: str) -> Iterator[Path]:
-    """A temporary neighbour of `target` that takes its place when the block succeeds and disappears when it fails. Of a
-    link, the file that it points to is replaced; permissions stay.
+    """Write a temporary neighbour of a file that takes its place when the block succeeds and disappears when it fails.
+
+    Args:
+        target: place of the file. Of a link, the file that it points to is replaced; permissions stay.
+        what: subject of messages.
+
+    Yields:
+        Path of the neighbour.
     """
     place = Path(os.path.realpath(target))
     sweep_parts(place.parent)
@@ -83,19 +109,32 @@ def replacing(target: Path, what: str) -> Iterator[Path]:
 
 
 def write_text(path: Any, text: str, what: str) -> None:
-    """Write a file of text, whole or not at all. Raises StorageError for a place that cannot be written, and for a full
-    disk, which leaves the old file.
+    """Write a file of text, whole or not at all.
+
+    Args:
+        path: place of the file.
+        text: its content, written as UTF-8.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for a place that cannot be written, and a full disk, which leaves the old file.
     """
     with replacing(check_folder(path, what), what) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
 
 def sweep_parts(folder: str | Path) -> list[Path]:
-    """Remove what writers that are gone left unfinished in a folder. Returns what was removed.
+    """Remove unfinished files of processes that have ended.
 
-    Files whose writer lives are locked and stay; those of writers on other machines too, where the file system carries
-    locks between machines (NFS from version 4 on does). Where it has no locks at all, everything stays. So does what
-    has another kind of name, and what is not ours to open.
+    Args:
+        folder: folder that is searched.
+
+    Returns:
+        Paths that were removed.
+
+    Files whose writer lives are locked and stay; those of writers on other machines too, if the file system carries
+    locks between machines (NFS from version 4 on does). Without locks everything stays. So do files with other names,
+    and files that may not be opened.
     """
     removed = []
     for path in sorted(Path(folder).glob(f".*{_SUFFIX}")):
@@ -115,7 +154,7 @@ def sweep_parts(folder: str | Path) -> list[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove what this process is writing: for one that ends at once, without its ``finally``."""
+    """Remove the files that this process is writing, for a process that ends at once, without its ``finally``."""
     for path in tuple(_unfinished):
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -147,7 +186,7 @@ def _locked(target: Path) -> tuple[Path, int]:
 
 
 def _lock(descriptor: int) -> str:
-    """Lock an open file; whose it is then: "ours", "theirs", or "nobody's" where there are no locks."""
+    """Lock an open file and return its owner: "ours", "theirs", or "nobody's" on file systems without locks."""
     import fcntl
 
     try:

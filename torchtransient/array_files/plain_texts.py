@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from torchtransient.checks import check_special, path_of, short_message
-from torchtransient.errors import StorageError, TorchTransientError
+from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 
 MOST_LEVELS = 100
 # Most nodes of a text with fewer characters, once aliases are expanded.
 _NODES = 2**16
+# Ground truth of 1024 x 1024 points with normals takes 43 MB as text.
+_CHARACTERS = 2**27
 _WITHOUT_POINT = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 # Errors of PyYAML's constructors and Python's parsers for texts in another format.
 _WRONG = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RecursionError, MemoryError)
@@ -41,7 +43,15 @@ def text_of_file(path: Any, what: str) -> str:
 
 
 def json_data(text: str | bytes, what: str) -> Any:
-    """Return the data of a JSON text. Raises StorageError; ``what``: subject of its message."""
+    """Return the data of a JSON text.
+
+    Args:
+        text: the text.
+        what: subject of messages.
+
+    Raises:
+        StorageError: for other texts.
+    """
     try:
         return json.loads(text)
     except _WRONG as error:
@@ -74,13 +84,93 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
         raise StorageError(f"{what}: expected YAML, got what cannot be read: {short_message(error)}.") from error
 
 
+def read_plain_yaml(text: str, what: str) -> Any:
+    """Return the data of a YAML text with any tags, which are left out.
+
+    Args:
+        text: the text.
+        what: subject of messages.
+
+    Returns:
+        Mappings, lists, texts and numbers as they stand under tags such as ``!!python/object``; nothing is executed.
+
+    Raises:
+        StorageError: for texts in another format, of more than 2^27 characters, more than 2^16 nodes with aliases
+            expanded, or more than 100 levels.
+        MissingPackageError: without PyYAML.
+    """
+    yaml = yaml_package(what)
+    if len(text) > _CHARACTERS:
+        raise StorageError(f"{what}: expected a YAML text below {_CHARACTERS:,} characters, got {len(text):,}.")
+    return yaml_data(text, what, yaml, _lenient_loader(yaml), _NODES)
+
+
+def write_plain_yaml(data: Any, what: str) -> str:
+    """Return plain data as YAML text that y-tal's loader reads as well.
+
+    Args:
+        data: mappings, lists, texts and numbers.
+        what: subject of messages.
+
+    Raises:
+        MissingPackageError: without PyYAML.
+    """
+    text: str = yaml_package(what).safe_dump(data, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def _lenient_loader(yaml: Any) -> Any:
+    """Return a loader that reads all tags as the plain data under them."""
+    class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
+        """Plain data only."""
+
+    def plain(loader: Any, _suffix: str, node: Any) -> Any:
+        if isinstance(node, yaml.MappingNode):
+            return loader.construct_mapping(node, deep=True)
+        if isinstance(node, yaml.SequenceNode):
+            return loader.construct_sequence(node, deep=True)
+        return loader.construct_scalar(node)
+
+    for tag in ("timestamp", "binary"):  # JSON has neither dates nor bytes
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
+    for tag in ("set", "omap", "pairs"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
+    Loader.add_multi_constructor("", plain)
+    return Loader
+
+
+def yaml_package(what: str) -> Any:
+    """Return the module yaml.
+
+    Args:
+        what: subject of messages.
+
+    Raises:
+        MissingPackageError: if PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
+        ) from error
+    return yaml
+
+
 def safe_loader(yaml: Any) -> Any:
-    """Return the loader of PyYAML that makes plain data only, the one in C if it is installed."""
+    """Return the loader of PyYAML that makes plain data only, the one in C if it is installed.
+
+    Args:
+        yaml: the package PyYAML.
+    """
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def reads_exponents(loader: Any) -> Any:
     """Return a loader class of PyYAML after changing it to read plain 1e-10 as a number, as JSON and YAML 1.2 do.
+
+    Args:
+        loader: class of PyYAML.
 
     Quoted 1e-10 stays a text. PyYAML follows YAML 1.1, where a number needs a point.
     """

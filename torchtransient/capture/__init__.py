@@ -1,5 +1,6 @@
-"""Captures around a corner: which points of a relay wall are lit and seen (`Scan`), on which surface they lie (`Wall`),
-and what was measured there (`Capture`). Plain tensors and numbers; how captures are simulated stands in `nlos`.
+"""Captures around a corner: points of a relay wall that are lit and seen (`Scan`), the surface that they lie on
+(`Wall`), and the light that was measured there (`Capture`). Plain tensors and numbers; captures are simulated in
+`nlos`.
 """
 
 from torchtransient.capture.capture import Capture as Capture

@@ -1,9 +1,10 @@
-"""What was measured on a relay wall, as tensors."""
+"""Light that was measured on a relay wall, as tensors with a scan and an axis."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,20 +14,21 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.capture.arithmetic import summed
-from torchtransient.capture.files import reader, writer
-from torchtransient.capture.metadata import metadata_text
 from torchtransient.capture.scan import Scan, laser_index
 from torchtransient.checks import arguments_of, finite, flag, of_class, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 from torchtransient.tensor_record import TensorRecord
 
 _CHANNEL_AND_TIME = 2
+# `tt.nlos.read_capture` and `tt.nlos.write_capture`, which stand above.
+ReadsCaptures = Callable[..., Any]
+WritesCaptures = Callable[..., Path]
+_files: list[tuple[ReadsCaptures, WritesCaptures]] = []
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Capture(TensorRecord):
-    """A capture around a corner: the light that leaves each sensor point of `scan` towards the sensor's origin.
+    """Capture around a corner: light that leaves each sensor point of `scan` towards the sensor's origin.
 
     Either or both of
 
@@ -36,16 +38,16 @@ class Capture(TensorRecord):
       ``exp(-2 pi i nu (opl - start_opl))``.
 
     ``steady``: (C, ...) without the time, all light. ``polarized``: the four Stokes components come before C in all of
-    them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (what
-    JSON can hold; names are texts, tuples come back as lists); that of a batch is a list under ``batch``. ``axis`` is
-    in metres of optical path, counted as the scan's ``first_and_last_leg`` says.
+    them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (data
+    that JSON can hold; names are texts, tuples come back as lists); that of a batch is a list under ``batch``. ``axis``
+    is in metres of optical path, counted as the scan's ``first_and_last_leg`` says.
 
-    Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory where they can.
-    Two captures are equal when all but ``metadata`` is.
+    Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory if possible.
+    Two captures are equal if all but ``metadata`` is.
 
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in results of renders: they concern the measured
-    tensors, and ``detach`` the scan's points too; the scan stays where it is, as the axes do
-    (``capture.scan.to(device)`` moves it). Raises ShapeError where tensors, scan and axis do not fit or nothing was
+    tensors, and ``detach`` the scan's points too; the scan stays on its device, as the axes do
+    (``capture.scan.to(device)`` moves it). Raises ShapeError if tensors, scan and axis do not fit or nothing was
     measured, StorageError for metadata that is not plain.
     """
 
@@ -108,11 +110,12 @@ class Capture(TensorRecord):
             raise ShapeError(f"Capture: expected {name} ({words}) as its {self.scan!r} and axis say, got {shape}.")
 
     def detach(self) -> Capture:
-        """Without gradients, in the scan's points neither."""
+        """Return the capture without gradients, in the scan's points neither."""
         return replace(super().detach(), scan=self.scan.detach())
 
     @classmethod
     def merged_notes(cls, records: Sequence[Capture]) -> dict[str, Any]:
+        """Return the metadata of a batch."""
         return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
 
     def _shown_notes(self) -> dict[str, str]:
@@ -122,27 +125,52 @@ class Capture(TensorRecord):
 
     @classmethod
     def read(cls, path: str | Path, format: str | None = None, **said: Any) -> Capture:
-        """Read a capture of any known layout: `tt.nlos.read_capture`, with its arguments and errors."""
-        read = reader()
+        """Read a capture of any known layout.
+
+        Args:
+            path: the file.
+            format: name of the layout, None to find it.
+            said: other arguments of `tt.nlos.read_capture`, whose errors it raises.
+        """
+        read, _ = _registered()
         with arguments_of("Capture.read", read, ("path", "format")):
             capture: Capture = read(path, format, **said)
         return capture
 
     def write(self, path: str | Path, format: str = "torchtransient") -> Path:
-        """Write it in a layout, the library's own or another: `tt.nlos.write_capture`, with its errors."""
-        return writer()(path, self, format=format)
+        """Write the capture in the library's layout or another one.
+
+        Args:
+            path: place of the file.
+            format: name of the layout; errors as `tt.nlos.write_capture`.
+
+        Returns:
+            The path.
+        """
+        _, write = _registered()
+        return write(path, self, format=format)
 
     # -------------------------------------------------------------------------------------------------- measurements
 
     def total(self) -> Tensor:
-        """All light that the transient holds: its sum over time, (C, *scan.shape). Whole numbers stay whole (int64),
-        half precision becomes float32. Raises ShapeError without one.
+        """Return all light of the transient, its sum over time.
+
+        Returns:
+            (C, *scan.shape). Whole numbers stay whole (int64), half precision becomes float32.
+
+        Raises:
+            ShapeError: without a transient.
         """
         return summed(self._cube("total"), self._time)
 
     def peak_time(self) -> Tensor:
-        """Centre of the bin in which most light (sum over channels, S0 of a polarized capture) arrives at each pair,
-        metres, float64 in the scan's shape; NaN where there is none. Raises ShapeError without a transient.
+        """Return the centre of the bin in which most light arrives, summed over channels (S0 of a polarized capture).
+
+        Returns:
+            Metres, float64 in the scan's shape; NaN without light.
+
+        Raises:
+            ShapeError: without a transient.
         """
         cube = self._cube("peak_time")
         if self.polarized:
@@ -152,10 +180,18 @@ class Capture(TensorRecord):
         return torch.where(highest > 0, self.axis.centers_opl.to(cube.device)[index], torch.nan)
 
     def crop(self, start_opl: float, end_opl: float) -> Capture:
-        """The capture with the bins alone that lie in [start_opl, end_opl), metres, at least in part.
+        """Return the capture with the bins that lie in [start_opl, end_opl), at least in part.
 
-        A view, with an axis of its own; ``steady`` stays all light, and a phasor what it is. Raises ShapeError without
-        a transient, UnitError where no bin is left.
+        Args:
+            start_opl: metres.
+            end_opl: metres.
+
+        Returns:
+            A view, with an axis of its own; ``steady`` stays all light, and a phasor is kept.
+
+        Raises:
+            ShapeError: without a transient.
+            UnitError: if no bin is left.
         """
         cube, axis = self._cube("crop"), self.axis
         assert axis is not None
@@ -178,7 +214,9 @@ class Capture(TensorRecord):
     # ---------------------------------------------------------------------------------------------- parts of a scan
 
     def confocal(self) -> Capture:
-        """The confocal capture in an exhaustive one: its diagonal. Raises SceneError unless spots are sensor points."""
+        """Return the confocal capture in an exhaustive one: its diagonal. Raises SceneError unless spots are sensor
+        points.
+        """
         scan, rank = self.scan.confocal(), len(self.scan.sensor_shape)
 
         def diagonal(tensor: Tensor) -> Tensor:
@@ -190,9 +228,14 @@ class Capture(TensorRecord):
         return replace(self, scan=scan, **self._mapped(diagonal))
 
     def single(self, laser: int | tuple[int, ...]) -> Capture:
-        """The single capture of one spot of an exhaustive one, a view; `laser`: its index in the laser's list or grid.
+        """Return the single capture of one spot of an exhaustive one, a view.
 
-        Raises SceneError for other kinds of scan, ShapeError for an index that is not there.
+        Args:
+            laser: index in the laser's list or grid.
+
+        Raises:
+            SceneError: for other kinds of scan.
+            ShapeError: for an index out of range.
         """
         scan, index = self.scan.single(laser), laser_index(self.scan, laser)
         rank = len(self.scan.sensor_shape)
@@ -209,7 +252,7 @@ class Capture(TensorRecord):
 
     @property
     def _time(self) -> int:
-        """The dimension of time, from behind."""
+        """Dimension of time, counted from the last."""
         return -len(self.scan.shape) - 1
 
     def _cube(self, who: str) -> Tensor:
@@ -219,7 +262,7 @@ class Capture(TensorRecord):
 
 
 def _measured(name: str, values: Any) -> Tensor | None:
-    """Numbers of any library as a tensor. Raises ShapeError for what holds none."""
+    """Return numbers of any library as a tensor. Raises ShapeError for other objects."""
     if isinstance(values, Tensor) and values.layout != torch.strided:
         raise ShapeError(f"Capture: expected {name} as a dense tensor, got {values.layout}. Use tensor.to_dense().")
     if values is None or isinstance(values, Tensor):
@@ -234,3 +277,99 @@ def _measured(name: str, values: Any) -> Tensor | None:
         return torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ShapeError(f"Capture: expected {name} as a tensor of numbers, got {shown(values)}: {error}.") from None
+
+
+# ----------------------------------------------------------------------------------------------------------- arithmetic
+
+
+def precision_of(tensor: Tensor) -> torch.dtype:
+    """Return the dtype that operators compute in: float64 for captures in double precision, else float32.
+
+    Args:
+        tensor: measured numbers.
+    """
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def computed(tensor: Tensor) -> Tensor:
+    """Return measured numbers in the precision of arithmetic, :func:`precision_of`.
+
+    Whole numbers wrap around, half precision overflows, and torch has no arithmetic for some dtypes of files.
+
+    Args:
+        tensor: numbers of any dtype.
+    """
+    return tensor.to(precision_of(tensor))
+
+
+def summed(tensor: Tensor, dim: int) -> Tensor:
+    """Return the sum over a dimension.
+
+    Args:
+        tensor: numbers of any dtype.
+        dim: dimension.
+
+    Returns:
+        int64 of whole numbers (float64 of uint64), else :func:`computed` numbers.
+    """
+    if tensor.is_floating_point():
+        return computed(tensor).sum(dim)
+    wide = torch.float64 if tensor.dtype == torch.uint64 else torch.int64
+    return tensor.to(wide).sum(dim)
+
+
+# ------------------------------------------------------------------------------------------------------------- metadata
+
+
+def metadata_text(metadata: Any, who: str) -> str:
+    """Return metadata as JSON; tuples come back as lists.
+
+    Args:
+        metadata: names and plain data.
+        who: subject of messages.
+
+    Raises:
+        StorageError: for other objects, data that JSON cannot hold, and names that are no texts, which JSON would
+            convert: 1 and "1" would be one name.
+    """
+    if not isinstance(metadata, Mapping):
+        raise StorageError(f"{who}: expected metadata as names and values, got {shown(metadata)}.")
+    try:
+        found = json.dumps(dict(metadata), default=_refuse)
+        _check_names(metadata)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise StorageError(f"{who}: expected metadata of plain data that JSON can hold: {error}.") from None
+    return found
+
+
+def _check_names(data: Any) -> None:
+    if isinstance(data, Mapping):
+        for name in data:
+            if not isinstance(name, str):
+                raise TypeError(f"the name {shown(name)} is a {type(name).__name__} and no text")
+    for part in data.values() if isinstance(data, Mapping) else data if isinstance(data, list | tuple) else ():
+        _check_names(part)
+
+
+def _refuse(value: object) -> Any:
+    raise TypeError(f"{type(value).__name__} is not plain data")
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def register_files(read: ReadsCaptures, write: WritesCaptures) -> None:
+    """Register the functions that read and write captures; a later call replaces an earlier one.
+
+    Args:
+        read: `tt.nlos.read_capture`.
+        write: `tt.nlos.write_capture`.
+    """
+    _files[:] = [(read, write)]
+
+
+def _registered() -> tuple[ReadsCaptures, WritesCaptures]:
+    """Return reader and writer. Raises StorageError until the room of the layouts is loaded."""
+    if not _files:
+        raise StorageError("Capture: no layout of files is loaded. Import torchtransient.nlos first.")
+    return _files[0]

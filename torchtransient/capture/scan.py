@@ -1,4 +1,4 @@
-"""Which points of a relay wall a laser lights and a sensor sees, and what lengths are counted."""
+"""Scans of a relay wall: points that a laser lights and a sensor sees, and the lengths that are counted."""
 
 from __future__ import annotations
 
@@ -84,18 +84,27 @@ class Scan:
         extent: Numbers | None = None,
         first_and_last_leg: bool = False,
     ) -> Scan:
-        """A regular grid of nx x ny sensor points on a wall; `size` is (nx, ny) or one number for both.
+        """Return a regular grid of nx x ny sensor points on a wall.
 
-        `wall`: a :class:`Wall`, a Mitsuba dictionary of a rectangle, or (vertices, faces) of a curved wall, on which
-        points are found along its mean normal. Rows of the grid run along v, columns along u. `laser` is the spot of a
-        single scan: a point (3,) on the wall, or its coordinates (u, v); None is the middle of the wall. `laser_grid`
-        is the size of an exhaustive scan's grid of spots, None for the sensor's. `cell_centers` and `extent` as in
-        :meth:`Wall.grid`, for both grids. Origins that are None stand a quarter of the wall's width to the -u side of
-        its middle and an eighth of it before the wall, where they see all of a flat wall.
+        Args:
+            wall: a :class:`Wall`, a Mitsuba dictionary of a rectangle, or (vertices, faces) of a curved wall, on which
+                points are found along its mean normal. Rows of the grid run along v, columns along u.
+            size: (nx, ny), or one number for both.
+            kind: "single", "confocal" or "exhaustive".
+            laser: spot of a single scan: a point (3,) on the wall, or its coordinates (u, v); None is the middle of the
+                wall.
+            sensor_origin: (3,); None stands a quarter of the wall's width to the -u side of its middle and an eighth of
+                it before the wall, from where all of a flat wall is seen.
+            laser_origin: (3,); None as for the sensor.
+            laser_grid: size of an exhaustive scan's grid of spots, None for the sensor's.
+            cell_centers: as in :meth:`Wall.grid`, for both grids.
+            extent: as in :meth:`Wall.grid`, for both grids.
+            first_and_last_leg: lengths count from the laser's origin to the sensor's.
 
-        Raises SceneError where a spot misses the wall, for a laser or a laser grid that the kind has no use for, and
-        for an exhaustive scan of one pair, which is a single one; ArgumentError for pairs, which :meth:`points` takes;
-        otherwise as the class and :meth:`Wall.grid`.
+        Raises:
+            SceneError: for a spot that misses the wall, a laser or a laser grid that the kind has no use for, and an
+                exhaustive scan of one pair, which is a single one.
+            ArgumentError: for pairs, which :meth:`points` takes; otherwise as the class and :meth:`Wall.grid`.
         """
         _check_kind(kind)
         if kind not in GRID_KINDS:
@@ -149,12 +158,22 @@ class Scan:
         laser_normals: Any = None,
         first_and_last_leg: bool = False,
     ) -> Scan:
-        """A scan of given points: `sensor_points` (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
+        """Return a scan of given points.
 
-        `laser_points` as in the class; left out for confocal scans. `wall` as in :meth:`grid`: all points must lie on
-        it, to 1e-4 of its diagonal, and take its normals; None when the points are known to lie on a wall of a scene,
-        or are those of a measured one. `normals`, `laser_normals`: of the sensor points and of the spots, in their
-        shapes, where no wall says them; spots of confocal scans have those of the sensor points. Errors as the class.
+        Args:
+            sensor_points: (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
+            kind: as in the class.
+            laser_points: as in the class; left out for confocal scans.
+            sensor_origin: (3,).
+            laser_origin: (3,).
+            wall: as in :meth:`grid`: all points must lie on it, to 1e-4 of its diagonal, and take its normals; None for
+                points on a wall of a scene, or of a measured one.
+            normals: of the sensor points, in their shape, without a wall.
+            laser_normals: of the spots, in their shape; confocal ones have those of the sensor points.
+            first_and_last_leg: as in the class.
+
+        Raises:
+            ShapeError, UnitError, SceneError, ArgumentError: as the class.
         """
         _check_kind(kind)
         sensor = _float64_points("sensor_points", sensor_points)
@@ -207,17 +226,17 @@ class Scan:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """What follows (C, T) in a capture: (Sy, Sx) or (N,); for exhaustive scans the laser's dimensions before it."""
+        """Shape behind (C, T) in a capture: (Sy, Sx) or (N,); for exhaustive scans the laser's dimensions before it."""
         return (*self.laser_shape, *self.sensor_shape) if self.kind == "exhaustive" else self.sensor_shape
 
     @property
     def pairs(self) -> int:
-        """How many histograms a capture has: pairs of a laser spot and a sensor point."""
+        """Number of histograms in a capture: pairs of a laser spot and a sensor point."""
         return math.prod(self.shape)
 
     @property
     def is_planar(self) -> bool:
-        """Whether all laser and sensor points lie in one plane, to 1e-6 of their extent."""
+        """True if all laser and sensor points lie in one plane, to 1e-6 of their extent."""
         points = torch.cat([self.sensor_points.reshape(-1, 3), self.laser_points.reshape(-1, 3)])
         spread = torch.linalg.svdvals((points - points.mean(0)).cpu())
         return bool(len(spread) < 3 or spread[2] <= 1e-6 * spread[0])
@@ -226,8 +245,9 @@ class Scan:
     def spacing(self) -> tuple[float, float]:
         """Distances (along a row, along a column) between neighbours of a regular sensor grid, metres.
 
-        Raises ShapeError for a list of points, for a grid that is not regular to 1e-6 of its extent, and where a row or
-        column holds one point.
+        Raises:
+            ShapeError: for a list of points, for a grid that is not regular to 1e-6 of its extent, and for rows or
+                columns of one point.
         """
         if self.sensor_points.ndim != 3 or min(self.sensor_shape) < 2:
             raise ShapeError(f"Scan.spacing: expected a grid of at least 2 x 2 sensor points, got {self.sensor_shape}.")
@@ -259,18 +279,24 @@ class Scan:
 
     @property
     def legs(self) -> Tensor:
-        """What :attr:`first_and_last_leg` adds to the length of each pair, in the scan's :attr:`shape`, metres."""
+        """Lengths that :attr:`first_and_last_leg` adds to each pair, in the scan's :attr:`shape`, metres."""
         laser = self.laser_legs
         if self.kind == "exhaustive":
             laser = laser.reshape(*self.laser_shape, *(1,) * len(self.sensor_shape))
         return laser + self.sensor_legs
 
     def default_axis(self, hidden_bounds: Any, bin_width_opl: float) -> TimeAxis:
-        """Bins of `bin_width_opl` metres that hold all light of three bounces off things in a box.
+        """Return an axis that holds all light of three bounces off things in a box.
 
-        `hidden_bounds`: (2, 3), the corners of lowest and of highest coordinates, metres. The axis starts and ends on
-        multiples of the width. Lengths follow :attr:`first_and_last_leg`. Raises ShapeError and UnitError for bounds
-        that are none, and as TimeAxis.
+        Args:
+            hidden_bounds: (2, 3), the corners of lowest and of highest coordinates, metres.
+            bin_width_opl: width of a bin, metres.
+
+        Returns:
+            Axis that starts and ends on multiples of the width. Lengths follow :attr:`first_and_last_leg`.
+
+        Raises:
+            ShapeError, UnitError: for other bounds, and as TimeAxis.
         """
         low, high = bounds_of(hidden_bounds, "Scan.default_axis")
         width = positive("Scan.default_axis: bin_width_opl", bin_width_opl)
@@ -280,7 +306,7 @@ class Scan:
     # ------------------------------------------------------------------------------------------------- other scans
 
     def to(self, device: Any) -> Self:
-        """The scan with its tensors on a device; they stay float64."""
+        """Return the scan with its tensors on a device; they stay float64."""
         if isinstance(device, torch.dtype):
             raise ShapeError(f"Scan.to: expected a device, got {device}; points are float64 throughout.")
         names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
@@ -288,14 +314,19 @@ class Scan:
         return replace(self, **moved)
 
     def detach(self) -> Self:
-        """The scan without gradients in its points."""
+        """Return the scan without gradients in its points."""
         names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
         return replace(self, **{n: getattr(self, n).detach() for n in names if getattr(self, n) is not None})
 
     def single(self, laser: int | tuple[int, ...]) -> Scan:
-        """The single scan of one spot of an exhaustive one; `laser`: its index in the laser's list or grid.
+        """Return the single scan of one spot of an exhaustive one.
 
-        Raises SceneError for other kinds, ShapeError for an index that is not there.
+        Args:
+            laser: index in the laser's list or grid.
+
+        Raises:
+            SceneError: for other kinds.
+            ShapeError: for an index out of range.
         """
         if self.kind != "exhaustive":
             raise SceneError(f"Scan.single: expected an exhaustive scan, got a {self.kind} one.")
@@ -304,7 +335,9 @@ class Scan:
         return replace(self, kind="single", laser_points=self.laser_points[index], laser_normals=normals)
 
     def confocal(self) -> Scan:
-        """The confocal scan in an exhaustive one whose spots are its sensor points. Raises SceneError for others."""
+        """Return the confocal scan in an exhaustive one whose spots are its sensor points. Raises SceneError for
+        others.
+        """
         same = self.laser_points.shape == self.sensor_points.shape and bool(
             torch.allclose(self.laser_points, self.sensor_points, rtol=0, atol=1e-9)
         )
@@ -342,7 +375,15 @@ def _check_kind(kind: Any) -> None:
 
 
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
-    """`laser` as an index into the spots of a scan. Raises ShapeError where there is none."""
+    """Return an index into the spots of a scan.
+
+    Args:
+        scan: an exhaustive one.
+        laser: whole number, or one for each dimension.
+
+    Raises:
+        ShapeError: for an index out of range.
+    """
     index = laser if isinstance(laser, tuple) else (laser,)
     whole = tuple(number for i in index if (number := as_whole(i)) is not None)
     inside = len(whole) == len(index) == len(scan.laser_shape)
@@ -456,7 +497,15 @@ def _behind(height: float) -> str:
 # Shortest and longest path from spots over a box to sensor points: the span of a time axis.
 
 def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
-    """Return the corners (3,) of a box of lowest and highest coordinates, float64. Raises ShapeError, UnitError."""
+    """Return the corners (3,) of a box of lowest and highest coordinates, float64.
+
+    Args:
+        bounds: (2, 3), metres.
+        who: subject of messages.
+
+    Raises:
+        ShapeError, UnitError: for other bounds.
+    """
     plain = real_array(bounds)
     if plain is None or plain.shape != (2, 3):
         raise ShapeError(f"{who}: expected bounds (2, 3), the lowest and the highest corner, got {shown(bounds)}.")
@@ -467,10 +516,15 @@ def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
 
 
 def shortest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Lower bound of the lengths of three-bounce paths over the box, metres.
+    """Return a lower bound of the lengths of three-bounce paths over a box, metres.
 
     The sum of the distances of spot and sensor point to the box, each to its own nearest point: exact for confocal
     scans, at most too short otherwise.
+
+    Args:
+        scan: the scan.
+        low: lowest corner (3,).
+        high: highest corner (3,).
     """
     first, last = _legs(scan)
     near = [torch.linalg.vector_norm(p - p.clamp(low, high), dim=-1) for p in _points(scan)]
@@ -478,8 +532,14 @@ def shortest(scan: Scan, low: Tensor, high: Tensor) -> float:
 
 
 def longest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Upper bound of the lengths of three-bounce paths over the box, metres. Sums of distances are convex: the longest
-    path goes over a corner.
+    """Return an upper bound of the lengths of three-bounce paths over a box, metres.
+
+    Sums of distances are convex: the longest path goes over a corner.
+
+    Args:
+        scan: the scan.
+        low: lowest corner (3,).
+        high: highest corner (3,).
     """
     laser, sensor = _points(scan)
     first, last = _legs(scan)

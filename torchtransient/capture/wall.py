@@ -1,4 +1,4 @@
-"""The relay wall as a surface that points are laid out on: a parallelogram or a triangle mesh."""
+"""Relay walls as surfaces that points are laid out on: a parallelogram or a triangle mesh."""
 
 from __future__ import annotations
 
@@ -9,23 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.capture.triangles import first_hits, triangle_normals
 from torchtransient.checks import Numbers, as_whole, checked_mesh, flag, positive, real_array, shares, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 # A point counts as lying on the wall up to this part of the wall's diagonal: coordinates of files have five digits.
 ON_WALL = 1e-4
 # From the edges of a wall, in parts of its size and its distance from the origin.
 _EDGE = 2.0**-20
+# Pairs of a ray and a triangle that are tested in one array.
+_PAIRS_AT_ONCE = 2**20
+# Rays through a shared edge must not slip between its triangles: the barycentric coordinates of a hit may lack this.
+_BARY_SLACK = 1e-9
 # Indices of points have 32 bits in kernels.
 _MOST_POINTS = 2**32 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
+    """Relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
 
     A flat wall is the parallelogram `center + (2u - 1) half_u + (2v - 1) half_v`. On a curved one a point is found by
     going from that place along `normal` (the mesh's mean normal) to the mesh, from the front. `normal` points into the
@@ -54,10 +58,19 @@ class Wall:
         up: Numbers = (0.0, 1.0, 0.0),
         albedo: float | Numbers = 0.5,
     ) -> Wall:
-        """A diffuse rectangle, metres. u runs along `up x normal`, v along `up` as far as it lies in the wall.
+        """Return a diffuse rectangle. u runs along `up x normal`, v along `up` as far as it lies in the wall.
 
-        `albedo`: one number or a linear sRGB triple. Raises UnitError for sizes that are not positive or albedos
-        outside of [0, 1], SceneError for a normal without a direction or along `up`.
+        Args:
+            width: metres.
+            height: metres.
+            center: (3,), metres.
+            normal: (3,), any length.
+            up: (3,), any length.
+            albedo: one number or a linear sRGB triple.
+
+        Raises:
+            UnitError: for sizes that are not positive or albedos outside of [0, 1].
+            SceneError: for a normal without a direction or along `up`.
         """
         width, height = positive("Wall.plane: width", width), positive("Wall.plane: height", height)
         n, u, v = _frame(triple("Wall.plane normal", normal), triple("Wall.plane up", up), "Wall.plane")
@@ -75,11 +88,19 @@ class Wall:
         up: Numbers = (0.0, 1.0, 0.0),
         albedo: float | Numbers = 0.5,
     ) -> Wall:
-        """A diffuse triangle mesh: `vertices` (V, 3) metres, `faces` (F, 3) whole numbers, wound against the clock as
-        seen from the room.
+        """Return a diffuse triangle mesh. u and v span the smallest rectangle across the mean normal that holds the
+        mesh.
 
-        u and v span the smallest rectangle across the mean normal that holds the mesh. Raises ShapeError for other
-        shapes or indices, UnitError for numbers that are not finite, SceneError for a mesh without a mean normal.
+        Args:
+            vertices: (V, 3), metres.
+            faces: (F, 3) whole numbers, wound against the clock as seen from the room.
+            up: (3,), any length.
+            albedo: one number or a linear sRGB triple.
+
+        Raises:
+            ShapeError: for other shapes or indices.
+            UnitError: for numbers that are not finite.
+            SceneError: for a mesh without a mean normal.
         """
         points, triangles = checked_mesh("Wall.mesh", vertices, faces)
         corners = points[triangles]
@@ -106,9 +127,13 @@ class Wall:
 
     @classmethod
     def of(cls, description: Any) -> Wall:
-        """A wall; a Mitsuba dictionary of a `rectangle` or of `mesh_arrays`; or a pair (vertices, faces).
+        """Return the wall of a description.
 
-        Raises SceneError for anything else; then errors as :meth:`mesh`.
+        Args:
+            description: a wall; a Mitsuba dictionary of a `rectangle` or of `mesh_arrays`; or a pair (vertices, faces).
+
+        Raises:
+            SceneError, ArgumentError: for anything else; then errors as :meth:`mesh`.
         """
         if isinstance(description, Wall):
             return description
@@ -164,13 +189,20 @@ class Wall:
 
     @property
     def is_planar(self) -> bool:
-        """Whether the wall is a parallelogram; a mesh counts as curved, however flat it is."""
+        """True for a parallelogram; a mesh counts as curved, however flat it is."""
         return self.vertices is None
 
     def at(self, u: Any, v: Any) -> tuple[Array, Array]:
-        """Points and unit normals (..., 3) at coordinates `u`, `v`, which broadcast. On the edges they stand a
-        millionth of the wall's size inside, where rays in single precision meet it. Raises SceneError for coordinates
-        outside of [0, 1] and where a curved wall has a hole.
+        """Return points and unit normals (..., 3) at coordinates.
+
+        Args:
+            u: in [0, 1], broadcast with `v`. On the edges points stand a millionth of the wall's size inside, where
+                rays in single precision meet it.
+            v: in [0, 1].
+
+        Raises:
+            SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.
+            ShapeError: for anything but numbers that broadcast.
         """
         places = [real_array(u), real_array(v)]
         if places[0] is None or places[1] is None:
@@ -197,7 +229,7 @@ class Wall:
         return points.reshape(flat.shape), normals.reshape(flat.shape)
 
     def _inside(self, share: Array, half: Array) -> Array:
-        """Coordinates that are not nearer to the edges than single precision can tell."""
+        """Return coordinates as far from the edges as single precision needs."""
         margin = _EDGE * (self.diagonal + np.abs(self.center).max()) / (2 * np.linalg.norm(half))
         return np.clip(share, margin, 1 - margin)
 
@@ -269,7 +301,15 @@ class Wall:
 
 
 def triple(what: str, values: Any) -> Array:
-    """Three finite numbers as float64 (3,). Raises ShapeError and UnitError."""
+    """Return three finite numbers as float64 (3,).
+
+    Args:
+        what: subject of messages.
+        values: numbers of any library.
+
+    Raises:
+        ShapeError, UnitError: for anything else.
+    """
     array = real_array(values)
     if array is None:
         raise ShapeError(f"{what}: expected three numbers [x, y, z], got {shown(values)}.")
@@ -281,7 +321,15 @@ def triple(what: str, values: Any) -> Array:
 
 
 def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
-    """(nx, ny) of one number or a pair. Raises ShapeError unless both are whole and at least 1."""
+    """Return (nx, ny).
+
+    Args:
+        size: one whole number or a pair, at least 1.
+        who: subject of messages.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     given: Any = size
     several = isinstance(given, Sequence) or getattr(given, "ndim", 0) == 1
     pair = [as_whole(n) for n in (given if several else (given, given))]
@@ -326,3 +374,120 @@ def _extent(extent: Numbers | None) -> tuple[float, float, float, float]:
 def _places(count: int, low: float, high: float, centers: bool) -> Array:
     share = (np.arange(count) + 0.5) / count if centers or count == 1 else np.arange(count) / (count - 1)
     return low + (high - low) * share
+
+
+# ----------------------------------------------------------------------------------------------- rays against triangles
+
+
+def first_hits(origins: Array, direction: Array, corners: Array) -> tuple[Array, Indices]:
+    """Find the first triangle that each of some parallel rays meets, from either side.
+
+    Args:
+        origins: (N, 3).
+        direction: unit vector (3,), the same for all rays.
+        corners: corners of triangles (F, 3, 3).
+
+    Returns:
+        Distance (N,) and index (N,) of the triangle; infinity and -1 for rays that meet none.
+
+    Source: Moeller and Trumbore (1997), for the triangles alone that share a cell with a ray on a grid across the rays.
+    """
+    cells = _Cells(corners, direction)
+    distances, indices = np.full(len(origins), np.inf), np.full(len(origins), -1, dtype=np.int64)
+    rows, counts = cells.candidates(origins)
+    ends = np.cumsum(counts)
+    start = 0
+    while start < len(origins):
+        # As many rays as fit, and one at least.
+        base = ends[start] - counts[start]
+        stop = max(start + 1, int(np.searchsorted(ends, base + _PAIRS_AT_ONCE, side="right")))
+        here = counts[start:stop]
+        ray = np.repeat(np.arange(start, stop), here)
+        within = np.arange(len(ray)) - np.repeat(np.cumsum(here) - here, here)
+        triangle = cells.triangles[np.repeat(rows[start:stop], here) + within]
+        t = _distances(origins[ray], direction, corners[triangle])
+        # Of equally near ones the first in the mesh, as a search over all triangles would have it.
+        order = np.lexsort((triangle, t, ray))
+        rays, first = np.unique(ray[order], return_index=True)
+        nearest = t[order][first]
+        distances[rays] = nearest
+        indices[rays] = np.where(np.isfinite(nearest), triangle[order][first], -1)
+        start = stop
+    return distances, indices
+
+
+def _distances(origins: Array, direction: Array, corners: Array) -> Array:
+    """Return distances along rays (N, 3) to a triangle (N, 3, 3) of each; infinity for a ray that passes it."""
+    a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(direction, second)
+    determinant = (first * across).sum(1)
+    # What the ray runs along has no point to meet; relative to the edges, since small triangles are triangles too.
+    scale = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    open_to_ray = np.abs(determinant) > 1e-12 * scale
+    inverse = np.where(open_to_ray, 1 / np.where(open_to_ray, determinant, 1.0), 0.0)
+    to_origin = origins - a
+    u = (to_origin * across).sum(1) * inverse
+    other = np.cross(to_origin, first)
+    v = (other @ direction) * inverse
+    t = (other * second).sum(1) * inverse
+    met = open_to_ray & (u >= -_BARY_SLACK) & (v >= -_BARY_SLACK) & (u + v <= 1 + _BARY_SLACK) & (t > 0)
+    return np.where(met, t, np.inf)
+
+
+class _Cells:
+    """Lists of triangles that reach into each cell of a grid across a direction."""
+
+    def __init__(self, corners: Array, direction: Array):
+        helper = np.eye(3)[np.abs(direction).argmin()]
+        first = np.cross(direction, helper)
+        first /= np.linalg.norm(first)
+        self._frame = np.stack([first, np.cross(direction, first)], axis=1)
+        flat = corners @ self._frame
+        low, high = flat.min(1), flat.max(1)
+        self._low = low.min(0)
+        self._size = np.maximum(high.max(0) - self._low, 1e-300)
+        # A triangle that reaches into many cells is listed in each: fewer cells until the lists stay short.
+        self._count = max(1, int(np.sqrt(len(corners))))
+        while self._count > 1 and self._spans(low, high)[2].sum() > 16 * len(corners):
+            self._count = (self._count + 1) // 2
+        begin, width, number = self._spans(low, high)
+        triangle = np.repeat(np.arange(len(corners)), number)
+        within = np.arange(len(triangle)) - np.repeat(np.cumsum(number) - number, number)
+        wide = np.repeat(width[:, 0], number)
+        cell = self._index(np.repeat(begin, number, axis=0) + np.stack([within % wide, within // wide], axis=1))
+        order = np.argsort(cell, kind="stable")
+        self.triangles = triangle[order]
+        self._starts = np.searchsorted(cell[order], np.arange(self._count**2 + 1))
+
+    def candidates(self, origins: Array) -> tuple[Indices, Indices]:
+        """Return the start in `triangles` and the length of each ray's list; length 0 beside the grid."""
+        place = origins @ self._frame
+        slack = 1e-9 * self._size
+        inside = ((place >= self._low - slack) & (place <= self._low + self._size + slack)).all(1)
+        cell = self._index(self._cell(place))
+        return self._starts[cell], np.where(inside, self._starts[cell + 1] - self._starts[cell], 0)
+
+    def _cell(self, places: Array) -> Indices:
+        scaled = np.floor((places - self._low) / self._size * self._count)
+        return np.asarray(np.clip(scaled, 0, self._count - 1), dtype=np.int64)
+
+    def _spans(self, low: Array, high: Array) -> tuple[Indices, Indices, Indices]:
+        """First cells (F, 2) of triangles, numbers of cells along both axes, and in all."""
+        slack = 1e-6 * self._size / self._count
+        begin, end = self._cell(low - slack), self._cell(high + slack)
+        width = end - begin + 1
+        return begin, width, width.prod(1)
+
+    def _index(self, cells: Indices) -> Indices:
+        return np.asarray(cells[..., 1] * self._count + cells[..., 0])
+
+
+def triangle_normals(corners: Array) -> Array:
+    """Return unit normals (F, 3) of triangles by the winding of their corners; zero for triangles without an area.
+
+    Args:
+        corners: (F, 3, 3).
+    """
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.where(length > 0, length, 1.0))

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options
-from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.cli.options import film_of_options, load_scene, scene_options
 
 NOT_REACHED = 1
 
@@ -20,7 +19,7 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer
     name = "N,N,..."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        """The numbers of a text; a usage error for anything else."""
+        """Return the numbers of a text; anything else is a usage error."""
         if isinstance(value, tuple):
             return value
         try:
@@ -54,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
     setting.
     """
     from torchtransient.files.result_file import check_folder
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     film = film_of_options(options)
     if options["plot"]:

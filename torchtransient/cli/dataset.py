@@ -14,10 +14,10 @@ PATH = click.Path(path_type=Path)
 
 
 class GeneratesByDefault(click.Group):
-    """What is no name of a subcommand is a recipe to generate from."""
+    """Group whose first argument, unless it names a subcommand, is a recipe to generate from."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """`FILE --out DIR` as `generate FILE --out DIR`."""
+        """Read `FILE --out DIR` as `generate FILE --out DIR`."""
         if args and args[0] not in {*self.commands, *ctx.help_option_names}:
             near = difflib.get_close_matches(args[0], self.commands, 1, 0.7)
             if near and not Path(args[0]).exists():
@@ -162,7 +162,11 @@ def export(folder: Path, out: Path, kind: str, quiet: bool) -> None:
 
 
 def read_recipe(path: Path) -> Any:
-    """The recipe of a file."""
+    """Return the recipe of a file.
+
+    Args:
+        path: the file.
+    """
     from torchtransient.data import Recipe
 
     return Recipe.read(path)

@@ -22,7 +22,7 @@ _TITLE = (
 
 @dataclass
 class Fit:
-    """The way of a fit: one loss and one colour for each step, and the last colour."""
+    """Course of a fit: one loss and one colour for each step, and the last colour."""
 
     losses: list[float] = field(default_factory=list)
     colours: list[list[float]] = field(default_factory=list)
@@ -36,11 +36,20 @@ def fit_colour(
     learning_rate: float = 0.06,
     look: Callable[[torch.Tensor, Any], None] = lambda loss, output: None,
 ) -> Fit:
-    """Fit the colour of the wall with Adam, from the transient alone, and return the way.
+    """Fit the colour of the wall with Adam, from the transient alone.
 
-    `renderer`: a TransientRenderer whose only parameter is KEY, at its start value; `target`: (C, T, H, W). Few samples
-    per pixel make single bins noisy, so averages over 8 x 8 pixels and 2 bins are compared, each relative to its own
-    size (the pixels that see the lamp would outweigh all others). `look` is called with loss and output of every step.
+    Few samples per pixel make single bins noisy, so averages over 8 x 8 pixels and 2 bins are compared, each relative
+    to its own size (the pixels that see the lamp would outweigh all others).
+
+    Args:
+        renderer: a TransientRenderer whose only parameter is KEY, at its start value.
+        target: (C, T, H, W).
+        steps: of Adam.
+        learning_rate: of Adam, at the start.
+        look: called with loss and output of every step.
+
+    Returns:
+        The course of the fit.
     """
     import torch
     from tqdm import tqdm
@@ -90,9 +99,9 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     from torchtransient.files.result_file import write_result
     from torchtransient.scene.variant import DEFAULT_VARIANT
     from torchtransient.vis.fit_monitor import FitMonitor
-    from torchtransient.vis.overview import plot_overview
     from torchtransient.vis.pages.layout import import_bokeh
-    from torchtransient.vis.view import view
+    from torchtransient.vis.pages.page import view
+    from torchtransient.vis.pictures import plot_overview
 
     import_bokeh()  # missing packages before the work
     try:

@@ -39,7 +39,9 @@ class Finding:
 
 
 def versions() -> list[Finding]:
-    """Python and the packages; a missing or mismatched one is a problem, a missing optional one a note."""
+    """Return findings about Python and the packages; a missing or mismatched one is a problem, an optional one a
+    note.
+    """
     python = platform.python_version()
     good = sys.version_info >= (3, 11)
     found = [Finding("ok" if good else "problem", "python", python if good else f"{python}; 3.11 or newer is needed")]
@@ -57,7 +59,7 @@ def versions() -> list[Finding]:
 
 
 def _judged(name: str, version: str) -> Finding:
-    """A tested version of a package that is there, or any of one whose internals nothing here follows."""
+    """Return a finding about a package that is there, by the versions that were tested."""
     try:
         from torchtransient.plugins._registry import untested
     except ImportError as error:  # what the package needs is missing, and stands in a line of its own
@@ -78,7 +80,7 @@ def _version(name: str) -> str | None:
 
 
 def llvm() -> list[Finding]:
-    """The LLVM that this process is bound to, and what programs get that import Mitsuba without us."""
+    """Return findings about the LLVM of this process, and of programs that import Mitsuba without this library."""
     from torchtransient import _llvm
     from torchtransient.errors import VariantError
 
@@ -106,7 +108,11 @@ def llvm() -> list[Finding]:
 
 
 def variants(llvm_is_good: bool) -> list[Finding]:
-    """The variants that Mitsuba was built with, and whether one of each kind renders and differentiates here."""
+    """Return findings about the variants of Mitsuba, one of each kind rendered and differentiated.
+
+    Args:
+        llvm_is_good: try an LLVM variant.
+    """
     import mitsuba as mi
 
     found = [Finding("ok", "variants", " ".join(mi.variants()))]
@@ -118,7 +124,9 @@ def variants(llvm_is_good: bool) -> list[Finding]:
 
 
 def cuda() -> list[Finding]:
-    """The GPU, as Dr.Jit and torch see it. None is a note: the llvm variants do without."""
+    """Return findings about the GPU, as Dr.Jit and torch see it. A missing one is a note: the llvm variants do
+    without.
+    """
     import drjit as dr
     import torch
 
@@ -134,7 +142,11 @@ def cuda() -> list[Finding]:
 
 
 def probe(variant: str) -> Finding:
-    """Render a small scene and differentiate it under `variant`, in a process of its own."""
+    """Return the finding of a small scene that is rendered and differentiated in a process of its own.
+
+    Args:
+        variant: of Mitsuba.
+    """
     code, _, errors = _run([sys.executable, "-c", _RENDER, variant], dict(os.environ))
     if code == 0:
         return Finding("ok", variant, "renders and differentiates")

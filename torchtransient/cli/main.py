@@ -41,14 +41,14 @@ _FAULTS = (
 
 
 class Commands(click.Group):
-    """Imports a command when it is asked for, and turns the library's errors into messages."""
+    """Group that imports a command when it is used, and turns the library's errors into messages."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order of COMMANDS."""
+        """Return names in the order of COMMANDS."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name, from the module of that name."""
+        """Return the command of a name, from the module of that name."""
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"torchtransient.cli.{cmd_name}")
@@ -56,7 +56,7 @@ class Commands(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The list of commands, without importing any."""
+        """Write the list of commands, without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
@@ -90,7 +90,7 @@ class Commands(click.Group):
 
 def _in_options(message: Any) -> str:
     # Where the library could not be imported, its films are not known, and its message is as it is.
-    from torchtransient.cli.words import in_options
+    from torchtransient.cli.options import in_options
 
     return in_options(str(message))
 

@@ -8,13 +8,12 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.options import assignments
-from torchtransient.cli.pictures import video_options
+from torchtransient.cli.options import assignments, video_options
 
 # Pictures of a capture: option, function of `tt.vis`, what it shows.
 PICTURES = {
     "transients": ("transients_grid", "histograms of points over the wall"),
-    "peak_time": ("peak_time_map", "when most light arrives"),
+    "peak_time": ("peak_time_picture", "when most light arrives"),
     "layout": ("scan_layout", "wall, points and origins"),
 }
 # What the file may say and the command line replaces.
@@ -54,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.files.capture_file import check_capture_target
-    from torchtransient.nlos.arguments import checked_seed
+    from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     target = check_capture_target(options["output"] or _beside(scene))
@@ -117,18 +116,18 @@ def _summary(capture: Any) -> str:
 
 
 def _drawable(hidden: Any) -> tuple[dict[str, Any], list[str]]:
-    """The shapes that a layout can show, and the names of the others."""
+    """Return the shapes that a layout can show, and the names of the others."""
     if not isinstance(hidden, dict):
         return {}, ["the shapes of the scene"]
-    from torchtransient.vis.hidden_shapes import DRAWN
+    from torchtransient.vis.scans import DRAWN
 
     drawn = {name: shape for name, shape in hidden.items() if shape.get("type") in DRAWN}
     return drawn, [name for name in hidden if name not in drawn]
 
 
 def _check_pictures(options: dict[str, Any]) -> None:
-    from torchtransient.vis.overview import check_picture
-    from torchtransient.vis.video_file import check_video
+    from torchtransient.vis.files import check_picture
+    from torchtransient.vis.videos import check_video
 
     for name in PICTURES:
         if options[name]:
@@ -154,5 +153,5 @@ def _write_pictures(capture: Any, setup: dict[str, Any], options: dict[str, Any]
     if options["video"]:
         look = {name: options[name] for name in ("fps", "exposure", "curve", "accumulate", "every")}
         stamp = not options["no_stamp"]
-        tt.vis.wall_video(capture, options["video"], stamp=stamp, progress=not options["quiet"], **look)
+        tt.vis.video(capture, options["video"], stamp=stamp, progress=not options["quiet"], **look)
         click.echo(f"{options['video']}: the wall as the light arrives")

@@ -1,15 +1,20 @@
-"""Options that commands share, and what their values mean."""
+"""Options that commands share, and the library's messages in their words."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from torchtransient.cli.films import film_options
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.chirps import Chirps
+from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.gates import gates_from_text
+from torchtransient.rendering.films import Beats, FilmLayout, Gates, Histogram, Phasors, Rates
 
 if TYPE_CHECKING:
     import torch
@@ -17,10 +22,49 @@ if TYPE_CHECKING:
     from torchtransient.scene.load import Scene
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+# Options of each film, the first one its name in messages.
+OPTIONS: dict[type[FilmLayout], tuple[str, ...]] = {
+    Histogram: ("--start-opl", "--bin-width-opl", "--num-bins"),
+    Phasors: ("--frequencies",),
+    Gates: ("--gates",),
+    Rates: ("--rates",),
+    Beats: ("--chirps",),
+}
+PICTURES = ("overview", "peak_time", "rainbow", "video")
+# Python of messages, and the options in its place.
+_WORDS = {
+    "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
+    "tt.plan(scene) finds a window": "`torchtransient plan SCENE` finds a window",
+    " RenderOutput.stats has the energies.": "",
+    ", by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)": "",
+    "tt.plan: outputs are some of": "--outputs takes some of",
+    "error='relative'": "--error relative",
+    "tt.plan: ": "",
+    "tt.load: ": "",
+    "temporal_filter: ": "--temporal-filter: ",
+    "sensors: the scene has": "--sensor: the scene has",
+    "neither the film nor the call has": "neither the film of the scene nor the command line has",
+}
+# Calls and classes of reconstruction, after arguments have become options.
+_RECONSTRUCTION = {
+    " to read_capture": "",
+    "reconstruct: ": "",
+    "DiffusionDeconvolution: ": "--slab: ",
+    "method '": "--method '",
+    "VoxelGrid.before: ": "",
+    "Give extent=(width, height) in metres": "Give --extent WIDTH,HEIGHT in metres",
+    "Use Backprojection, which takes any points.": "Take --method bp or fbp.",
+    "expected size= for a list of points": "expected --voxels for a list of points",
+    "Crop the capture.": "Give --record.",
+}
 
 
 def scene_options(command: Command) -> Command:
-    """The scene file and what changes how it is read and rendered, the settings of every film included."""
+    """Add the scene file, and the options of how it is read and rendered, those of every film included.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.argument("scene", type=click.Path(path_type=Path)),
         click.option("--variant", help="Mitsuba variant, such as llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb."),
@@ -35,7 +79,15 @@ def scene_options(command: Command) -> Command:
 
 
 def assignments(given: Sequence[str], option: str) -> dict[str, str]:
-    """`("a=1", "b=x")` as a dictionary. A usage error names the option when there is no `=`, or a name comes twice."""
+    """Return `("a=1", "b=x")` as a dictionary.
+
+    Args:
+        given: texts NAME=VALUE.
+        option: name of the option, for messages.
+
+    Raises:
+        BadParameter: for a text without `=`, and a name that comes twice.
+    """
     found: dict[str, str] = {}
     for text in given:
         name, sign, value = text.partition("=")
@@ -48,7 +100,15 @@ def assignments(given: Sequence[str], option: str) -> dict[str, str]:
 
 
 def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
-    """`("red.reflectance.value=0.5,0.1,0.1",)` as tensors. Nested lists as in Python give more dimensions."""
+    """Return `("red.reflectance.value=0.5,0.1,0.1",)` as tensors. Nested lists as in Python give more dimensions.
+
+    Args:
+        given: texts KEY=VALUE.
+        option: name of the option, for messages.
+
+    Raises:
+        BadParameter: for values that are no numbers.
+    """
     import torch
 
     values = {}
@@ -63,8 +123,305 @@ def scene_values(given: Sequence[str], option: str) -> dict[str, torch.Tensor]:
 
 
 def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene:
-    """The scene of a command line."""
+    """Return the scene of a command line.
+
+    Args:
+        scene: its file.
+        variant: Mitsuba variant, None for the default.
+        params: texts NAME=VALUE that fill $NAME of the file.
+    """
     import torchtransient as tt
 
     values: dict[str, Any] = dict(assignments(params, "--param"))
     return tt.load(scene, variant=variant, **values)
+
+
+
+# ---------------------------------------------------------------------------------------------------------------- films
+
+
+def film_options(command: Command) -> Command:
+    """Add the options of all films to a command.
+
+    Args:
+        command: function of a command.
+    """
+    options = (
+        click.option("--start-opl", type=float, help="Start of the time axis, metres of optical path."),
+        click.option("--bin-width-opl", type=float, help="Width of a bin, metres of optical path."),
+        click.option("--num-bins", type=int, help="Number of bins."),
+        click.option(
+            "--frequencies", metavar="NU,NU,...", help="Phasors at these cycles per metre instead of a transient."
+        ),
+        click.option(
+            "--gates", metavar="GATE;GATE;...", help="Gates as scene files write them, instead of a transient."
+        ),
+        click.option(
+            "--rates",
+            metavar="START:WIDTH:BINS",
+            help="Bins of the rate of path lengths, m/s, beside those of time, of a scene in which things move.",
+        ),
+        click.option(
+            "--chirps",
+            metavar="BANDWIDTH:DURATION:WAVELENGTH",
+            help="Beats of chirps (Hz, s, m; a window such as :blackman may follow) over the axis, instead of a "
+            "transient.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def film_of_options(options: Mapping[str, Any]) -> FilmLayout | None:
+    """Return the film that the options of a command ask for, None without one.
+
+    Args:
+        options: values by name.
+
+    Raises:
+        ArgumentError: for options of two films, and for a part of an axis.
+        UnitError: for frequencies, rates and chirps that are no numbers.
+    """
+    histogram = _histogram(options)
+    axis = None if histogram is None else histogram.axis
+    rows = [film for film in (_rates(options, axis), _chirps(options, axis)) if film is not None]
+    every = (None if rows else histogram, _phasors(options), _gates(options), *rows)
+    found = [film for film in every if film is not None]
+    if len(found) > 1:
+        flags = " and ".join(OPTIONS[type(film)][0] for film in found)
+        raise ArgumentError(f"{flags} ask for different films: leave out one of them.")
+    return found[0] if found else None
+
+
+def _histogram(options: Mapping[str, Any]) -> Histogram | None:
+    start, width, bins = (options.get(name) for name in ("start_opl", "bin_width_opl", "num_bins"))
+    if start is None and width is None and bins is None:
+        return None
+    if start is None or width is None or bins is None:
+        raise ArgumentError("--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all.")
+    return Histogram(TimeAxis(start, width, bins))
+
+
+def _phasors(options: Mapping[str, Any]) -> FilmLayout | None:
+    given = options.get("frequencies")
+    if given is None:
+        return None
+    try:
+        return Phasors(FrequencyAxis(tuple(float(text) for text in given.split(","))))
+    except ValueError:
+        raise UnitError(f"--frequencies: expected numbers with commas, got '{given}'.") from None
+
+
+def _gates(options: Mapping[str, Any]) -> FilmLayout | None:
+    given = options.get("gates")
+    return None if given is None else Gates(gates_from_text(given))
+
+
+def _rates(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | None:
+    given = options.get("rates")
+    if given is None:
+        return None
+    try:
+        start, width, bins = given.split(":")
+        numbers = float(start), float(width), int(bins)
+    except ValueError:
+        raise UnitError(f"--rates: expected START:WIDTH:BINS in m/s, such as -10.25:0.5:41, got '{given}'.") from None
+    return Rates(RateAxis(*numbers), axis)
+
+
+def _chirps(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | None:
+    given = options.get("chirps")
+    if given is None:
+        return None
+    numbers, window = given.split(":")[:3], given.split(":")[3:]
+    try:
+        bandwidth, duration, wavelength = map(float, numbers)
+    except ValueError:
+        raise UnitError(
+            f"--chirps: expected BANDWIDTH:DURATION:WAVELENGTH in Hz, s and m, such as 1e9:1e-5:1550e-9, got '{given}'."
+        ) from None
+    chirps = Chirps(bandwidth, duration, wavelength, **({"window": ":".join(window)} if window else {}))
+    return Beats(chirps, axis)
+
+
+def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
+    """Return the contents of a written file in words, and how they were made.
+
+    Args:
+        film: of the render.
+        output: the render.
+    """
+    tensor = film.tensor(output)
+    sizes = " x ".join(map(str, () if tensor is None else tensor.shape))
+    shape = f"{sizes} ({'Stokes x ' if output.polarized else ''}C x {film.letter} x H x W)"
+    if film.has_bins:
+        return shape, f", {output.stats.temporal_filter} filter"
+    return f"{shape} {film.plural}", ""
+
+
+def pictures_of(film: FilmLayout) -> tuple[str, ...]:
+    """Return the pictures of ``torchtransient render`` that show a film.
+
+    Args:
+        film: of the render.
+    """
+    if isinstance(film, Histogram | Rates):
+        return ("overview", "peak_time", "rainbow", "video")
+    return ("video",) if isinstance(film, Phasors | Gates) else ()
+
+
+def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
+    """Write a video of a render and return its contents in words.
+
+    Args:
+        film: of the render.
+        output: the render.
+        path: place of the video.
+        progress: show a progress bar.
+
+    Raises:
+        ArgumentError: for films without a video.
+    """
+    from torchtransient.vis.phasors import phasor_video
+    from torchtransient.vis.videos import video
+
+    if isinstance(film, Phasors):
+        phasor_video(output, path, progress=progress)
+        return "the wave of the first frequency"
+    if not isinstance(film, Histogram | Gates | Rates):
+        raise ArgumentError(f"--video shows nothing of {film.plural}; leave it out.")
+    video(output, path, progress=progress)
+    return f"{film.count} frames" + (", one for each gate" if isinstance(film, Gates) else "")
+
+
+# ------------------------------------------------------------------------------------------------------------- pictures
+
+
+def video_options(command: Command) -> Command:
+    """Add the options of a video's frames.
+
+    Args:
+        command: function of a command.
+    """
+    options = (
+        click.option("--fps", type=click.FloatRange(min=0, min_open=True), default=25.0, show_default=True),
+        click.option("--exposure", type=click.FloatRange(min=0, min_open=True), help="Factor.  [default: measured]"),
+        click.option(
+            "--curve", type=click.Choice(["srgb", "gamma", "log", "linear"]), default="srgb", show_default=True
+        ),
+        click.option("--accumulate", is_flag=True, help="Show the light that has arrived so far."),
+        click.option("--every", type=click.IntRange(min=1), default=1, show_default=True, help="Bins in a frame."),
+        click.option("--no-stamp", is_flag=True, help="No time under the frames."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def picture_options(command: Command) -> Command:
+    """Add the options of pictures that `render` writes beside the result.
+
+    Args:
+        command: function of a command.
+    """
+    options = (
+        click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png)."),
+        click.option("--video", type=click.Path(path_type=Path), help="Write the light in flight (.mp4 or .gif)."),
+        click.option("--peak-time", type=click.Path(path_type=Path), help="Write when most light arrives (.png)."),
+        click.option("--rainbow", type=click.Path(path_type=Path), help="Write time as hue (.png)."),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
+    """Check that the pictures of `picture_options` can be written and show the film.
+
+    Args:
+        options: values by name.
+        film: of the render, None before it is known.
+
+    Raises:
+        StorageError: for a place that cannot be written.
+        UsageError: for a picture that does not show what the film measures.
+    """
+    from torchtransient.vis.files import check_picture
+    from torchtransient.vis.videos import check_video
+
+    for name in PICTURES:
+        if not options[name]:
+            continue
+        flag = f"--{name.replace('_', '-')}"
+        if film is not None and name not in pictures_of(film):
+            raise click.UsageError(f"{flag} shows a histogram over time; leave it out for {film.plural}.")
+        if name == "video":
+            check_video(options[name])
+        else:
+            check_picture(options[name], flag)
+
+
+def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title: str) -> None:
+    """Write the pictures of `picture_options` that are asked for, and print their names.
+
+    Args:
+        output: the render.
+        film: its film.
+        options: values by name.
+        title: of the pictures.
+    """
+    import torchtransient as tt
+
+    if options["overview"]:
+        transient = output.rates.sum(-4) if output.transient is None else output.transient
+        power = (transient[0], output.steady[0]) if output.polarized else (transient, output.steady)
+        errors = None
+        if output.cells is not None:
+            errors = output.error_map()[0] if output.polarized else output.error_map()
+        tt.vis.plot_overview(
+            *power, output.axis, path=options["overview"], pixel=options["pixel"], title=title, errors=errors
+        )
+        click.echo(f"{options['overview']}: overview")
+    if options["peak_time"]:
+        tt.vis.peak_time_picture(output, options["peak_time"], title=title)
+        click.echo(f"{options['peak_time']}: arrival of the peak")
+    if options["rainbow"]:
+        tt.vis.rainbow(output, options["rainbow"])
+        click.echo(f"{options['rainbow']}: hue by arrival")
+    if options["video"]:
+        shown = write_film_video(film, output, options["video"], progress=not options["quiet"])
+        click.echo(f"{options['video']}: {shown}")
+
+
+# ------------------------------------------------------------------------------------------------------------- messages
+
+
+def in_options(message: str) -> str:
+    """Return a message of the library with options in the place of Python.
+
+    Args:
+        message: of an error or a warning.
+    """
+    for kind, flags in OPTIONS.items():
+        message = message.replace(f"Give {kind.example}", f"Give {', '.join(flags)}")
+    for python, option in _WORDS.items():
+        message = message.replace(python, option)
+    return message
+
+
+def arguments_as_options(message: str, names: Sequence[str]) -> str:
+    """Return a message with ``name=`` as ``--name``, and without calls of reconstruction.
+
+    Args:
+        message: of an error.
+        names: arguments that are options.
+    """
+    for name in names:
+        option = f"--{name.replace('_', '-')}"
+        # With a value behind it, or as a name alone.
+        message = re.sub(rf"\b{name}=(?=['\"\w])", f"{option} ", message)
+        message = re.sub(rf"\b{name}=", option, message)
+    for python, option in _RECONSTRUCTION.items():
+        message = message.replace(python, option)
+    return message

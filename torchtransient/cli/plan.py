@@ -9,8 +9,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options
-from torchtransient.cli.options import load_scene, scene_options
+from torchtransient.cli.options import film_of_options, load_scene, scene_options
 from torchtransient.rendering.films import layout_of_plugin
 from torchtransient.rendering.plan import Plan, known_outputs
 from torchtransient.scene.inventory import scene_inventory
@@ -22,7 +21,7 @@ class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer 
     name = "NAME,NAME,..."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """The words of a text."""
+        """Return the words of a text."""
         return value if isinstance(value, tuple) else tuple(part.strip() for part in value.split(",") if part.strip())
 
 
@@ -38,9 +37,7 @@ error_option = click.option(
 @click.option(
     "--outputs",
     type=Names(),
-    default="transient",
-    show_default=True,
-    help=f"Some of {', '.join(known_outputs())}.",
+    help=f"Some of {', '.join(known_outputs())}.  [default: that of the film of the options or the scene]",
 )
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")
 @click.option("--tail", type=float, default=1e-3, show_default=True, help="Share of the light left to deeper paths.")

@@ -19,13 +19,13 @@ _OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin",
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
-    """One to some numbers with commas between them."""
+    """One to ``most`` numbers with commas between them."""
 
     def __init__(self, kind: Callable[[str], Any], most: int, metavar: str) -> None:
         self.kind, self.most, self.name = kind, most, metavar
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """(...,) of a text."""
+        """Return the numbers (...,) of a text."""
         if isinstance(value, tuple):
             return value
         try:
@@ -38,7 +38,11 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newe
 
 
 def file_options(command: Command) -> Command:
-    """What a file of another program leaves open."""
+    """Add the options for values that a file of another program leaves open.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.option("--format", "layout", help="Layout of CAPTURE (docs/capture_files.md).  [default: found]"),
         click.option("--wall-size", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the scanned area, metres."),
@@ -54,7 +58,11 @@ def file_options(command: Command) -> Command:
 
 
 def capture_options(command: Command) -> Command:
-    """What is done to a capture before a method sees it."""
+    """Add the options of how a capture is prepared.
+
+    Args:
+        command: function of a command.
+    """
     options = (
         click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
         click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
@@ -110,7 +118,7 @@ def command(capture: Path, **options: Any) -> None:
     bp, fbp: any points. Which loses what: docs/nlos_reconstruction.md. The volume's file holds values (C, Z, Y, X),
     depths and axes; tt.nlos.read_volume reads it.
     """
-    from torchtransient.cli.words import arguments_as_options
+    from torchtransient.cli.options import arguments_as_options
     from torchtransient.errors import TorchTransientError
 
     _check_together(options)
@@ -152,7 +160,7 @@ def _run(capture: Path, options: dict[str, Any]) -> None:
 
 
 def _tell(measured: Any, choice: Any) -> None:
-    """On stderr: the method, and what neither the file nor the command line said."""
+    """Print the method, and values that neither the file nor the command line had, on stderr."""
     click.echo(f"--method {choice.name}: {choice.reason}", err=True)
     assumed = measured.metadata.get("assumed") or {}
     if assumed:
@@ -167,7 +175,7 @@ def _as_words(value: Any) -> str:
 
 
 def _check_together(options: dict[str, Any]) -> None:
-    """Mistakes that can be told without the file."""
+    """Refuse options that contradict each other, before the file is read."""
     from torchtransient.checks import positive, share
 
     positive("--gamma", options["gamma"])
@@ -194,7 +202,7 @@ def _choice(capture: Any, method: str | None) -> Any:
 
 
 def _picture(options: dict[str, Any], target: Path) -> Path | None:
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     if options["no_picture"]:
         return None
@@ -204,9 +212,9 @@ def _picture(options: dict[str, Any], target: Path) -> Path | None:
 
 
 def _prepared(capture: Any, options: dict[str, Any]) -> Any:
-    """The capture as the method gets it: cut, summed, without its slab, on its device."""
-    from torchtransient.nlos.preparation import moved_to, sum_bins, without_slab
-    from torchtransient.reconstruction.proportions import check_record
+    """Return the capture as the method takes it: cut, summed, without its slab, on its device."""
+    from torchtransient.nlos.reconstruct import moved_to, sum_bins, without_slab
+    from torchtransient.reconstruction.capture_checks import check_record
 
     if options["record"] is not None:
         check_record(capture.axis, options["record"][1], "--record")
@@ -227,7 +235,7 @@ def _camera(options: dict[str, Any]) -> Any:
 
 
 def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
-    """The voxels that are asked for; None for those of the method."""
+    """Return the voxels that are asked for; None for those of the method."""
     from torchtransient.nlos.reconstruct import default_grid
     from torchtransient.reconstruction import VoxelGrid
 
@@ -253,7 +261,7 @@ def _grid(capture: Any, method: str, options: dict[str, Any]) -> Any:
 
 
 def _noted(volume: Any, path: Path, measured: Any, reason: str, options: dict[str, Any]) -> Any:
-    """With what the file and the command line said, as far as it is plain data."""
+    """Return the volume with notes of the file and the command line, as far as they are plain data."""
     from dataclasses import replace
 
     said = {name: options[name] for name in ("record", "sum_bins", "slab", "slab_snr") if options[name] is not None}

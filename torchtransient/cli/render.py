@@ -9,9 +9,17 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.films import film_of_options, summary
-from torchtransient.cli.options import assignments, load_scene, scene_options, scene_values
-from torchtransient.cli.pictures import check_pictures, picture_options, write_pictures
+from torchtransient.cli.options import (
+    assignments,
+    check_pictures,
+    film_of_options,
+    load_scene,
+    picture_options,
+    scene_options,
+    scene_values,
+    summary,
+    write_pictures,
+)
 from torchtransient.cli.plan import error_option, plan_of_options
 from torchtransient.errors import PhysicsWarning
 from torchtransient.rendering.films import layout_of_output
@@ -149,12 +157,12 @@ def _render_to_tolerance(
 
 
 def _power(output: Any) -> tuple[Any, Any]:
-    """Transient and steady image without the components that describe the polarization."""
+    """Return transient and steady image without the components that describe the polarization."""
     return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
 
 
 def _report_energy(output: Any) -> None:
-    """Light outside of the time axis is easily overlooked in a picture, so it is said in numbers."""
+    """Print the light outside of the time axis, which is easily overlooked in a picture."""
     before, after = output.outside
     if before + after > 0.001:
         axis = output.axis

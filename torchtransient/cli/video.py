@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from torchtransient.cli.pictures import video_options
+from torchtransient.cli.options import video_options
 
 
 @click.command()

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said, path_of
-from torchtransient.array_files.hdf5_limits import check_memory
+from torchtransient.array_files.hdf5 import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import positive, shown
@@ -27,7 +27,7 @@ from torchtransient.data.shard_format import COUNTED, measured_names
 from torchtransient.data.transient_dataset import TransientDataset
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.captures import tal
-from torchtransient.files.scan_data import scan_from_data
+from torchtransient.files.plain_data import scan_from_data
 from torchtransient.rendering.progress import with_bar
 
 _WHAT = "WebDataset"

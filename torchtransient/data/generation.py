@@ -360,7 +360,7 @@ def _check_recipe(recipe: Any, folder: Any) -> None:
 
 
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
-    from torchtransient.array_files.hdf5_writing import hdf5_package
+    from torchtransient.array_files.hdf5 import hdf5_package
     from torchtransient.data.shard_format import check_compression, check_store
 
     hdf5_package(_WHAT)

@@ -28,7 +28,7 @@ from torchtransient.data.specification import (
     samples_of,
 )
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError, UnitError
-from torchtransient.files.scan_data import scan_data
+from torchtransient.files.plain_data import scan_data
 from torchtransient.plugins import versions_of_others
 from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer

@@ -3,7 +3,7 @@
 A file has the arguments of :class:`~torchtransient.data.Recipe` as entries. ``scene`` is the name of an XML file, a
 scene dictionary, ``{builtin: cornell_box, resolution: 32}`` for a function of ``tt.scenes``, or ``{one_of: {a: ..., b:
 ...}, weights: [...]}``. A capture has ``hidden`` instead, with ``wall`` and ``scan`` as in the YAML files of captures
-(:mod:`torchtransient.nlos.description`).
+(:mod:`torchtransient.nlos.setup_files`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from torchtransient.data.serialization import (
 )
 from torchtransient.data.specification import OneOf, Specification
 from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
@@ -487,8 +487,7 @@ def _builtin(given: Mapping[str, Any]) -> Any:
 
 
 def _capture(section: Section, folder: Path, arguments: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    from torchtransient.nlos.described_shapes import described_shapes
-    from torchtransient.nlos.description import scan_of, wall_of
+    from torchtransient.nlos.setup_files import described_shapes, scan_of, wall_of
 
     hidden = described_shapes(section.get("hidden"), folder)
     arguments["scan"] = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))

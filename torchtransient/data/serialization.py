@@ -26,8 +26,7 @@ from torchtransient.data import poses as poses
 from torchtransient.data.distributions import Distribution
 from torchtransient.errors import SceneError
 from torchtransient.files.content_key import contents_of
-from torchtransient.files.plain_data import plain, restored
-from torchtransient.files.scan_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import plain, restored, scan_data, scan_from_data
 from torchtransient.gates import Gate
 from torchtransient.plugins.dictionaries import Pixels, Voxels
 from torchtransient.pulses import Pulse

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import hdf5_package
 from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_folder, check_source, damage_said, path_of
-from torchtransient.array_files.hdf5_limits import check_memory, dataset_of, is_number, read_dataset
-from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.hdf5 import check_memory, dataset_of, hdf5_package, is_number, new_hdf5, read_dataset
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.checks import as_whole, count, mapping, shown
 from torchtransient.data.sample import Sample

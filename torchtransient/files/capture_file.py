@@ -1,13 +1,13 @@
-"""A capture around a corner on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+"""Captures around a corner on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Both hold the same names, arrays in torch's order as :class:`~torchtransient.capture.Capture` has them: `transient` (C,
 T, ...) with `start_opl`, `bin_width_opl` (metres of optical path), `num_bins`; `phasor` (C, F, ...) with
 `frequencies_per_metre` float64 (F,) and `phasor_start_opl`; `steady` (C, ...); polarized captures with the four Stokes
 components before C. The scan is float64, in metres: `sensor_points`, `laser_points`, `sensor_origin`, `laser_origin`,
-where they are known `sensor_normals` and `laser_normals`, and `sensor_legs`, `laser_legs`, the ways to the sensor and
-from the laser, whether or not `first_and_last_leg` says that they count. `kind`, `channels`, `metadata` and `wall` are
-texts, the last three JSON; arrays in the wall stand beside it as `wall_0`, `wall_1`, .... What is not there is left
-out. Numbers and texts are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
+if they are known `sensor_normals` and `laser_normals`, and `sensor_legs`, `laser_legs`, the ways to the sensor and
+from the laser, independent of `first_and_last_leg`, which says if they count. `kind`, `channels`, `metadata` and
+`wall` are texts, the last three JSON; arrays in the wall stand beside it as `wall_0`, `wall_1`, .... Missing parts are
+left out. Numbers and texts are attributes of the HDF5 file and zero-dimensional arrays of the `.npz`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files.entries import flag_of, names_of, notes_of, number_of, text_of, whole_of
-from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.plain_data import flag_of, names_of, notes_of, number_of, plain, restored, text_of, whole_of
 
 FORMAT = "torchtransient capture 2"
 # Those of the first version have no checksums.
@@ -43,16 +42,31 @@ _POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "se
 
 
 def check_capture_target(path: str | Path) -> Path:
-    """Return `path`, or raise StorageError when a capture could not be written there. For before a long simulation."""
+    """Return the path of a new capture after checking that it can be written, for before a long simulation.
+
+    Args:
+        path: place of the file.
+
+    Raises:
+        StorageError: as :func:`write_capture`.
+    """
     return array_file.check_target(path, _WHAT)
 
 
 def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any] | None = None) -> Path:
-    """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
+    """Write a capture in the library's own format; an existing file is replaced once the new one is complete.
 
-    `metadata`: plain data stored beside the capture's own, which goes before. Gradients are not stored. Raises
-    StorageError for an unknown ending, a folder that is missing, a full disk, metadata or a wall that is not plain
-    data.
+    Args:
+        path: place of the file, ending in .h5, .hdf5 or .npz.
+        capture: gradients are not stored.
+        metadata: plain data stored beside the capture's own, which takes precedence.
+
+    Returns:
+        The path.
+
+    Raises:
+        StorageError: for an unknown ending, a folder that is missing, a full disk, metadata or a wall that is not plain
+            data.
     """
     target = check_capture_target(path)
     if not isinstance(capture, Capture):
@@ -83,9 +97,13 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
 
 
 def read_capture(path: str | Path) -> Capture:
-    """Read what `write_capture` wrote, bit by bit, as tensors on the CPU. What somebody put beside it is left alone.
+    """Read a capture of :func:`write_capture`, bit by bit, as tensors on the CPU.
 
-    Raises StorageError when the file is missing, damaged or not a capture.
+    Args:
+        path: the file. Names that other programs put there are left alone.
+
+    Raises:
+        StorageError: for a file that is missing, damaged or no capture.
     """
     values = read_arrays(path, FORMATS, _WHAT, _is_known)
     with damage_said(Path(path), _WHAT):

@@ -1,4 +1,4 @@
-"""A text that stands for a simulation: equal where everything that decides about its numbers is equal."""
+"""Keys of simulations: texts that are equal if everything that decides about the numbers is equal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ import torch
 
 
 def content_key(*parts: Any) -> str:
-    """Of descriptions, scans, arrays and plain data; files that descriptions name count with what is in them."""
+    """Return a key of descriptions, scans, arrays and plain data.
+
+    Args:
+        parts: any of these; files that descriptions name count with their content.
+
+    Returns:
+        SHA-256, hexadecimal.
+    """
     return hashlib.sha256(_text(parts).encode()).hexdigest()
 
 
@@ -43,7 +50,11 @@ def _text(value: Any) -> str:
 
 
 def contents_of(path: Path) -> str:
-    """A text that stands for what is in a file, "" for texts that name none."""
+    """Return the SHA-256 of a file's content, "" for paths of no file.
+
+    Args:
+        path: any path.
+    """
     try:
         if not path.is_file():
             return ""

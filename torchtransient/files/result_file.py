@@ -1,15 +1,15 @@
-"""A render on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+"""Renders on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
 Both hold the same names. Arrays have torch's order: `steady` float32 (..., C, H, W) and one of `transient` float32
 (..., C, T, H, W), radiance integrated over each bin, with `edges_opl` float64 (T + 1,), metres; `phasor` complex64
 (..., C, F, H, W) with `frequencies_per_metre` float64 (F,), cycles per metre of optical path; `gated` float32 (..., C,
-G, H, W) with `gates` (the text of scene files), where files of earlier versions say `transient`; `rates` float32 (...,
+G, H, W) with `gates` (the text of scene files), called `transient` in files of earlier versions; `rates` float32 (...,
 C, R, T, H, W) with `edges_opl` and the bins of the rate (`rates_start`, `rates_bin_width` in m/s, `rates_num_bins`);
 `beats` float32 (..., C, 2, T, H, W) with `edges_opl` and the chirps (`chirps_bandwidth_hz`, `chirps_duration_s`,
 `chirps_wavelength_m`, `chirps_window`); or `slow_phasor` complex64 (..., C, S, F, H, W) with `slow_times` float64 (S,),
 seconds, and `frequencies_per_metre`. Polarized variants have the four Stokes components before C. The numbers of the
 axis (`start_opl`, and with `edges_opl` the `bin_width_opl`, in metres, and `num_bins`), `channels` (JSON: the names of
-the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `checksums.py`) are attributes of the HDF5 file
+the C channels), `format`, `metadata` (JSON) and `checksums` (JSON, see `array_file.py`) are attributes of the HDF5 file
 and zero-dimensional arrays of the `.npz`. A cube is written in parts, so that no second copy of it is needed.
 """
 
@@ -27,10 +27,10 @@ import torch
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, StorageError
-from torchtransient.files.entries import names_of, notes_of, number_of, text_of, whole_of
+from torchtransient.files.plain_data import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
 from torchtransient.rendering.films import FILMS, layout_of_entries, layout_of_output
@@ -53,7 +53,7 @@ _KNOWN |= {"cells", *_OF_ERRORS}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(ErrorBars, TensorRecord):
-    """What `read_result` returns: the tensors of a render, its axis, and what was noted about its making.
+    """Render that was read from a file: tensors, axis, and metadata about its making.
 
     `transient` with `axis`, `phasor` with `frequencies`, `gated` with `gates`, `rates` with `rate_axis` and `beats`
     with `chirps`, both with `axis`, or `slow_phasor` with `slow_times` and `frequencies`; the others are None.
@@ -86,6 +86,7 @@ class Result(ErrorBars, TensorRecord):
 
     @classmethod
     def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
+        """Return the metadata of a batch."""
         return {"metadata": {"batch": [record.metadata for record in records]}}
 
     def _shown_notes(self) -> dict[str, str]:
@@ -93,20 +94,42 @@ class Result(ErrorBars, TensorRecord):
 
 
 def check_target(path: str | Path) -> Path:
-    """Return `path`, or raise StorageError when a result could not be written there. For before a long render."""
+    """Return the path of a new result after checking that it can be written, for before a long render.
+
+    Args:
+        path: place of the file.
+
+    Raises:
+        StorageError: as :func:`write_result`.
+    """
     return array_file.check_target(path, _WHAT)
 
 
 def check_folder(path: str | Path) -> None:
-    """Raise StorageError when the folder of `path` is missing or closed to us, or `path` is a folder itself."""
+    """Check that the folder of a path can be written.
+
+    Args:
+        path: place of a file.
+
+    Raises:
+        StorageError: for a folder that is missing or closed, and for a path that is a folder itself.
+    """
     array_file.check_folder(path, _WHAT)
 
 
 def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
-    """Write a render, or a result that was read. An existing file is replaced once the new one is complete.
+    """Write a render, or a result that was read; an existing file is replaced once the new one is complete.
 
-    `metadata`: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render. Raises
-    StorageError for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
+    Args:
+        path: place of the file, ending in .h5, .hdf5 or .npz.
+        output: the render.
+        metadata: plain data (numbers, strings, lists, dictionaries) stored beside the statistics of the render.
+
+    Returns:
+        The path.
+
+    Raises:
+        StorageError: for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
     """
     target = check_target(path)
     given: Any = output
@@ -141,11 +164,16 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
 
 
 def read_result(path: str | Path) -> Result:
-    """Read what `write_result` wrote, as tensors on the CPU. What somebody put beside it is left alone.
+    """Read a result of :func:`write_result`, as tensors on the CPU.
 
-    Every number and text is compared with its checksum. Files of the first version of the format have none: they are
-    read all the same. Raises StorageError when the file is missing, damaged, changed by another program or not a
-    result.
+    Args:
+        path: the file. Names that other programs put there are left alone.
+
+    Returns:
+        The result. Numbers and texts are compared with their checksums, which files of the first version do not have.
+
+    Raises:
+        StorageError: for a file that is missing, damaged, changed by another program or no result.
     """
     values = read_arrays(path, FORMATS, _WHAT, _is_known)
     with damage_said(Path(path), _WHAT):

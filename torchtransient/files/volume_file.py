@@ -1,6 +1,6 @@
-"""A reconstructed volume on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
+"""Reconstructed volumes on disk: HDF5 (`.h5`, `.hdf5`) or NumPy's `.npz`, chosen by the file's ending.
 
-Both hold the same names: `values` (..., C, Z, Y, X), or (..., C, N, Z, Y, X) with `times` (N,) where a camera filmed;
+Both hold the same names: `values` (..., C, Z, Y, X), or (..., C, N, Z, Y, X) with `times` (N,) of a film camera;
 `directions` (..., C, 3, Z, Y, X) of methods that find normals, in world coordinates. The grid is float64, in metres:
 `depths` (Z,), `pitch` (2,) as (dy, dx), and the vectors (3,) `first`, `along_x`, `along_y`, `normal`; voxel (k, j, i)
 stands at ``first + j dy along_y + i dx along_x + depths[k] normal``. `method` is a text, `metadata` one of JSON; texts
@@ -15,11 +15,10 @@ import numpy as np
 
 from torchtransient.array_files import array_file
 from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
-from torchtransient.capture.metadata import metadata_text
+from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
-from torchtransient.files.entries import notes_of, text_of
-from torchtransient.reconstruction.hidden_volume import HiddenVolume
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.files.plain_data import notes_of, text_of
+from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
 
 FORMAT = "torchtransient volume 2"
 # Those of the first version have no checksums.
@@ -29,15 +28,29 @@ _VECTORS = ("first", "along_x", "along_y", "normal")
 
 
 def check_volume_target(path: str | Path) -> Path:
-    """Return `path`, or raise StorageError when a volume could not be written there. For before long computations."""
+    """Return the path of a new volume after checking that it can be written, for before long computations.
+
+    Args:
+        path: place of the file.
+
+    Raises:
+        StorageError: as :func:`write_volume`.
+    """
     return array_file.check_target(path, _WHAT)
 
 
 def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
-    """Write a volume; an existing file is replaced once the new one is complete. Returns the path.
+    """Write a volume; an existing file is replaced once the new one is complete.
 
-    Gradients are not stored. Raises StorageError for an unknown ending, a folder that is missing, a full disk, and
-    metadata that is not plain data.
+    Args:
+        path: place of the file, ending in .h5, .hdf5 or .npz.
+        volume: gradients are not stored.
+
+    Returns:
+        The path.
+
+    Raises:
+        StorageError: for an unknown ending, a folder that is missing, a full disk, and metadata that is not plain data.
     """
     target = check_volume_target(path)
     if not isinstance(volume, HiddenVolume):
@@ -53,9 +66,13 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
 
 
 def read_volume(path: str | Path) -> HiddenVolume:
-    """Read what `write_volume` wrote, as tensors on the CPU. What somebody put beside it is left alone.
+    """Read a volume of :func:`write_volume`, as tensors on the CPU.
 
-    Raises StorageError when the file is missing, damaged or not a volume.
+    Args:
+        path: the file. Names that other programs put there are left alone.
+
+    Raises:
+        StorageError: for a file that is missing, damaged or no volume.
     """
     needed, optional = ("values", "depths", "pitch", *_VECTORS), ("times", "directions")
     known = {*needed, *optional, "format", "method", "metadata"}

@@ -1,4 +1,4 @@
-"""YAML files as checked plain data: sections whose entries are asked for by name and kind."""
+"""YAML files as checked plain data: sections whose entries are taken by name and kind."""
 
 from __future__ import annotations
 
@@ -10,30 +10,32 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchtransient.array_files.plain_texts import safe_loader, text_of_file, yaml_data
+from torchtransient.array_files.plain_texts import safe_loader, text_of_file, yaml_data, yaml_package
 from torchtransient.checks import path_of, shown, some_of
-from torchtransient.errors import MissingPackageError, SceneError
+from torchtransient.errors import SceneError
 
 _MISSING = object()
 
 
 def read_yaml(source: str | Path, who: str) -> tuple[dict[str, Any], Path]:
-    """The mapping of a YAML file, and the folder that it lies in. A text with a line break is YAML itself, in the
-    current folder.
+    """Read the mapping of a YAML file by PyYAML's safe loader; nothing is executed.
 
-    Read by PyYAML's safe loader: plain data only, nothing is executed. A name that stands twice in a mapping is an
-    error. Raises MissingPackageError without PyYAML, StorageError for a missing file and for what is no YAML,
-    SceneError for what is no mapping.
+    Args:
+        source: path of a file, a folder that holds one of its name, or a text with a line break: YAML itself.
+        who: subject of messages.
+
+    Returns:
+        The mapping, and the folder of the file (of a text the current one).
+
+    Raises:
+        MissingPackageError: without PyYAML.
+        StorageError: for a missing file and for other texts than YAML.
+        SceneError: for anything but a mapping, and a name that stands twice in one.
     """
-    try:
-        import yaml
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{who}: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]'."
-        ) from error
+    yaml = yaml_package(who)
 
     class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
-        """Says so where a later entry would silently replace an earlier one."""
+        """Safe loader that refuses a name that stands twice."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
@@ -62,9 +64,12 @@ def _text(source: str | Path, who: str) -> tuple[str, Path]:
 
 
 class Section:
-    """A mapping whose entries are taken out by name. What is wrong is a SceneError that names the entry.
+    """Mapping whose entries are taken by name. Wrong entries raise a SceneError that names them.
 
-    `known`: all names that may stand there; others are an error that names the nearest one.
+    Args:
+        data: the mapping.
+        where: place in the file, for messages.
+        known: all names that may stand there; another one is an error that names the nearest of them.
     """
 
     def __init__(self, data: Any, where: str, known: Iterable[str]):
@@ -83,7 +88,7 @@ class Section:
         return self.data.get(name) is not None
 
     def get(self, name: str, default: Any = _MISSING) -> Any:
-        """An entry as it is; `default` where it is missing or null. Raises SceneError where there is no default."""
+        """Return an entry as it is, `default` if it is missing or null. Raises SceneError without a default."""
         value = self.data.get(name)
         if value is not None:
             return value
@@ -92,12 +97,12 @@ class Section:
         return default
 
     def number(self, name: str, default: Any = _MISSING) -> Any:
-        """A finite number; `default` as it is."""
+        """Return a finite number; `default` as it is."""
         value = self.get(name, default)
         return value if name not in self else as_number(value, self._at(name))
 
     def whole(self, name: str, default: Any = _MISSING, least: int | None = 1) -> Any:
-        """A whole number, at least `least`; `default` as it is."""
+        """Return a whole number, at least `least`; `default` as it is."""
         value = self.get(name, default)
         if name not in self:
             return value
@@ -108,28 +113,28 @@ class Section:
         return int(number)
 
     def flag(self, name: str, default: bool) -> bool:
-        """true or false."""
+        """Return true or false."""
         value = self.get(name, default)
         if not isinstance(value, bool):
             raise SceneError(f"{self._at(name)}: expected true or false, got {shown(value)}.")
         return value
 
     def text(self, name: str, default: Any = _MISSING) -> Any:
-        """A text; `default` as it is."""
+        """Return a text; `default` as it is."""
         value = self.get(name, default)
         if name in self and not isinstance(value, str):
             raise SceneError(f"{self._at(name)}: expected a text, got {shown(value)}.")
         return value
 
     def choice(self, name: str, choices: Sequence[str], default: Any = _MISSING) -> Any:
-        """One of some texts."""
+        """Return one of some texts."""
         value = self.get(name, default)
         if value not in choices:
             raise SceneError(f"{self._at(name)}: expected one of {some_of(choices)}, got {shown(value)}.")
         return value
 
     def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
-        """A list of finite numbers, as many as one of `counts` says; `default` as it is."""
+        """Return a list of finite numbers, as many as one of `counts`; `default` as it is."""
         value = self.get(name, default)
         if name not in self:
             return value
@@ -143,7 +148,15 @@ class Section:
 
 
 def as_number(value: Any, where: str) -> float:
-    """A finite number. YAML 1.1 reads 1e-3 as a text: it counts too. Raises SceneError for others."""
+    """Return a finite number, also of a text, since YAML 1.1 reads 1e-3 as one.
+
+    Args:
+        value: entry of a YAML file.
+        where: place of the entry, for messages.
+
+    Raises:
+        SceneError: for anything else.
+    """
     number = math.nan
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         with contextlib.suppress(ValueError, OverflowError):
@@ -154,7 +167,16 @@ def as_number(value: Any, where: str) -> float:
 
 
 def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:
-    """The first of `folders` that has a file of that name. Raises SceneError where none does."""
+    """Return the path of a file in the first of some folders that has it.
+
+    Args:
+        name: of the file.
+        folders: in the order in which they are searched.
+        where: place of the entry, for messages.
+
+    Raises:
+        SceneError: if none has it.
+    """
     for folder in folders:
         path = folder / name
         if os.path.isfile(path):

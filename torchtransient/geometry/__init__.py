@@ -11,6 +11,7 @@ Pixels count as kornia counts them: the centre of the first pixel is (0, 0), u r
 
 from torchtransient.geometry.distances import distance_from_opl as distance_from_opl
 from torchtransient.geometry.distances import distance_from_z_depth as distance_from_z_depth
+from torchtransient.geometry.distances import normals_from_distance as normals_from_distance
 from torchtransient.geometry.distances import opl_from_distance as opl_from_distance
 from torchtransient.geometry.distances import points_from_distance as points_from_distance
 from torchtransient.geometry.distances import ray_directions as ray_directions
@@ -20,4 +21,3 @@ from torchtransient.geometry.pinhole import extrinsics as extrinsics
 from torchtransient.geometry.pinhole import intrinsics as intrinsics
 from torchtransient.geometry.pinhole import pinhole_camera as pinhole_camera
 from torchtransient.geometry.pinhole import to_world_from_extrinsics as to_world_from_extrinsics
-from torchtransient.geometry.surface_normals import normals_from_distance as normals_from_distance

@@ -1,4 +1,5 @@
-"""Depth along the axis, distance along the ray, points, and the optical path of light that has met one surface.
+"""Depth along the axis, distance along the ray, points, normals, and the optical path of light that has met one
+surface.
 
 Images are (..., H, W). `camera_matrix` (3, 3) or (..., 3, 3) is that of `intrinsics`, of the same image. Lengths in
 metres. NaN, of pixels that meet nothing, stays NaN, and nothing flows back from there. Results have the dtype of the
@@ -20,8 +21,18 @@ from torchtransient.geometry.pinhole import camera_matrices, camera_to_world, im
 
 @without_autocast
 def ray_directions(camera_matrix: Any, size: tuple[int, int], to_world: Any = None) -> Tensor:
-    """Unit vectors (..., 3, H, W) from the pinhole through the centres of the pixels of an image of `size` (H, W): in
-    kornia's camera, or in the world of a sensor's `to_world`. Raises ShapeError.
+    """Return unit vectors from the pinhole through the centres of pixels.
+
+    Args:
+        camera_matrix: (..., 3, 3).
+        size: (H, W) of the image.
+        to_world: pose (..., 4, 4) of the sensor, for vectors of the world; None for those of kornia's camera.
+
+    Returns:
+        (..., 3, H, W).
+
+    Raises:
+        ShapeError: for other shapes.
     """
     matrix = camera_matrices(camera_matrix, "ray_directions")
     return _rays(single(matrix), image_size(size, "ray_directions"), to_world).to(matrix.dtype)
@@ -41,7 +52,12 @@ def _rays(matrix: Tensor, size: tuple[int, int], to_world: Any = None) -> Tensor
 
 @without_autocast
 def distance_from_z_depth(z_depth: Tensor, camera_matrix: Any) -> Tensor:
-    """Distance from the pinhole along each pixel's ray (the label `depth`) of depth along the axis (`z_depth`)."""
+    """Return the distance along each pixel's ray (the label `depth`).
+
+    Args:
+        z_depth: depth along the axis (the label `z_depth`), (..., H, W), metres.
+        camera_matrix: (..., 3, 3).
+    """
     cosines = _cosines(z_depth, camera_matrix, "distance_from_z_depth")
     known, depth = without_nan(z_depth)
     return torch.where(known, depth / cosines, torch.nan).to(z_depth.dtype)
@@ -49,7 +65,12 @@ def distance_from_z_depth(z_depth: Tensor, camera_matrix: Any) -> Tensor:
 
 @without_autocast
 def z_depth_from_distance(distance: Tensor, camera_matrix: Any) -> Tensor:
-    """Depth along the axis (the label `z_depth`) of distance along each pixel's ray (`depth`)."""
+    """Return the depth along the axis (the label `z_depth`).
+
+    Args:
+        distance: distance along each pixel's ray (the label `depth`), (..., H, W), metres.
+        camera_matrix: (..., 3, 3).
+    """
     cosines = _cosines(distance, camera_matrix, "z_depth_from_distance")
     known, along = without_nan(distance)
     return torch.where(known, along * cosines, torch.nan).to(distance.dtype)
@@ -57,8 +78,16 @@ def z_depth_from_distance(distance: Tensor, camera_matrix: Any) -> Tensor:
 
 @without_autocast
 def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = None) -> Tensor:
-    """Points (..., 3, H, W) at a distance along each pixel's ray: in kornia's camera, or in the world of a sensor's
-    `to_world` (the label `position`).
+    """Return the points at a distance along each pixel's ray.
+
+    Args:
+        distance: (..., H, W), metres.
+        camera_matrix: (..., 3, 3).
+        to_world: pose (..., 4, 4) of the sensor, for points of the world (the label `position`); None for those of
+            kornia's camera.
+
+    Returns:
+        (..., 3, H, W), metres.
     """
     size = image_of(distance, "points_from_distance")
     points = _rays(_like(camera_matrix, distance, "points_from_distance"), size, to_world)
@@ -73,12 +102,22 @@ def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = N
 def opl_from_distance(
     distance: Tensor, camera_matrix: Any = None, to_world: Any = None, *, light: Any = None, index: float | Tensor = 1.0
 ) -> Tensor:
-    """Optical path of light that has met one surface, at a distance along each pixel's ray: from the emitter there and
-    on to the camera. There and back, `2 index distance`, of a light at the pinhole.
+    """Return the optical path of light from an emitter to the surface at a distance along each pixel's ray and on to
+    the camera. There and back, `2 index distance`, of a light at the pinhole.
 
-    `light`: its place in the world, (3,) or (..., 3), which wants `camera_matrix` and the sensor's `to_world`. `index`:
-    of refraction of what is between, a number, or a tensor that broadcasts to the image and keeps its gradient. Raises
-    ShapeError, UnitError.
+    Args:
+        distance: (..., H, W), metres.
+        camera_matrix: (..., 3, 3), for a light elsewhere.
+        to_world: pose (..., 4, 4) of the sensor, for a light elsewhere.
+        light: place in the world, (3,) or (..., 3), metres; None for the pinhole.
+        index: index of refraction between them, a number, or a tensor that broadcasts to the image and keeps its
+            gradient.
+
+    Returns:
+        (..., H, W), metres.
+
+    Raises:
+        ShapeError, UnitError: for other arguments.
     """
     image_of(distance, "opl_from_distance")
     given = _index(index, distance, "opl_from_distance")
@@ -94,12 +133,20 @@ def opl_from_distance(
 def distance_from_opl(
     opl: Tensor, camera_matrix: Any = None, to_world: Any = None, *, light: Any = None, index: float | Tensor = 1.0
 ) -> Tensor:
-    """Distance along each pixel's ray of light that has met one surface, by its optical path: the inverse of
-    `opl_from_distance`, on the ellipse with the light and the pinhole as foci.
+    """Return the distance along each pixel's ray of light that has met one surface, the inverse of `opl_from_distance`,
+    on the ellipse with the light and the pinhole as foci.
 
-    NaN, of which nothing flows back, where the path is too short for any surface: negative, or not longer than the way
-    from the light to the pinhole. Light that comes straight from the emitter is none of these. Raises as
-    `opl_from_distance`.
+    Args:
+        opl: optical path, (..., H, W), metres.
+        camera_matrix: as in `opl_from_distance`, with its errors.
+        to_world: as there.
+        light: as there.
+        index: as there.
+
+    Returns:
+        (..., H, W), metres. NaN, of which nothing flows back, if the path is too short for any surface: negative, or
+        not longer than the way from the light to the pinhole. Light that comes straight from the emitter is not
+        handled.
     """
     image_of(opl, "distance_from_opl")
     path, given = single(opl), _index(index, opl, "distance_from_opl")
@@ -121,7 +168,15 @@ def distance_from_opl(
 
 
 def image_of(image: Any, where: str) -> tuple[int, int]:
-    """Height and width. Raises ShapeError for what is no floating image."""
+    """Return height and width of a floating image.
+
+    Args:
+        image: (..., H, W).
+        where: subject of messages.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     if not isinstance(image, Tensor) or image.ndim < 2 or not image.is_floating_point():
         got = f"{tuple(image.shape)} of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
         raise ShapeError(f"{where}: expected a floating image (..., H, W), got {got}.")
@@ -129,15 +184,19 @@ def image_of(image: Any, where: str) -> tuple[int, int]:
 
 
 def without_nan(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Where an image is no NaN; and the image, in single precision at least, with 1 elsewhere: a slope of zero times
-    NaN would be NaN, and reach cameras and lights.
+    """Return the mask of numbers, and the image in single precision at least, with 1 for NaN.
+
+    A slope of zero times NaN would be NaN, and reach cameras and lights.
+
+    Args:
+        image: (..., H, W).
     """
     known = ~torch.isnan(image)
     return known, torch.where(known, single(image), 1.0)
 
 
 def _like(camera_matrix: Any, image: Tensor, where: str) -> Tensor:
-    """In the image's place and precision, single at least."""
+    """Return camera matrices on the image's device in its precision, single at least."""
     return camera_matrices(camera_matrix, where).to(image.device, torch.promote_types(image.dtype, torch.float32))
 
 
@@ -158,13 +217,13 @@ def _index(index: Any, image: Tensor, where: str) -> float | Tensor:
 
 
 def _cosines(image: Tensor, camera_matrix: Any, where: str) -> Tensor:
-    """Of the angles between rays and axis."""
+    """Return the cosines between rays and axis."""
     size = image_of(image, where)
     return _rays(_like(camera_matrix, image, where), size)[..., 2, :, :]
 
 
 def _triangle(image: Tensor, camera_matrix: Any, to_world: Any, light: Any, where: str) -> tuple[Tensor, Tensor]:
-    """Rays (..., 3, H, W) in the world, and from the pinhole to the light (..., 3, 1, 1)."""
+    """Return rays (..., 3, H, W) in the world, and the vector (..., 3, 1, 1) from the pinhole to the light."""
     size = image_of(image, where)
     if camera_matrix is None or to_world is None:
         raise UnitError(f"{where}: a light that is not at the pinhole wants camera_matrix= and to_world=.")
@@ -174,3 +233,42 @@ def _triangle(image: Tensor, camera_matrix: Any, to_world: Any, light: Any, wher
         raise ShapeError(f"{where}: expected light as points (..., 3) of the world, got {tuple(place.shape)}.")
     origin = camera_to_world(to_world).to(matrix)[..., :3, 3]
     return _rays(matrix, size, to_world), (place - origin)[..., None, None]
+
+
+@without_autocast
+def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = None) -> Tensor:
+    """Return unit normals, turned to the camera, of distances along the rays.
+
+    The cross product of Sobel's derivatives of the points, as `kornia.geometry.depth_to_normals`, whose normals point
+    away from the camera. Each normal depends on its eight neighbours: at edges it lies between those of both sides, on
+    the rim of the image it is one-sided, and if one of the nine distances is NaN so is the normal. The label `normals`
+    is that of the shading, on the side of the surface's front: it has the other sign for a surface that is seen from
+    behind. For depth along the axis: `normals_from_distance(distance_from_z_depth(z, K), K)`.
+
+    Args:
+        distance: the label `depth`, (..., H, W), metres.
+        camera_matrix: (..., 3, 3).
+        to_world: pose (..., 4, 4) of the sensor, for normals of the world; None for those of kornia's camera.
+
+    Returns:
+        (..., 3, H, W).
+
+    Raises:
+        ShapeError: for images of one row or column.
+    """
+    from kornia.filters import spatial_gradient
+
+    if min(image_of(distance, "normals_from_distance")) < 2:
+        raise ShapeError(f"normals_from_distance: expected two rows and columns at least, got {tuple(distance.shape)}.")
+    known, filled = without_nan(distance)
+    points = points_from_distance(filled, camera_matrix)
+    size = points.shape[-2:]
+    along = spatial_gradient(points.reshape(-1, 3, *size))
+    normals = -torch.nn.functional.normalize(torch.linalg.cross(along[:, :, 0], along[:, :, 1], dim=1), dim=1)
+    normals = normals.reshape(points.shape)
+    if to_world is not None:
+        turn = camera_to_world(to_world).to(normals)[..., :3, :3]
+        normals = (turn @ normals.flatten(-2)).reshape(normals.shape)
+    unknown = (~known).to(normals).reshape(-1, 1, *size)
+    near = torch.nn.functional.max_pool2d(unknown, 3, stride=1, padding=1).reshape(*known.shape[:-2], 1, *size) > 0
+    return torch.where(near, torch.nan, normals).to(distance.dtype)

@@ -32,16 +32,25 @@ def intrinsics(
     principal_point_offset: Any = (0.0, 0.0),
     crop_offset: Sequence[int] = (0, 0),
 ) -> Tensor:
-    """Camera matrix (3, 3) of a `perspective` or `thinlens` sensor, in pixels; (..., 3, 3) of angles (...).
+    """Return the camera matrix of a `perspective` or `thinlens` sensor, in pixels.
 
-    `fov_deg`: angle of view along `fov_axis`, degrees, 0 to 180; a tensor keeps its gradient (`x_fov` of a scene is
-    along "x"). `size`: (height, width) of the whole film. `principal_point_offset`: Mitsuba's
-    `principal_point_offset_x` and `_y`, shares of the film's width and height by which the axis goes to the left and
-    up, (2,) or (..., 2). `crop_offset`: `crop_offset_x` and `_y` of a film with a crop window, in pixels; the matrix is
-    that of the window.
+    Pixels are square. The first pixel's centre is (0, 0). Half precision is computed in float32 and given back. Values
+    are not checked inside of `torch.func.vmap` and `torch.compile`.
 
-    Pixels are square. The first pixel's centre is (0, 0). Half precision is computed in float32 and given back. Raises
-    UnitError, ShapeError, ArgumentError; values are not looked at inside of `torch.func.vmap` and `torch.compile`.
+    Args:
+        fov_deg: angle of view along `fov_axis`, degrees, 0 to 180; a tensor (...) keeps its gradient (`x_fov` of a
+            scene is along "x").
+        size: (height, width) of the whole film.
+        fov_axis: "x", "y", "diagonal", "smaller" or "larger".
+        principal_point_offset: Mitsuba's `principal_point_offset_x` and `_y`, shares of the film's width and height by
+            which the axis goes to the left and up, (2,) or (..., 2).
+        crop_offset: `crop_offset_x` and `_y` of a film with a crop window, in pixels; the matrix is that of the window.
+
+    Returns:
+        (3, 3), or (..., 3, 3) of angles (...).
+
+    Raises:
+        UnitError, ShapeError, ArgumentError: for other arguments.
     """
     where = "intrinsics"
     height, width = image_size(size, where)
@@ -72,8 +81,13 @@ def intrinsics(
 
 @without_autocast
 def extrinsics(to_world: Any) -> Tensor:
-    """World to kornia's camera, (..., 4, 4), of a sensor's `to_world`, a rigid motion. Raises ShapeError,
-    UnitError.
+    """Return the transform from the world to kornia's camera.
+
+    Args:
+        to_world: pose (..., 4, 4) of a sensor, a rigid motion.
+
+    Raises:
+        ShapeError, UnitError: for other transforms.
     """
     matrix = _rigid(to_world, "extrinsics")
     return _half_turn(matrix)[:, None] * _back(matrix)
@@ -81,8 +95,13 @@ def extrinsics(to_world: Any) -> Tensor:
 
 @without_autocast
 def to_world_from_extrinsics(extrinsics: Any) -> Tensor:
-    """A sensor's `to_world` of what takes the world to kornia's camera, a rigid motion. Raises ShapeError,
-    UnitError.
+    """Return a sensor's `to_world` of the transform from the world to kornia's camera.
+
+    Args:
+        extrinsics: (..., 4, 4), a rigid motion.
+
+    Raises:
+        ShapeError, UnitError: for other transforms.
     """
     matrix = _rigid(extrinsics, "to_world_from_extrinsics")
     return _back(matrix) * _half_turn(matrix)
@@ -90,16 +109,27 @@ def to_world_from_extrinsics(extrinsics: Any) -> Tensor:
 
 @without_autocast
 def camera_to_world(to_world: Any) -> Tensor:
-    """Kornia's camera to the world, (..., 4, 4), of a sensor's `to_world`: the inverse of `extrinsics`."""
+    """Return the transform (..., 4, 4) from kornia's camera to the world, the inverse of `extrinsics`.
+
+    Args:
+        to_world: pose (..., 4, 4) of a sensor.
+    """
     matrix = transforms(to_world, "camera_to_world")
     return matrix * _half_turn(matrix)
 
 
 @without_autocast
 def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) -> PinholeCamera:
-    """`kornia.geometry.PinholeCamera` of intrinsics (..., 3, 3) and a sensor's `to_world` (..., 4, 4), a batch of one
-    or more. `size`: (height, width) of the image. Its `project` and `unproject` take points of the world and pixels as
-    said above. Raises ShapeError.
+    """Return a `kornia.geometry.PinholeCamera`, a batch of one or more, whose `project` and `unproject` take points of
+    the world and pixels.
+
+    Args:
+        camera_matrix: intrinsics (..., 3, 3).
+        to_world: pose (..., 4, 4) of the sensor.
+        size: (height, width) of the image.
+
+    Raises:
+        ShapeError: for other shapes.
     """
     from kornia.geometry.camera import PinholeCamera
 
@@ -117,7 +147,15 @@ def pinhole_camera(camera_matrix: Tensor, to_world: Any, size: Sequence[int]) ->
 
 
 def camera_matrices(given: Any, where: str) -> Tensor:
-    """Camera matrices (..., 3, 3). Raises ShapeError for others and for those without an inverse."""
+    """Return camera matrices (..., 3, 3).
+
+    Args:
+        given: numbers of any library.
+        where: subject of messages.
+
+    Raises:
+        ShapeError: for other shapes and for matrices without an inverse.
+    """
     matrix = _numbers(given, "intrinsics", where)
     if matrix.ndim < 2 or matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"{where}: expected intrinsics (..., 3, 3), got {tuple(matrix.shape)}.")
@@ -127,7 +165,15 @@ def camera_matrices(given: Any, where: str) -> Tensor:
 
 
 def transforms(given: Any, where: str) -> Tensor:
-    """Transforms (..., 4, 4). Raises ShapeError."""
+    """Return transforms (..., 4, 4).
+
+    Args:
+        given: numbers of any library, or a transform of Mitsuba.
+        where: subject of messages.
+
+    Raises:
+        ShapeError: for other shapes.
+    """
     matrix = _numbers(getattr(given, "matrix", given), "to_world", where)
     if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
         raise ShapeError(f"{where}: expected a transform (..., 4, 4), got {tuple(matrix.shape)}.")
@@ -135,7 +181,7 @@ def transforms(given: Any, where: str) -> Tensor:
 
 
 def _rigid(given: Any, where: str) -> Tensor:
-    """Transforms whose inverse is their transpose. Raises UnitError for those that scale, shear or mirror."""
+    """Return transforms whose inverse is their transpose. Raises UnitError for scales, shears and mirrors."""
     matrix = transforms(given, where)
     known = matrix.detach().double()
     turn, last = known[..., :3, :3], known.new_tensor([0.0, 0.0, 0.0, 1.0])
@@ -151,7 +197,7 @@ def _rigid(given: Any, where: str) -> Tensor:
 
 
 def _back(matrix: Tensor) -> Tensor:
-    """The inverse of a rigid motion."""
+    """Return the inverse of a rigid motion."""
     exact = single(matrix)
     rotation = exact[..., :3, :3].mT
     back = torch.cat([rotation, -(rotation @ exact[..., :3, 3:])], -1)
@@ -159,7 +205,7 @@ def _back(matrix: Tensor) -> Tensor:
 
 
 def _numbers(given: Any, name: str, where: str) -> Tensor:
-    """A floating tensor; float32 of numbers and whole numbers, float64 of arrays that are."""
+    """Return a floating tensor; float32 of numbers and whole numbers, float64 of arrays of such."""
     numbers = number_tensor(given, f"{where}: expected {name} as numbers")
     return numbers if numbers is given or "float64" in str(getattr(given, "dtype", "")) else numbers.float()
 
@@ -169,7 +215,15 @@ def _half_turn(like: Tensor) -> Tensor:
 
 
 def image_size(size: Any, where: str) -> tuple[int, int]:
-    """(height, width). Raises ShapeError."""
+    """Return (height, width).
+
+    Args:
+        size: two whole numbers.
+        where: subject of messages.
+
+    Raises:
+        ShapeError: for anything else.
+    """
     numbers = list(size) if isinstance(size, Sequence) and not isinstance(size, str) else []
     if len(numbers) != 2:
         raise ShapeError(f"{where}: expected size as (height, width), got {shown(size)}.")

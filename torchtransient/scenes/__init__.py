@@ -12,9 +12,9 @@ from torchtransient.scenes.nlos import nlos_corner as nlos_corner
 from torchtransient.scenes.nlos import nlos_letter as nlos_letter
 from torchtransient.scenes.nlos import nlos_mannequin as nlos_mannequin
 from torchtransient.scenes.nlos import nlos_plates as nlos_plates
+from torchtransient.scenes.nlos import nlos_room as nlos_room
 from torchtransient.scenes.nlos import nlos_z as nlos_z
 from torchtransient.scenes.nlos import relay_wall as relay_wall
-from torchtransient.scenes.nlos_room import nlos_room as nlos_room
 from torchtransient.scenes.walls import etalon_slab as etalon_slab
 from torchtransient.scenes.walls import glass_slab_before_wall as glass_slab_before_wall
 from torchtransient.scenes.walls import light_over_plane as light_over_plane

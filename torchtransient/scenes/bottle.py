@@ -27,10 +27,18 @@ LASER_RADIUS = 0.004
 
 
 def lathe(profile: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Surface of revolution about the y axis, normals outward: vertices (V, 3) and triangles (F, 3).
+    """Return a surface of revolution about the y axis, normals outward.
 
-    `profile`: (N, 2), radius and height from one pole (radius 0) to the other, going up. Raises SceneError when the
-    outline does not start and end on the axis or has fewer than three points, or `segments` is less than three.
+    Args:
+        profile: (N, 2), radius and height from one pole (radius 0) to the other, going up.
+        segments: corners of a ring, at least three.
+
+    Returns:
+        Vertices (V, 3) and triangles (F, 3).
+
+    Raises:
+        SceneError: for an outline that does not start and end on the axis or has fewer than three points, and for too
+            few segments.
     """
     profile = np.asarray(profile, dtype=np.float64)
     if profile.ndim != 2 or profile.shape[1] != 2 or len(profile) < 3 or np.any(profile[[0, -1], 0] != 0):
@@ -65,7 +73,13 @@ def lathe(profile: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float
 
 
 def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
-    """Write a triangle mesh as a binary PLY file; the folder is made."""
+    """Write a triangle mesh as a binary PLY file; the folder is made.
+
+    Args:
+        path: place of the file.
+        vertices: (V, 3).
+        faces: (F, 3).
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     rows["count"], rows["index"] = 3, faces
@@ -100,18 +114,33 @@ def milk_bottle(
     anisotropy: float = 0.7,
     beam_degrees: float = 8.0,
 ) -> SceneDict:
-    """A bottle of water with a little milk on a table, a laser that shines up from its base. Lengths in metres.
+    """Return a bottle of water with a little milk on a table, and a laser that shines up from its base.
 
-    The bottle is written to `mesh` (a .ply path); it is one rough dielectric boundary of relative index `index` around
-    the liquid, which fills it. `milk` scales the liquid's scattering, `anisotropy` is the mean cosine g, `beam_degrees`
-    the half opening angle of the beam. The film counts times from the laser to the bottle's surface
-    (`camera_unwarp`): a picture of the bottle shows events when they happen, as the photographs of Velten et al. (2013)
-    do after unwarping. The laser is a disk inside of the liquid, just above the base, since lights
-    cannot be connected to through a rough boundary; and not a point, near which scattered light has no bound.
+    The bottle is one rough dielectric boundary around the liquid, which fills it. The film counts times from the laser
+    to the bottle's surface (`camera_unwarp`): a picture of the bottle shows events when they happen, as the photographs
+    of Velten et al. (2013) do after unwarping. The laser is a disk inside of the liquid, just above the base, since
+    lights cannot be connected to through a rough boundary; and not a point, near which scattered light has no bound.
 
-    Keys of interest: `bottle.interior_medium.sigma_t.value.value` (in units of `EXTINCTION_UNIT`),
-    `bottle.interior_medium.albedo.value.value`, `bottle.bsdf.alpha`. Raises
-    UnitError or SceneError for numbers out of range.
+    Args:
+        mesh: path of the .ply that the bottle is written to.
+        resolution: one side in pixels, or (width, height).
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
+        roughness: of the boundary, `alpha` of `roughdielectric`.
+        index: relative index of refraction of the liquid.
+        milk: factor of the liquid's scattering.
+        anisotropy: mean cosine g.
+        beam_degrees: half opening angle of the beam, degrees.
+
+    Returns:
+        Scene dictionary with the keys `bottle.interior_medium.sigma_t.value.value` (in units of `EXTINCTION_UNIT`),
+        `bottle.interior_medium.albedo.value.value`, `bottle.bsdf.alpha`.
+
+    Raises:
+        UnitError, SceneError: for numbers out of range.
     """
     beam, mean_cosine = finite("beam_degrees", beam_degrees), finite("anisotropy", anisotropy)
     if not 0 < beam < 90:

@@ -29,17 +29,29 @@ def furnace(
     rr_depth: int | None = 1000,
     emitter_sampling: bool = False,
 ) -> SceneDict:
-    """A diffuse sphere that emits `radiance` from its whole inner side, seen from its centre. Lengths in metres.
+    """Return a diffuse sphere that emits from its whole inner side, seen from its centre.
 
-    Every pixel sees the same thing. Russian roulette starts at `rr_depth`, beyond `max_depth` by default, so that the
-    only bias is the truncation at `max_depth` segments: the energy left out is `radiance * reflectance**max_depth / (1
-    - reflectance)`. Closed form: `closed_forms.furnace`.
+    Every pixel sees the same light. By default a dark point light at the centre takes the emitter samples, and emission
+    is found by BSDF sampling alone, which leaves no noise in the image.
 
-    By default a dark point light at the centre takes the emitter samples, and emission is found by BSDF sampling alone,
-    which leaves no noise in the image. `emitter_sampling=True` samples the wall itself, too; rays start a little off
-    the wall (1.8e-4 of the radius), where the two strategies meet other points of it, which makes the furnace 0.03 %
-    too dark. Mitsuba's own integrators are 0.17 % too bright there (3.9.1): its sphere light gives some points of its
-    own surface the density of a sphere seen from outside.
+    Args:
+        radius: metres.
+        reflectance: albedo of the wall.
+        radiance: emitted radiance.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path. The truncation leaves out the energy ``radiance *
+            reflectance**max_depth / (1 - reflectance)``.
+        rr_depth: start of Russian roulette, by default beyond `max_depth`.
+        emitter_sampling: sample the wall itself, too. Rays start a little off the wall (1.8e-4 of the radius), where
+            the two strategies meet other points of it, which makes the furnace 0.03 % too dark. Mitsuba's own
+            integrators are 0.17 % too bright there (3.9.1): its sphere light gives some points of its own surface the
+            density of a sphere seen from outside.
+
+    Closed form: `closed_forms.furnace`.
     """
     scene: SceneDict = {
         "type": "scene",
@@ -74,11 +86,22 @@ def integrating_sphere(
     max_depth: int = 64,
     rr_depth: int | None = 1000,
 ) -> SceneDict:
-    """A diffuse sphere lit by a point source of `intensity` (W/sr) at its centre and seen from there. Lengths in
-    metres.
+    """Return a diffuse sphere lit by a point source at its centre and seen from there.
 
     Light reaches the wall at `radius` everywhere with irradiance `intensity / radius**2`, then crosses the sphere along
     independent chords. Closed form: `closed_forms.integrating_sphere_radiance`.
+
+    Args:
+        radius: metres.
+        reflectance: albedo of the wall.
+        intensity: of the source, W/sr.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
+        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     return {
         "type": "scene",
@@ -108,12 +131,24 @@ def parallel_plates(
     max_depth: int = 64,
     rr_depth: int | None = 1000,
 ) -> SceneDict:
-    """Two emitting diffuse squares facing each other, the camera half-way between them. Lengths in metres.
+    """Return two emitting diffuse squares that face each other, the camera half-way between them.
 
-    The plates stand at z = -separation / 2 and +separation / 2 and reach `half_extent` to each side. The camera looks
-    at one of them through a field of view of 0.5 degrees, so that the first leg is separation / 2 to 1e-5. Of a
-    flight's energy at most `(separation / half_extent)**2` leaves through the open sides; arrivals before `half_extent`
-    do not notice the edges. Closed form: `closed_forms.parallel_plates`.
+    The plates stand at z = -separation / 2 and +separation / 2. The camera looks at one of them through a field of view
+    of 0.5 degrees, so that the first leg is separation / 2 to 1e-5. Closed form: `closed_forms.parallel_plates`.
+
+    Args:
+        separation: distance of the plates, metres.
+        reflectance: albedo of both.
+        radiance: emitted radiance.
+        half_extent: half a side of the squares, metres. Of a flight's energy at most ``(separation / half_extent)**2``
+            leaves through the open sides; arrivals before `half_extent` do not notice the edges.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
+        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     gap = positive("separation", separation)
     size = scale(positive("half_extent", half_extent))

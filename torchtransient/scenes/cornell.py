@@ -25,17 +25,32 @@ def cornell_box(
     index: float = 1.5,
     sampler: str = "independent",
 ) -> SceneDict:
-    """The standard Cornell box as Mitsuba ships it, with a transient film and integrator. Lengths in metres.
+    """Return the standard Cornell box as Mitsuba ships it, with a transient film and integrator.
 
-    The room is the cube [-1, 1]^3 without its front face, the camera sits at z = 3.90 and looks along -z. Keys of
-    interest: `white`, `red`, `green` (BSDFs), `light`, `small-box`, `large-box`. `large-box` stands on the left, a
-    centimetre deep in the floor (derivatives by its pose lack the line in which they meet, and warn of it);
-    `mirror=True` makes it an ideal mirror, `glass=True` a smooth dielectric of refractive index `index` (not both,
-    ArgumentError).
+    The room is the cube [-1, 1]^3 without its front face, the camera sits at z = 3.90 and looks along -z. `large-box`
+    stands on the left, a centimetre deep in the floor (derivatives by its pose lack the line in which they meet, and
+    warn of it).
 
-    `resolution` is one side in pixels or (width, height); the film holds `num_bins` bins of `bin_width_opl` from
-    `start_opl` on. Returns a dictionary with transforms as (4, 4) arrays. Source of the numbers: the scene `cbox` of
-    Mitsuba 3.
+    Args:
+        resolution: one side in pixels, or (width, height).
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
+        mirror: make `large-box` an ideal mirror.
+        glass: make it a smooth dielectric.
+        index: index of refraction of the glass.
+        sampler: plugin name of the sampler.
+
+    Returns:
+        Scene dictionary with transforms as (4, 4) arrays and the keys `white`, `red`, `green` (BSDFs), `light`,
+        `small-box`, `large-box`.
+
+    Raises:
+        ArgumentError: for both `mirror` and `glass`.
+
+    Source of the numbers: the scene `cbox` of Mitsuba 3.
     """
     if mirror and glass:
         raise ArgumentError("cornell_box: expected at most one of mirror=True and glass=True, got both; choose one")

@@ -1,5 +1,5 @@
 """Triangle meshes as arrays: vertices float64 (V, 3) in metres and faces int64 (F, 3), against the clock as seen from
-outside. `triangle_mesh` makes shapes of scene dictionaries of them; nothing is written to disk.
+outside. `triangle_mesh` makes shapes of scene dictionaries of them, without files.
 """
 
 from __future__ import annotations
@@ -21,11 +21,19 @@ Albedo: TypeAlias = "float | Numbers"
 
 
 def triangle_mesh(vertices: Any, faces: Any, *, reflectance: Albedo = 0.5, to_world: Matrix | None = None) -> SceneDict:
-    """A diffuse shape of a scene dictionary, `mesh_arrays`, made of `vertices` (V, 3), metres, and `faces` (F, 3).
+    """Return a diffuse shape of a scene dictionary, `mesh_arrays`.
 
-    `reflectance`: one albedo, or three of linear sRGB. Its key `<name>.vertex_positions` is a parameter of the scene,
-    (V, 3) in world space. Raises ShapeError for other shapes and for faces of vertices that are not there, UnitError
-    for vertices that are not finite and albedos outside of [0, 1].
+    Its key `<name>.vertex_positions` is a parameter of the scene, (V, 3) in world space.
+
+    Args:
+        vertices: (V, 3), metres.
+        faces: (F, 3).
+        reflectance: one albedo, or three of linear sRGB.
+        to_world: transform (4, 4).
+
+    Raises:
+        ShapeError: for other shapes and for faces of missing vertices.
+        UnitError: for vertices that are not finite and albedos outside of [0, 1].
     """
     points, triangles = checked_mesh("triangle_mesh", vertices, faces)
     shape: SceneDict = {
@@ -50,7 +58,14 @@ def joined(*meshes: Mesh) -> Mesh:
 
 
 def plate(width: float, height: float, center: Triple = (0.0, 0.0, 0.0), cells: int = 1) -> Mesh:
-    """A rectangle across z that faces -z, of `cells` x `cells` pairs of triangles."""
+    """Return a rectangle across z that faces -z, of `cells` x `cells` pairs of triangles.
+
+    Args:
+        width: metres.
+        height: metres.
+        center: (3,), metres.
+        cells: pairs of triangles along a side.
+    """
     n = count("cells", cells)
     x = np.linspace(-0.5, 0.5, n + 1) * positive("width", width)
     y = np.linspace(-0.5, 0.5, n + 1) * positive("height", height)
@@ -62,8 +77,12 @@ def plate(width: float, height: float, center: Triple = (0.0, 0.0, 0.0), cells: 
 
 
 def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
-    """A closed ellipsoid along the axes: an icosahedron whose triangles are split in four `level` times, 20 4^level of
-    them, with all vertices on the surface.
+    """Return a closed ellipsoid along the axes: an icosahedron whose triangles are split, all vertices on the surface.
+
+    Args:
+        center: (3,), metres.
+        radii: one or (3,), metres.
+        level: times that each triangle is split in four: 20 4^level triangles.
     """
     golden = (1 + 5**0.5) / 2
     a, b = 1.0, golden
@@ -80,7 +99,13 @@ def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
 
 
 def octahedral_ellipsoid(center: Triple, radii: float | Triple, level: int = 2) -> Mesh:
-    """As `ellipsoid`, made of an octahedron: 8 4^level triangles that are less alike, cut in planes of the axes."""
+    """Return an :func:`ellipsoid` made of an octahedron: triangles that are less alike, cut in planes of the axes.
+
+    Args:
+        center: (3,), metres.
+        radii: one or (3,), metres.
+        level: times that each triangle is split in four: 8 4^level triangles.
+    """
     corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     vertices, faces = subdivided((corners, faces), level)
@@ -89,7 +114,13 @@ def octahedral_ellipsoid(center: Triple, radii: float | Triple, level: int = 2) 
 
 
 def subdivided(mesh: Mesh, times: int = 1) -> Mesh:
-    """Every triangle as four, `times` times, with a vertex in the middle of every edge, which neighbours share."""
+    """Return a mesh whose triangles are split in four, with a vertex in the middle of every edge, which neighbours
+    share.
+
+    Args:
+        mesh: vertices and faces.
+        times: repetitions, at most 8.
+    """
     vertices, faces = mesh
     for _ in range(_times("subdivide", times)):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
@@ -103,8 +134,14 @@ def subdivided(mesh: Mesh, times: int = 1) -> Mesh:
 
 
 def sheet(outline: Any, z: float = 0.0) -> Mesh:
-    """A flat polygon across z that faces -z. `outline` (N, 2): its corners (x, y) against the clock, x to the right and
-    y up; simple, not crossing itself. Raises SceneError for others.
+    """Return a flat polygon across z that faces -z.
+
+    Args:
+        outline: corners (x, y), (N, 2), against the clock, x to the right and y up; simple, not crossing itself.
+        z: its place, metres.
+
+    Raises:
+        SceneError: for other outlines.
     """
     points = np.asarray(outline, dtype=np.float64)
     faces = triangulated(points)[:, ::-1]
@@ -112,7 +149,13 @@ def sheet(outline: Any, z: float = 0.0) -> Mesh:
 
 
 def solid(outline: Any, z: float, thickness: float) -> Mesh:
-    """The closed body between `sheet` at `z` and the same polygon at `z + thickness`. Errors as `sheet`."""
+    """Return the closed body between `sheet` at `z` and the same polygon at `z + thickness`.
+
+    Args:
+        outline: as in `sheet`, with its errors.
+        z: front, metres.
+        thickness: metres.
+    """
     front, faces = sheet(outline, z)
     n = len(front)
     back = front + np.array([0.0, 0.0, positive("thickness", thickness)])
@@ -133,7 +176,14 @@ def _times(name: str, value: int) -> int:
 
 
 def triangulated(outline: Vertices) -> Faces:
-    """Triangles (N - 2, 3) of a simple polygon (N, 2) given against the clock, by cutting ears (Meisters 1975)."""
+    """Return triangles (N - 2, 3) of a simple polygon, by cutting ears (Meisters 1975).
+
+    Args:
+        outline: corners (N, 2), against the clock.
+
+    Raises:
+        ShapeError, SceneError: for other outlines.
+    """
     if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3:
         raise ShapeError(f"outline: expected at least three corners (N, 2), got shape {outline.shape}")
     x, y = outline.T
@@ -156,7 +206,7 @@ def triangulated(outline: Vertices) -> Faces:
 
 
 def _crosses_itself(outline: Vertices) -> bool:
-    """Whether two edges that are not neighbours meet."""
+    """Return True if two edges that are not neighbours meet."""
     n = len(outline)
     starts, ends = outline, np.roll(outline, -1, axis=0)
     for i in range(n):
@@ -185,7 +235,7 @@ def _turn(a: Vertices, b: Vertices, c: Vertices) -> Any:
 
 
 def _triangles_of_edges(vertices: Vertices, edge: float) -> Faces:
-    """All triples of vertices that are one edge apart, wound outward about the origin."""
+    """Return all triples of vertices that are one edge apart, wound outward about the origin."""
     near = np.abs(np.linalg.norm(vertices[:, None] - vertices, axis=-1) - edge) < 1e-9 * edge
     n = len(vertices)
     triples = [(i, j, k) for i in range(n) for j in range(i + 1, n) for k in range(j + 1, n)]

@@ -1,33 +1,80 @@
 """Hidden scenes of captures around a corner: shapes without light or camera. Lengths in metres.
 
-The relay wall lies in the plane z = 0 and looks along +z (`relay_wall`); hidden things are at positive z and face it. A
-dictionary of each function holds shapes by name, for `tt.nlos.simulate` or as parts of a scene. Seen in pictures of a
-scan, x runs to the right and y up, which is how letters read.
+The relay wall lies in the plane z = 0 and looks along +z (`relay_wall`); hidden things are at positive z and face it.
+Each function returns a dictionary of shapes by name, for `tt.nlos.simulate` or as parts of a scene. Seen in pictures of
+a scan, x runs to the right and y up, so that letters read as usual.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import finite, positive, real_array, shown, transform
-from torchtransient.errors import SceneError, ShapeError
-from torchtransient.scenes.letters import outline
+from torchtransient.checks import finite, flag, positive, real_array, shown, transform
+from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.scenes.meshes import Albedo, Mesh, ellipsoid, joined, plate, sheet, solid, subdivided, triangle_mesh
 from torchtransient.scenes.parts import SceneDict, diffuse
-from torchtransient.scenes.transforms import scale
+from torchtransient.scenes.transforms import rotate, scale, translate
+
+# Width of a stroke of a letter, and half of it.
+_S = 0.2
+_H = 0.5 * _S
+
+# Corners (x, y) of block letters without holes in [0, 1]^2, against the clock.
+OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
+    "C": ((0, 0), (1, 0), (1, _S), (_S, _S), (_S, 1 - _S), (1, 1 - _S), (1, 1), (0, 1)),
+    "E": ((0, 0), (1, 0), (1, _S), (_S, _S), (_S, 0.5 - _H), (0.8, 0.5 - _H), (0.8, 0.5 + _H), (_S, 0.5 + _H),
+          (_S, 1 - _S), (1, 1 - _S), (1, 1), (0, 1)),
+    "F": ((0, 0), (_S, 0), (_S, 0.5 - _H), (0.8, 0.5 - _H), (0.8, 0.5 + _H), (_S, 0.5 + _H), (_S, 1 - _S), (1, 1 - _S),
+          (1, 1), (0, 1)),
+    "H": ((0, 0), (_S, 0), (_S, 0.5 - _H), (1 - _S, 0.5 - _H), (1 - _S, 0), (1, 0), (1, 1), (1 - _S, 1),
+          (1 - _S, 0.5 + _H), (_S, 0.5 + _H), (_S, 1), (0, 1)),
+    "I": ((0.5 - _H, 0), (0.5 + _H, 0), (0.5 + _H, 1), (0.5 - _H, 1)),
+    "K": ((0, 0), (_S, 0), (_S, 0.38), (0.34, 0.5), (0.75, 0), (1, 0), (0.48, 0.62), (0.95, 1), (0.65, 1), (_S, 0.64),
+          (_S, 1), (0, 1)),
+    "L": ((0, 0), (1, 0), (1, _S), (_S, _S), (_S, 1), (0, 1)),
+    "N": ((0, 0), (_S, 0), (_S, 0.66), (1 - _S, 0), (1, 0), (1, 1), (1 - _S, 1), (1 - _S, 0.34), (_S, 1), (0, 1)),
+    "S": ((0, 0), (1, 0), (1, 0.5 + _H), (_S, 0.5 + _H), (_S, 1 - _S), (1, 1 - _S), (1, 1), (0, 1), (0, 0.5 - _H),
+          (1 - _S, 0.5 - _H), (1 - _S, _S), (0, _S)),
+    "T": ((0.5 - _H, 0), (0.5 + _H, 0), (0.5 + _H, 1 - _S), (1, 1 - _S), (1, 1), (0, 1), (0, 1 - _S),
+          (0.5 - _H, 1 - _S)),
+    "U": ((0, 0), (1, 0), (1, 1), (1 - _S, 1), (1 - _S, _S), (_S, _S), (_S, 1), (0, 1)),
+    "V": ((0.5 - _H, 0), (0.5 + _H, 0), (1, 1), (1 - _S, 1), (0.5, 0.25), (_S, 1), (0, 1)),
+    "X": ((0, 0), (0.23, 0), (0.5, 0.36), (0.77, 0), (1, 0), (0.62, 0.5), (1, 1), (0.77, 1), (0.5, 0.64), (0.23, 1),
+          (0, 1), (0.38, 0.5)),
+    "Y": ((0.5 - _H, 0), (0.5 + _H, 0), (0.5 + _H, 0.45), (1, 1), (0.77, 1), (0.5, 0.65), (0.23, 1), (0, 1),
+          (0.5 - _H, 0.45)),
+    "Z": ((0, 0), (1, 0), (1, _S), (0.27, _S), (1, 1 - _S), (1, 1), (0, 1), (0, 1 - _S), (0.73, 1 - _S), (0, _S)),
+}  # fmt: skip
+# Albedos by what they are of.
+COLOURS = {"walls": 0.7, "floor": 0.4, "ceiling": 0.8, "desk": 0.5, "shelf": 0.45, "books": 0.6, "chair": 0.3,
+           "person": 0.6}  # fmt: skip
 
 
 def relay_wall(width: float = 2.0, height: float = 2.0, albedo: Albedo = 0.5) -> SceneDict:
-    """The wall that light goes around the corner by: a diffuse rectangle around the origin that faces +z."""
+    """Return the relay wall: a diffuse rectangle around the origin that faces +z.
+
+    Args:
+        width: metres.
+        height: metres.
+        albedo: one number or a linear sRGB triple.
+    """
     half = [positive("width", width) / 2, positive("height", height) / 2, 1.0]
     return {"type": "rectangle", "to_world": scale(half), "bsdf": diffuse(albedo)}
 
 
 def nlos_z(*, size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9, thickness: float = 0.0) -> SceneDict:
-    """The letter Z, `size` high and wide, `depth` before the wall: `nlos_letter("Z")`."""
+    """Return the letter Z: `nlos_letter("Z")`.
+
+    Args:
+        size: height and width, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
+        thickness: metres, 0 for a sheet.
+    """
     return nlos_letter("Z", size=size, depth=depth, albedo=albedo, thickness=thickness)
 
 
@@ -40,11 +87,19 @@ def nlos_letter(
     thickness: float = 0.0,
     subdivide: int = 0,
 ) -> SceneDict:
-    """A block letter, `size` high and wide, as the mesh `letter`, the side that faces the wall at z = `depth`.
+    """Return a block letter as the mesh `letter`, the side that faces the wall at z = `depth`.
 
-    `thickness` 0 is a sheet, whose back is black; more is a closed body, which reaches to `depth + thickness`.
-    `subdivide`: every triangle as 4^subdivide, for fits of its vertices. Letters: `scenes.letters.OUTLINES`. Raises
-    SceneError for others and UnitError for lengths that are not positive.
+    Args:
+        letter: one of `scenes.nlos.OUTLINES`.
+        size: height and width, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
+        thickness: 0 is a sheet, whose back is black; more is a closed body, which reaches to `depth + thickness`.
+        subdivide: splits of every triangle in four, for fits of its vertices.
+
+    Raises:
+        ArgumentError: for other letters.
+        UnitError: for lengths that are not positive.
     """
     corners = outline(letter, positive("size", size))
     z = positive("depth", depth)
@@ -52,11 +107,37 @@ def nlos_letter(
     return {"letter": triangle_mesh(*subdivided(mesh, subdivide), reflectance=albedo)}
 
 
+def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
+    """Return the corners of a letter around the origin, against the clock.
+
+    Args:
+        letter: one of `OUTLINES`, which have no holes.
+        size: height and width, metres.
+
+    Returns:
+        (N, 2), metres.
+
+    Raises:
+        ArgumentError: for other letters.
+    """
+    if not isinstance(letter, str) or letter not in OUTLINES:
+        raise ArgumentError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
+    return (np.array(OUTLINES[letter], dtype=np.float64) - 0.5) * size
+
+
 def nlos_plates(
     *,
     size: float = 0.8, depth: float = 0.8, gap: float = 0.5, albedo: Albedo = 0.9, second_size: float | None = None
 ) -> SceneDict:
-    """A square plate `front` before the wall and another one, `back`, `gap` behind it. `second_size` None: as large."""
+    """Return a square plate `front` before the wall and another one, `back`, behind it.
+
+    Args:
+        size: side of the front plate, metres.
+        depth: its distance from the wall, metres.
+        gap: distance of the back plate from it, metres.
+        albedo: one number or a linear sRGB triple.
+        second_size: side of the back plate, None for the same.
+    """
     z = positive("depth", depth)
     far = positive("second_size", size if second_size is None else second_size)
     return {
@@ -66,10 +147,16 @@ def nlos_plates(
 
 
 def nlos_corner(size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9) -> SceneDict:
-    """Two plates that meet at a right angle and light each other, open towards the wall, and a small one before them.
+    """Return two plates that meet at a right angle and light each other, open towards the wall, and a small one before
+    them.
 
     `left` and `right` start at z = `depth` at x = -size / 2 and size / 2 and meet at x = 0, `size / 2` deeper. `small`
     hides a part of `right`.
+
+    Args:
+        size: width and height, metres.
+        depth: distance from the wall, metres.
+        albedo: one number or a linear sRGB triple.
     """
     s, z = positive("size", size), positive("depth", depth)
     y = np.array([-s / 2, s / 2])
@@ -100,9 +187,12 @@ _BODY = (
 
 
 def mannequin(height: float = 1.45, level: int = 3) -> Mesh:
-    """A body of six closed ellipsoids that overlap and hide each other, around the origin; one arm reaches towards -z.
+    """Return a body of six closed ellipsoids that overlap and hide each other, around the origin; one arm reaches
+    towards -z.
 
-    `height` in metres from the soles to the top of the head; 120 4^level triangles.
+    Args:
+        height: from the soles to the top of the head, metres.
+        level: fineness; 120 4^level triangles.
     """
     factor = positive("height", height) / 1.41
     parts = [ellipsoid(factor * np.array(center), factor * np.array(radii), level) for center, radii in _BODY]
@@ -113,9 +203,17 @@ def nlos_mannequin(
     *,
     depth: float = 1.2, height: float = 1.45, albedo: Albedo = 0.7, level: int = 3, x: float = 0.0
 ) -> SceneDict:
-    """A standing `mannequin` as the mesh `body`, its axis `depth` before the wall and `x` beside its middle.
+    """Return a standing `mannequin` as the mesh `body`.
 
-    Raises SceneError when the outstretched arm would reach through the wall.
+    Args:
+        depth: distance of its axis from the wall, metres.
+        height: metres.
+        albedo: one number or a linear sRGB triple.
+        level: fineness of the mesh.
+        x: distance of its axis from the middle, metres.
+
+    Raises:
+        SceneError: if the outstretched arm would reach through the wall.
     """
     vertices, faces = mannequin(height, level)
     vertices = vertices + np.array([finite("x", x), 0.0, positive("depth", depth)])
@@ -126,10 +224,13 @@ def nlos_mannequin(
 
 
 def bounds(shapes: SceneDict) -> NDArray[np.float64]:
-    """The box (2, 3) around the shapes of a dictionary: lowest and highest coordinates, metres.
+    """Return the box (2, 3) around the shapes of a dictionary: lowest and highest coordinates, metres.
 
-    For shapes of this room: rectangles, disks, cubes, spheres and meshes as arrays. Raises SceneError for others, and
-    for a dictionary without any.
+    Args:
+        shapes: rectangles, disks, cubes, spheres and meshes as arrays, by name.
+
+    Raises:
+        SceneError: for other shapes, and for a dictionary without any.
     """
     if not isinstance(shapes, dict):
         raise SceneError(f"bounds: expected a dictionary of shapes, got {shown(shapes)}")
@@ -164,3 +265,92 @@ def _rows(name: str, entry: str, values: Any) -> NDArray[np.float64]:
     if rows is None or not rows.size or rows.shape[-1] != 3:
         raise ShapeError(f"bounds: expected {entry} of {name} as rows of three numbers, got {shown(values)}")
     return rows
+
+
+# --------------------------------------------------------------------------------------------------------------- a room
+
+
+def nlos_room(
+    width: float = 3.6,
+    height: float = 2.6,
+    depth: float = 3.2,
+    *,
+    albedo: float | None = None,
+    person: bool = True,
+    level: int = 3,
+) -> SceneDict:
+    """Return an office of which `relay_wall(width, height)` is one wall: floor, ceiling, walls, desk, shelf, chair,
+    person.
+
+    The room fills |x| <= width / 2, |y| <= height / 2 and 0 <= z <= depth. Furniture is placed from the walls and keeps
+    its size.
+
+    Args:
+        width: metres, at least 2.4.
+        height: metres, at least 2.2.
+        depth: metres, at least 2.4.
+        albedo: of everything, None for those of `COLOURS`.
+        person: False leaves the room empty, as a background to subtract.
+        level: fineness of the person's mesh.
+
+    Raises:
+        UnitError: for smaller rooms.
+    """
+    for name, size, least in (("width", width, 2.4), ("height", height, 2.2), ("depth", depth, 2.4)):
+        positive(f"{name} beyond the {least} m of the furniture", positive(name, size) - least + 1e-9)
+    flag("person", person)
+    x, y, z = width / 2, height / 2, depth
+
+    def of(what: str) -> float:
+        return COLOURS[what] if albedo is None else albedo
+
+    shapes: SceneDict = {
+        "floor": _face([0, -y, z / 2], [x, z / 2], rotate([1, 0, 0], -90), of("floor")),
+        "ceiling": _face([0, y, z / 2], [x, z / 2], rotate([1, 0, 0], 90), of("ceiling")),
+        "left_wall": _face([-x, 0, z / 2], [z / 2, y], rotate([0, 1, 0], 90), of("walls")),
+        "right_wall": _face([x, 0, z / 2], [z / 2, y], rotate([0, 1, 0], -90), of("walls")),
+        "back_wall": _face([0, 0, z], [x, y], rotate([0, 1, 0], 180), of("walls")),
+    }
+    floor = -y
+    desk = [x - 0.45, floor, z - 1.0]
+    shapes["desk_top"] = _block([desk[0], floor + 0.73, desk[2]], [0.8, 0.04, 1.4], of("desk"))
+    for number, (i, k) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
+        leg = [desk[0] + i * 0.36, floor + 0.355, desk[2] + k * 0.65]
+        shapes[f"desk_leg_{number}"] = _block(leg, [0.05, 0.71, 0.05], of("desk"))
+    shapes["screen"] = _block([x - 0.35, floor + 0.98, desk[2]], [0.03, 0.36, 0.6], of("chair"))
+    chair = [x - 1.15, floor, desk[2]]
+    shapes["chair_seat"] = _block([chair[0], floor + 0.45, chair[2]], [0.44, 0.06, 0.44], of("chair"))
+    shapes["chair_back"] = _block([chair[0] - 0.2, floor + 0.76, chair[2]], [0.05, 0.5, 0.42], of("chair"))
+    shapes["chair_post"] = _block([chair[0], floor + 0.21, chair[2]], [0.08, 0.42, 0.08], of("chair"))
+    _add_shelf(shapes, [-x + 0.75, floor, z - 0.17], of("shelf"), of("books"))
+    if person:
+        # Two metres before the wall at most, so that a deep room does not hide its person in the dark.
+        place = [-0.25 * x, floor + 0.85, min(0.55 * z, 2.0)]
+        vertices, faces = mannequin(1.7, level)
+        vertices = vertices + np.array(place) - [0.0, vertices[:, 1].min() + 0.85, 0.0]
+        shapes["person"] = triangle_mesh(vertices, faces, reflectance=of("person"))
+    return shapes
+
+
+def _add_shelf(shapes: SceneDict, foot: Sequence[float], wood: float, books: float) -> None:
+    """Add a shelf of five boards between two sides before the back wall, with books on three of them."""
+    x, y, z = foot
+    wide, deep, high = 1.0, 0.3, 1.8
+    for number, side in enumerate((-1, 1)):
+        shapes[f"shelf_side_{number}"] = _block([x + side * wide / 2, y + high / 2, z], [0.03, high, deep], wood)
+    for number in range(5):
+        board = [x, y + 0.05 + number * 0.42, z]
+        shapes[f"shelf_board_{number}"] = _block(board, [wide - 0.03, 0.03, deep], wood)
+    for number, (at, length) in enumerate(((-0.25, 0.4), (0.2, 0.5), (-0.1, 0.7))):
+        middle = [x + at, y + 0.065 + (number + 1) * 0.42 + 0.13, z + 0.03]
+        shapes[f"books_{number}"] = _block(middle, [length, 0.26, 0.2], books)
+
+
+def _face(center: Sequence[float], half: Sequence[float], turn: np.ndarray, albedo: float) -> SceneDict:
+    to_world = translate(center) @ turn @ scale([half[0], half[1], 1.0])
+    return {"type": "rectangle", "to_world": to_world, "bsdf": diffuse(albedo)}
+
+
+def _block(center: Sequence[float], size: Sequence[float], albedo: float) -> SceneDict:
+    to_world = translate(center) @ scale(np.asarray(size) / 2)
+    return {"type": "cube", "to_world": to_world, "bsdf": diffuse(albedo)}

@@ -1,4 +1,4 @@
-"""The pieces that every scene dictionary of this room is made of: film, sensor, integrator, surface."""
+"""Parts of scene dictionaries: film, sensor, integrator, surface."""
 
 from __future__ import annotations
 
@@ -15,11 +15,16 @@ SceneDict = dict[str, Any]
 def transient_film(
     resolution: int | tuple[int, int], num_bins: int, start_opl: float, bin_width_opl: float
 ) -> SceneDict:
-    """A `transient_hdr_film` with a box reconstruction filter.
+    """Return a `transient_hdr_film` with a box reconstruction filter.
 
-    `resolution` is one side of a square film or (width, height) in pixels; `start_opl` and `bin_width_opl` are metres
-    of optical path length. Raises SceneError or UnitError for sizes below one, a width of zero or a start that is not
-    finite.
+    Args:
+        resolution: one side of a square film in pixels, or (width, height).
+        num_bins: number of bins.
+        start_opl: start of the first bin, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+
+    Raises:
+        SceneError, UnitError: for sizes below one, a width of zero or a start that is not finite.
     """
     given: Any = resolution
     array = getattr(given, "ndim", None)
@@ -42,8 +47,16 @@ def transient_film(
 def perspective(
     to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent", near_clip: float = 1e-3
 ) -> SceneDict:
-    """A pinhole camera; `fov` in degrees along the smaller side of the film, `near_clip` in metres, `spp` samples per
-    pixel."""
+    """Return a pinhole camera.
+
+    Args:
+        to_world: its pose (4, 4).
+        fov: angle of view along the smaller side of the film, degrees.
+        film: dictionary of the film.
+        spp: samples per pixel.
+        sampler: plugin name of the sampler.
+        near_clip: metres.
+    """
     return {
         "type": "perspective",
         "fov_axis": "smaller",
@@ -60,9 +73,11 @@ def perspective(
 
 
 def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
-    """The integrator `transient_path`; `max_depth` counts segments as Mitsuba does, -1 for no limit.
+    """Return the integrator `transient_path`.
 
-    `rr_depth=None` keeps the plugin's own start of Russian roulette.
+    Args:
+        max_depth: segments of the longest path as Mitsuba counts them, -1 for no limit.
+        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     integrator: SceneDict = {"type": "transient_path", "max_depth": checked_depth(max_depth)}
     if rr_depth is not None:
@@ -71,12 +86,26 @@ def transient_path(max_depth: int, rr_depth: int | None = None) -> SceneDict:
 
 
 def checked_depth(max_depth: int) -> int:
-    """Segments of the longest path. Raises ArgumentError unless it is a whole number, -1 for no limit."""
+    """Return the segments of the longest path.
+
+    Args:
+        max_depth: whole number, -1 for no limit.
+
+    Raises:
+        ArgumentError: for anything else.
+    """
     return count("max_depth", max_depth, -1, ArgumentError)
 
 
 def diffuse(reflectance: float | Numbers) -> SceneDict:
-    """A Lambertian BSDF; one albedo for all wavelengths or three, linear sRGB. Raises UnitError outside of [0, 1]."""
+    """Return a Lambertian BSDF.
+
+    Args:
+        reflectance: one albedo for all wavelengths, or three of linear sRGB.
+
+    Raises:
+        UnitError: outside of [0, 1].
+    """
     albedo = shares("albedo or reflectance", reflectance)
     value = {"type": "rgb", "value": list(albedo)} if isinstance(albedo, tuple) else albedo
     return {"type": "diffuse", "reflectance": value}

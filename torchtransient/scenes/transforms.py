@@ -28,21 +28,32 @@ def _triple(name: str, values: Triple) -> NDArray[np.float64]:
 
 
 def identity() -> Matrix:
-    """The transform that leaves every point where it is, shape (4, 4)."""
+    """Return the transform (4, 4) that moves nothing."""
     return np.eye(4)
 
 
 def translate(offset: Triple) -> Matrix:
-    """Shift by `offset` (3,), metres. Returns (4, 4). Raises ShapeError unless three numbers come."""
+    """Return a shift (4, 4).
+
+    Args:
+        offset: (3,), metres.
+
+    Raises:
+        ShapeError: unless it has three numbers.
+    """
     matrix = np.eye(4)
     matrix[:3, 3] = _triple("translate", offset)
     return matrix
 
 
 def scale(factor: float | Triple) -> Matrix:
-    """Scale about the origin by one number or by one per axis (3,). Returns (4, 4).
+    """Return a scaling (4, 4) about the origin.
 
-    A zero factor has no inverse and raises SceneError: Mitsuba inverts every transform.
+    Args:
+        factor: one number, or one per axis (3,).
+
+    Raises:
+        SceneError: for a zero factor, which has no inverse: Mitsuba inverts every transform.
     """
     alone = real_array(factor)
     factors = np.full(3, alone) if alone is not None and alone.ndim == 0 else _triple("scale", factor)  # type: ignore[arg-type]
@@ -52,9 +63,14 @@ def scale(factor: float | Triple) -> Matrix:
 
 
 def rotate(axis: Triple, angle_deg: float) -> Matrix:
-    """Rotate about `axis` (3,) through the origin by `angle_deg` degrees, right-handed. Returns (4, 4).
+    """Return a right-handed rotation (4, 4) about an axis through the origin, by Rodrigues' formula.
 
-    Rodrigues' formula. The axis need not have unit length; a zero axis raises SceneError.
+    Args:
+        axis: (3,), any length.
+        angle_deg: degrees.
+
+    Raises:
+        SceneError: for a zero axis.
     """
     direction = _triple("rotate", axis)
     length = np.linalg.norm(direction)
@@ -69,10 +85,17 @@ def rotate(axis: Triple, angle_deg: float) -> Matrix:
 
 
 def look_at(origin: Triple, target: Triple, up: Triple = (0.0, 1.0, 0.0)) -> Matrix:
-    """Frame at `origin` whose local +z looks at `target`, local +y as near to `up` as it can be. Returns (4, 4).
+    """Return a frame (4, 4) whose local +z looks at a target, local +y as near to `up` as possible.
 
-    All three arguments have shape (3,), metres. Local +x points to the *left* of the view, as Mitsuba's cameras expect.
-    Raises SceneError when origin and target coincide or `up` is parallel to the view.
+    Local +x points to the *left* of the view, as Mitsuba's cameras expect.
+
+    Args:
+        origin: (3,), metres.
+        target: (3,), metres.
+        up: (3,), any length.
+
+    Raises:
+        SceneError: if origin and target coincide or `up` is parallel to the view.
     """
     eye = _triple("look_at origin", origin)
     forward = _triple("look_at target", target) - eye

@@ -22,12 +22,25 @@ def moving_wall(
     spp: int = 256,
     max_depth: int = 6,
 ) -> SceneDict:
-    """A diffuse square at height `z` under a camera at z = 4 and a point light at (0.5, 0, 4). Lengths in metres.
+    """Return a diffuse square at height `z` under a camera at z = 4 and a point light at (0.5, 0, 4).
 
-    The wall fills the film (field of view 10 degrees). `side_panel=True` adds a fixed diffuse panel beside it, which
-    brings several bounces. Keys for gradients: `wall.to_world`, `wall.bsdf.reflectance.value`,
-    `side.bsdf.reflectance.value`, `light.position`. For the derivative of the arrival time with respect to `z`: each of
-    the two legs grows by the cosine between it and the wall's normal, about -2 together.
+    The wall fills the film (field of view 10 degrees). Keys for gradients: `wall.to_world`,
+    `wall.bsdf.reflectance.value`, `side.bsdf.reflectance.value`, `light.position`. For the derivative of the arrival
+    time with respect to `z`: each of the two legs grows by the cosine between it and the wall's normal, about -2
+    together.
+
+    Args:
+        z: height of the wall, metres.
+        side_panel: add a fixed diffuse panel beside it, which brings several bounces.
+        panel_reflectance: albedo of the panel.
+        wall_reflectance: albedo of the wall.
+        intensity: of the light, W/sr.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
     """
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     scene: SceneDict = {
@@ -59,11 +72,21 @@ def light_over_plane(
     bin_width_opl: float = 0.05,
     spp: int = 4096,
 ) -> SceneDict:
-    """A point light and an irradiance meter at the same place, `height` above a diffuse plane. Lengths in metres.
+    """Return a point light and an irradiance meter at the same place above a diffuse plane.
 
-    The plane is z = 0 and reaches `half_extent` to each side. The meter is a square of side 2e-4 `height` facing the
-    plane; the light hangs 1e-4 `height` below it, so that the meter casts no shadow on the plane. Film: one pixel,
-    direct light only. Closed form: `closed_forms.light_over_plane`.
+    The plane is z = 0. The meter is a square of side 2e-4 `height` facing the plane; the light hangs 1e-4 `height`
+    below it, so that the meter casts no shadow on the plane. Film: one pixel, direct light only. Closed form:
+    `closed_forms.light_over_plane`.
+
+    Args:
+        height: metres.
+        reflectance: albedo of the plane.
+        intensity: of the light, W/sr.
+        half_extent: half a side of the plane, metres.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
     """
     h = positive("height", height)
     meter = translate([0.0, 0.0, h]) @ rotate([0, 1, 0], 180) @ scale(1e-4 * h)
@@ -103,12 +126,24 @@ def etalon_slab(
     max_depth: int = 32,
     rr_depth: int | None = 1000,
 ) -> SceneDict:
-    """A smooth glass slab met head-on by the camera, with an area light behind or in front of it. Lengths in metres.
+    """Return a smooth glass slab met head-on by the camera, with an area light behind or in front of it.
 
     The slab fills 0 <= z <= thickness, the camera stands at z = thickness + 1 and looks along -z through a field of
-    view of 0.1 degrees. `light="behind"` puts a black emitting square at z = -1: the camera sees the transmitted
-    orders, after 2 m of air. `light="front"` puts it at z = thickness + 2, behind the camera: the camera sees the
-    reflected orders, after 3 m of air. Closed form: `closed_forms.etalon_slab`.
+    view of 0.1 degrees. Closed form: `closed_forms.etalon_slab`.
+
+    Args:
+        thickness: of the slab, metres.
+        index: of refraction.
+        light: "behind", a black emitting square at z = -1: the camera sees the transmitted orders, after 2 m of air; or
+            "front", at z = thickness + 2, behind the camera: it sees the reflected orders, after 3 m of air.
+        radiance: emitted radiance.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
+        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     d = positive("thickness", thickness)
     if not is_one_of(light, ("behind", "front")):
@@ -152,11 +187,22 @@ def glass_slab_before_wall(
     spp: int = 256,
     max_depth: int = 5,
 ) -> SceneDict:
-    """A tilted smooth glass slab between a camera at z = 4 and a diffuse wall at z = 0. Lengths in metres.
+    """Return a tilted smooth glass slab between a camera at z = 4 and a diffuse wall at z = 0.
 
-    The point light at (1.8, 0, 2) reaches the wall past the slab. The slab is 0.5 m thick; its refractive index changes
-    the direction, the Fresnel weight and the optical path length of what the camera sees. Key for the gradient: the
-    slab's `eta`.
+    The point light at (1.8, 0, 2) reaches the wall past the slab, which is 0.5 m thick. Its index changes direction,
+    Fresnel weight and optical path length of the camera's light. Key for the gradient: the slab's `eta`.
+
+    Args:
+        index: of refraction.
+        tilt_deg: turn of the slab, degrees.
+        wall_reflectance: albedo of the wall.
+        intensity: of the light, W/sr.
+        resolution: pixels of a side.
+        num_bins: bins of the film.
+        start_opl: start of the film, metres of optical path.
+        bin_width_opl: width of a bin, metres of optical path.
+        spp: samples per pixel.
+        max_depth: segments of the longest path.
     """
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     slab = translate([0.0, 0.0, 2.4]) @ rotate([0, 1, 0], tilt_deg) @ scale([0.8, 0.8, 0.25])

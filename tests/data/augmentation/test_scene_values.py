@@ -18,7 +18,7 @@ from torchtransient.data.scene_values import OF_DEVICES, UNAFFECTED, check_value
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
-from torchtransient.sensing.devices.devices import KINDS
+from torchtransient.sensing.devices import KINDS
 
 N = 6
 OPERATIONS = {

@@ -27,7 +27,7 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
-from torchtransient.files.scan_data import scan_from_data
+from torchtransient.files.plain_data import scan_from_data
 from torchtransient.scene.variant import active_variant
 
 D = tt.data

@@ -28,7 +28,7 @@ from torchtransient.data import (
 from torchtransient.data.exports import decode_web_sample
 from torchtransient.data.serialization import written_frequencies
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files.scan_data import scan_data
+from torchtransient.files.plain_data import scan_data
 from torchtransient.tensor_record import same
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.formats import read_capture
+from torchtransient.files import read_capture
 from torchtransient.units import SPEED_OF_LIGHT
 
 MEASURED = Path(__file__).with_name("measured")

@@ -2,7 +2,7 @@
 
 ``meas`` (x, y, t) as HDF5 has it: counts of a confocal scan through a slab of foam, bins of 16 ps. ``out`` (t, 1): the
 laser's own response, or light through a slab, at one point, bins of 8 ps. The files say neither width; the published
-scans are 0.6 to 0.7 m wide. Other programs do not write this layout, and nothing is gained by it over ``rect_data``.
+scans are 0.6 to 0.7 m wide. Other programs do not write this layout; ``rect_data`` holds the same.
 """
 
 from __future__ import annotations
@@ -11,28 +11,36 @@ import numpy as np
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents
-from torchtransient.files.captures.gaps import Gaps, flat_scan, grid_points, tensor_of, time_axis
+from torchtransient.files.captures.gaps import Gaps, flat_scan, grid_points, numbers_in, tensor_of, time_axis
 
 NAME = "cdt"
 BIN_WIDTH_S, SLAB_BIN_WIDTH_S = 16e-12, 8e-12
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of these: ``meas`` whose first two axes are a square, or ``out`` of one column."""
+    """Return True for ``meas`` whose first two axes are a square, or ``out`` of one column.
+
+    Args:
+        contents: the file.
+    """
     scan, slab = contents.shapes.get("meas"), contents.shapes.get("out")
     square = scan is not None and len(scan) == 3 and scan[0] == scan[1] != scan[2]
     return square or (slab is not None and len(slab) == 2 and slab[1] == 1)
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """A confocal capture on the plane z = 0 around the origin, hidden side +z, counts of the file's own kind;
-    ``wall_size=`` is needed. Of ``out``: a capture of one point.
+    """Return a confocal capture on the plane z = 0 around the origin, hidden side +z; of ``out`` a capture of one
+    point.
+
+    Args:
+        contents: the file.
+        gaps: arguments of the reader; ``wall_size=`` is needed.
+
+    Raises:
+        StorageError: for wrong entries, and without ``wall_size=``.
     """
     name = "meas" if "meas" in contents.shapes else "out"
-    data = contents.array(name)
-    dims = 3 if name == "meas" else 2
-    if data is None or data.ndim != dims or data.dtype.kind not in "iuf":
-        raise gaps.error(f"expected {name} with {dims} dimensions, got {None if data is None else data.shape}.")
+    data = numbers_in(contents, name, gaps, 3 if name == "meas" else 2)
     left = sorted(set(contents.shapes) - {name})
     if name == "out":
         axis = time_axis(gaps, None, None, len(data), SLAB_BIN_WIDTH_S)

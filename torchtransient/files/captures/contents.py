@@ -1,7 +1,7 @@
-"""What lies in a file of another program: arrays and texts by name, whatever kind of file it is.
+"""Contents of files of other programs: arrays and texts by name, independent of the kind of file.
 
 HDF5, MATLAB's files of both kinds (7.3, which are HDF5, and those before), NumPy's ``.npz``, and JSON. Arrays have the
-order of HDF5 throughout; that of MATLAB is the other way round, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
+order of HDF5 throughout; that of MATLAB is the reverse, so that its ``(y, x, t)`` comes as ``(t, x, y)``.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said, npz_shapes, read_npz
-from torchtransient.array_files.hdf5_limits import check_memory, read_attributes, read_dataset
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import check_memory, hdf5_package, read_attributes, read_dataset
 from torchtransient.array_files.plain_texts import json_data, text_of_file
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.mat5 import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File, Other
 
 WHAT = "capture file"
 _BLOCK = 64
@@ -30,11 +29,17 @@ _ENDINGS = {
 
 
 class Contents(Protocol):
-    """``shapes``: root arrays and structures by name, None for what has no shape; ``source``: the file; ``links``:
-    names that lead elsewhere, which are not followed; ``reader``: the function of another package that reads it.
+    """Open file of another program.
 
-    ``array(name)``: numbers, None where the name is missing or empty; names of a structure's fields are
-    ``structure/field``. ``text(name)`` likewise.
+    Attributes:
+        source: path of the file.
+        reader: function of another package that reads it, for messages.
+        shapes: root arrays and structures by name, None for entries without a shape.
+        attributes: texts beside the arrays.
+        links: names that lead elsewhere, which are not followed.
+
+    ``array(name)`` returns numbers, None for a name that is missing or empty; a field of a structure is
+    ``structure/field``. ``text(name)`` likewise. ``fields(name)``: names in a structure, empty for other entries.
     """
 
     source: Path
@@ -50,7 +55,17 @@ class Contents(Protocol):
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Contents]:
-    """The contents of an HDF5, MATLAB, NumPy or JSON file. Raises StorageError for others, and for what is damaged."""
+    """Open an HDF5, MATLAB, NumPy or JSON file.
+
+    Args:
+        path: the file.
+
+    Yields:
+        Its contents.
+
+    Raises:
+        StorageError: for other files, and for damage.
+    """
     source = check_source(path, WHAT)
     with damage_said(source, WHAT, "a capture of the layout that was read"):
         if zipfile.is_zipfile(source):
@@ -69,7 +84,7 @@ def opened(path: str | Path) -> Iterator[Contents]:
 
 
 class Hdf5Contents:
-    """An open HDF5 file."""
+    """Open HDF5 file."""
 
     reader = "h5py.File"
 
@@ -85,7 +100,7 @@ class Hdf5Contents:
         self.links = frozenset(name for name in self.shapes if self._is_link(name))
 
     def _is_link(self, name: str) -> bool:
-        """Whether there is no more than a way to elsewhere, or nothing."""
+        """Return True for a link to elsewhere, or to nothing."""
         import h5py
 
         return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
@@ -105,13 +120,14 @@ class Hdf5Contents:
         return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
+        """Return a text, None if it is missing or empty."""
         value = self._read(name)
         if value is not None and not isinstance(value, str):
             raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
-        """The names in a structure; empty for what is none."""
+        """Return the names in a structure, empty for other entries."""
         import h5py
 
         if self._is_link(name):
@@ -124,13 +140,13 @@ class Hdf5Contents:
 
 
 def _sole(value: Any) -> str:
-    """A text, also one in an array of one."""
+    """Return a text, also of an array of one."""
     sole = np.asarray(value).reshape(-1)[0] if np.size(value) == 1 else value
     return sole.decode("utf-8", "replace") if isinstance(sole, bytes) else str(sole)
 
 
 class MatContents:
-    """A MATLAB file of versions 5 to 7."""
+    """MATLAB file of versions 5 to 7."""
 
     reader = "scipy.io.loadmat"
 
@@ -198,7 +214,7 @@ class NpzContents:
 
 
 class JsonContents:
-    """A JSON object, or a list of such: frames whose entries have one shape each. Arrays are (frames, ...)."""
+    """JSON object, or list of objects: frames whose entries have one shape each. Arrays are (frames, ...)."""
 
     reader = "json.load"
 
@@ -236,12 +252,12 @@ class JsonContents:
         return frozenset(value) if isinstance(value, dict) else frozenset()
 
     def entry(self, name: str, frame: int = 0) -> Any:
-        """Plain data of one frame, None where it has none of that name."""
+        """Return plain data of one frame, None if it has no such entry."""
         return self._entry(self._frames[frame], name)
 
     @staticmethod
     def _entry(frame: Any, name: str) -> Any:
-        """``a/b``: the entry b of the object a, or of the one object in a list."""
+        """Return an entry; ``a/b`` is the entry b of the object a, or of the one object in the list a."""
         for part in name.split("/"):
             frame = frame[0] if isinstance(frame, list) and len(frame) == 1 else frame
             frame = frame.get(part) if isinstance(frame, dict) else None

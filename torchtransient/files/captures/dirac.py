@@ -1,24 +1,30 @@
 """NLOS Dirac captures: confocal grids on the wall z = 0 (HDF5, a layout that y-tal calls deprecated).
 
 ``data_t`` (T, X, Y), ``xg`` and ``yg`` (X, Y) in metres, ``xa`` (X,), ``ya`` (Y,), ``da`` (T,), the optical path in
-metres at which each bin starts. ``offset_laser`` and ``offset_camera``: the legs that were taken off all lengths; where
-the laser's is zero, they count. Nothing says where the sensor and the laser stand.
+metres at which each bin starts. ``offset_laser`` and ``offset_camera``: the legs that were taken off all lengths; if
+the laser's is zero, they count. The places of sensor and laser are not stored.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import new_hdf5
+from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import WHAT, Contents
-from torchtransient.files.captures.gaps import Gaps, cannot, hidden_side, only_transient, scan_of, tensor_of, time_axis
-from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.captures.gaps import (
+    Gaps,
+    cannot,
+    hidden_side,
+    numbers_in,
+    only_transient,
+    scan_of,
+    tensor_of,
+    time_axis,
+)
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}
@@ -27,14 +33,26 @@ _UNEVEN = 1e-3
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of this layout."""
+    """Return True for a file of this layout.
+
+    Args:
+        contents: the file.
+    """
     return set(contents.shapes) >= _REQUIRED
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """The confocal capture. Where the legs count, ``sensor_origin=`` and ``laser_origin=`` are needed."""
-    data, da = _real(contents, "data_t", 3, gaps), _real(contents, "da", None, gaps).reshape(-1)
-    x, y = _real(contents, "xg", 2, gaps), _real(contents, "yg", 2, gaps)
+    """Return the confocal capture.
+
+    Args:
+        contents: the file.
+        gaps: arguments of the reader; if the legs count, ``sensor_origin=`` and ``laser_origin=`` are needed.
+
+    Raises:
+        StorageError: for wrong entries, uneven bins, and missing arguments.
+    """
+    data, da = numbers_in(contents, "data_t", gaps, 3), numbers_in(contents, "da", gaps).reshape(-1)
+    x, y = numbers_in(contents, "xg", gaps, 2), numbers_in(contents, "yg", gaps, 2)
     if x.shape != data.shape[1:] or y.shape != data.shape[1:] or len(da) != len(data) or len(da) < 2:
         raise gaps.error(
             f"expected data_t (T, X, Y), xg and yg (X, Y), da (T,) with T of 2 or more, got {data.shape}, {x.shape}, "
@@ -49,7 +67,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         raise gaps.error(f"expected equal steps in da, got {steps.min():.6g} to {steps.max():.6g} m.")
     points = np.stack(np.broadcast_arrays(x.T, y.T, 0.0), -1).astype(np.float64)
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    legs = not np.any(_real(contents, "offset_laser", None, gaps))
+    legs = not np.any(numbers_in(contents, "offset_laser", gaps))
     sensor_origin, laser_origin = (
         gaps.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
     )
@@ -62,19 +80,16 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     return Capture(tensor_of(data).transpose(1, 2)[None], axis, scan, metadata=gaps.metadata(**offsets))
 
 
-def _real(contents: Contents, name: str, dims: int | None, gaps: Gaps) -> NDArray[Any]:
-    array = contents.array(name)
-    if array is None or array.dtype.kind not in "iuf" or dims not in (None, array.ndim):
-        words = "missing or empty" if array is None else f"{array.dtype} of {array.shape}"
-        raise gaps.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {words}.")
-    return array
-
-
 def write(target: Path, capture: Capture) -> None:
     """Write a confocal capture of a grid along x and y on the wall z = 0, hidden side +z, of two bins or more.
 
-    Where the legs do not count, their lengths stand in the offsets. Raises StorageError for others; origins are lost
-    (:func:`read` asks for them where they count).
+    Args:
+        target: checked path.
+        capture: if its legs do not count, their lengths stand in the offsets. Origins are lost; :func:`read` asks for
+            them if they count.
+
+    Raises:
+        StorageError: for other captures.
     """
     transient, scan = only_transient(capture, NAME), capture.scan
     points = array_of(scan.sensor_points, WHAT)

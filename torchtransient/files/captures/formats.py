@@ -1,4 +1,4 @@
-"""Captures of this and of other programs on disk: which layout a file has is found from what lies in it."""
+"""Captures of this and of other programs on disk. A file's layout is found from its contents."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from types import ModuleType
 from typing import Any
 
 from torchtransient.array_files.array_file import HDF5, check_folder, damage_said, path_of
-from torchtransient.array_files.hdf5_limits import read_attributes
-from torchtransient.array_files.hdf5_writing import hdf5_package
+from torchtransient.array_files.hdf5 import hdf5_package, read_attributes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.files import register_files
+from torchtransient.capture.capture import register_files
 from torchtransient.checks import is_one_of, shown, some_of
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
@@ -38,9 +37,14 @@ _MAT = (".mat",)
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout of files: ``recognises`` what lies in one, ``read``, and ``write`` where that makes sense.
+    """Layout of files: a module with `NAME`, `recognises`, `read`, and `write` unless it is only read.
 
-    ``endings``: those of files that are written.
+    Attributes:
+        name: in `format=` and metadata.
+        recognises: predicate of contents.
+        read: capture of contents and of the arguments of :func:`read_capture`.
+        write: writer of a capture to a checked path, None for layouts that are only read.
+        endings: endings of files that are written.
     """
 
     name: str
@@ -77,19 +81,29 @@ def read_capture(
 ) -> Capture:
     """Read a capture of any known layout, as tensors on the CPU. Nothing in the file is executed.
 
-    `format`: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828" or
-    "vl53l8"; None finds it from the content, not from the name. Measured arrays are read once, and not copied after
-    that but to sum bounces or to make signed numbers of unsigned ones; axes change places as views. In what is not of
-    this library ``metadata["format"]`` names the layout, ``metadata["assumed"]`` what neither file nor caller said,
-    with the value that was taken, and ``metadata["not_read"]`` what else lies in the file.
+    Args:
+        path: the file.
+        format: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828"
+            or "vl53l8"; None finds it from the content, independent of the name.
+        wall_size: metres, one number or (width, height) of a scanned area whose points are the centres of its cells.
+        bin_width_s: width of a bin, seconds.
+        start_s: start of the first bin, seconds.
+        sensor_origin: (3,) metres.
+        laser_origin: (3,) metres.
+        frequencies: frequencies of phasors.
+        frame: index of the frame in a file of several, from 0.
 
-    The other arguments say what a file leaves open; docs/capture_files.md tells which layout needs which. `wall_size`:
-    metres, one number or (width, height) of a scanned area whose points are the centres of its cells. `bin_width_s`,
-    `start_s`: seconds. `sensor_origin`, `laser_origin`: (3,) metres. `frequencies`: of phasors. `frame`: which one
-    of a file that holds several, from 0.
+    Returns:
+        The capture. In files of other programs ``metadata["format"]`` names the layout, ``metadata["assumed"]`` values
+        that neither file nor caller gave, and ``metadata["not_read"]`` other entries of the file.
 
-    Raises StorageError for files that are missing, damaged, of no known layout, or that hold what is no capture of this
-    library; where something is left open that counts; where an argument has no meaning or the file says it itself.
+    Raises:
+        StorageError: for files that are missing, damaged, of no known layout, or hold no capture of this library; for a
+            value that is missing and counts; for an argument that has no meaning or that the file gives itself.
+
+    The arguments after `format` give values that a file lacks; docs/capture_files.md tells which layout needs which.
+    Measured arrays are read once, and copied after that only to sum bounces or to make signed numbers of unsigned ones;
+    axes change places as views.
     """
     given = {
         "wall_size": wall_size, "bin_width_s": bin_width_s, "start_s": start_s, "sensor_origin": sensor_origin,
@@ -109,14 +123,22 @@ def read_capture(
 
 
 def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, format: str = OWN) -> Path:
-    """Write a capture; an existing file is replaced once the new one is complete. Returns the path.
+    """Write a capture; an existing file is replaced once the new one is complete.
 
-    `format`: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The
-    library's own holds all of a capture, and `metadata`, plain data, beside its own. What another layout cannot hold is
-    an error.
+    Args:
+        path: place of the file.
+        capture: the capture.
+        metadata: plain data beside the capture's own, in the library's own format.
+        format: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The
+            library's own holds all of a capture.
 
-    Raises StorageError for an unknown format or ending, a folder that is missing, a full disk, and captures that the
-    format cannot hold.
+    Returns:
+        The path.
+
+    Raises:
+        StorageError: for an unknown ending, a folder that is missing, a full disk, and captures that the format cannot
+            hold.
+        ArgumentError: for an unknown format.
     """
     _check_name(format, FORMATS)
     if format == OWN:
@@ -144,7 +166,7 @@ def _check_name(name: Any, names: tuple[str, ...]) -> None:
 
 
 def _is_own(source: Path) -> bool:
-    """Whether a file says that it is one of this library."""
+    """Return True for a file that names a format of this library."""
     if not source.is_file():
         return False
     if zipfile.is_zipfile(source):
@@ -158,7 +180,7 @@ def _is_own(source: Path) -> bool:
 
 
 def _asked_for(contents: Contents, name: str) -> Layout:
-    """The layout of a name. Raises StorageError for a file that has another one."""
+    """Return the layout of a name. Raises StorageError for a file of another one."""
     layout = next(entry for entry in LAYOUTS if entry.name == name)
     others = [entry.name for entry in LAYOUTS if entry.recognises(contents)]
     if others and not layout.recognises(contents):

@@ -1,4 +1,6 @@
-"""What a file leaves open, and who fills it: whoever reads it, or a value that the capture's metadata tells of."""
+"""Values that a file leaves open, filled by its reader's arguments or by assumptions that the capture's metadata name;
+and the parts of a capture that layouts have in common.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import as_whole, finite, positive, real_array, shown
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.contents import WHAT
+from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 Numbers = NDArray[Any]
@@ -33,9 +35,15 @@ _SIGNED = {np.dtype(np.uint16): np.int32, np.dtype(np.uint32): np.int64, np.dtyp
 
 
 class Gaps:
-    """``given``: what whoever reads a file says about it, by the names of :func:`read_capture`'s arguments.
+    """Arguments of a reader of one file, and what was assumed in their place.
 
-    ``assumed``: what nobody said, and what is taken instead; becomes ``metadata["assumed"]``.
+    Args:
+        given: values by the names of :func:`read_capture`'s arguments.
+        layout: name of the layout.
+        source: the file.
+
+    Attributes:
+        assumed: values that neither file nor caller gave; becomes ``metadata["assumed"]``.
     """
 
     def __init__(self, given: Mapping[str, Any], layout: str, source: Path) -> None:
@@ -45,9 +53,10 @@ class Gaps:
         self._used: set[str] = set()
 
     def fill(self, name: str, stored: Any, default: Any = _NEEDED) -> Any:
-        """``stored``, what the file says; else what is given; else ``default``, as an assumption.
+        """Return ``stored``, the file's value; else the given one; else ``default``, as an assumption.
 
-        Raises StorageError where the file and an argument both say it, and where nothing does.
+        Raises:
+            StorageError: if both file and argument, or neither, have it.
         """
         given = self._given.get(name)
         self._used.add(name)
@@ -63,18 +72,25 @@ class Gaps:
         return default
 
     def width(self, stored: float | None, default_s: Any = _NEEDED) -> float:
-        """Width of the bins in metres: ``stored`` in metres, or ``bin_width_s``."""
+        """Return the width of the bins in metres: ``stored`` in metres, or ``bin_width_s``."""
         found = self.fill("bin_width_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(positive("read_capture: bin_width_s", found))
 
     def start(self, stored: float | None, default_s: float = 0.0) -> float:
-        """Start of the bins in metres: ``stored`` in metres, or ``start_s``, or its default."""
+        """Return the start of the bins in metres: ``stored`` in metres, or ``start_s``, or its default."""
         found = self.fill("start_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(finite("read_capture: start_s", found))
 
     def origin(self, name: str, stored: NDArray[Any] | None, points: NDArray[Any], normals: Any, legs: bool) -> Any:
-        """Where a sensor or a laser stands (3,). Where nobody says so and its distance counts, an error; else a place
-        before the middle of the points.
+        """Return the place of a sensor or a laser, (3,).
+
+        Args:
+            name: "sensor_origin" or "laser_origin".
+            stored: place in the file, any shape.
+            points: points of the scan.
+            normals: normals there, or None.
+            legs: the distance counts, so that a missing place is an error; otherwise one before the middle of the
+                points is assumed.
         """
         default = _NEEDED if legs else before(points, normals)
         found = real_array(self.fill(name, None if stored is None else stored.reshape(-1), default))
@@ -83,7 +99,7 @@ class Gaps:
         return found
 
     def frame(self, frames: int) -> int:
-        """Number of the frame that is read: ``frame``, which a file of one needs not be told."""
+        """Return the index of the frame that is read: ``frame``, which a file of one frame does not need."""
         given = self.fill("frame", None, 0) if frames == 1 else self._given.get("frame")
         self._used.add("frame")
         self.assumed.pop("frame", None)
@@ -95,7 +111,7 @@ class Gaps:
         return number
 
     def extent(self, stored: tuple[float, float] | None) -> tuple[float, float]:
-        """Width along x and height along y of a scanned area, metres."""
+        """Return width along x and height along y of a scanned area, metres."""
         given = self.fill("wall_size", stored)
         sides = real_array(given)
         if sides is None or sides.shape not in ((), (2,)) or not bool(np.isfinite(sides).all() and (sides > 0).all()):
@@ -104,23 +120,65 @@ class Gaps:
         return width, height
 
     def check_all_used(self) -> None:
-        """Raise StorageError for an argument that a layout has no use for."""
+        """Raise StorageError for an argument without use in this layout."""
         left = sorted(set(self._given) - self._used)
         if left:
             names = ", ".join(f"{name}=" for name in left)
             raise self.error(f"{names} has no meaning for this layout. Leave it out.")
 
     def metadata(self, **entries: Any) -> dict[str, Any]:
-        """``format``, ``assumed`` where something was, and ``entries`` that are not None."""
+        """Return ``format``, ``assumed`` unless it is empty, and ``entries`` that are not None."""
         said = {"assumed": self.assumed} if self.assumed else {}
         return {"format": self._layout, **said, **{name: value for name, value in entries.items() if value is not None}}
 
     def error(self, message: str) -> StorageError:
+        """Return an error that names file and layout."""
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
 
+def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = None) -> NDArray[Any]:
+    """Return an array of real numbers.
+
+    Args:
+        contents: the file.
+        name: of the array.
+        gaps: for messages.
+        dims: number of its dimensions, None for any.
+
+    Raises:
+        StorageError: for anything else, and for an array that is missing or empty.
+    """
+    array = contents.array(name)
+    if array is None or array.dtype.kind not in "iuf" or dims not in (None, array.ndim):
+        got = "nothing" if array is None else f"{array.dtype} of {array.shape}"
+        raise gaps.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {got}.")
+    return array
+
+
+def number_in(contents: Contents, name: str, gaps: Gaps) -> float | None:
+    """Return one real number, None if it is missing.
+
+    Args:
+        contents: the file.
+        name: of the number.
+        gaps: for messages.
+
+    Raises:
+        StorageError: for anything else.
+    """
+    array = contents.array(name)
+    if array is not None and (array.size != 1 or array.dtype.kind not in "iuf"):
+        raise gaps.error(f"expected one number as {name}, got {array.dtype} of {array.shape}.")
+    return None if array is None else float(array.reshape(-1)[0])
+
+
 def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
-    """A place a diagonal, or a metre, before the middle of points, on the side of their normals."""
+    """Return a place a diagonal, or a metre, before the middle of points, on the side of their normals.
+
+    Args:
+        points: (..., 3), metres.
+        normals: (..., 3), None for +z.
+    """
     flat = np.asarray(points, np.float64).reshape(-1, 3)
     towards = np.array([0.0, 0.0, 1.0])
     # Numbers of damaged files overflow; a scan refuses what comes out.
@@ -133,8 +191,12 @@ def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
 
 
 def assumed_in(capture: Capture, name: str, value: Any) -> bool:
-    """Whether a capture's metadata says that nobody knew this of the file it was read from, and it still is what was
-    assumed.
+    """Return True if a capture's metadata say that a value was assumed, and it still is the same.
+
+    Args:
+        capture: with any metadata.
+        name: argument of :func:`read_capture`.
+        value: value in the capture.
     """
     said = capture.metadata.get("assumed")
     if not isinstance(said, Mapping) or name not in said:
@@ -144,14 +206,25 @@ def assumed_in(capture: Capture, name: str, value: Any) -> bool:
 
 
 def same_points(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    """Whether points are the same but for the rounding of single precision."""
+    """Return True for points that are equal up to the rounding of single precision.
+
+    Args:
+        a: (..., 3).
+        b: (..., 3).
+    """
     with np.errstate(all="ignore"):  # damaged files
         return a.shape == b.shape and bool((np.abs(a - b) <= _ROUNDING * np.abs(a).max()).all())
 
 
 def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArray[np.float64]]:
-    """What the metadata of a capture that was read keep of the hidden volume: so many numbers by name, NaN where there
-    is something else. Metadata are anyone's.
+    """Return numbers about the hidden volume from the metadata of a capture.
+
+    Args:
+        capture: with any metadata.
+        sizes: numbers of values by name.
+
+    Returns:
+        Arrays by name, NaN for values that are missing or of another size.
     """
     said = capture.metadata.get("hidden_volume")
     found = {name: real_array(said.get(name)) if isinstance(said, Mapping) else None for name in sizes}
@@ -162,15 +235,25 @@ def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArr
 
 
 def hidden_side(scan: Scan) -> NDArray[np.float64]:
-    """The direction (3,) from the wall to its hidden side: the mean normal, or where the sensor stands."""
+    """Return the direction (3,) from the wall to its hidden side: the mean normal, or that to the sensor without
+    normals.
+
+    Args:
+        scan: of a capture.
+    """
     towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
     mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
     return mean
 
 
 def tensor_of(array: NDArray[Any]) -> Tensor:
-    """An array that was read as a tensor, on its memory where torch can compute with its numbers. Raises StorageError
-    for counts beyond those of int64.
+    """Return an array of a file as a tensor, on its memory if torch can compute with its numbers.
+
+    Args:
+        array: any shape; unsigned numbers of 16 bits and more become signed ones.
+
+    Raises:
+        StorageError: for counts beyond those of int64.
     """
     if array.dtype.kind == "u" and array.dtype.itemsize == _MOST_BYTES and array.size and int(array.max()) > _MOST:
         raise StorageError(f"{WHAT}: expected counts below 2^63, got {int(array.max())}.")
@@ -179,15 +262,22 @@ def tensor_of(array: NDArray[Any]) -> Tensor:
 
 
 def grid_points(size: tuple[int, int], extent: tuple[float, float]) -> NDArray[np.float64]:
-    """Centres (Y, X, 3) of the cells of an area around the origin in the plane z = 0; ``size`` (Y, X), ``extent``
-    (width, height) in metres.
+    """Return centres (Y, X, 3) of the cells of an area around the origin in the plane z = 0.
+
+    Args:
+        size: (Y, X).
+        extent: (width, height) in metres.
     """
     y, x = ((np.arange(n) + 0.5 - n / 2) * (side / n) for n, side in zip(size, reversed(extent), strict=True))
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 0.0), -1)
 
 
 def zone_grid(zones: int) -> tuple[int, ...]:
-    """(rows, columns) of a chip's zones where they are a square or 3 x 6, else (zones,)."""
+    """Return (rows, columns) of a chip's zones if they are a square or 3 x 6, else (zones,).
+
+    Args:
+        zones: their number.
+    """
     side = math.isqrt(zones)
     return (side, side) if side * side == zones else (3, 6) if zones == _WIDE else (zones,)
 
@@ -195,9 +285,14 @@ def zone_grid(zones: int) -> tuple[int, ...]:
 def flat_scan(
     kind: str, points: NDArray[np.float64], gaps: Gaps, spot: Any = None, origin: NDArray[np.float64] | None = None
 ) -> Scan:
-    """A scan of a grid or list on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
+    """Return a scan on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
 
-    ``origin`` (3,): where laser and sensor stand, as a file says it.
+    Args:
+        kind: of the scan.
+        points: grid or list (..., 3), metres.
+        gaps: arguments of the reader.
+        spot: (3,) of a single scan.
+        origin: (3,), place of laser and sensor in the file.
     """
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     laser = points if spot is None else np.asarray(spot, np.float64)
@@ -216,7 +311,18 @@ def scan_of(
     laser_normals: Numbers | None,
     legs: bool,
 ) -> Scan:
-    """A scan of arrays."""
+    """Return a scan of arrays.
+
+    Args:
+        kind: of the scan.
+        sensor_points: (..., 3), metres.
+        laser_points: (..., 3), metres.
+        sensor_origin: (3,).
+        laser_origin: (3,).
+        sensor_normals: in the shape of the points, or None.
+        laser_normals: in the shape of the spots, or None.
+        legs: lengths count the first and the last leg.
+    """
     arrays = (sensor_points, laser_points, sensor_origin, laser_origin, sensor_normals, laser_normals)
     names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
     tensors: dict[str, Any] = {
@@ -227,8 +333,16 @@ def scan_of(
 
 
 def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> Tensor:
-    """The transient (T, ...) of a capture of one channel. Raises StorageError for what a layout cannot hold: batches,
-    several channels, Stokes components, phasors, truth values, lengths that are counted otherwise (``legs``).
+    """Return the transient (T, ...) of a capture of one channel.
+
+    Args:
+        capture: of one channel, no batch.
+        layout: name of the layout, for messages.
+        legs: value of ``first_and_last_leg`` that the layout has, None for both.
+
+    Raises:
+        StorageError: for batches, several channels, Stokes components, phasors, truth values, lengths that are counted
+            otherwise.
     """
     if capture.transient is None or capture.phasor is not None or capture.polarized:
         raise cannot(layout, "one transient alone", "phasors or Stokes components")
@@ -243,7 +357,17 @@ def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> T
 
 
 def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: int = 0) -> None:
-    """Raise StorageError unless a tensor has one channel and no batch, and counts that can be read again."""
+    """Check that a tensor has one channel, no batch, and counts that can be read again.
+
+    Args:
+        capture: that it belongs to.
+        tensor: (..., C, T, ...).
+        layout: name of the layout, for messages.
+        before_channel: dimensions before C.
+
+    Raises:
+        StorageError: for other tensors.
+    """
     if tensor.dtype == torch.uint64:
         tensor_of(array_of(tensor, WHAT))
     dims = before_channel + 2 + len(capture.scan.shape)
@@ -255,6 +379,13 @@ def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: i
 
 
 def cannot(layout: str, holds: str, got: str) -> StorageError:
+    """Return the error for a capture that a layout cannot hold.
+
+    Args:
+        layout: its name.
+        holds: captures that it holds.
+        got: the capture, in words.
+    """
     return StorageError(
         f"{WHAT}: the layout {layout!r} holds {holds}, got {got}. The library's own format holds all of a capture: "
         "format='torchtransient'."
@@ -264,15 +395,27 @@ def cannot(layout: str, holds: str, got: str) -> StorageError:
 def time_axis(
     gaps: Gaps, start: float | None, width: float | None, bins: int, default_s: Any = _NEEDED, start_bins: float = 0.0
 ) -> TimeAxis:
-    """The axis of a file that says its start and width in metres, or leaves them open; ``start_bins``: the start then,
-    in bins.
+    """Return the axis of a file that has its start and width in metres, or leaves them open.
+
+    Args:
+        gaps: arguments of the reader.
+        start: metres of optical path, or None.
+        width: metres of optical path, or None.
+        bins: their number.
+        default_s: width that is assumed, seconds.
+        start_bins: start that is assumed, in bins.
     """
     found = gaps.width(width, default_s)
     return TimeAxis(gaps.start(start, opl_to_seconds(start_bins * found)), found, bins)
 
 
 def frequency_axis(gaps: Gaps, stored: FrequencyAxis | None) -> FrequencyAxis:
-    """The frequencies of a file, or those that are given."""
+    """Return the frequencies of a file, or the given ones.
+
+    Args:
+        gaps: arguments of the reader.
+        stored: those of the file, or None.
+    """
     found = gaps.fill("frequencies", stored)
     if not isinstance(found, FrequencyAxis):
         raise gaps.error(f"expected frequencies as a FrequencyAxis, got {shown(found)}.")

@@ -22,12 +22,14 @@ from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
+    number_in,
+    numbers_in,
     only_transient,
     scan_of,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 
 NAME = "phasor_field"
 _VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}
@@ -35,17 +37,29 @@ _REQUIRED = {"data", "laserPos", "cameraPos", "deltat"}
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of this layout."""
+    """Return True for a file of this layout.
+
+    Args:
+        contents: the file.
+    """
     return "dataset" in contents.shapes and contents.fields("dataset") >= _REQUIRED
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """A single capture of a list of points, or all pairs of two lists. ``metadata["reciprocal"]``: whether camera and
-    laser have changed places. ``hidden_volume``: corners and spacing.
+    """Return a single capture of a list of points, or all pairs of two lists.
+
+    Args:
+        contents: the file.
+        gaps: arguments of the reader.
+
+    Returns:
+        The capture; ``metadata["reciprocal"]`` is True if camera and laser have changed places, ``hidden_volume`` has
+        corners and spacing.
+
+    Raises:
+        StorageError: for wrong entries.
     """
-    data = _field(contents, "data", gaps)
-    if data is None or data.ndim != 3:
-        raise gaps.error(f"expected dataset.data (t, cameras, lasers), got {None if data is None else data.shape}.")
+    data = numbers_in(contents, "dataset/data", gaps, 3)
     points = {who: _points(contents, f"{who}Pos", gaps) for who in ("camera", "laser")}
     normals = {who: _normals(contents, f"{who}Norm", points[who], gaps) for who in points}
     bins = _number(contents, "t", gaps)
@@ -95,18 +109,19 @@ def _normals(contents: Contents, name: str, points: NDArray[Any], gaps: Gaps) ->
 
 
 def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    array = _field(contents, name, gaps)
-    if array is not None and array.size != 1:
-        raise gaps.error(f"expected one number as dataset.{name}, got {array.shape}.")
-    return None if array is None else float(array.reshape(-1)[0])
+    return number_in(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
 
 
 def write(target: Path, capture: Capture) -> None:
     """Write a single or exhaustive capture as MATLAB 7.3. Grids become lists, row after row.
 
-    A single capture is written as the data has it: the sensor points as those of the laser, the spot as the camera's.
-    Raises StorageError for confocal captures, for lengths that leave out the first and the last leg, for normals that
-    are not known.
+    Args:
+        target: checked path.
+        capture: a single one is written as the data has it: sensor points as those of the laser, the spot as the
+            camera's.
+
+    Raises:
+        StorageError: for confocal captures, for lengths that leave out the first and the last leg, for missing normals.
     """
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
     if scan.kind in ("confocal", "pairs"):

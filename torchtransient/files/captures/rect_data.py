@@ -26,11 +26,13 @@ from torchtransient.files.captures.gaps import (
     flat_scan,
     grid_points,
     hidden_side,
+    number_in,
+    numbers_in,
     only_transient,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_mat
+from torchtransient.files.captures.matlab import write_mat
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
 NAME = "rect_data"
@@ -38,29 +40,37 @@ _OFF_GRID = 1e-3
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of these: ``rect_data``, or ``meas`` whose last two axes are a square."""
+    """Return True for ``rect_data``, or ``meas`` whose last two axes are a square.
+
+    Args:
+        contents: the file.
+    """
     shape = contents.shapes.get("meas")
     square = shape is not None and len(shape) == 3 and shape[1] == shape[2] != shape[0]
     return contents.shapes.get("rect_data") is not None or square
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """A confocal capture, or with ``SPAD_index`` a single one, on the plane z = 0 around the origin, hidden side +z.
+    """Return a confocal capture, or with ``SPAD_index`` a single one, on the plane z = 0 around the origin, hidden side
+    +z.
 
-    What the file does not say is to be given: ``bin_width_s=`` (4 ps for the data of the light-cone transform, 32 ps
-    for those of f-k migration), ``wall_size=``. Origins are assumed: their distances do not count.
+    Args:
+        contents: the file.
+        gaps: arguments of the reader, for values that the file lacks: ``bin_width_s=`` (4 ps for the data of the
+            light-cone transform, 32 ps for those of f-k migration), ``wall_size=``. Origins are assumed: their
+            distances do not count.
+
+    Raises:
+        StorageError: for wrong entries and missing arguments.
     """
     name = "rect_data" if "rect_data" in contents.shapes else "meas"
-    data = contents.array(name)
-    if data is None or data.ndim != 3 or data.dtype.kind not in "iuf":
-        got = "none" if data is None else f"{data.dtype} of {data.shape}"
-        raise gaps.error(f"expected {name} of real numbers on three axes, got {got}.")
+    data = numbers_in(contents, name, gaps, 3)
     spad = contents.array("SPAD_index")
     tensor = tensor_of(data)
     tensor = tensor if name == "rect_data" and spad is None else tensor.transpose(1, 2)
     size = tensor.shape[1], tensor.shape[2]
-    width, ts = _number(contents, "width", gaps), _number(contents, "ts", gaps)
-    spacing = _number(contents, "sampling_spacing", gaps)
+    width, ts = _positive(contents, "width", gaps), _positive(contents, "ts", gaps)
+    spacing = _positive(contents, "sampling_spacing", gaps)
     if width is not None and spacing is not None and abs(size[1] * spacing - 2 * width) > 1.01 * spacing:
         raise gaps.error(
             f"width says that the scan is {2 * width:g} m wide, sampling_spacing {size[1] * spacing:g} m. Correct one "
@@ -78,13 +88,10 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     return Capture(tensor[None], axis, scan, metadata=metadata)
 
 
-def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    array = contents.array(name)
-    if array is None:
-        return None
-    value = float(array.reshape(-1)[0]) if array.size == 1 and array.dtype.kind in "iuf" else float("nan")
-    if not (np.isfinite(value) and value > 0):
-        raise gaps.error(f"expected {name} as one number above zero, got {array.dtype} of {array.shape}.")
+def _positive(contents: Contents, name: str, gaps: Gaps) -> float | None:
+    value = number_in(contents, name, gaps)
+    if value is not None and not (np.isfinite(value) and value > 0):
+        raise gaps.error(f"expected {name} as one number above zero, got {value!r}.")
     return value
 
 
@@ -99,10 +106,14 @@ def _index(spad: NDArray[Any], size: tuple[int, int], gaps: Gaps) -> tuple[int, 
 def write(target: Path, capture: Capture) -> None:
     """Write a confocal capture, or a single one whose spot is a sensor point, as MATLAB 7.3.
 
-    ``ts`` stands beside ``rect_data`` in both. Where the grid lies in space is lost, and the start of the axis must be
-    0. Raises StorageError for grids that are not regular and at right angles, for those of confocal captures that are
-    not square, for those that run the other way round (a reflection would be lost), for lengths with the first and last
-    leg.
+    Args:
+        target: checked path.
+        capture: its axis starts at 0, lengths without the first and last leg. The place of the grid in space is lost;
+            ``ts`` stands beside ``rect_data`` in both kinds.
+
+    Raises:
+        StorageError: for grids that are not regular and at right angles, confocal ones that are not square, grids that
+            run the other way round (a reflection would be lost), and other lengths.
     """
     transient, scan = only_transient(capture, NAME, legs=False), capture.scan
     points = array_of(scan.sensor_points, WHAT)
@@ -137,7 +148,7 @@ def write(target: Path, capture: Capture) -> None:
 
 
 def _pitches(points: NDArray[Any]) -> tuple[float, float]:
-    """Distances between columns and between rows of a grid. Raises StorageError unless it is regular."""
+    """Return the distances between columns and between rows of a grid. Raises StorageError for an irregular one."""
     rows, columns = points.shape[:2]
     x, y = (points[0, -1] - points[0, 0]) / (columns - 1), (points[-1, 0] - points[0, 0]) / (rows - 1)
     expected = points[0, 0] + np.arange(rows)[:, None, None] * y + np.arange(columns)[None, :, None] * x

@@ -8,7 +8,9 @@ which y-tal executes and this reader does not. What is missing is HDF5's empty d
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,10 +21,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import hdf5_package, new_hdf5
+from torchtransient.array_files.hdf5 import hdf5_package, new_hdf5, write_parts
+from torchtransient.array_files.plain_texts import read_plain_yaml, write_plain_yaml
+from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import StorageError
-from torchtransient.files.captures import tal_scene_info
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.files.captures.gaps import (
     Gaps,
@@ -35,7 +38,8 @@ from torchtransient.files.captures.gaps import (
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_parts
+from torchtransient.files.plain_data import plain, restored
+from torchtransient.plugins.films.transform_bins import transform_bins
 
 NAME = "tal"
 _STOKES = 4
@@ -45,11 +49,17 @@ _KNOWN = frozenset(
 ) | {"H", "H_format", "volume_format", "delta_t", "t_start", _LEGS, "scene_info"}
 _GRIDS = {"UNKNOWN": 0, "N_3": 1, "X_Y_3": 2}
 _VOLUMES = {"UNKNOWN": 0, "N_3": 1, "X_Y_Z_3": 2, "X_Y_3": 3}
+# Our part of the information: a JSON text, in which numbers keep every digit.
+_OWN = "torchtransient"
+# What metadata hold after reading; other entries were added since.
+_READ = {"format", "assumed", "scene_info", "tal", "not_read"}
+# Kinds of numbers as NumPy writes them.
+_DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
 @dataclass(frozen=True)
 class HFormat:
-    """What the dimensions of ``H`` are: ``grids`` of points or lists, with those of the laser or without."""
+    """Dimensions of ``H``: times or frequencies, ``grids`` of points or lists, with those of the laser or without."""
 
     number: int
     frequencies: bool
@@ -71,7 +81,11 @@ _NUMBERS = {"UNKNOWN": 0} | {name: form.number for name, form in _FORMATS.items(
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of y-tal's."""
+    """Return True for a file of y-tal.
+
+    Args:
+        contents: the file.
+    """
     return {"H", "H_format", "sensor_grid_xyz"} <= set(contents.shapes)
 
 
@@ -79,11 +93,19 @@ def recognises(contents: Contents) -> bool:
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """The capture of a file of y-tal. ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` what makes a
-    file that is written of it the same again.
+    """Return the capture of a file of y-tal.
 
-    Origins that are missing are assumed where their distance does not count. Laser points of ``T_Si`` and ``T_Sx_Sy``
-    are one (single), those of the sensor (confocal), or as many elsewhere (pairs). Raises StorageError for others.
+    Args:
+        contents: the file.
+        gaps: arguments of the reader. Missing origins are assumed if their distance does not count.
+
+    Returns:
+        The capture; ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` settings by which a file that is
+        written of it is the same again. Laser points of ``T_Si`` and ``T_Sx_Sy`` are one (single), those of the sensor
+        (confocal), or as many elsewhere (pairs).
+
+    Raises:
+        StorageError: for other files, wrong entries and missing arguments.
     """
     number = _whole(contents, "H_format", gaps)
     form = next((form for form in _FORMATS.values() if form.number == number), None)
@@ -91,8 +113,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
     kept: dict[str, Any] = {"dtypes": {}}
     text = contents.text("scene_info")
-    info = None if text is None else tal_scene_info.parsed(text, WHAT)
-    own = tal_scene_info.own_part(info)
+    info = None if text is None else _scene_info(text)
+    own = _own_part(info)
     legs = gaps.fill(_LEGS, _flag(contents, _LEGS, kept), False)
     scan = _scan(contents, gaps, form, legs, kept)
     measured = _measured(contents, gaps, form, kept)
@@ -101,7 +123,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
     tensor = _from_tal(measured, form, polarized)
     if form.frequencies:
-        found = tal_scene_info.frequencies(info, own, len(measured), start)
+        found = _frequencies(info, own, len(measured), start)
         axis = frequency_axis(gaps, found)
         if start is not None and axis.start_opl != start:
             raise gaps.error(
@@ -120,8 +142,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], left: list[str]) -> dict[str, Any]:
-    """What this library has written beside, into ``scene_info``; ``assumed`` and ``left`` where another program has
-    taken something out since, or put something in.
+    """Return parts of a capture that this library has written into ``scene_info``.
+
+    ``assumed`` and ``left`` name what another program has taken out, or put in, since.
     """
     metadata, steady = dict(own.get("metadata") or {}), own["steady"]
     if steady is not None and np.shape(steady)[-len(scan.shape) :] != scan.shape:
@@ -150,13 +173,13 @@ def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any
 
 
 def _from_tal(measured: Tensor, form: HFormat, polarized: bool) -> Tensor:
-    """(T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
+    """Return (T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
     tensor = _swapped(measured, form)
     return tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
 
 
 def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
-    """x and y of each grid in the other order, which is its own reverse."""
+    """Exchange x and y of each grid, which is its own inverse."""
     if not form.grids:
         return tensor
     return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
@@ -267,17 +290,21 @@ def _volume(contents: Contents, gaps: Gaps) -> int | None:
 
 
 def write(target: Path, capture: Capture) -> None:
-    """Write a capture as y-tal reads it. A phasor is written where there is no transient.
+    """Write a capture so that y-tal reads it. A phasor is written if there is no transient.
 
-    Channels' names, metadata, the wall and the steady image go into ``scene_info``, unless the capture was read from
-    such a file and has none of them: then ``scene_info`` is written as it was. Raises StorageError for a batch, several
-    channels, and a transient beside a phasor.
+    Args:
+        target: checked path.
+        capture: names of channels, metadata, the wall and the steady image go into ``scene_info``, unless the capture
+            was read from such a file and has none of them: then ``scene_info`` is written as it was.
+
+    Raises:
+        StorageError: for a batch, several channels, and a transient beside a phasor.
     """
     form_name, h = _h(capture)
     form = _FORMATS[form_name]
-    kept = tal_scene_info.kept_of(capture)
+    kept = _kept(capture)
     arrays = _arrays(capture, kept, form)
-    text = tal_scene_info.written(capture, kept, WHAT)
+    text = _scene_info_text(capture, kept)
     formats = {"H_format": (_NUMBERS, form.number)}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
@@ -296,7 +323,7 @@ def write(target: Path, capture: Capture) -> None:
 
 
 def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
-    """The name of H's format, and H as a view where the tensor lies on the CPU."""
+    """Return the name of H's format, and H as a view if the tensor lies on the CPU."""
     if capture.transient is not None and capture.phasor is not None:
         raise cannot(NAME, "a transient or a phasor", "both; write dataclasses.replace(capture, phasor=None, ...)")
     scan = capture.scan
@@ -345,7 +372,9 @@ def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[st
 
 
 def _as_stored(name: str, value: Any, dtype: str | None) -> NDArray[Any]:
-    """As the file had it that it was read from; else points in single precision, where that loses nothing."""
+    """Return an array in the dtype of the file that it was read from, else points in single precision if that is
+    exact.
+    """
     array = np.ascontiguousarray(array_of(value, WHAT)) if isinstance(value, Tensor) else np.asarray(value)
     if dtype is not None and (
         _holds(array, np.dtype(dtype)) or (name.endswith("normals") and np.dtype(dtype).kind == "f")
@@ -355,10 +384,113 @@ def _as_stored(name: str, value: Any, dtype: str | None) -> NDArray[Any]:
 
 
 def _holds(array: NDArray[Any], dtype: np.dtype[Any]) -> bool:
-    """Whether numbers of another kind are the same."""
+    """Return True if numbers are the same in another dtype."""
     if array.dtype == dtype:
         return True
     if dtype.kind not in "iufc" or (dtype.kind != "c" and array.dtype.kind == "c"):
         return False
     with np.errstate(all="ignore"):
         return math.prod(array.shape) == 0 or bool(np.array_equal(array.astype(dtype).astype(array.dtype), array))
+
+
+# ----------------------------------------------------------------------------------------------------------- scene_info
+
+
+def _scene_info(text: str) -> Any:
+    """Return ``scene_info`` as plain data. Raises StorageError."""
+    return _as_json(read_plain_yaml(text, WHAT))
+
+
+def _own_part(info: Any) -> dict[str, Any] | None:
+    """Return the part of ``scene_info`` that this library writes, None in files of other programs.
+
+    ``channels``, ``metadata``, ``wall``, ``steady``, ``frequencies_per_metre``, ``phasor_start_opl``. Raises
+    StorageError for damage.
+    """
+    text = info.get(_OWN) if isinstance(info, Mapping) else None
+    if not isinstance(text, str):
+        return None
+    try:
+        own = json.loads(text)
+        return dict(own) | {name: restored(own[name], {}) for name in ("wall", "steady")}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise StorageError(f"capture file: scene_info.{_OWN} is damaged: {error}.") from None
+
+
+def _frequencies(info: Any, own: Mapping[str, Any] | None, count: int, start_opl: float | None) -> FrequencyAxis | None:
+    """Return the frequencies of ``count`` phasors: as this library wrote them, or those that a render of y-tal with
+    these settings keeps; None without either.
+    """
+    if own is not None and own.get("frequencies_per_metre") is not None:
+        return FrequencyAxis(tuple(own["frequencies_per_metre"]), own["phasor_start_opl"])
+    config = info.get("config") if isinstance(info, Mapping) else None
+    if not isinstance(config, Mapping) or config.get("histogram_mode") != "frequency":
+        return None
+    numbers = [config.get(name) for name in ("wl_mean", "wl_sigma", "num_bins", "bin_width_opl")]
+    if any(isinstance(n, bool) or not isinstance(n, int | float) for n in numbers):
+        return None
+    mean, sigma, bins, width = (float(n) for n in numbers if n is not None)
+    # A spectrum has as many lines as H has rows, whatever a damaged text says of bins.
+    if not (0 < bins <= 2**31 and bins * width / max(sigma, 1e-300) < 1e3 * (count + 10)):
+        return None
+    found = transform_bins(mean, sigma, int(bins), width)
+    return FrequencyAxis(tuple(found.tolist()), start_opl or 0.0) if len(found) == count else None
+
+
+def _kept(capture: Capture) -> dict[str, Any]:
+    """Return settings of a file that was read, from a capture's metadata: ``dtypes`` by name, and if they are there
+    ``scene_info_text``, ``volume_format``, ``delta_t``. Other entries are left out: metadata may be anything.
+    """
+    given = capture.metadata.get("tal")
+    given = given if isinstance(given, Mapping) else {}
+    dtypes = given.get("dtypes")
+    names = dtypes.items() if isinstance(dtypes, Mapping) else ()
+    kept: dict[str, Any] = {"dtypes": {name: kind for name, kind in names if _DTYPE.fullmatch(str(kind))}}
+    kinds = {"scene_info_text": str | None, "volume_format": int, "delta_t": float}
+    return kept | {name: given[name] for name, kind in kinds.items() if name in given and isinstance(given[name], kind)}
+
+
+def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
+    """Return the text for a capture: as it was read if nothing about it has changed, None if there was none."""
+    text = kept.get("scene_info_text")
+    added = bool(capture.channels or set(capture.metadata) - _READ)
+    added = added or capture.scan.wall is not None or capture.steady is not None
+    if "scene_info_text" in kept and not added and capture.frequencies == _kept_frequencies(capture, kept):
+        before = None if text is None else _scene_info(text)
+        if capture.metadata.get("scene_info") == before:
+            return None if text is None else str(text)
+    info: dict[str, Any] = {"original_format": str(capture.metadata.get("format", _OWN))}
+    given = capture.metadata.get("scene_info")
+    own = {
+        "channels": capture.channels, "metadata": dict(capture.metadata),
+        "wall": plain(capture.scan.wall, None, "wall"), "steady": plain(capture.steady, None, "steady"),
+    }  # fmt: skip
+    if capture.frequencies is not None:
+        own |= {
+            "frequencies_per_metre": capture.frequencies.frequencies, "phasor_start_opl": capture.frequencies.start_opl,
+        }  # fmt: skip
+    if capture.polarized:
+        # Not the variant, which 0.21 looks at: its `read_capture` raises for polarized ones.
+        info["is_polarized"] = True
+    info |= given if isinstance(given, Mapping) else {}
+    return write_plain_yaml(_as_json(info) | {_OWN: json.dumps(own)}, WHAT)
+
+
+def _kept_frequencies(capture: Capture, kept: Mapping[str, Any]) -> FrequencyAxis | None:
+    if capture.frequencies is None:
+        return None
+    text = kept.get("scene_info_text")
+    info = None if text is None else _scene_info(text)
+    count, start = capture.frequencies.num_frequencies, capture.frequencies.start_opl
+    return _frequencies(info, _own_part(info), count, start)
+
+
+def _as_json(data: Any) -> Any:
+    """Return plain data as JSON has it: names are texts, sequences lists."""
+    if isinstance(data, Mapping):
+        return {name if isinstance(name, str) else json.dumps(_as_json(name)): _as_json(v) for name, v in data.items()}
+    if isinstance(data, list | tuple | set | frozenset):
+        return [_as_json(value) for value in data]
+    if isinstance(data, bytes):
+        return data.hex()
+    return data if data is None or isinstance(data, bool | int | float | str) else str(data)

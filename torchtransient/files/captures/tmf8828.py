@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents, JsonContents
-from torchtransient.files.captures.gaps import Gaps, scan_of, tensor_of, time_axis, zone_grid
+from torchtransient.files.captures.gaps import Gaps, numbers_in, scan_of, tensor_of, time_axis, zone_grid
 
 NAME = "tmf8828"
 BIN_WIDTH_S, ZERO_BIN = 93.0e-12, 13.56
@@ -33,17 +33,28 @@ _KEPT = ("reference_hist", "pose", "dist_to_plane", "time_captured")
 
 
 def recognises(contents: Contents) -> bool:
-    """Return whether a file holds frames of this layout."""
+    """Return True for a file of frames of this layout.
+
+    Args:
+        contents: the file.
+    """
     return set(contents.shapes) >= {"hists", "reference_hist"}
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """A confocal capture of one frame, with the legs from and to the chip; ``frame=`` chooses one of several.
+    """Return a confocal capture of one frame, with the legs from and to the chip.
 
     Points are where the zones meet the plane ``dist_to_plane`` in front of the chip, without that as far as each zone's
-    own depth. Raises StorageError where neither says how far away the wall is.
+    own depth.
+
+    Args:
+        contents: the file.
+        gaps: arguments of the reader; ``frame=`` chooses one of several.
+
+    Raises:
+        StorageError: for wrong entries, and if neither distance is there.
     """
-    hists = _numbers(contents, "hists", gaps, dims=3)
+    hists = numbers_in(contents, "hists", gaps, 3)
     frames, zones, bins = hists.shape
     chosen = gaps.frame(frames)
     axis = time_axis(gaps, None, None, bins, BIN_WIDTH_S, start_bins=-ZERO_BIN)
@@ -60,7 +71,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _entry(contents: Contents, name: str, chosen: int) -> Any:
-    """An entry of the frame as it stands in the file: numbers, or a text."""
+    """Return an entry of the frame as it stands in the file: numbers, or a text."""
     if isinstance(contents, JsonContents):
         return contents.entry(name, chosen)
     array = contents.array(name)
@@ -70,12 +81,12 @@ def _entry(contents: Contents, name: str, chosen: int) -> Any:
 def _points(
     contents: Contents, chosen: int, shape: tuple[int, ...], pose: NDArray[np.float64], gaps: Gaps
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Points where the zones meet the wall (*shape, 3), and the wall's normals there."""
+    """Return points where the zones meet the wall (*shape, 3), and the wall's normals there."""
     rows, columns = shape if len(shape) > 1 else (shape[0], 1)
     x, y = (half * (2 * (np.arange(n) + 0.5) / n - 1) for half, n in zip(HALF_FIELD, (rows, columns), strict=True))
     ways = np.stack(np.broadcast_arrays(x[:, None], y[None, :], 1.0), -1) @ pose[:3, :3].T
     if contents.array("dist_to_plane") is not None:
-        distance = _numbers(contents, "dist_to_plane", gaps, dims=1)[chosen]
+        distance = numbers_in(contents, "dist_to_plane", gaps, 1)[chosen]
         depths = np.full((rows, columns), distance, np.float64)
         normals = np.broadcast_to(-pose[:3, 2], (*shape, 3))
     elif (measured := contents.array("distances/depths_1")) is not None:
@@ -93,17 +104,8 @@ def _pose(contents: Contents, chosen: int, gaps: Gaps) -> NDArray[np.float64]:
     if contents.array("pose") is None:
         gaps.assumed["pose"] = np.eye(4).tolist()
         return np.eye(4)
-    pose: NDArray[np.float64] = _numbers(contents, "pose", gaps, dims=3)[chosen].astype(np.float64)
+    pose: NDArray[np.float64] = numbers_in(contents, "pose", gaps, 3)[chosen].astype(np.float64)
     turn = pose[:3, :3]
     if pose.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-3) or np.linalg.det(turn) < 0:
         raise gaps.error("expected pose as a turn and a shift (4, 4).")
     return pose
-
-
-def _numbers(contents: Contents, name: str, gaps: Gaps, dims: int) -> NDArray[Any]:
-    """(frames, ...)."""
-    array = contents.array(name)
-    if array is None or array.ndim != dims or array.dtype.kind not in "iuf":
-        got = "nothing" if array is None else f"{array.dtype} of {array.shape[1:]}"
-        raise gaps.error(f"expected {name} with {dims - 1} dimensions of numbers in each frame, got {got}.")
-    return array

@@ -3,7 +3,7 @@
 ``data``, as HDF5 has its axes: confocal ([colours,] t, bounces, x, y), pairs ([colours,] t, bounces, x, y, laser x,
 laser y); files with the attribute ``data order`` = ``row-major`` have all axes the other way round, those of positions
 too. ``deltaT`` and ``t0`` are metres of optical path, from the laser's origin to the sensor's. The two axes of a grid
-become the rows (y) and columns (x) of a scan; which of the scene's axes they run along is the positions' affair.
+become the rows (y) and columns (x) of a scan; the axes of the scene that they run along follow from the positions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import array_of, replacing
-from torchtransient.array_files.hdf5_writing import new_hdf5
+from torchtransient.array_files.hdf5 import new_hdf5, write_parts
 from torchtransient.capture import Capture
 from torchtransient.checks import shown
 from torchtransient.errors import StorageError
@@ -25,13 +25,13 @@ from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
+    number_in,
     only_transient,
     same_points,
     scan_of,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.captures.mat_file import write_parts
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}
@@ -45,14 +45,26 @@ _INT64 = 2**63
 
 
 def recognises(contents: Contents) -> bool:
-    """Whether a file is one of the data set."""
+    """Return True for a file of the data set.
+
+    Args:
+        contents: the file.
+    """
     return set(contents.shapes) >= _REQUIRED
 
 
 def read(contents: Contents, gaps: Gaps) -> Capture:
-    """The capture, colours as channels, bounces summed up (``metadata["bounces"]``: how many there were).
+    """Return the capture, colours as channels, bounces summed up. Single captures are pairs with one spot.
 
-    ``hidden_volume`` of the metadata: position, rotation, size. Single captures are pairs with one spot.
+    Args:
+        contents: the file.
+        gaps: arguments of the reader.
+
+    Returns:
+        The capture; ``metadata`` hold the number of ``bounces`` and ``hidden_volume``: position, rotation, size.
+
+    Raises:
+        StorageError: for wrong entries.
     """
     missing = sorted(_REQUIRED - set(contents.shapes))
     if missing:
@@ -77,7 +89,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     elif transient.ndim == _CONFOCAL:
         raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
     scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
-    axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltaT", gaps), transient.shape[1])
+    axis = time_axis(gaps, number_in(contents, "t0", gaps), number_in(contents, "deltaT", gaps), transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
     return Capture(transient, axis, scan, metadata=gaps.metadata(bounces=bounces, hidden_volume=volume or None))
 
@@ -90,7 +102,7 @@ def _reversed(contents: Contents) -> bool:
 
 
 def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
-    """(C, T, [Ly, Lx,] Sy, Sx), summed a bounce at a time: all of them would take several times the memory."""
+    """Return (C, T, [Ly, Lx,] Sy, Sx), summed a bounce at a time: all of them would take several times the memory."""
     shape = contents.shapes["data"]
     if shape is None or len(shape) not in (4, 5, 6, 7):
         raise gaps.error(f"expected data with 4 to 7 dimensions, got {shape}.")
@@ -132,7 +144,7 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
 
 
 def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None = None) -> NDArray[np.float64] | None:
-    """(Y, X, 3), from (3, X, Y), or (Y, X, 3) in files that have their axes the other way round."""
+    """Return (Y, X, 3), from (3, X, Y), or (Y, X, 3) in files that have their axes the other way round."""
     array = contents.array(name)
     if array is None:
         return None
@@ -147,21 +159,19 @@ def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None =
     return np.ascontiguousarray(array, np.float64)
 
 
-def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    array = contents.array(name)
-    if array is not None and (array.size != 1 or array.dtype.kind not in "iuf"):
-        raise gaps.error(f"expected one number as {name}, got {array.dtype} of {array.shape}.")
-    return None if array is None else float(array.reshape(-1)[0])
-
-
 # ------------------------------------------------------------------------------------------------------------- writing
 
 
 def write(target: Path, capture: Capture) -> None:
     """Write a capture as the data set has them, in the order of HDF5. All light stands in the second of the bounces.
 
-    What is not known of the hidden volume is NaN. Raises StorageError for lists of points, for lengths that leave out
-    the first and the last leg, for normals that are not known, and for what no foreign layout holds.
+    Args:
+        target: checked path.
+        capture: a grid with normals, lengths with the first and last leg. Unknown numbers of the hidden volume are NaN.
+
+    Raises:
+        StorageError: for lists of points, for lengths that leave out the first and the last leg, for missing normals,
+            and for parts of a capture that no foreign layout holds.
     """
     transient, scan = only_transient(capture, NAME, legs=True), capture.scan
     if scan.kind == "pairs":
@@ -200,7 +210,7 @@ def write(target: Path, capture: Capture) -> None:
 
 
 class _Bounce:
-    """The one bounce of a dataset that is written to, indexed by bins."""
+    """One bounce of a dataset that is written to, indexed by bins."""
 
     def __init__(self, dataset: Any) -> None:
         self._dataset = dataset

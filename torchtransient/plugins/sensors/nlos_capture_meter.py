@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from torchtransient.capture.triangles import first_hits
+from torchtransient.capture.wall import first_hits
 from torchtransient.checks import real_array, shown
 from torchtransient.errors import SceneError
 from torchtransient.plugins._registry import register
