@@ -27,7 +27,6 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
-from torchtransient.files.plain_data import scan_from_data
 from torchtransient.scene.variant import active_variant
 
 D = tt.data
@@ -427,7 +426,19 @@ def test_light_that_is_not_finite_is_no_sample(monkeypatch, broken):
         recipe.sample(5)
 
 
-def test_a_reflectance_of_nothing_and_of_all_is_possible():
+@pytest.fixture
+def unrendered(monkeypatch):
+    """A check passes; its renders, which follow, fail at once."""
+
+    def render(*arguments, **keywords):
+        raise SceneError("not rendered")
+
+    monkeypatch.setattr(tt.TransientRenderer, "forward", render)
+    with pytest.warns(TorchTransientWarning, match="not rendered"):
+        yield
+
+
+def test_a_reflectance_of_nothing_and_of_all_is_possible(unrendered):
     small(vary={RED: D.Uniform(0, 1)}).check()
 
 
@@ -488,7 +499,7 @@ def test_entries_that_look_alike_are_other_structures():
     assert len({sample.values["white.reflectance"] for sample in found}) == 3
 
 
-def test_a_distribution_that_rejects_is_checked():
+def test_a_distribution_that_rejects_is_checked(unrendered):
     small(vary={BOX: Ball()}).check()
     # Both ends at once have no direction, which no sample draws.
     point = D.Uniform([-0.5, -0.5, 3], [0.5, 0.5, 4])
@@ -534,21 +545,6 @@ def test_what_scenes_have_of_their_own_is_told_by_scene():
     recipe = small(D.OneOf({"a": box(), "b": turned}), {}, labels=["shape"])
     about = recipe._maker.about()
     assert about["shapes"]["a"] == about["shapes"]["b"][::-1]
-    recipe.check()
-
-
-@pytest.mark.slow
-def test_scans_that_vary_are_all_told():
-    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
-    parts = (None, (0.2, 0.2, 0.6, 0.6))
-    scans = [tt.nlos.Scan.grid(wall, (3, 3), kind="confocal", extent=extent) for extent in parts]
-    hidden = {"plate": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])}}
-    recipe = D.Recipe(
-        hidden, {"scan": D.Choice(scans)}, scan=scans[0], variant=VARIANT, time_axis=tt.TimeAxis(0, 0.05, 60), spp=4
-    )
-    told = recipe._maker.about()["scans"]
-    assert [scan_from_data(one) for one in told] == scans
-    assert {recipe.sample(index).values["scan"] for index in range(6)} == {"#0", "#1"}
 
 
 # ------------------------------------------------------------------------------------------------ orders, kinds, ends
