@@ -12,8 +12,6 @@ import builtins
 import re
 from pathlib import Path
 
-import pytest
-
 import torchtransient
 from support import walks
 from support.sweeps import together
@@ -200,29 +198,6 @@ def test_rooms_of_sensing():
     assert tested <= set(SENSING)
 
 
-@pytest.mark.parametrize(
-    ("place", "line", "message"),
-    [
-        ("numerics/draws.py", "from torchtransient.sensing.spad.spad import coates", "imports 'spad' (level 4)"),
-        ("itof/itof.py", "from torchtransient.sensing.timing import tdc", "imports 'timing' (level 3)"),
-        ("itof/itof.py", "def f():\n    from ..chain.compose import Compose", "imports 'chain'"),
-        ("spad/spad.py", "from torchtransient.sensing import Sensor", "from the file that it stands in"),
-        ("tdc.py", "import torch", "in no room"),
-        ("toolbox/tdc.py", "import torch", "in no room"),
-        ("spad/spad.py", "from torchtransient.sensing.numerics.draws import binomial", None),
-        ("spad/spad.py", "from torchtransient.sensing.spad.binary_frames import BinaryFrames", None),
-        ("spad/spad.py", "from torchtransient.axes import TimeAxis", None),
-    ],
-)
-def test_the_rules_of_sensing_bite(tmp_path, place, line, message):
-    path = tmp_path / "sensing" / place
-    path.parent.mkdir(parents=True)
-    path.write_text(line + "\n", encoding="utf-8")
-    found = list(violations_in_sensing(path, tmp_path))
-    assert len(found) == (message is not None)
-    assert message is None or message in found[0]
-
-
 def from_tests(path):
     """What a file takes from the tests: imports of their modules, and paths into their folder."""
     own = {p.stem for p in TESTS.glob("*") if not p.name.startswith("_")} | {"tests"}
@@ -242,17 +217,6 @@ def from_tests(path):
 @together("path", BENCHMARKS + TOOLS, lambda p: p.relative_to(TESTS.parent).as_posix())
 def test_benchmarks_and_tools_do_without_tests(path):
     assert list(from_tests(path)) == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    ["from support.gradient_cases.problem import Case", "import tests.support", "import support", 'FOLDER = "tests"',
-     "def f():\n    from support import cubes", 'sys.path.append("../tests/support")'],
-)  # fmt: skip
-def test_what_benchmarks_may_not_do(tmp_path, line):
-    path = tmp_path / "script.py"
-    path.write_text(line + "\n", encoding="utf-8")
-    assert len(list(from_tests(path))) == 1
 
 
 def test_tests_share_through_their_support():
@@ -285,87 +249,6 @@ def test_tests_take_one_door_to_the_core():
 def test_every_package_has_a_level():
     rooms = {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
     assert rooms <= set(LEVEL)
-
-
-@pytest.mark.parametrize(
-    ("room", "line", "message"),
-    [
-        ("vis", "import mitsuba as mi", "must not know mitsuba"),
-        ("vis", "def f():\n    import drjit", "must not know drjit"),
-        ("plugins", "import torch.nn", "must not know torch"),
-        ("plugins", "from torch import nn", "must not know torch"),
-        ("plugins", "from mitsuba import Float", "import mitsuba as mi"),
-        ("plugins", "import mitsuba.ad.integrators", "import mitsuba as mi"),
-        ("rendering", "from mitsuba.ad import Adam", "import mitsuba as mi"),
-        ("plugins", "from torchtransient.rendering import autograd", "imports 'rendering'"),
-        ("plugins", "from ..rendering import autograd", "imports 'rendering'"),
-        ("plugins", "from .. import rendering", "imports 'rendering'"),
-        ("plugins", "from torchtransient import vis", "imports 'vis'"),
-        ("scenes", "from torchtransient.accuracy import measure", "imports 'accuracy'"),
-        ("accuracy", "from torchtransient.testing import closed_forms", "imports 'testing'"),
-        ("capture", "def f():\n    import mitsuba as mi", "must not know mitsuba"),
-        ("capture", "from torchtransient.reconstruction import fk", "imports 'reconstruction'"),
-        ("reconstruction", "import mitsuba as mi", "must not know mitsuba"),
-        ("reconstruction", "from torchtransient.sensing import SPAD", "imports 'sensing'"),
-        ("reconstruction", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("rendering", "from torchtransient.nlos import simulate", "imports 'nlos'"),
-        ("files", "from torchtransient.nlos import scene", "imports 'nlos'"),
-        ("toolbox", "import os", "has no level"),
-    ],
-)
-def test_the_rules_bite(tmp_path, room, line, message):
-    path = tmp_path / room / "module.py"
-    path.parent.mkdir()
-    path.write_text(line + "\n", encoding="utf-8")
-    found = list(violations(path, tmp_path))
-    assert len(found) == 1
-    assert message in found[0]
-
-
-@pytest.mark.parametrize(
-    ("room", "line"),
-    [
-        ("plugins", "import mitsuba as mi"),
-        ("plugins", "import mitsuba.python.ad.integrators.common as common"),
-        ("plugins", "from mitsuba.python.ad.integrators.common import RBIntegrator"),
-        ("plugins", "from torchtransient.errors import SceneError"),
-        ("plugins", "from ..errors import SceneError"),
-        ("plugins", "from . import _registry"),
-        ("capture", "import torch"),
-        ("reconstruction", "import torch"),
-        ("reconstruction", "from torchtransient.capture import Scan"),
-        ("nlos", "import mitsuba as mi"),
-        ("nlos", "from torchtransient.capture import Scan, Capture"),
-        ("nlos", "from torchtransient.reconstruction import fk"),
-        ("nlos", "from torchtransient.rendering.renderer import TransientRenderer"),
-    ],
-)
-def test_what_rooms_may_import(tmp_path, room, line):
-    path = tmp_path / room / "module.py"
-    path.parent.mkdir()
-    path.write_text(line + "\n", encoding="utf-8")
-    assert list(violations(path, tmp_path)) == []
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "closed"),
-    [
-        ("from torchtransient.vis import second", "from torchtransient.vis.first import a", True),
-        ("import torchtransient.vis.second", "from . import first", True),
-        ("def f():\n    from torchtransient.vis.second import b", "from .first import a", True),
-        ("from torchtransient.vis.second import b", "", False),
-        ("import typing\nif typing.TYPE_CHECKING:\n    from .second import b", "from .first import a", True),
-        ("if TYPE_CHECKING:\n    import os\nelse:\n    from .second import b", "from .first import a", True),
-        ("from torchtransient.vis import name", "", True),  # the package's `__init__` imports both
-    ],
-)
-def test_circles_are_found(tmp_path, first, second, closed):
-    folder = tmp_path / "vis"
-    folder.mkdir()
-    texts = {"__init__": "from .first import a\nfrom .second import b", "first": first, "second": second}
-    for name, text in texts.items():
-        (folder / f"{name}.py").write_text(text + "\n", encoding="utf-8")
-    assert bool(import_circles(tmp_path)) == closed
 
 
 # ---------------------------------------------------------------------------------------------- errors that are raised
@@ -419,13 +302,6 @@ def test_the_list_of_bare_errors_holds_nothing_else():
     for name, allowed in BARE.items():
         tree = syntax_of(PACKAGE / name)
         assert allowed <= {error for _, error in raised(tree)}, name
-
-
-@pytest.mark.parametrize("line", ["raise ValueError('a')", "raise TypeError", "raise ImportError('x') from None"])
-def test_a_new_bare_error_is_found(tmp_path, line):
-    path = tmp_path / "module.py"
-    path.write_text(f"def f():\n    {line}\n", encoding="utf-8")
-    assert [number for number, _ in bare(path, tmp_path)] == [2]
 
 
 @together("path", FILES, lambda path: path.relative_to(PACKAGE).as_posix())
