@@ -92,7 +92,11 @@ class Chirps:
         return self.bandwidth_hz / self.duration_s / SPEED_OF_LIGHT
 
     def beats_hz(self, axis: TimeAxis) -> Tensor:
-        """Return the beat frequencies of the centres of bins, (T,) float64, hertz; negative before zero length."""
+        """Return the beat frequencies of the centres of bins, (T,) float64, hertz; negative before zero length.
+
+        Args:
+            axis: axis of ``opl +- k rate``, as of :attr:`RenderOutput.beats`.
+        """
         return of_class("Chirps.beats_hz: axis", axis, TimeAxis).centers_opl * self.hertz_per_metre
 
     @property
@@ -114,14 +118,25 @@ class Chirps:
         """Return chirps of the same sweep that last ``times`` as long: the same beats in lines as much narrower.
 
         Light that is rendered with them on an axis of narrow bins has hardly a line of its own, which is what
-        `sensing.CoherentReceiver` draws fields of. Raises UnitError for numbers that are not positive.
+        `sensing.CoherentReceiver` draws fields of.
+
+        Args:
+            times: factor of bandwidth and duration, at least 1 to narrow the lines.
+
+        Raises:
+            UnitError: for numbers that are not positive.
         """
         factor = positive("Chirps.longer: times", times)
         return replace(self, bandwidth_hz=factor * self.bandwidth_hz, duration_s=factor * self.duration_s)
 
     def line_amplitude(self, opl: Numbers) -> Array:
-        """Evaluate the transform of the window over optical path length, of any shape, metres; its square has unit
-        integral over lines of c / B. Real, since the phase counts from the middle of the chirp.
+        """Evaluate the transform of the window; its square has unit integral over lines of c / B.
+
+        Args:
+            opl: optical path lengths from the middle of the line, of any shape, metres.
+
+        Returns:
+            float64 in the shape of ``opl``; real, since the phase counts from the middle of the chirp.
         """
         cosines = WINDOWS[self.window]
         return self._amplitude(numbers("Chirps.line_amplitude: opl", opl) / self.resolution_opl) / _norm(cosines)

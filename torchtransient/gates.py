@@ -75,7 +75,15 @@ class Gate:
 
     @classmethod
     def rectangular(cls, start_opl: float, end_opl: float) -> Gate:
-        """Return a gate that is fully open in ``[start_opl, end_opl)``; it has no slope, hence no gradient in time."""
+        """Return a gate that is fully open in ``[start_opl, end_opl)``; it has no slope, hence no gradient in time.
+
+        Args:
+            start_opl: first optical path length with sensitivity, metres.
+            end_opl: first one after it, metres.
+
+        Raises:
+            UnitError: unless the end follows the start.
+        """
         return cls("rectangular", start_opl, end_opl)
 
     @classmethod
@@ -126,18 +134,32 @@ class Gate:
 
     @classmethod
     def rectangular_s(cls, start_s: float, end_s: float) -> Gate:
-        """Return :meth:`rectangular` from seconds. Raises UnitError for times of 10 ms and more."""
+        """Return :meth:`rectangular` from seconds. Raises UnitError for times of 10 ms and more.
+
+        Args:
+            start_s: first time with sensitivity, seconds.
+            end_s: first one after it, seconds.
+        """
         start, end = (near_seconds(t, "start_s and end_s", "Gate.rectangular_s") for t in (start_s, end_s))
         return cls.rectangular(seconds_to_opl(start), seconds_to_opl(end))
 
     @classmethod
     def gaussian_s(cls, center_s: float, fwhm_s: float) -> Gate:
-        """Return :meth:`gaussian` from seconds. Raises UnitError for times of 10 ms and more."""
+        """Return :meth:`gaussian` from seconds. Raises UnitError for times of 10 ms and more.
+
+        Args:
+            center_s: centre, seconds.
+            fwhm_s: full width at half maximum, seconds.
+        """
         center, fwhm = (near_seconds(t, "center_s and fwhm_s", "Gate.gaussian_s") for t in (center_s, fwhm_s))
         return cls.gaussian(seconds_to_opl(center), seconds_to_opl(fwhm))
 
     def shifted(self, opl: float) -> Gate:
-        """Return the same gate, opened ``opl`` metres later."""
+        """Return the same gate, opened ``opl`` metres later.
+
+        Args:
+            opl: delay, metres of optical path; negative for earlier.
+        """
         opl = finite("Gate.shifted: opl", opl)
         if self.kind == "gaussian":
             return Gate.gaussian(self.opl[0] + opl, self.opl[1])
@@ -200,7 +222,14 @@ class Gate:
         return values
 
     def spread(self, pulse: Pulse) -> Gate:
-        """Return the gate for light with a pulse: its sensitivity averaged over the pulse around each arrival."""
+        """Return the gate for light with a pulse: its sensitivity averaged over the pulse around each arrival.
+
+        Args:
+            pulse: shape of the light's pulse over optical path length.
+
+        Returns:
+            Tabulated gate, longer by the pulse.
+        """
         low, high = pulse.support_opl
         at = np.linspace(self.start_opl - high, self.end_opl - low, NODES)
         if self.kind == "rectangular":

@@ -90,12 +90,28 @@ class Pulse:
 
     @classmethod
     def gaussian(cls, fwhm_opl: float, center_opl: float = 0.0) -> Pulse:
-        """Return a Gaussian of full width at half maximum ``fwhm_opl`` (metres), cut at four standard deviations."""
+        """Return a Gaussian of full width at half maximum ``fwhm_opl`` (metres), cut at four standard deviations.
+
+        Args:
+            fwhm_opl: full width at half maximum, metres.
+            center_opl: centre, metres.
+
+        Raises:
+            UnitError: for widths that are not positive.
+        """
         return cls("gaussian", fwhm_opl, center_opl)
 
     @classmethod
     def rectangular(cls, width_opl: float, center_opl: float = 0.0) -> Pulse:
-        """Return a pulse that is constant over ``width_opl`` (metres)."""
+        """Return a pulse that is constant over ``width_opl`` (metres).
+
+        Args:
+            width_opl: width, metres.
+            center_opl: centre, metres.
+
+        Raises:
+            UnitError: for widths that are not positive.
+        """
         return cls("rectangular", width_opl, center_opl)
 
     @classmethod
@@ -116,21 +132,37 @@ class Pulse:
 
     @classmethod
     def gaussian_s(cls, fwhm_s: float, center_s: float = 0.0) -> Pulse:
-        """Return :meth:`gaussian` from seconds. Raises UnitError for widths of 1 ms and more."""
+        """Return :meth:`gaussian` from seconds. Raises UnitError for widths of 1 ms and more.
+
+        Args:
+            fwhm_s: full width at half maximum, seconds.
+            center_s: centre, seconds.
+        """
         width = near_seconds(fwhm_s, "fwhm_s", "Pulse.gaussian_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(center_s, "center_s", "Pulse.gaussian_s")
         return cls.gaussian(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def rectangular_s(cls, width_s: float, center_s: float = 0.0) -> Pulse:
-        """Return :meth:`rectangular` from seconds. Raises UnitError for widths of 1 ms and more."""
+        """Return :meth:`rectangular` from seconds. Raises UnitError for widths of 1 ms and more.
+
+        Args:
+            width_s: width, seconds.
+            center_s: centre, seconds.
+        """
         width = near_seconds(width_s, "width_s", "Pulse.rectangular_s", limit_s=LONGEST_PULSE_S)
         center = near_seconds(center_s, "center_s", "Pulse.rectangular_s")
         return cls.rectangular(seconds_to_opl(width), seconds_to_opl(center))
 
     @classmethod
     def tabulated_s(cls, times_s: Numbers, values: Numbers, center_s: float = 0.0) -> Pulse:
-        """Return :meth:`tabulated` from times in seconds. Raises UnitError for times of 10 ms and more."""
+        """Return :meth:`tabulated` from times in seconds. Raises UnitError for times of 10 ms and more.
+
+        Args:
+            times_s: times, (N,), rising, seconds.
+            values: densities there, (N,), of any scale.
+            center_s: shift of the shape, seconds.
+        """
         times = numbers("Pulse.tabulated_s: times_s", times_s).ravel()
         for time in times.tolist():
             near_seconds(time, "times_s", "Pulse.tabulated_s")
@@ -138,7 +170,11 @@ class Pulse:
         return cls.tabulated(seconds_to_opl(times), values, seconds_to_opl(center))
 
     def shifted(self, opl: float) -> Pulse:
-        """Return the same shape, ``opl`` metres later."""
+        """Return the same shape, ``opl`` metres later.
+
+        Args:
+            opl: delay, metres of optical path; negative for earlier.
+        """
         return replace(self, center_opl=self.center_opl + finite("Pulse.shifted: opl", opl))
 
     # ------------------------------------------------------------------------------------------------ the density

@@ -79,7 +79,7 @@ def test_render_of_a_plan(folder):
     assert stored.metadata["stats"]["variant"] == plan.variant == "llvm_ad_mono"
 
 
-@pytest.mark.parametrize("described", long([True, False], [True]))
+@pytest.mark.parametrize("described", long([True, False], [False]))
 def test_render_of_a_plan_for_gates(folder, described):
     """The film of the options, or else that of the scene, says what is planned; with --rtol until its error is met."""
     gates = "rectangular 6 6.5"
@@ -88,12 +88,12 @@ def test_render_of_a_plan_for_gates(folder, described):
     film += '<integer name="width" value="8"/><integer name="height" value="8"/>'
     (folder / "gated.xml").write_text(SCENE.replace(histogram, film) if described else SCENE, encoding="utf-8")
     options = () if described else ("--gates", gates)
-    result = run("render", "gated.xml", "-o", "out.npz", "--plan", "--error", "relative", "--rtol", 0.4, "--seed", 3,
+    result = run("render", "gated.xml", "-o", "out.npz", "--plan", "--error", "relative", "--rtol", 0.5, "--seed", 3,
                  "--quiet", *options)  # fmt: skip
     assert result.exit_code == 0, result.output
     given = None if described else tt.Gate.rectangular(6.0, 6.5)
     plan = tt.plan("gated.xml", "gates", gates=given, error="relative", seed=3)
-    expected = plan.renderer().to_tolerance(rtol=0.4, seed=3, progress=False)
+    expected = plan.renderer().to_tolerance(rtol=0.5, seed=3, progress=False)
     torch.testing.assert_close(read_result(folder / "out.npz").gated, expected.output.gated)
     assert "Russian roulette: none" in result.stdout and "reached" in result.stdout
 
@@ -186,7 +186,7 @@ def test_plan_of_rates_and_beats(moving):
     result = run("plan", "moving.xml", "--outputs", "rates", "--json")
     told = json.loads(result.stdout)
     assert told["film"] == "rates" and told["rates"]["rates_num_bins"] == 64
-    result = run("plan", "moving.xml", "--outputs", "beats", "--chirps", "1e9:1e-5:1550e-9")
+    result = run("plan", "moving.xml", "--chirps", "1e9:1e-5:1550e-9")
     assert result.exit_code == 0 and "a bin for each line of the chirps" in result.stdout
     result = run("plan", "moving.xml", "--outputs", "beats")
     assert result.exit_code == 2 and "Give --chirps" in result.output

@@ -142,6 +142,27 @@ def test_rates_and_beats_of_a_film():
             losses.squared_loss(result(x, name, **one), result(y, name, **other))
 
 
+def test_distances_between_results_over_rates():
+    """Along the rates, in m/s; along the arrivals, in metres, if that is asked for. Light that lies elsewhere by k bins
+    is k widths away.
+    """
+    rate_axis = RateAxis(-2.0, 0.5, 6)
+    x = torch.zeros(1, 6, BINS, 2, 2)
+    x[:, 1, 2] = 1.0
+    y = x.roll(3, 1).roll(1, 2)
+    a, b = (result(t, "rates", rate_axis=rate_axis) for t in (x, y))
+    spectra = [result(t.sum(2, keepdim=True).expand_as(x) / BINS, "rates", rate_axis=rate_axis) for t in (x, y)]
+    assert float(losses.wasserstein_loss(*spectra)) == pytest.approx(1.5)
+    found = losses.wasserstein_loss(a, b, dim=-3, reduction="none")
+    torch.testing.assert_close(found, losses.wasserstein_loss(x, y, AXIS.bin_width_opl, dim=-3, reduction="none"))
+    for loss in (losses.wasserstein_loss, losses.cumulative_loss):
+        torch.testing.assert_close(loss(a, y), loss(x, y, 0.5, dim=-4))
+    torch.testing.assert_close(losses.multiscale_loss(a, b), losses.multiscale_loss(x, y, dim=-4))
+    beats = torch.rand(2, 1, 2, BINS, 3, 3)
+    found = losses.wasserstein_loss(*(result(t, "beats") for t in beats))
+    torch.testing.assert_close(found, losses.wasserstein_loss(*beats, AXIS.bin_width_opl))
+
+
 def test_frequencies_are_an_axis():
     x = torch.randn(1, 5, 2, 2, dtype=torch.complex64)
     bands = BAND, dataclasses.replace(BAND, start_opl=3)

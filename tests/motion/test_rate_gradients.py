@@ -106,7 +106,7 @@ ROOM_KEYS = [
 POSES = ["back.to_world", "side.to_world", "sensor.to_world"]
 
 
-@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
 def test_velocities_colours_and_places_in_a_room(variant):
     compare(renderer_of(tt.load(room(), variant=variant).moving(MOTIONS), ROOM_KEYS))
 
@@ -144,6 +144,41 @@ def test_outlines_that_poses_move(where, key):
     compare(renderer_of(loaded, [key], spp=8192), directions, seeds=range(12))
 
 
+def behind(bender):
+    """A body before a wall, seen in a mirror or through a tilted pane; all move."""
+    dark = {"type": "diffuse", "reflectance": 0.4}
+    if bender == "mirror":
+        lamp, depth = [0.6, 0.5, -0.3], 3
+        nodes = {"bender": plate((0, 0, 2), (0.1, 0.05, 0), half=2, bsdf={"type": "conductor"}),
+                 "body": plate((0.33, 0.22, -1), (0.33, 0.22, 1), half=0.4, bsdf=dark, up=(0.5, 1, 0)),
+                 "wall": plate((0, 0, -2.5), (0, 0, 0), half=9)}  # fmt: skip
+    else:
+        lamp, depth = [0.6, 0.5, 1.7], 6
+        nodes = {"bender": {"type": "cube", "bsdf": {"type": "dielectric", "int_ior": 1.5},
+                            "to_world": translate([0, 0, 1.2]) @ rotate([1, 0, 0], 20) @ scale([3, 3, 0.1])},
+                 "body": plate((0.05, 0.02, 2.4), (0.05, 0.02, 0), half=0.24, bsdf=dark),
+                 "wall": plate((0, 0, 3.2), (0, 0, 0), half=9)}  # fmt: skip
+    motions = {"bender": MOTIONS["back"], "body": MOTIONS["side"], "wall": tt.Motion(linear=(0, 0.3, -2.0))}
+    nodes = scene(4, 24, depth, **nodes, lamp=LAMP | {"position": lamp})
+    return tt.load(nodes, variant=VARIANT).moving(motions | {name: MOTIONS[name] for name in ("sensor", "lamp")})
+
+
+AWAY = torch.zeros(4, 4)
+AWAY[2, 3] = 1.0
+SEEN = [("mirror", "body.to_world"), ("mirror", "lamp.position"), ("mirror", "sensor.to_world"),
+        ("mirror", "bender.to_world"), ("pane", "body.to_world"), ("pane", "lamp.position"),
+        ("pane", "sensor.to_world")]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("bender", "key"), [pytest.param(*one, marks=() if one == SEEN[0] else pytest.mark.slow) for one in SEEN]
+)
+def test_outlines_and_shadows_behind_a_mirror_or_a_pane_that_moves(bender, key):
+    """The light that they hide and uncover has the rate of the whole way. Of poses of a mirror, what moves it away."""
+    direction = SIDEWAYS if key.endswith("to_world") else torch.tensor([1.0, 0.5, 0.0])
+    compare(renderer_of(behind(bender), [key]), {key: AWAY if key.startswith("bender") else direction}, seeds=range(6))
+
+
 # ------------------------------------------------------------------------------------------- glass, meshes, copies, fog
 
 
@@ -160,7 +195,7 @@ def test_velocities_and_index_of_glass():
     compare(renderer_of(loaded, keys, spp=1 << 15), seeds=range(8))
 
 
-@pytest.mark.parametrize("variant", in_variants("llvm_ad_rgb"))
+@pytest.mark.parametrize("variant", in_variants(VARIANT))
 def test_velocities_of_vertices(variant):
     vertices = np.array([[-9, -9, 3.0], [9, -9, 3.2], [9, 9, 3.1], [-9, 9, 2.9]])
     speeds = np.array([[0.3, -0.4, 1.2], [0.5, 1.0, -0.7], [0.2, 0.1, 2.0], [-1.0, 0.3, 0.4]])
@@ -168,6 +203,26 @@ def test_velocities_of_vertices(variant):
              "vertex_velocity": speeds}  # fmt: skip
     loaded = tt.load(room(back=sheet), variant=variant).moving({"side": MOTIONS["side"]})
     compare(renderer_of(loaded, ["back.vertex_velocity", "side.velocity.linear", "lamp.position"]))
+
+
+def bent_lamp(**more):
+    corners = np.array([[0.5, -0.3, 0.5], [1.3, -0.3, 0.5], [1.3, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    lamp = {"type": "mesh_arrays", "vertices": corners, "faces": np.array([[0, 1, 2], [0, 2, 3]]),
+            "vertex_velocity": np.random.default_rng(1).normal(size=(4, 3)) * 1.5,
+            "emitter": {"type": "area", "radiance": 5.0}}  # fmt: skip
+    return tt.load(room(lamp=lamp, **more), variant=VARIANT).moving({name: MOTIONS[name] for name in ("back", "side")})
+
+
+def test_velocities_of_lamps_whose_vertices_move():
+    compare(renderer_of(bent_lamp(), ["lamp.vertex_velocity", "back.velocity.linear"], spp=2048))
+
+
+@pytest.mark.slow
+def test_places_and_shadows_of_lamps_whose_vertices_move():
+    grows = {"lamp.vertex_positions": torch.tensor([[0.5, 0, 1], [1, 0.3, 0.5], [0.2, 0.5, 0.8], [0.5, -0.4, 1.2]])}
+    compare(renderer_of(bent_lamp(), list(grows)), grows)
+    hider = plate((0.5, 0.1, 1.6), (0.9, 0.1, 0.5), half=0.3, up=(0.4, 1, 0))
+    compare(renderer_of(bent_lamp(plate=hider), ["plate.to_world"]), {"plate.to_world": SIDEWAYS}, seeds=range(6))
 
 
 def test_velocities_of_copies():
@@ -189,6 +244,19 @@ def test_wind_and_the_colour_of_walls_behind_fog():
     loaded = tt.load(nodes, variant=VARIANT).moving({"back": MOTIONS["back"], "mist": wind})
     keys = ["mist.velocity.linear", "mist.velocity.angular", "back.velocity.linear", "back.bsdf.reflectance.value"]
     compare(renderer_of(loaded, keys))
+
+
+def test_wind_on_a_grid():
+    """Its numbers, and what moves the places at which it blows."""
+    data = np.random.default_rng(3).normal(size=(2, 3, 3, 3)).astype(np.float32)
+    wind = {"type": "gridvolume", "data": data, "to_world": translate([-5, -5, 0]) @ scale([10, 10, 3])}
+    fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.8, "id": "mist", "velocity": wind}
+    box = {"type": "cube", "to_world": translate([0, 0, 1.5]) @ scale([5, 5, 0.9]), "bsdf": {"type": "null"},
+           "interior": fog}  # fmt: skip
+    nodes = room(4, box=box)
+    nodes["integrator"]["type"] = "transient_prbvolpath"
+    loaded = tt.load(nodes, variant=VARIANT).moving({"back": MOTIONS["back"], "sensor": MOTIONS["sensor"]})
+    compare(renderer_of(loaded, ["mist.velocity.data", "back.velocity.linear", "lamp.position", "back.to_world"]))
 
 
 @pytest.mark.slow

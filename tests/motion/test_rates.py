@@ -285,6 +285,24 @@ def test_instances_that_move():
     assert float(mean_rate(apart).max()) > 1.0
 
 
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_lamp_whose_vertices_move(seen):
+    """Vertices with the velocities of a rigid body are that body, of light that is found and that is sampled."""
+    corners = np.array([[0.5, -0.3, 0.5], [1.3, -0.3, 0.5], [1.3, 0.5, 0.5], [0.5, 0.5, 0.5]])
+    lamp = {"type": "mesh_arrays", "vertices": corners, "faces": np.array([[0, 1, 2], [0, 2, 3]]),
+            "texcoords": corners[:, :2], "emitter": {"type": "area", "radiance": 5.0}}  # fmt: skip
+    if seen:
+        lamp |= {"vertices": corners * [0.7, 0.7, 3], "faces": lamp["faces"][:, ::-1]}
+    linear, angular, center = np.array([0.1, 0.2, 1.3]), np.array([0.3, 0.8, 0.5]), np.array([0.2, 0, 1.0])
+    whirl = linear + np.cross(angular, lamp["vertices"] - center)
+    wall = plate((0, 0, 3), (0, 0, 0), half=5)
+    found = rates_of(scene(4, 30, wall=wall, lamp=lamp | {"vertex_velocity": whirl}))
+    expected = rates_of(scene(4, 30, wall=wall, lamp=lamp),
+                        {"lamp": tt.Motion(linear=linear, angular=angular, center=center)})  # fmt: skip
+    assert float(expected.sum()) > 0
+    assert float((found - expected).abs().sum()) < 1e-5 * float(expected.sum())
+
+
 # ----------------------------------------------------------------------------------------------------------------- fog
 
 
@@ -377,6 +395,8 @@ def test_range_and_speed_of_a_wall_from_two_beats(variant):
         found, approach = tt.sensing.range_and_speed(beats, CHIRPS, axis)
         assert float(found) == pytest.approx(distance, abs=1e-4)
         assert float(approach) == pytest.approx(speed, abs=1e-4)
+        for whole, one in zip(tt.sensing.range_and_speed(out), (found, approach), strict=True):
+            assert float(whole.reshape(-1, 1, 1)[0]) == float(one)
 
 
 def test_beats_are_the_rates_of_a_film_of_rates():

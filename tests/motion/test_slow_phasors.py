@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError
 from torchtransient.scenes.transforms import look_at, scale
 
 TIMES, FREQUENCIES = (-0.3, 0.0, 0.2), (0.0, 0.4, 1.0)
@@ -56,6 +57,22 @@ def test_derivative_by_the_velocity():
     expected = math.cos(phase) * 2 * math.pi * 2 * TIMES[0]
     gradient = renderer.values[key].grad
     assert abs(float(gradient[2]) - expected) < 1e-3 and gradient[:2].abs().max() < 1e-2
+
+
+def test_motions_that_count_twice():
+    """Of an exposure over poses that move on with the velocity that the phasors follow; frames do not."""
+    renderer = tt.TransientRenderer(scene(), ["wall.to_world"], frequencies=FREQUENCIES, slow_times=TIMES, spp=4)
+    moving = {"wall": tt.Motion(linear=(0.0, 0.0, SPEED))}
+    with pytest.warns(PhysicsWarning, match="'wall' has a velocity"):
+        tt.over_time(renderer, moving, tt.Exposure(0.1), seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", PhysicsWarning)
+        frames = tt.over_time(renderer, moving, tt.Frames([0.0, 0.1]), seed=0).slow_phasor
+    # A frame at 0.1 s has at its time 0 the phase that the first frame has at 0.1 s, and so on.
+    lengths = torch.tensor([6 - 2 * SPEED * (frame + t) for frame in (0.0, 0.1) for t in TIMES]).reshape(2, -1)
+    found = frames[:, 0, :, 1].mean((-2, -1))
+    expected = torch.polar(torch.ones_like(lengths), -2 * math.pi * FREQUENCIES[1] * lengths)
+    torch.testing.assert_close(found / found.abs(), expected, rtol=0, atol=1e-3)
 
 
 def test_what_it_asks_for():

@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from support.rates import VARIANT, mean_rate, plate, rates_of, scene
-from torchtransient.errors import GradientError, SceneError
+from torchtransient.errors import SceneError
 from torchtransient.scenes.transforms import scale, translate
 
 RATES = tt.RateAxis(-10.0, 0.25, 80)
@@ -71,19 +71,3 @@ def test_parts_of_shapes_move_with_them_alone():
     )
     with pytest.raises(SceneError, match="'glow': expected the motion of 'lamp'"):
         tt.render(moving, rates=RATES, spp=4, seed=0)
-
-
-def test_edges_seen_in_mirrors_that_move():
-    """Of a mesh whose vertices have velocities, too."""
-    corners = np.array([[-3, -3, 3], [3, -3, 3], [3, 3, 3], [-3, 3, 3]], dtype=float)
-    mirror = {
-        "type": "mesh_arrays", "vertices": corners, "faces": np.array([[0, 2, 1], [0, 3, 2]]),
-        "bsdf": {"type": "conductor"}, "vertex_velocity": np.tile([[0.0, 0.0, 1.0]], (4, 1)),
-    }  # fmt: skip
-    nodes = scene(fov=30, depth=4, floor=plate((0, 0, -2), (0, 0, 0), half=9), mirror=mirror,
-                  block=plate((0.0, 0.9, -1.0), (0, 0.9, 2.0), half=0.5))  # fmt: skip
-    nodes["lamp"] = {"type": "point", "position": [0.5, 2.5, -0.2], "intensity": 10.0}
-    renderer = tt.TransientRenderer(tt.load(nodes, variant=VARIANT), ["block.to_world"], rates=RATES, spp=4,
-                                    temporal_filter="tent", physics="ignore")  # fmt: skip
-    with pytest.raises(GradientError, match="seen in mirrors or through glass"):
-        renderer(seed=0).rates.sum().backward()

@@ -16,7 +16,6 @@ from support.film_storage import storage
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.plugins.films.block import BinLayout, reduce_mode
 from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 
 SLOPED = [("tent", 0.5), ("gaussian", 0.5), ("gaussian", 0.2), ("gaussian", 3.0)]
@@ -205,11 +204,6 @@ def test_unknown_parameter_is_reported():
         mi.load_dict({"type": "transient_hdr_film", "temporal_binz": 3})
 
 
-def test_nothing_rendered_yet():
-    with pytest.raises(SceneError, match="render"):
-        make_film().develop()
-
-
 def test_four_channels_a_colour_in_polarized_variants():
     for variant, channels in (("llvm_ad_mono_polarized", 4), ("llvm_ad_spectral_polarized", 12)):
         with mi.variant_context(variant):
@@ -279,18 +273,6 @@ def test_widths_of_no_gaussian(stddev):
         make_temporal_filter("gaussian", stddev)
 
 
-def test_how_far_filters_reach():
-    """In bins before and behind an arrival."""
-    reaches = {name: make_temporal_filter(name, 0.75).reach for name in ("box", "tent", "gaussian")}
-    assert reaches == {"box": (0, 0), "tent": (-0.5, 0.5), "gaussian": (-3, 3)}
-    assert make_temporal_filter("gaussian", 0.75).radius == 3 and make_temporal_filter("gaussian", 0.8).radius == 4
-
-
-def test_factory_names():
-    with pytest.raises(SceneError, match="lanczos"):
-        make_temporal_filter("lanczos")
-
-
 # ----------------------------------------------------------------------------------------- pieces of the histogram
 
 
@@ -332,22 +314,6 @@ def test_bins_far_behind_the_first_are_told_apart():
     assert not np.any(np.array(lost))
 
 
-def test_how_lanes_add_to_a_histogram():
-    """Each by itself where most of them add to many bins of a large array, on a processor."""
-    large, modes = dr.zeros(mi.Float, dr.expand_threshold() + 1), dr.ReduceMode
-    many, few = make_film(temporal_bins=64), make_film(temporal_bins=63)
-    assert many.reduce_mode(large, False, True) == modes.Direct and few.reduce_mode(large, False, True) == modes.Auto
-    assert many.reduce_mode(large, False, False) == modes.Auto
-    assert many.reduce_mode(dr.zeros(mi.Float, 64), False, True) == modes.Auto
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dr, "backend_v", lambda array: dr.JitBackend.CUDA)
-        assert many.reduce_mode(large, False, True) == modes.Auto
-    given = [(False, False), (False, True), (True, False), (True, True)]
-    assert [reduce_mode(*one) for one in given] == [modes.Auto, modes.Direct, modes.NoConflicts, modes.NoConflicts]
-    assert BinLayout(large, 0, 1, 1, 1, 1).mode == modes.Auto
-    assert BinLayout(large, 0, 1, 1, 1, 1, exclusive=True).mode == modes.NoConflicts
-
-
 @pytest.mark.parametrize(("settings", "first", "last"), [
     ({}, 0, BINS), ({"temporal_filter": "tent"}, -0.5, BINS + 0.5),
     ({"temporal_filter": "gaussian", "gaussian_stddev": 0.5}, -2, BINS + 2),
@@ -358,20 +324,3 @@ def test_arrivals_that_can_reach_the_window(settings, first, last):
     assert make_film(**settings).arrivals() is None
     window = make_film(steady=False, **settings).arrivals()
     assert (window.first, window.last) == (first * WIDTH, last * WIDTH)
-
-
-def test_eight_filters_are_kept():
-    film = make_film(temporal_filter="gaussian", pulse="rectangular", pulse_width_opl=0.5)
-    made = [film.filter]
-    for stddev in (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2):
-        film.gaussian_stddev = stddev
-        made.append(film.filter)
-    film.gaussian_stddev = 0.5
-    assert film.filter is made[0] and len(film._filters) == 8
-    film.gaussian_stddev = 1.3  # takes the place of that of 0.6, used longest ago
-    assert len(film._filters) == 8
-    for stddev, kept in ((0.7, made[2]), (0.5, made[0])):
-        film.gaussian_stddev = stddev
-        assert film.filter is kept
-    film.gaussian_stddev = 0.6
-    assert film.filter is not made[1]

@@ -40,6 +40,17 @@ def test_every_pair_is_a_net(variant):
         assert all(len(set(row)) == 32 for row in strata)
 
 
+def test_two_calls_are_a_net_in_four_dimensions():
+    """Of 2^12 points every box of volume 2^-8 holds 16 (t = 4): more points fill more boxes."""
+    first, second = points(2**12, pixels=3, calls=2)
+    x = np.concatenate([first, second], 2)
+    for sides in (sides for sides in itertools.product(range(9), repeat=4) if sum(sides) == 8):
+        number = np.zeros(x.shape[:2], int)
+        for k, side in enumerate(sides):
+            number = (number << side) + np.floor(x[..., k] * 2**side).astype(int)
+        assert all((np.bincount(pixel, minlength=256) == 16).all() for pixel in number)
+
+
 def test_any_number_of_samples():
     """Of 7 points no two lie in one eighth; further ones follow with `advance`."""
     x = points(7)

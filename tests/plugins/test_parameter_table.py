@@ -13,18 +13,14 @@ import pytest
 
 from tools.every_plugin import LEFT_OUT, every_plugin
 from torchtransient import plugins
-from torchtransient.errors import GradientError, PluginRegistrationError
 from torchtransient.plugins import parameter_effect
-from torchtransient.plugins.parameter_effect import Row, declare_effects, lineage
+from torchtransient.plugins.parameter_effect import declare_effects, lineage
 from torchtransient.plugins.parameters import (
-    CORRECT,
     ParameterEffect,
     ParameterTracker,
     attached_effects,
     can_carry_gradients,
-    check_slope,
     effect_of,
-    moving_names,
 )
 
 NON_DIFFERENTIABLE, READ_ONLY = 0x1, 0x4
@@ -263,23 +259,6 @@ def test_marks_count_unless_the_row_is_trusted():
     assert (int(mi.ParamFlags.NonDifferentiable), int(mi.ParamFlags.ReadOnly)) == (NON_DIFFERENTIABLE, READ_ONLY)
 
 
-def test_coefficients_are_named():
-    mi.set_variant("llvm_ad_spectral")
-    texture = mi.load_dict({"type": "rgb", "value": [0.5, 0.4, 0.3]})
-    assert "coefficients" in effect_of(texture, "value").reason
-    assert effect_of(mi.load_dict({"type": "uniform", "value": 0.5}), "value").reason == CORRECT
-
-
-def test_reasons():
-    assert effect_of(mi.load_dict({"type": "sphere"}), "to_world").reason == CORRECT
-    stand_in = effect_of(mi.load_dict({"type": "dielectric"}), "eta").reason
-    assert stand_in.startswith(CORRECT) and "diff_dielectric" in stand_in
-    coating = effect_of(mi.load_dict({"type": "roughplastic"}), "alpha")
-    assert not coating.biased and "diff_rough_plastic" in coating.reason
-    index = effect_of(mi.load_dict({"type": "principled"}), "specular")
-    assert not index.biased and "diff_principled" in index.reason
-
-
 # ------------------------------------------------------------------------------------------------- plugins of one's own
 
 
@@ -316,22 +295,6 @@ def test_a_plugin_enters_by_its_own_file(own_rows):
         assert lineage(node)[:2] == ("Veil", "Curtain")
 
 
-def test_precedence(own_rows):
-    sphere = mi.load_dict({"type": "sphere"})
-    own, other = (ParameterEffect(reason=reason) for reason in ("own", "other"))
-    declare_effects("Sphere", {"*": other})
-    assert effect_of(sphere, "to_world") == other, "a special class goes before a general one"
-    declare_effects("Sphere", {"to_world": [Row(own, lambda site: False), Row(other, lambda site: True), Row(own)]})
-    assert effect_of(sphere, "to_world").reason == "other", "the first row whose condition holds"
-    declare_effects("Sphere", {"to_world": own})
-    assert effect_of(sphere, "a.b.to_world").reason == "own", "a key goes before any key, the last entry counts"
-
-
-def test_roles_are_checked():
-    with pytest.raises(PluginRegistrationError, match=r"'speed' of Sphere.*shape, normal"):
-        declare_effects("Sphere", {"speed": ParameterEffect(role="temperature")})
-
-
 # -------------------------------------------------------------------------------------------------------- the tracker
 
 
@@ -347,40 +310,6 @@ def room():
     }
 
 
-def test_one_walk_answers_again_and_again():
-    scene = mi.load_dict(room())
-    tracker = ParameterTracker(scene)
-    params = mi.traverse(scene)
-    names = {"copy.to_world": "shape", "box.vertex_normals": "shape", "light.position": "emitter",
-             "sensor.x_fov": "sensor", "group.part.bsdf.eta": "index", "group.part.to_world": "shape"}  # fmt: skip
-    for key, role in names.items():
-        attach(scene, key)
-        ((_, name, effect),) = tracker.attached()
-        assert (name, effect.role) == (key.rsplit(".", 1)[-1], role)
-        assert len(tracker.attached_values()) == 1
-        params[key] = dr.detach(params[key])
-        params.update()
-        assert tracker.attached() == [] and tracker.attached_values() == []
-
-
-def test_attributes_of_meshes_are_followed():
-    scene = mi.load_dict({"type": "scene", "box": {"type": "cube"}})
-    (box,) = scene.shapes()
-    box.add_attribute("vertex_color", 1, [0.5] * box.vertex_count())
-    tracker = ParameterTracker(scene)
-    for n in range(40):  # their memory moves
-        box.add_attribute(f"vertex_more_{n}", 1, [0.5] * box.vertex_count())
-    attach(scene, "box.vertex_color")
-    ((_, name, effect),) = tracker.attached()
-    assert name == "vertex_color" and not effect.moves
-
-
-def test_a_parameter_that_is_not_set_is_no_obstacle():
-    scene = mi.load_dict({"type": "scene", "wisp": {"type": "sphere", "bsdf": {"type": "hair"}}})
-    assert ParameterTracker(scene).attached() == []
-    assert attached_effects(mi.traverse(scene)) == []
-
-
 def test_an_integrator_may_keep_it():
     scene = mi.load_dict(room())
     film = weakref.ref(scene.sensors()[0].film())
@@ -392,24 +321,3 @@ def test_an_integrator_may_keep_it():
     assert gone() is None and film() is None
 
 
-def test_asking_launches_no_kernel():
-    scene = mi.load_dict(room())
-    tracker = ParameterTracker(scene)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        tracker.attached()
-        assert not dr.kernel_history((dr.KernelType.JIT,))
-
-
-# ------------------------------------------------------------------------------------------------------------ the slope
-
-
-def test_one_message_for_a_missing_slope():
-    scene = mi.load_dict(room())
-    params = attach(scene, "box.vertex_positions", "group.part.bsdf.eta")
-    names = moving_names(attached_effects(params))
-    assert sorted(names) == ["box.vertex_normals", "box.vertex_positions", "bsdf.eta"]
-    check_slope([], False, "box", "")
-    check_slope(["wall.to_world"], True, "tent", "")
-    with pytest.raises(GradientError, match=r"'wall.to_world', 'x'.*'box' has no slope.*Do that\."):
-        check_slope(["wall.to_world", "x"], False, "box", "Do that.")

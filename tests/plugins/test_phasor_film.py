@@ -15,7 +15,6 @@ from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.plugins.films import phasor_sums
 
-START = 2.0
 GRID = {"frequency_first": -0.4, "frequency_step": 0.11, "frequency_count": 37}
 LIST = {"frequencies": "0, 3.7 -1.25, 0.5, 12.5"}
 
@@ -248,11 +247,6 @@ def test_slope_of_the_adjoint():
     np.testing.assert_allclose(np.array(slope), expected, atol=2e-6 * np.abs(expected).max())
 
 
-def test_description():
-    text = str(make_film(**GRID))
-    assert "37 from -0.4 to 3.56 per metre" in text
-
-
 def test_defaults_that_nobody_asked_for_are_said():
     with pytest.warns(TorchTransientWarning, match=r"no frequencies are given.*mitransient's defaults, .* cycles per"):
         mi.load_dict({"type": "phasor_hdr_film"})
@@ -263,35 +257,6 @@ def test_defaults_that_nobody_asked_for_are_said():
 
 
 # ---------------------------------------------------------------------------------------------- pieces of the sums
-
-
-@pytest.mark.parametrize("scale", [4.0, -4.0])
-@pytest.mark.parametrize("side", [1, -1])
-def test_deviations_of_a_grid(scale, side):
-    """Up to 1e-14 of the highest frequency are rounding, whichever way they point."""
-    from torchtransient.plugins.films.phasor import step_of
-
-    for share, step in ((0.95e-14, scale / 2), (1.1e-14, None)):
-        frequencies = np.array([0, 0.5, 1.0]) * scale
-        frequencies[1] += side * share * 4
-        assert step_of(frequencies) == step
-    assert step_of(np.array([0.0])) == step_of(np.array([-3.0])) == 0.0
-    assert step_of(np.array([1.0, 5.0])) == 4.0
-
-
-def test_sizes_of_what_paths_keep():
-    film = make_film(3, 4, **LIST)
-    for most, slots, overflows in ((0, 1, False), (1, 1, False), (5, 5, False), (16, 16, False), (17, 16, True)):
-        for tangents, numbers in ((False, 3), (True, 6)):
-            film.start_render()
-            block = film.create_event_block(Job(1, 2, 5), mi.UInt32(0), Copies(), most, tangents)
-            assert (block.slots, block.overflows, block.width, block.paths) == (slots, overflows, 3, 30)
-            assert dr.width(block.count) == 30 and dr.width(block.opl) == slots * 30
-            assert [dr.width(array) for array in block.values] == [slots * 30] * numbers
-    pairs = make_film(3, 4, **LIST, exhaustive_scan=True, laser_scan_width=5, laser_scan_height=7)
-    pairs.start_render()
-    block = pairs.create_event_block(Job(1, 2, 4), mi.UInt32(0), Copies(), 1)
-    assert (block.width, block.paths) == (3 * 5 * 7, 3 * 5 * 7 * 2 * 4)
 
 
 def test_events_of_any_channel_and_sign_take_room():
@@ -327,24 +292,6 @@ def test_frequencies_of_one_thread(monkeypatch, frequencies, tangents, block, si
     assert made == [sizes]
 
 
-def test_memory_that_no_event_was_written_to_counts_for_nothing():
-    """Paths without an event, and with fewer than there is room for."""
-    film = make_film(2, 1, **LIST)
-    film.start_render()
-    block = film.create_event_block(Job(0, 1, 2), mi.UInt32([0, 0, 30, 30]), Copies(), 3)
-    block.opl = dr.full(mi.Float64, float("nan"), 12)
-    block.values = [dr.full(mi.Float, float("nan"), 12) for _ in range(3)]
-    events = block.begin()
-    for opl, active in ((0.25, [False, True, False, False]), (0.5, [False, True, True, False])):
-        block.put(events, mi.Float64(opl), [mi.Float(v) for v in (1, 2, 4)], mi.Bool(active))
-    block.end(events)
-    block.finish()
-    found = np.array(film.bands[0][2], dtype=float).reshape(2, 5, 3, 2)
-    waves = [np.exp(-2j * np.pi * film.frequencies * opl) for opl in (0.25, 0.5)]
-    expected = np.array([waves[0] + waves[1], waves[1]])[..., None] * np.array([1, 2, 4])
-    np.testing.assert_allclose(found[..., 0] + 1j * found[..., 1], expected, atol=1e-5)
-
-
 def test_sums_of_a_band_that_is_not_the_first(monkeypatch):
     """Rows of a pass are counted from the first of the band."""
     monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", 2 * 3 * 30)
@@ -361,8 +308,3 @@ def test_sums_of_a_band_that_is_not_the_first(monkeypatch):
     found = [np.array(flat).reshape(-1, 3, 5, 3, 2) for _, _, flat in film.bands]
     assert not found[0].any() and not found[1][0].any() and not found[2].any()
     assert (found[1][1, ..., 0] == np.array([3, 7, 11])[:, None, None]).all() and not found[1][..., 1].any()
-
-
-def test_one_path_is_traced_whatever_its_events_take(monkeypatch):
-    monkeypatch.setattr("torchtransient.plugins.films.phasor.MAX_EVENT_BYTES", 10)
-    assert make_film(**LIST).lanes_at_most(16) == 1

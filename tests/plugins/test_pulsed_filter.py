@@ -199,28 +199,11 @@ def test_errors(arguments, message):
         make_film(**arguments)
 
 
-def test_a_width_without_a_pulse_is_reported():
-    with pytest.raises(RuntimeError, match="pulse_fwhm_opl"):
-        make_film(pulse_fwhm_opl=0.3)
-
-
 # -------------------------------------------------------------------------------------------- the table of a kernel
 
 
 def box_of(bins, **settings):
     return PulsedFilter(BoxFilter(), [Pulse.rectangular(bins * 0.5, **settings)], 0.5)
-
-
-@pytest.mark.parametrize(("bins", "nodes"), [(3, 1024), (4, 512), (4000, 8), (300, 8), (0.01, 16384), (0.125, 16384)])
-def test_nodes_of_a_bin(bins, nodes):
-    """2048 or more over the kernel, a power of two; 8 at least and 16384 at most."""
-    assert box_of(bins).nodes_per_bin == nodes
-
-
-def test_the_longest_kernel():
-    assert box_of(4096).reach == (-2048, 2049)
-    with pytest.raises(SceneError, match=r"together cover 4097 bins of 0\.5 m; at most 4096"):
-        box_of(4097)
 
 
 @pytest.mark.parametrize("bins", [2, 30])

@@ -179,14 +179,6 @@ def test_a_specfilm_becomes_a_film_with_its_bands():
     torch.testing.assert_close(out.transient, tt.TransientRenderer(ours, spp=64)(seed=0).transient)
 
 
-@pytest.mark.parametrize("variant, names", [("llvm_ad_mono", ("L",)), ("llvm_ad_rgb", ("R", "G", "B"))])
-def test_names_of_plain_channels(variant, names):
-    mi.set_variant(variant)
-    lamp, wall = {"type": "uniform", "value": 1.0}, {"type": "uniform", "value": 0.5}
-    scene = tt.load(description(film(bands={}), lamp=lamp, wall=wall), variant=variant)
-    assert tt.TransientRenderer(scene, spp=1)(seed=0).channels == names
-
-
 # ------------------------------------------------------------------------------------------- samples and channels
 
 
@@ -259,40 +251,6 @@ def test_the_observer_is_mitsuba_s():
         assert not np.array(rows[k])[:, outside].any()
 
 
-def test_how_finely_curves_are_tabulated():
-    """As their finest step, at least 65 nodes, at most 4096, over what all of them reach; a floor under all of it."""
-    mi.set_variant("llvm_ad_spectral")
-
-    def density(**values):
-        return SensorResponse({name: mi.load_dict(node) for name, node in values.items()})
-
-    coarse = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"}
-    other = {"type": "regular", "wavelength_min": 450, "wavelength_max": 700, "values": "1, 2"}
-    fine = {"type": "regular", "wavelength_min": 600, "wavelength_max": 610,
-            "values": ", ".join(str(1 + k % 3) for k in range(101))}  # fmt: skip
-    finest = fine | {"values": ", ".join(str(1 + k % 3) for k in range(9001))}
-    found = [density(a=coarse), density(a=coarse, b=other), density(a=coarse, b=fine), density(a=coarse, b=finest)]
-    assert [one.range for one in found] == [(400, 500), (400, 700), (400, 610), (400, 610)]
-    assert [one._density.pdf.shape[0] for one in found] == [65, 65, 2101, 4096]
-    assert found[0].tabulate(np.array([399.0, 425.0, 450.0])).tolist() == [[0, 0.5, 1]]
-    pdf = np.array(found[0]._density.pdf)
-    np.testing.assert_allclose(pdf, np.maximum(1 - np.abs(np.linspace(-1, 1, 65)), 0.01), rtol=1e-4)
-
-
-def test_ends_of_the_observer_s_table():
-    """Both belong to it, and nothing is read behind its last node."""
-    mi.set_variant("llvm_ad_spectral")
-    observer = StandardObserver()
-    numbers = np.arange(1.0, 96.0) ** 2
-    observer._tables = [mi.Float(np.r_[numbers * scale, np.full(4, np.nan)]) for scale in (1, 2, 3)]
-    at = np.array([360.0, 362.5, 365.0, 827.5, 830.0, 359.99, 830.01])
-    rows = observer.matrix(mi.UnpolarizedSpectrum(*(mi.Float(at) for _ in range(4))))
-    expected = np.interp(at, np.linspace(360, 830, 95), numbers, left=0, right=0)
-    assert len(rows) == 4
-    for row in rows:
-        np.testing.assert_allclose(np.array(row), expected * np.array([[1], [2], [3]]), rtol=1e-4)
-
-
 def curves_of(**nodes):
     mi.set_variant("llvm_ad_spectral")
     return SensorResponse({name: mi.load_dict(node) for name, node in nodes.items()})
@@ -323,17 +281,6 @@ def test_curves_count_alike_where_wavelengths_are_drawn():
     assert np.array(curves_of(a=low, b=low)._density.pdf).min() == pytest.approx(0.02)
 
 
-def test_even_curves_have_the_fewest_nodes():
-    """Also beside others that say how fine they are; one of a single step is as fine as another."""
-    even = {"type": "uniform", "value": 2.0, "wavelength_min": 400, "wavelength_max": 500}
-    fine = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": ", ".join("12" * 100)}
-    counts = [
-        np.array(curves_of(**nodes)._density.pdf).size
-        for nodes in ({"a": even}, {"a": even, "b": fine}, {"a": fine, "b": even})
-    ]
-    assert counts == [65, 200, 200]
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_curve_that_is_no_number_is_refused(value):
     mi.set_variant(VARIANT)
@@ -344,10 +291,3 @@ def test_a_curve_that_is_no_number_is_refused(value):
     )
     with pytest.raises(SceneError, match=r"'bad' must be finite"):
         SensorResponse({"bad": curve})
-
-
-def test_curves_are_seen_beside_the_film_s_settings():
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    seen = mi.traverse(mi.load_dict(film()))
-    assert all(any(key.startswith(f"{name}.") for key in seen.keys()) for name in BANDS)  # noqa: SIM118

@@ -212,6 +212,8 @@ OBLIQUE = np.array([[7, -4, 4, 0], [1, 8, 4, 0], [-8, -4, 1, 0], [0, 0, 0, 9]]) 
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
 DISTANT = {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}
+SPOT = {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20}
+SHORT = {"type": "perspective", "fov": 40, "far_clip": 2.5, "to_world": CAMERA, "film": FILM}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
         "emitter": {"type": "angulararea", "cutoff_angle": 20.0}}  # fmt: skip
 
@@ -227,7 +229,12 @@ def box(z, tilt=UPRIGHT):
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
     ({"mirror": MIRROR}, "light.position", "mirrors"),
     ({"sensor": DISTANT}, BODY, "'sensor'"),
-    ({"light": {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20, "beam_width": 20}}, BODY, "rim.*'light'"),
+    ({"light": SPOT | {"beam_width": 20}}, BODY, "rim.*'light'"),
+    ({"light": SPOT | {"texture": STEPS}}, "light.to_world", "steps in the light of 'light'"),
+    ({"sensor": SHORT, "ball": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.3}}, "ball.to_world",
+     "clip planes.*'ball'"),
+    ({"sensor": SHORT, "ball": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.3}}, "sensor.to_world",
+     "clip planes.*'ball'"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
@@ -249,6 +256,11 @@ def test_what_is_called_correct(tmp_path):
     table = plate(wall=STRIPED).parameters()
     for key in (BODY, "light.position"):
         assert table[key].reason == "correct" and table[key].moves_silhouette and not table[key].biased
+    # Clip planes cut what is out of view, and the light of a spot is smooth.
+    beside = {"type": "sphere", "center": [3, 0, 1.5], "radius": 0.3}
+    smooth = SPOT | {"texture": STEPS | {"filter_type": "bilinear"}}
+    for key in ("ball.to_world", BODY, "light.to_world", "sensor.to_world"):
+        assert plate(sensor=SHORT, ball=beside, light=smooth).parameters()[key].edges_missing == ()
     off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
     assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
     (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")

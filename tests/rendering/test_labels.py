@@ -649,16 +649,6 @@ def test_first_return_refuses_other_shapes(shape):
         first_return(torch.zeros(shape), tt.TimeAxis(1.0, 0.5, 6))
 
 
-def test_first_return_refuses_mistakes():
-    axis = tt.TimeAxis(1.0, 0.5, 6)
-    with pytest.raises(ShapeError, match="4 Stokes"):
-        first_return(torch.zeros(3, 2, 6, 1, 3), axis, polarized=True)
-    with pytest.raises(ShapeError):
-        first_return(torch.zeros(2, 6, 1, 3, dtype=torch.complex64), axis)
-    with pytest.raises(UnitError, match="threshold"):
-        first_return(torch.zeros(2, 6, 1, 3), axis, threshold=-1.0)
-
-
 # ---------------------------------------------------------------------------------------------------------- errors
 
 
@@ -734,54 +724,6 @@ def test_recorded_calls_follow_the_sensor(kind):
         close(labels["z_depth"], (away * axis[:, None, None]).sum(0).numpy(), atol=1e-4)
         if kind != "orthographic":
             close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
-
-
-def test_recorded_calls_follow_a_mask():
-    def make(freeze):
-        mask = {"type": "mask", "opacity": {"type": "uniform", "value": 0.2}, "inner": grey(0.2)}
-        pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf=mask)
-        key = "pane.bsdf.opacity.value"
-        return renderer_of(camera(), parameters=[key], options={"freeze": freeze}, pane=pane, wall=plane())
-
-    opacities = [0.2, 0.8, 0.3, 0.9, 0.1]
-    found = same_recorded(make, [{"pane.bsdf.opacity.value": x} for x in opacities], ["shape", "z_depth", "albedo"])
-    for x, labels in zip(opacities, found, strict=True):
-        assert (labels["shape"] == int(x < 0.5)).all()
-
-
-def test_recorded_calls_follow_a_scan():
-    def make(freeze):
-        meter = {"type": "nlos_capture_meter", "film": film(4, 3), "sensor_origin": [0.5, 0.0, 2.0]}
-        description = scene_of(None, wall={"type": "rectangle", "sensor": meter})
-        del description["sensor"]
-        scene = tt.load(description, variant=VARIANT)
-        key = next(key for key in scene.parameters() if key.endswith("sensor_origin"))
-        return tt.TransientRenderer(scene, parameters=[key], physics="ignore", freeze=freeze)
-
-    (key,) = make(True)._keys
-    origins = [[0.5, 0.0, 2.0], [0.6, 0.1, 1.0], [0.0, 0.0, 3.0], [0.1, 0.2, 2.5], [0.3, 0.3, 1.5]]
-    found = same_recorded(make, [{key: origin} for origin in origins], ["depth", "position", "normals"])
-    for origin, labels in zip(origins, found, strict=True):
-        away = labels["position"] - torch.tensor(origin)[:, None, None]
-        close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
-
-
-def test_recorded_calls_follow_instances():
-    group = {"type": "shapegroup", "part": {"type": "sphere", "radius": 0.5}}
-
-    def make(freeze):
-        copied = {"type": "instance", "nested": {"type": "ref", "id": "group"}, "to_world": translate([0, 0, 0])}
-        return renderer_of(
-            camera(fov=FOV), parameters=["copied.to_world"], options={"freeze": freeze}, group=group, copied=copied
-        )
-
-    poses = [translate([x, 0, 0]).astype(np.float32) for x in (0.0, 0.2, 0.4, 0.6, 0.8)]
-    names = ["depth", "position", "shape", "normals"]
-    found = same_recorded(make, [{"copied.to_world": pose} for pose in poses], names)
-    for pose, labels in zip(poses, found, strict=True):
-        hit = labels["shape"] == 0
-        away = labels["position"][:, hit] - torch.from_numpy(pose[:3, 3])[:, None]
-        close(torch.linalg.norm(away, dim=0), np.full(int(hit.sum()), 0.5), atol=1e-4)
 
 
 def test_built_scenes_are_freed():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import drjit as dr
 import numpy as np
@@ -123,42 +122,6 @@ def test_a_render_of_an_integrators_own_is_called():
 
 
 # -------------------------------------------------------------------------------------------- what is told apart
-
-
-def structure(value):
-    from torchtransient.plugins.frozen_state import state_below
-
-    return state_below(value)[0]
-
-
-@pytest.mark.parametrize(
-    ("a", "b"),
-    [
-        (0.0, -0.0), (1, 1.0), (1, True), ([1], (1,)), ({"a": 1}, {"b": 1}), ([[1], 2], [1, [2]]), ("1", 1),
-        ({1: {2}}, {1: {3}}), (0.5, math.nextafter(0.5, 1)), (range(3), range(4)), (b"a", b"b"), (1j, 2j),
-    ],
-)  # fmt: skip
-def test_structures_differ(a, b):
-    assert structure([a]) != structure([b])
-    assert structure([a]) == structure([a])
-
-
-def test_not_a_number_is_like_another():
-    assert structure([float("nan")]) == structure([float("inf") - float("inf")])
-
-
-INCOMPARABLE = {"iterator": iter([1]), "builtin": open, "object": {1: object()}, "set": {(1, 2)}, "lambda": lambda: 0}
-
-
-@pytest.mark.parametrize("value", INCOMPARABLE.values(), ids=INCOMPARABLE)
-def test_what_cannot_be_compared_is_refused(value):
-    from torchtransient.plugins.frozen_state import NotComparableError
-
-    if callable(value) and value.__class__.__name__ == "function":
-        assert structure(value)
-        return
-    with pytest.raises(NotComparableError):
-        structure(value)
 
 
 LOOSE = {

@@ -8,12 +8,10 @@ import torch
 import torchtransient as tt
 from support.pages import Page
 from torchtransient.rendering import recording
-from torchtransient.rendering.engine import LARGE_FILM
-from torchtransient.rendering.recording import MOST_AT_ONCE
 
-VARIANT = "llvm_ad_rgb"
 PAGE = Page("docs/speed.md")
-TEXT = PAGE.text
+
+
 NEW = [recording.FIRST, recording.RECORDED, recording.LAUNCHED]
 
 
@@ -55,18 +53,3 @@ def test_threads(names):
     assert names["after"] == names["before"]
     expected = names["traced"](seed=0).transient
     torch.testing.assert_close(names["alone"].transient, expected, rtol=1e-5, atol=1e-5 * expected.max().item())
-
-
-def test_numbers_and_reasons_are_those_of_the_code():
-    assert f"recordings of {recording.MAX_STRUCTURES} kinds of calls" in TEXT
-    assert f"and {recording.MAX_RECORDINGS} for sizes" in TEXT
-    assert f"that {max(recording.MOST_UNLAUNCHED, recording.MAX_STRUCTURES)} calls in a row" in TEXT
-    assert f"up to {MOST_AT_ONCE} at once" in TEXT
-    assert LARGE_FILM == 2**18 and "films below 2^18 values" in TEXT
-    for name in ("FIRST", "SWITCHED_OFF", "SEVERAL", "LARGE", "PROGRESS", "OWN_ENTRY", "NO_FREEZING"):
-        assert f"`{getattr(recording, name)}`" in TEXT
-
-
-def test_it_is_linked_where_it_is_looked_for():
-    for page in ("README.md", "docs/torch_layer.md"):
-        assert "speed.md" in Page(page).text, page

@@ -13,12 +13,10 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import DeviceError, UnitError
+from torchtransient.errors import UnitError
 from torchtransient.plugins import drjit_pool
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
-
-VARIANT = "llvm_ad_rgb"
 
 
 @pytest.fixture(autouse=True)
@@ -74,27 +72,6 @@ def test_what_is_no_number_of_threads(n):
     assert tt.threads() == before
 
 
-def test_what_the_system_refuses_is_taken_back(monkeypatch):
-    before = tt.threads(2)
-
-    def refuse(count):
-        set_count(count)
-        raise RuntimeError("Resource temporarily unavailable")
-
-    set_count = dr.set_thread_count
-    with monkeypatch.context() as patch:
-        # The second call puts back.
-        patch.setattr(dr, "set_thread_count", lambda n: refuse(n) if n == 5 else set_count(n))
-        with pytest.raises(DeviceError, match=r"5 threads cannot be had: Resource.*stays at 2"):
-            tt.threads(5)
-    assert tt.threads() == before
-    with monkeypatch.context() as patch:
-        patch.setattr(torch, "set_num_threads", lambda n: None)
-        with pytest.raises(DeviceError, match=r"asked for 5 of torch and 5 of Dr\.Jit, which took 2 and 5"):
-            tt.threads(5)
-    assert tt.threads() == before
-
-
 class Asleep:
     """A nanothread whose thread falls asleep while it is told to end: it ends when a task wakes it."""
 
@@ -145,15 +122,6 @@ def test_threads_are_woken_by_a_task():
             assert helper.is_alive()
             ended.release()
             helper.join()
-
-
-def test_pools_shrink_where_no_thread_can_be_had(monkeypatch):
-    def refuse(self):
-        raise RuntimeError("can't start new thread")
-
-    with tt.threads(3), monkeypatch.context() as patch:
-        patch.setattr(threading.Thread, "start", refuse)
-        assert tt.threads(1).drjit == 1
 
 
 def test_renders_of_other_threads_end_first():

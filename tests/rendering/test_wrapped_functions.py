@@ -9,7 +9,7 @@ import random
 import subprocess
 import sys
 import textwrap
-from collections import OrderedDict, defaultdict, namedtuple
+from collections import namedtuple
 
 import drjit as dr
 import mitsuba as mi
@@ -104,19 +104,6 @@ def test_every_kind_of_value():
         tt.wrap(read, params)({"box.faces": torch.ones(count, 3)})
 
 
-def test_normals_go_back_with_positions():
-    """Mitsuba computes them anew where positions change: those of the description may be others."""
-    params = mi.traverse(mi.load_dict({"type": "cube"}))
-    normals = np.roll(np.array(params["vertex_normals"]), 3)
-    params["vertex_normals"] = mi.Float(normals)
-    params.update()
-    positions = torch.from_numpy(np.array(params["vertex_positions"]).reshape(-1, 3) * 2)
-    seen = []
-    tt.wrap(lambda params: seen.append(np.array(params["vertex_normals"])), params)({"vertex_positions": positions})
-    assert not np.allclose(seen[0], normals) and np.array_equal(np.array(params["vertex_normals"]), normals)
-    assert np.allclose(np.array(params["vertex_positions"]), positions.reshape(-1) / 2)
-
-
 @pytest.mark.slow
 def test_gradients_of_a_render_by_key():
     """A path length that changes, against central differences of the same samples."""
@@ -185,50 +172,6 @@ def test_a_scene_that_raises_is_put_back(texture):
 
     with pytest.raises(KeyError, match="own"):
         tt.wrap(fail, params)({"data": torch.ones(2, 2, 3)})
-    assert np.all(np.array(params["data"]) == 0.5)
-
-
-@pytest.mark.parametrize("way", ["closure", "argument", "method", "attribute", "entry", "state"])
-def test_scenes_are_found(texture, way):
-    params, _ = texture
-
-    class Holder:
-        held = params
-
-    def write(given, x):
-        (given or Holder.held)["data"] = mi.TensorXf(x)
-        (given or Holder.held).update()
-        return x
-
-    def closure(x):
-        return write(params, x)
-
-    class Model(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.params = params
-
-        def look(self, x):
-            return write(self.params, x)
-
-        wrapped = tt.wrap(look)
-
-    model, entries = Model(), [params]
-
-    x = torch.ones(2, 2, 3)
-    if way == "closure":
-        tt.wrap(closure)(x)
-    elif way == "argument":
-        tt.wrap(write)(params, x)
-    elif way == "method":
-        model.wrapped(x)
-        tt.wrap(model.look)(x)
-    elif way == "attribute":
-        tt.wrap(lambda x: model.look(x))(x)
-    elif way == "entry":
-        tt.wrap(lambda x: write(entries[0], x))(x)
-    else:
-        tt.wrap(write, state=params)(None, x)
     assert np.all(np.array(params["data"]) == 0.5)
 
 
@@ -342,52 +285,6 @@ def test_trees_go_in_and_out():
         assert torch.equal(x.grad, torch.full((2,), slope))
 
 
-@dataclasses.dataclass(frozen=True)
-class Frozen:
-    x: object
-
-
-class Named(dict):
-    """A dictionary with an attribute."""
-
-
-@pytest.mark.parametrize("kind", ["frozen", "own dictionary", "ordered", "default", "empty", "class"])
-def test_structures_of_other_kinds(kind):
-    x = torch.ones(2)
-    named, default = Named(b=x, a=1), defaultdict(int, x=x)
-    named.note = "kept"
-    given = {"frozen": Frozen(x), "own dictionary": named, "ordered": OrderedDict(b=x, a=1), "default": default,
-             "empty": [[], (), {}, x], "class": [Frozen, x]}[kind]  # fmt: skip
-    inside = []
-    found = tt.wrap(lambda tree: (inside.append(tree), tree)[1])(given)
-    assert type(found) is type(inside[0]) is type(given)
-    assert getattr(found, "note", None) == getattr(given, "note", None)
-    if isinstance(given, dict):
-        assert list(found) == list(given) and torch.equal(found.get("b", found.get("x")), x)
-    elif kind == "frozen":
-        assert torch.equal(found.x, x) and given.x is x and dr.is_tensor_v(inside[0].x)
-    else:
-        assert found[:-1] == given[:-1] and torch.equal(found[-1], x)
-
-
-def test_entries_of_a_vmap_return_the_same():
-    """The same structure, and equal values that are no arrays."""
-    each = iter(range(100))
-    ways = {
-        "text": lambda x: (x, "same", None, np.array([1, 2])),
-        "numbers that differ": lambda x: (x, next(each)),
-        "structures that differ": lambda x: [x] * (1 + next(each) % 2),
-        "names that differ": lambda x: {f"x{next(each)}": x},
-    }
-    xs = torch.rand(3, 2)
-    out = {}
-    torch.func.vmap(lambda x: out.setdefault("x", tt.wrap(ways["text"])(x))[0])(xs)
-    assert out["x"][1:3] == ("same", None) and out["x"][3].tolist() == [1, 2]
-    for way in list(ways)[1:]:
-        with pytest.raises(ShapeError, match=r"under torch\.func\.vmap every entry must return the same"):
-            torch.func.vmap(lambda x, way=way: (tt.wrap(ways[way])(x), x)[1])(xs)
-
-
 def test_results_of_every_type():
     def f(x):
         flat = x.array
@@ -419,13 +316,6 @@ def test_results_of_every_type():
         grad = torch.autograd.grad(out[key].sum(), x, retain_graph=True)[0]
         assert torch.equal(grad, torch.tensor(expected, dtype=torch.float32)), key
     assert not out["mask"].requires_grad and not out["index"].requires_grad
-
-
-def test_what_is_no_tensor_passes_as_it_is():
-    bsdf, got, array = mi.load_dict({"type": "diffuse"}), [], np.arange(3)
-    assert tt.wrap(lambda *given: got.extend(given))(1, "two", array, bsdf, None, mi.Float(2.5)) is None
-    assert got[:2] == [1, "two"] and got[3] is bsdf and got[4] is None and got[5] == 2.5
-    assert np.array_equal(got[2], array)
 
 
 @pytest.mark.parametrize("kind", ["number", "array of Dr.Jit", "array of NumPy"])
@@ -592,18 +482,6 @@ def test_functions_that_do_something_else_when_they_are_replayed():
 def test_what_is_refused(make, error, words):
     with pytest.raises(error, match=words):
         make()
-
-
-@pytest.mark.slow
-def test_another_variant_may_be_active_in_between(texture):
-    params, look_up = texture
-    wrapped = tt.wrap(look_up, params)
-    data = torch.rand(2, 2, 3, requires_grad=True)
-    out = wrapped({"data": data}, uv := torch.tensor([0.25, 0.25]))
-    mi.set_variant("llvm_ad_mono")
-    out.sum().backward()
-    assert torch.equal(wrapped({"data": data}, uv), out) and mi.variant() == "llvm_ad_mono"
-    assert torch.equal(data.grad[0, 0], torch.ones(3))
 
 
 @pytest.mark.slow

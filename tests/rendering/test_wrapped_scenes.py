@@ -158,78 +158,12 @@ def held(value, levels):
     return value
 
 
-def left_behind(scene, function):
-    """Return True if a wrapped function leaves its value in the scene."""
-    tt.wrap(function)(torch.full((2, 2, 3), 2.0))
-    params = mi.traverse(scene)
-    found = np.any(np.array(params[KEY]) != 0.5)
-    params[KEY] = mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32))
-    params.update()
-    return found
-
-
-@pytest.mark.parametrize("levels", [0, 1, 4, 5])
-def test_entries_of_entries_are_followed_four_deep(scene, levels):
-    params = mi.traverse(scene)
-    entries = held(params, levels)
-
-    def first(x):
-        found = entries
-        while isinstance(found, list):
-            found = found[0]
-        return write(found, x)
-
-    assert left_behind(scene, first) == (levels > 4)
-    # Nearer by another name.
-    near = held(params, 3)
-    a_way = held(near, 3)
-    assert not left_behind(scene, lambda x: (write(near[0][0][0], x), a_way)[0])
-
-
-def test_many_entries_are_data(scene):
-    """More than a thousand are looked at for themselves alone."""
-    params = mi.traverse(scene)
-    for rows, expected in (([[0]] * 999 + [[params]], False), ([[0]] * 1000 + [[params]], True)):
-        assert left_behind(scene, lambda x, rows=rows: write(rows[-1][0], x)) == expected
-    row = [[0]] * 1000 + [params]
-    assert not left_behind(scene, lambda x: write(row[-1], x))
-
-
-def test_comprehensions_and_circles(scene):
-    """Functions that call one another, lists that hold themselves, and variables of a comprehension alone."""
-    params, ring, module = mi.traverse(scene), [], types.ModuleType("ring")
-    ring.append(ring)
-    module.itself = module
-
-    def even(x, n):
-        return odd(x, n - 1) if n else x
-
-    def odd(x, n):
-        found = [write(params, x) for _ in range(1 - n)]
-        return even(x, n - 1) if n else (ring, module.itself, *found)[2]
-
-    assert not left_behind(scene, lambda x: even(x, 3))
-
-
-def test_code_of_libraries_is_not_followed():
-    """Nor are scenes of this library, which look after themselves."""
-    own = tt.load({"type": "scene"})
-    f = tt.wrap(lambda x: (np.mean, torch.relu, mi.render, own, torch.nn.Module, x)[-1] * dr.pi)
-    torch.testing.assert_close(f(torch.ones(2)), torch.full((2,), torch.pi))
-
-
 def test_scenes_of_two_variants_are_refused(scene):
     mi.set_variant("llvm_ad_mono")
     other = mi.traverse(mi.load_dict({"type": "uniform", "value": 2.0}))
     mi.set_variant(VARIANT)
     with pytest.raises(ArgumentError, match="parameters of scenes of one variant, got llvm_ad_mono, llvm_ad_rgb"):
         tt.wrap(lambda x: (scene, other, x)[-1])(torch.ones(1))
-
-
-def test_parameters_that_are_not_set():
-    """Hair with pigments has no absorption that is set."""
-    hair = mi.load_dict({"type": "hair", "eumelanin": 0.25, "pheomelanin": 0.5})
-    assert torch.equal(tt.wrap(lambda x: x * len((hair,)))(torch.ones(2)), torch.ones(2))
 
 
 # ----------------------------------------------------------------------------------------- gradients that would be lost

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import subprocess
 import sys
 import textwrap
@@ -26,83 +25,6 @@ squares = tt.wrap(lambda x: x * x)
 # ------------------------------------------------------------------------------------------------------------ scenes
 
 GLOBAL: dict[str, mi.SceneParameters] = {}
-
-
-def write(params, x):
-    params["value"] = x.array
-    params.update()
-    return x * params["value"]
-
-
-def nested(x):
-    def inside():
-        return write(GLOBAL["params"], x)
-
-    return inside()
-
-
-def by_a_helper(x):
-    return nested(x)
-
-
-def decorated(function):
-    held = GLOBAL["params"]
-
-    @functools.wraps(function)
-    def call(x):
-        return write(held, function(x))
-
-    return call
-
-
-class Model:
-    def __init__(self, thing):
-        self.thing = thing
-
-    def __call__(self, x):
-        return write(self.thing, x)
-
-    def look(self, x):
-        return write(self.thing, x)
-
-
-class Network(nn.Module):
-    def forward(self, x):
-        return write(GLOBAL["params"], x)
-
-
-def ways(texture, params):
-    return {
-        "a function inside": nested,
-        "a helper": by_a_helper,
-        "an object that is called": Model(params),
-        "a part of a method": functools.partial(Model(params).look),
-        "a module": Network(),
-        "a default": lambda x, given=params: write(given, x),
-        "a default by name": lambda x, *, given=params: write(given, x),
-        "a decorator": decorated(lambda x: x),
-        "traversed inside": lambda x: write(mi.traverse(texture), x),
-    }
-
-
-@pytest.mark.parametrize("way", list(ways(None, GLOBAL.setdefault("params", None))))
-def test_scenes_are_found_and_put_back(way):
-    texture = mi.load_dict({"type": "uniform", "value": 2.0})
-    params = GLOBAL["params"] = mi.traverse(texture)
-    x = torch.tensor([3.0], requires_grad=True)
-    tt.wrap(ways(texture, params)[way])(x).backward()
-    assert x.grad == 6 and params["value"] == 2 and not dr.grad_enabled(params["value"])
-
-
-def test_a_scene_that_is_only_read_is_that_of_the_call():
-    texture = mi.load_dict({"type": "uniform", "value": 2.0})
-    x = torch.ones(1, requires_grad=True)
-    out = tt.wrap(lambda x: x * texture.eval(dr.zeros(mi.SurfaceInteraction3f)).x)(x)
-    params = mi.traverse(texture)
-    params["value"] = 5.0
-    params.update()
-    out.backward()
-    assert x.grad == 2 and params["value"] == 5
 
 
 # --------------------------------------------------------------------------------------- derivatives that would be lost
@@ -214,13 +136,6 @@ def test_batches_without_entries():
         torch.func.vmap(squares)(torch.ones(0, 3))
 
 
-def test_numbers_that_are_kept_with_the_other_sign():
-    turned = torch._neg_view(torch.arange(100.0))
-    x = torch.ones(100, requires_grad=True)
-    assert turned.is_contiguous() and torch.equal(tt.wrap(lambda x: x * 1)(turned), -torch.arange(100.0))
-    torch.testing.assert_close(torch.autograd.grad(squares(x), x, turned)[0], -2 * torch.arange(100.0))
-
-
 # ----------------------------------------------------------------------------------------------- arguments and results
 
 
@@ -240,17 +155,6 @@ def test_structures_of_mitsuba_are_arguments():
         tt.wrap(f)(x, ray, mi.Transform4f())
 
 
-@pytest.mark.parametrize("kind", ["Ray3f", "SurfaceInteraction3f", "PCG32"])
-def test_structures_of_mitsuba_are_no_results(kind):
-    with pytest.raises(ShapeError, match=f"a {kind}, whose fields cannot be tensors. Return them in a dictionary"):
-        tt.wrap(lambda x: dr.zeros(getattr(mi, kind)))(torch.ones(1))
-
-
-def test_pointers_are_no_results():
-    with pytest.raises(ShapeError, match="got a BSDFPtr"):
-        tt.wrap(lambda x: dr.zeros(mi.BSDFPtr, 2))(torch.ones(1))
-
-
 def test_lists_and_tuples_keep_their_kind():
     class Several(list):
         note = "own"
@@ -264,23 +168,6 @@ def test_lists_and_tuples_keep_their_kind():
     values, doubled, size = tt.wrap(f)(highest, several, torch.Size((2, 3)))
     assert torch.equal(values, torch.ones(2)) and type(doubled) is Several and size == torch.Size((2, 3))
     assert np.all(doubled[0].numpy() == 2) and torch.equal(several[0], torch.ones(2))
-
-
-def test_containers_that_change_between_a_call_and_its_derivative():
-    class Settings(dict):
-        factor = 2.0
-
-    def f(plain, own, several):
-        return sum(plain.values()) + sum(own.values()) * own.factor + sum(several)
-
-    x = torch.ones(1, requires_grad=True)
-    plain, own, several = {"x": x}, Settings(x=x), [x]
-    out = tt.wrap(f)(plain, own, several)
-    plain["y"] = own["y"] = torch.ones(1)
-    own.factor = 5.0
-    several.append(torch.ones(1))
-    out.backward()
-    assert out == 4 and x.grad == 4
 
 
 # ------------------------------------------------------------------------------------------------------------- threads

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from types import SimpleNamespace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ import torch
 import torchtransient as tt
 from tools.small_room import GREY, make_room
 from torchtransient.errors import SceneError
-from torchtransient.plugins.dictionaries import Pixels
 from torchtransient.scene.checks import MOST_LEVELS
 from torchtransient.scene.description import (
     describe_dict,
@@ -30,34 +27,6 @@ VARIANT = "llvm_ad_rgb"
 
 def plain(value):
     return describe_dict({"type": "scene", "x": value}).tree["x"]
-
-
-def test_plain_data_of_every_kind(tmp_path):
-    leaf = torch.arange(6.0).reshape(2, 3).requires_grad_()
-    assert type(plain(np.float32(0.5))) is float and plain(np.array(3)) == 3 and plain(True) is True
-    assert plain(tmp_path) == str(tmp_path) and plain("text") == "text"
-    assert np.array_equal(plain(leaf), leaf.detach().numpy()) and isinstance(plain(leaf), np.ndarray)
-    given = np.arange(3.0)
-    taken = plain(given)
-    given += 1
-    assert taken.tolist() == [0, 1, 2]
-    assert plain([1, 2]) == [1.0, 2.0] and plain([(400.0, 0.1), (500.0, 0.2)]) == [[400.0, 0.1], [500.0, 0.2]]
-    assert isinstance(plain(np.eye(4).tolist()), np.ndarray) and isinstance(plain([[1, 2, 3]]), np.ndarray)
-    assert isinstance(plain([[[1, 2]]]), np.ndarray)
-
-
-def test_plain_data_of_mitsuba_and_drjit():
-    assert plain(mi.Color3f(1, 2, 3)) == [1, 2, 3] and plain(mi.ScalarPoint3f(1, 2, 3)) == [1, 2, 3]
-    assert plain(mi.Float(2.5)) == 2.5 and plain(dr.scalar.ArrayXf(1, 2)) == [1, 2]
-    tensor = plain(mi.TensorXf(np.arange(6.0), (2, 3)))
-    assert isinstance(tensor, np.ndarray) and tensor.tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert plain(mi.TensorXf([1.0, 2.0])) == [1, 2]
-    matrix = np.array([[1.0, 2, 3, 4], [0, 1, 5, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
-    for made in (mi.ScalarTransform4f(matrix), mi.Transform4f(matrix)):
-        assert np.array_equal(plain(made), matrix)
-    assert plain(mi.ScalarTransform3f(np.eye(3))).shape == (3, 3)
-    pixels = plain(mi.Bitmap(np.arange(12, dtype=np.float32).reshape(2, 2, 3)))
-    assert isinstance(pixels, Pixels) and np.array(pixels.values).ravel().tolist() == list(range(12))
 
 
 def test_tensors_of_three_rows_are_no_colours_or_points(capfd):
@@ -79,29 +48,6 @@ def test_tensors_of_three_rows_are_no_colours_or_points(capfd):
     assert np.array_equal(np.array(values["floor.bsdf.reflectance.volume.data"]), voxels)
     assert np.array_equal(np.array(values["ball.grid"]).ravel(), voxels.ravel())
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        (None, "expected a value at x, got None. Leave the entry out"),
-        ({3: 1}, "keys must be strings, got 3 at x"),
-        ([[1, 2], [3]], r"the list at x is not an array of numbers"),
-        (["a", 1], r"the list at x is not an array of numbers"),
-        ({"y": {"z": [["a"]]}}, r"the list at x\.y\.z is not an array"),
-        (object(), "the object at x cannot be described, and a scene must be rebuilt"),
-        (SimpleNamespace(detach=1), "the SimpleNamespace at x cannot be described"),
-    ],
-)
-def test_what_has_no_description(value, words):
-    with pytest.raises(SceneError, match=rf"tt\.load: {words}"):
-        plain(value)
-
-
-def test_several_transforms_are_no_transform():
-    several = mi.Transform4f().translate(mi.Point3f([1, 2], 0, 0))
-    with pytest.raises(SceneError, match=r"expected one transform at x, got matrices of shape \(4, 4, 2\)"):
-        plain(several)
 
 
 def test_matrices_that_are_no_transforms():
@@ -133,15 +79,6 @@ def test_dictionaries_as_deep_as_they_may_be():
         describe_dict({"type": "cube"})
 
 
-# ---------------------------------------------------------------------------------------------------------- equality
-
-
-
-
-
-
-
-
 # --------------------------------------------------------------------------------------------------------------- XML
 
 
@@ -157,12 +94,6 @@ def test_files_in_files_count_their_levels(tmp_path):
                 tt.load(tmp_path / "c.xml")
         else:
             tt.load(tmp_path / "c.xml")
-
-
-def test_parameters_of_other_types(tmp_path):
-    (tmp_path / "scene.xml").write_text("<scene/>", encoding="utf-8")
-    with pytest.raises(SceneError, match="XML parameter 'k' must be a string or a number, got list"):
-        tt.load(tmp_path / "scene.xml", k=[1])
 
 
 def test_files_that_are_no_scenes(tmp_path):
@@ -218,37 +149,6 @@ def test_cameras_and_integrators_of_ready_scenes():
     assert camera["sampler"] == {"type": "stratified", "sample_count": 9, "jitter": False}
     assert camera["film"].pop("rfilter") == {"type": "gaussian", "stddev": pytest.approx(0.4, rel=1e-6)}
     assert camera["film"] == {**{key: value for key, value in film.items() if key != "rfilter"}, "sample_border": False}
-
-
-@pytest.mark.parametrize(
-    ("given", "described"),
-    [
-        ({"type": "box"}, {"type": "box"}),
-        ({"type": "tent", "radius": 1.5}, {"type": "tent", "radius": 1.5}),
-        ({"type": "lanczos", "lobes": 4}, {"type": "lanczos", "lobes": 4}),
-        ({"type": "catmullrom"}, {"type": "catmullrom"}),
-    ],
-)
-def test_filters_of_ready_scenes(given, described):
-    room = make_room() | {"integrator": {"type": "path", "max_depth": 5}}
-    room["sensor"]["film"] = {"type": "hdrfilm", "width": 3, "height": 2, "rfilter": given}
-    tree = transient_dictionary(mi.load_dict(room, optimize=False))
-    films = [entry["film"] for entry in tree.values() if isinstance(entry, dict) and "film" in entry]
-    assert [film["rfilter"] for film in films] == [described]
-    assert [entry["max_depth"] for entry in tree.values() if isinstance(entry, dict) and "max_depth" in entry] == [5]
-
-
-
-
-
-
-def test_ready_scenes_that_stay_as_they_are():
-    assert transient_dictionary(mi.load_dict(make_room(), optimize=False)) is None
-
-
-# ------------------------------------------------------------------------------------------------ tried with less
-
-
 
 
 # --------------------------------------------------------------------------------------------------------- of a call

@@ -351,7 +351,7 @@ BAD = {
     "unknown output": ({"outputs": ("video",)}, "video"),
     "two films": ({"outputs": ("transient", "phasor")}, "a plan for"),
     "no frequencies": ({"outputs": ("phasor",)}, "frequencies"),
-    "frequencies without phasors": ({"frequencies": [1.0]}, r"outputs=\('phasor',\)\.$"),
+    "frequencies without phasors": ({"outputs": "transient", "frequencies": [1.0]}, r"outputs=\('phasor',\)\.$"),
     "gates of others": ({"outputs": ["steady", "stokes"], "gates": GATE}, r"\('gates', 'steady', 'stokes'\)"),
     "another film": ({"outputs": ("phasor", "steady"), "film": Gates(GATE)}, r"outputs=\('gates', 'steady'\)"),
     "unknown integrator": ({"integrator": "transient_teleport"}, "transient_teleport"),

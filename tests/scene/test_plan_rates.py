@@ -109,13 +109,22 @@ def test_plans_as_plain_data():
     assert told["rates"]["rates_num_bins"] == 64 and told["chirps"] is None and told["film"] == "rates"
 
 
+def test_settings_of_a_film_ask_for_its_output():
+    chirps = tt.Chirps(1e9, 1e-5, 1550e-9)
+    found = tt.plan(coming(), chirps=chirps)
+    assert found.outputs == ("beats",) and found.chirps == chirps
+    assert found.time_axis == tt.plan(coming(), "beats", chirps=chirps).time_axis
+    assert tt.plan(coming(), film=Rates(tt.RateAxis(-4.0, 1.0, 8))).outputs == ("rates",)
+    assert tt.plan(coming()).outputs == ("transient",)
+
+
 def test_wrong_requests():
     with pytest.raises(SceneError, match=r"chirps=tt\.Chirps"):
         tt.plan(wall(), outputs="beats")
     with pytest.raises(SceneError, match=r"rates=tt\.RateAxis"):
         tt.plan(wall(), outputs="rates", pilot=False, time_axis=tt.TimeAxis(0.0, 1.0, 9))
     with pytest.raises(ArgumentError, match="rates have no effect"):
-        tt.plan(wall(), rates=tt.RateAxis(0.0, 1.0, 3))
+        tt.plan(wall(), "transient", rates=tt.RateAxis(0.0, 1.0, 3))
     axis = tt.TimeAxis(0.0, 1.0, 9)
     with pytest.raises(ArgumentError, match="both give a time axis"):
         tt.plan(wall(), "rates", film=Rates(tt.RateAxis(0.0, 1.0, 3), axis), time_axis=axis)

@@ -7,7 +7,7 @@ import torch
 
 import torchtransient as tt
 from support import plan_scenes
-from support.marks import long
+from support.marks import long, long_pairs
 from torchtransient.errors import ArgumentError
 from torchtransient.rendering.error_bars import local_mean
 
@@ -112,8 +112,9 @@ def test_unknown_errors_are_refused():
         tt.plan(box(8), error="absolute")
 
 
-@pytest.mark.parametrize("error", ["squared", "relative"])
-@pytest.mark.parametrize("width", [0.06, 6.0])
+@pytest.mark.parametrize(
+    ("width", "error"), long_pairs([0.06, 6.0], ["squared", "relative"], [(0.06, "squared"), (6.0, "relative")])
+)
 def test_narrow_gates_are_connected_by_path_length(width, error):
     plan = tt.plan(box(), "gates", gates=tt.Gate.rectangular(7.5 - width / 2, 7.5 + width / 2), error=error)
     assert plan.connections == ("ellipsoidal" if width < 1 else None)

@@ -49,7 +49,7 @@ ROOMS = {
     "films": Room(
         ("plugins/films", "rendering/films.py"),
         ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py", "plugins/test_pulse*.py",
-         "plugins/test_response.py", "plugins/test_transform*.py", "plugins/test_wrong_options.py", "rendering/films",
+         "plugins/test_response.py", "plugins/test_wrong_options.py", "rendering/films",
          "integrators/test_*phasor*.py", "integrators/test_*film*.py"),
     ),
     "integrators": Room(

@@ -37,9 +37,7 @@ error_option = click.option(
 @click.option(
     "--outputs",
     type=Names(),
-    default="transient",
-    show_default=True,
-    help=f"Some of {', '.join(known_outputs())}.",
+    help=f"Some of {', '.join(known_outputs())}.  [default: that of the film of the options or the scene]",
 )
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")
 @click.option("--tail", type=float, default=1e-3, show_default=True, help="Share of the light left to deeper paths.")

@@ -32,7 +32,7 @@ from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.likelihoods import divisor, parts_of
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.measurement import PairLoss, shared_dim, squared_loss, takes_dim
-from torchtransient.losses.results import TRANSIENT, Transient, reads
+from torchtransient.losses.results import BINNED, Binned, reads
 
 # Options in bins or of an axis, which would mean something else at each scale.
 _OF_BINS = ("dead_bins", "bin_width_opl", "axis", "spacing")
@@ -42,10 +42,10 @@ _LIGHT_OF_BINS = {"floor": True, "background": False}
 _BINS = -3
 
 
-@reads(input=TRANSIENT, target=TRANSIENT)
+@reads(input=BINNED, target=BINNED)
 def multiscale_loss(
-    input: Transient,
-    target: Transient,
+    input: Binned,
+    target: Binned,
     compare: PairLoss = squared_loss,
     *,
     scales: Sequence[int] | None = None,

@@ -27,6 +27,20 @@ class HasTransient(Protocol):
     def transient(self) -> Tensor | None: ...
 
 
+class HasRates(Protocol):
+    """Result of a film of rates: `rates` with `rate_axis` and `axis`."""
+
+    @property
+    def rates(self) -> Tensor | None: ...
+
+
+class HasBeats(Protocol):
+    """Result of a film of beats: `beats` with `chirps` and `axis`."""
+
+    @property
+    def beats(self) -> Tensor | None: ...
+
+
 class HasPhasor(Protocol):
     """Result of a phasor film: `phasor` with `frequencies`."""
 
@@ -63,6 +77,7 @@ class HasDepth(Protocol):
 
 
 Transient = Tensor | HasTransient
+Binned = Tensor | HasTransient | HasRates | HasBeats
 Phasors = Tensor | HasPhasor
 Light = Tensor | HasTransient | HasPhasor | HasGated
 Picture = Tensor | HasSteady
@@ -70,6 +85,8 @@ Volume = Tensor | HasValues
 DepthMap = Tensor | HasDepth
 
 LIGHT = ("transient", "phasor", "gated", "rates", "beats")
+# What losses along the bins of a histogram take; of rates those of the rate.
+BINNED = ("transient", "rates", "beats")
 TRANSIENT, PHASOR, STEADY, VALUES, DEPTH = ("transient",), ("phasor",), ("steady",), ("values",), ("depth_m",)
 # The axes of each attribute, which two results have to share.
 _AXES = {
@@ -77,7 +94,7 @@ _AXES = {
     "gated": ("gates",),
 }  # fmt: skip
 _EVERY = (*LIGHT, *STEADY, *VALUES, *DEPTH)
-_IMAGES = -3
+_IMAGES, _RATES = -3, -4
 # Of the width of a bin or of a frequency: axes that went through files and units are equal but for rounding.
 _ROUNDING = 1e-3
 
@@ -125,21 +142,25 @@ def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known
     for name, attribute in taken.items():
         x = results[name]
         arguments[name] = getattr(x, attribute)
-        for setting, value in _settings(x, attribute, known, where).items():
+        along = _RATES if attribute == "rates" and measures[name] == BINNED else _IMAGES
+        for setting, value in _settings(x, attribute, known, arguments.get("dim") or along, where).items():
             if setting in known and arguments.get(setting) is None:
                 arguments[setting] = value
 
 
-def _settings(x: object, attribute: str, known: set[str], where: str) -> dict[str, Any]:
-    """Return the options that a result sets."""
+def _settings(x: object, attribute: str, known: set[str], dim: Any, where: str) -> dict[str, Any]:
+    """Return the options that a result sets; ``dim``: dimension of time or rates of images."""
     if attribute == "values" and "spacing" in known:
         return {"spacing": _spacing(getattr(x, "grid", None), where)}
     if attribute not in LIGHT:
         return {}
-    axis = getattr(x, "axis", None) if attribute == "transient" else None
+    axis = getattr(x, "axis", None) if attribute in BINNED else None
     scan = getattr(getattr(x, "scan", None), "shape", None)  # exhaustive captures and lists of points
+    if attribute == "rates" and dim == _RATES:
+        rates = getattr(x, "rate_axis", None)
+        return {"dim": dim, "bin_width_opl": None if rates is None else rates.bin_width}
     return {
-        "dim": _IMAGES if scan is None else -1 - len(scan),
+        "dim": dim if scan is None else -1 - len(scan),
         "axis": axis,
         "bin_width_opl": None if axis is None else axis.bin_width_opl,
     }

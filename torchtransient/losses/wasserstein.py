@@ -21,16 +21,16 @@ from torchtransient.losses.comparison import (
 )
 from torchtransient.losses.layouts import bin_width, bins_dim, item_dims
 from torchtransient.losses.loss_module import LossModule
-from torchtransient.losses.results import TRANSIENT, Transient, reads
+from torchtransient.losses.results import BINNED, Binned, reads
 
 # Pixels with less than this share of the light of the mean pixel of their item have no shape of their own.
 _MASS_FLOOR = 1e-3
 
 
-@reads(input=TRANSIENT, target=TRANSIENT)
+@reads(input=BINNED, target=BINNED)
 def wasserstein_loss(
-    input: Transient,
-    target: Transient,
+    input: Binned,
+    target: Binned,
     bin_width_opl: float | None = None,
     *,
     creation_cost_opl: float | None = None,
@@ -56,7 +56,7 @@ def wasserstein_loss(
         creation_cost_opl: length in metres above which light is rather missing than late; None: normalized records.
         floor: light of a pixel summed over its bins, above zero; None: 1e-3 of the mean pixel of each item of each.
         dim: dimension of time (`losses.layouts`), or another axis of equal bins, whose width and unit the distance then
-            has: -4 of rates (C, R, T, Y, X), with the width of their bins in m/s.
+            has: -4 of rates (C, R, T, Y, X), with the width of their bins in m/s. Results with `rates` have both.
         mask: bins that count; the others are empty in both.
         reduction: "mean" over pixels that count, "sum", or "none".
 
@@ -96,10 +96,10 @@ class WassersteinLoss(LossModule, function=wasserstein_loss, by_place=("bin_widt
     """`wasserstein_loss` with its options held."""
 
 
-@reads(input=TRANSIENT, target=TRANSIENT)
+@reads(input=BINNED, target=BINNED)
 def cumulative_loss(
-    input: Transient,
-    target: Transient,
+    input: Binned,
+    target: Binned,
     bin_width_opl: float | None = None,
     *,
     per_root_count: bool = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeAlias
 
 from torch import Tensor
@@ -12,8 +12,8 @@ from torchtransient.checks import as_whole, function, mapping, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.floating import holds
 from torchtransient.motion.rigid import Motion
-from torchtransient.motion.slow_times import Frames, SlowTimes
-from torchtransient.plugins.mitsuba_compat import POSITIONS
+from torchtransient.motion.slow_times import Exposure, Frames, SlowTimes
+from torchtransient.plugins.mitsuba_compat import POSITIONS, VELOCITY
 from torchtransient.rendering.job import draw_seed
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.poses import film_rows, pose_of, scene_size, watch_of
@@ -72,7 +72,7 @@ def over_time(
         ShapeError: for batches, and functions that return other than one value for each time.
         PhysicsError: with ``physics="error"`` of the renderer, for what moves further than the scene is large, or turns
             around, while the camera looks (of ``Frames``: what moves so far from one to the next). Otherwise that is a
-            ``PhysicsWarning``.
+            ``PhysicsWarning``, as is a motion that slow phasors follow already, by the velocity of the same body.
         SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
 
     Not supported: Doppler shifts of the light itself. See ``docs/motion.md``.
@@ -97,6 +97,8 @@ def over_time(
     moved = _values_at(moving, time_s, own)
     if watch_of(renderer).enabled:
         _check_units(renderer, moving, moved, time_s, each=isinstance(exposure, Frames))
+        if isinstance(exposure, Exposure) and renderer.film.measures == "slow_phasor":
+            _check_once(renderer, moved)
     poses: RenderOutput = renderer(
         {**(values or {}), **moved}, seed=[number] * len(time_s), spp=spp, progress=progress
     )
@@ -130,6 +132,20 @@ def _check_units(
             turns = how.angular.detach().norm().cpu() * (time_s[-1] - time_s[0]).detach().cpu().abs() / (2 * math.pi)
             if not holds(turns <= 1):
                 watch.warn(f"turns of {name}", f"over_time: {name!r} turns around {float(turns):.3g} times. {_UNITS}")
+
+
+def _check_once(renderer: TransientRenderer, moved: Iterable[str]) -> None:
+    """Warn of poses that move on while slow phasors follow the velocity of the same body."""
+    known = list(renderer.scene.known_parameters())
+    for key in moved:
+        body = key.rpartition(".")[0]
+        if any(name.startswith((f"{body}.{VELOCITY}", f"{body}.velocity.")) for name in known):
+            watch_of(renderer).warn(
+                f"twice {key}",
+                f"over_time: {body!r} has a velocity, which slow phasors follow over their times: with {key!r} its "
+                "motion counts twice. Take tt.Frames, a burst of pulses at each instant, or a scene without that "
+                "velocity.",
+            )
 
 
 def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -44,11 +44,25 @@ class SlowTimes(abc.ABC):
 
     @abc.abstractmethod
     def poses_s(self, rows: int) -> Tensor:
-        """Return the times of the poses, (K,), seconds, float64; ``rows``: height of the film."""
+        """Return the times of the poses, (K,), seconds, float64; ``rows``: height of the film.
+
+        Args:
+            rows: height of the film, pixels.
+
+        Returns:
+            (K,), seconds, float64.
+        """
 
     @abc.abstractmethod
     def combine(self, pictures: Tensor) -> Tensor:
-        """Return the result of one tensor of the output, (K, ..., H, W), one entry for each pose."""
+        """Return the result of one tensor of the output, (K, ..., H, W), one entry for each pose.
+
+        Args:
+            pictures: one tensor of the output for each pose, (K, ..., H, W).
+
+        Returns:
+            (..., H, W), or (K, ..., H, W) where poses stay apart.
+        """
 
 
 @dataclass(frozen=True)
@@ -89,7 +103,11 @@ class Exposure(SlowTimes):
         return self.beat_hz != 0
 
     def poses_s(self, rows: int = 1) -> Tensor:
-        """Return the times of the poses, (poses,), seconds."""
+        """Return the times of the poses, (poses,), seconds.
+
+        Args:
+            rows: height of the film, pixels; changes nothing.
+        """
         return float(self.duration_s) / 2 * torch.tensor(_nodes(int(self.poses)))
 
     def weights(self) -> Tensor:
@@ -97,7 +115,14 @@ class Exposure(SlowTimes):
         return torch.tensor(_beat_weights(int(self.poses), float(self.beat_hz) * float(self.duration_s)))
 
     def combine(self, pictures: Tensor) -> Tensor:
-        """Return the average of pictures (poses, ...), with the beat if they are complex."""
+        """Return the average of pictures (poses, ...), with the beat if they are complex.
+
+        Args:
+            pictures: (poses, ...), real or complex.
+
+        Returns:
+            (...), of the same dtype.
+        """
         if pictures.is_complex():
             # In double precision: what stands still is a thousand times what is left.
             return _sum(self.weights(), pictures.to(torch.complex128)).to(pictures.dtype)
@@ -128,15 +153,30 @@ class RollingShutter(SlowTimes):
         _check_poses("RollingShutter", self.poses)
 
     def poses_s(self, rows: int) -> Tensor:
-        """Return the times of the poses, (poses,), seconds."""
+        """Return the times of the poses, (poses,), seconds.
+
+        Args:
+            rows: height of the film, pixels.
+        """
         return float(self.row_s) * (rows - 1) / 2 * torch.tensor(_nodes_with_ends(int(self.poses)))
 
     def rows_s(self, rows: int) -> Tensor:
-        """Return the times of the rows, (rows,), seconds."""
+        """Return the times of the rows, (rows,), seconds.
+
+        Args:
+            rows: height of the film, pixels.
+        """
         return float(self.row_s) * (torch.arange(rows).double() - (rows - 1) / 2)
 
     def combine(self, pictures: Tensor) -> Tensor:
-        """Return the pictures (poses, ..., H, W) with each row at its time."""
+        """Return the pictures (poses, ..., H, W) with each row at its time.
+
+        Args:
+            pictures: (poses, ..., H, W).
+
+        Returns:
+            (..., H, W).
+        """
         rows = pictures.shape[-2]
         weights = torch.tensor(_through_ends(int(self.poses), np.linspace(-1, 1, rows) if rows > 1 else np.zeros(1)))
         return _sum(weights[..., None], pictures)
@@ -164,11 +204,22 @@ class PhaseSteps(SlowTimes):
         positive("PhaseSteps: period_s", self.period_s)
 
     def poses_s(self, rows: int = 1) -> Tensor:
-        """Return the times of the exposures, (number,), seconds."""
+        """Return the times of the exposures, (number,), seconds.
+
+        Args:
+            rows: height of the film, pixels; changes nothing.
+        """
         return float(self.period_s) * (torch.arange(int(self.number)).double() - (int(self.number) - 1) / 2)
 
     def combine(self, pictures: Tensor) -> Tensor:
-        """Return the pictures as they are, (number, ...)."""
+        """Return the pictures as they are, (number, ...).
+
+        Args:
+            pictures: (number, ...).
+
+        Returns:
+            (number, ...).
+        """
         return pictures
 
     def taps(self, taps: Tensor) -> Tensor:
@@ -213,11 +264,22 @@ class Frames(SlowTimes):
             raise UnitError(f"Frames: expected finite times in seconds, got {shown(time_s)}.")
 
     def poses_s(self, rows: int = 1) -> Tensor:
-        """Return the times, (K,), seconds."""
+        """Return the times, (K,), seconds.
+
+        Args:
+            rows: height of the film, pixels; changes nothing.
+        """
         return self.time_s
 
     def combine(self, pictures: Tensor) -> Tensor:
-        """Return the pictures as they are, (K, ...)."""
+        """Return the pictures as they are, (K, ...).
+
+        Args:
+            pictures: (K, ...).
+
+        Returns:
+            (K, ...).
+        """
         return pictures
 
     def __repr__(self) -> str:

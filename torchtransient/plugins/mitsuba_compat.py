@@ -325,6 +325,13 @@ def has_velocities(shape: Any) -> bool:
     return isinstance(shape, mi.Mesh) and shape.has_attribute(VELOCITY)
 
 
+def moved_by(plugin: Any) -> str | None:
+    """Return the name of the medium whose velocities a volume holds, which is named ``NAME.velocity``; None for others.
+    """
+    name, _, last = plugin.id().rpartition(".") if isinstance(plugin, mi.Volume) else ("", "", "")
+    return name if name and last == "velocity" else None
+
+
 def has_more_than_arrays(mesh: Any) -> bool:
     """Return True if a mesh has parameters beside its arrays and its weight: attributes, or a material by face."""
     shown = mi.traverse(mesh)

@@ -25,6 +25,7 @@ from torchtransient.plugins.mitsuba_compat import (
     is_dark,
     loses_slope_of_metal,
     lost_at,
+    moved_by,
     normal_texture,
 )
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
@@ -260,6 +261,11 @@ def _lies_in_dark_light(site: Site) -> bool:
     return bool(holders) and all(isinstance(holder, mi.Emitter) and is_dark(holder) for holder in holders)
 
 
+def _is_wind(site: Site) -> bool:
+    return moved_by(site.node) is not None
+
+
+WIND = Row(ParameterEffect(moves_length=True, role="velocity"), _is_wind, "the velocity of a medium")
 IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
@@ -326,6 +332,6 @@ declare_effects("RoughPlastic", {"eta": COATING, "alpha": COATING})
 
 declare_effects("Texture", {ANY_KEY: NUMBER_ROWS})
 declare_effects("IrregularSpectrum", {"wavelengths": WAVELENGTHS})
-declare_effects("Volume", {ANY_KEY: NUMBER_ROWS})
+declare_effects("Volume", {ANY_KEY: (WIND, *NUMBER_ROWS)})
 declare_effects("PhaseFunction", {ANY_KEY: (IN_EXTINCTION,)})
 declare_effects("Medium", {ANY_KEY: MEDIUM})

@@ -63,7 +63,12 @@ class RenderStats:
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
-        """Return the statistics of a job that has run; ``pixels``: number of pixels of each film."""
+        """Return the statistics of a job that has run; ``pixels``: number of pixels of each film.
+
+        Args:
+            job: the job, with the log of its runs.
+            pixels: number of pixels of each film.
+        """
         runs = job.log
         items, seconds = [item for run in runs for item in run.items], sum(run.seconds for run in runs)
         return cls(
@@ -86,8 +91,13 @@ class RenderStats:
 
     @classmethod
     def of_batch(cls, several: Sequence[RenderStats]) -> RenderStats:
-        """Join the statistics of renders of one batch: seeds and energies in a row, times added up. Raises
-        ``ShapeError`` for renders that were not made alike.
+        """Join the statistics of renders of one batch: seeds and energies in a row, times added up.
+
+        Args:
+            several: statistics of renders that were made alike.
+
+        Raises:
+            ShapeError: for renders of different samples, variants, integrators, filters or depths.
         """
         first = several[0]
         for name in ("spp", "variant", "integrator", "temporal_filter", "max_depth"):

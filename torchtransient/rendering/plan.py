@@ -224,7 +224,7 @@ class Plan(Effects):
 @opaque
 def plan(
     scene: Any,
-    outputs: Sequence[str] | str = ("transient",),
+    outputs: Sequence[str] | str | None = None,
     *,
     parameters: Sequence[str] = (),
     time_axis: TimeAxis | str | None = None,
@@ -256,7 +256,8 @@ def plan(
 
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
-        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands".
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for what
+            the settings of a film that are given call for, or else "transient".
         parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
@@ -311,10 +312,10 @@ def plan(
     if temporal_filter is not None:
         checked_filter(temporal_filter)
     loaded = load(scene)
-    wanted = _checked_outputs(outputs)
-    inventory = scene_inventory(loaded, sensor)
     named = {"frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
     given = requested_film(film, named)
+    wanted = _checked_outputs(outputs or ("transient" if given is None else given.output))
+    inventory = scene_inventory(loaded, sensor)
     own_axis = None if given is None else given.attributes().get("axis")
     if own_axis is not None:
         if time_axis is not None:

@@ -212,7 +212,11 @@ class Scene:
         return found
 
     def drop(self, options: BuildOptions) -> None:
-        """Forget the scene that was built with ``options``; the next use builds it anew."""
+        """Forget the scene that was built with ``options``; the next use builds it anew.
+
+        Args:
+            options: options of the build.
+        """
         self._builds.pop(options, None)
         self.installed.pop(options, None)
         self._slots.pop(options, None)
@@ -222,6 +226,12 @@ class Scene:
         """Return messages about unphysical values of the description, by key, for a scene built with ``options``.
 
         Called inside ``active_variant(scene.variant)``.
+
+        Args:
+            options: options of the build.
+
+        Returns:
+            Messages by key, empty where all values are physical.
         """
         found = self.built(options).findings()
         if found and options.merge:

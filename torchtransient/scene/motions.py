@@ -1,4 +1,4 @@
-"""Motions of bodies in a description: `rigid_motion` children of whatever moves."""
+"""Motions of bodies in a description: `rigid_motion` children of whatever moves, and volumes of media."""
 
 from __future__ import annotations
 
@@ -53,26 +53,21 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
     """
     import mitsuba as mi
 
-    if not motions and all(node.props.plugin_name() != PLUGIN for node in state.nodes):
-        return
     moving = [(node, key, index) for node in state.nodes for key, index in _motions_of(state, node)]
+    if not motions and not moving and all(node.props.plugin_name() != PLUGIN for node in state.nodes):
+        return
     name_children(state)
     for node, key, index in moving:
-        name, props = node.props.id(), state.nodes[index].props
-        if not name:
-            raise SceneError(f"{PLUGIN}: expected a named {node.props.plugin_name()} around it; give that an id.")
-        if props.get("of", name) != name:
-            raise SceneError(f"{PLUGIN}: one motion of {props['of']!r} and {name!r}; describe one for each.")
-        del node.props[key]
-        props["of"] = name
-        props.set_id(f"{name}.{CHILD}")
-        state.root.props[_free_key(state, name)] = mi.Properties.ResolvedReference(index)
+        _place(state, node, key, index)
     described = {state.nodes[index].props.get("of", ""): index for _, index in children(state, state.root)}
     names = {node.props.id() for node in state.nodes if _is_body(node)}
     for motion in motions:
         if motion.of not in names:
             known = some_of(sorted(name for name in names if name and not name.startswith("_")))
             raise SceneError(f"scene.moving: expected the name of a body, one of {known}, got {motion.of!r}.")
+        for key, index in children(state, state.root):
+            if state.nodes[index].props.id() == f"{motion.of}.{CHILD}" and _is_volume(state.nodes[index]):
+                del state.root.props[key]
         index = described.get(motion.of, -1)
         if index < 0 or state.nodes[index].props.plugin_name() != PLUGIN:
             node = mi.parser.SceneNode()
@@ -86,6 +81,33 @@ def place_motions(state: Any, motions: Sequence[BodyMotion]) -> None:
             state.root.props[_free_key(state, motion.of)] = mi.Properties.ResolvedReference(index)
         for part in ("linear", "angular", "center"):
             state.nodes[index].props[part] = mi.ScalarVector3f(getattr(motion, part))
+
+
+def _place(state: Any, node: Any, key: str, index: int) -> None:
+    """Make the velocity ``index`` of a body, its child ``key``, a child of the scene."""
+    import mitsuba as mi
+
+    name, velocity = node.props.id(), state.nodes[index]
+    props, own = velocity.props, f"{name}.{CHILD}"
+    if not name:
+        raise SceneError(f"{CHILD}: expected a named {node.props.plugin_name()} around it; give that an id.")
+    if _is_volume(velocity):
+        if node_kind(node) != "Medium":
+            raise SceneError(f"{name!r}: expected a {PLUGIN} as its {CHILD}; volumes are those of media alone.")
+        of = props.id().removesuffix(f".{CHILD}") if props.id().endswith(f".{CHILD}") else name
+        props["raw"] = True  # no colours
+    else:
+        of = props.get("of", name)
+        props["of"] = name
+    if of != name:
+        raise SceneError(f"{CHILD}: one motion of {of!r} and {name!r}; describe one for each.")
+    del node.props[key]
+    props.set_id(own)
+    state.root.props[_free_key(state, name)] = mi.Properties.ResolvedReference(index)
+
+
+def _is_volume(node: Any) -> bool:
+    return node_kind(node) == "Volume"
 
 
 def _is_body(node: Any) -> bool:
@@ -104,10 +126,17 @@ def _free_key(state: Any, name: str) -> str:
 def _motions_of(state: Any, node: Any) -> list[tuple[str, int]]:
     if node.props.plugin_name() == "scene":
         return []
-    found = children(state, node)
-    return [(key, index) for key, index in found if key == CHILD and state.nodes[index].props.plugin_name() == PLUGIN]
+    found = [(key, index, state.nodes[index]) for key, index in children(state, node) if key == CHILD]
+    return [(key, index) for key, index, held in found if held.props.plugin_name() == PLUGIN or _is_volume(held)]
+
+
+def moved_names(state: Any) -> set[str]:
+    """Return the names of the bodies of a parsed scene that motions and volumes of velocities refer to."""
+    rigid = {node.props.get("of", "") for node in state.nodes if node.props.plugin_name() == PLUGIN}
+    named = [node.props.id() for node in state.nodes if _is_volume(node)]
+    return rigid | {name.removesuffix(f".{CHILD}") for name in named if name.endswith(f".{CHILD}")}
 
 
 def has_velocities(state: Any) -> bool:
     """Return True if some body of a parsed scene has a velocity."""
-    return any(node.props.plugin_name() == PLUGIN or VELOCITY in node.props for node in state.nodes)
+    return bool(moved_names(state)) or any(VELOCITY in node.props for node in state.nodes)

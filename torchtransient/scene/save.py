@@ -31,7 +31,7 @@ from torchtransient.plugins.node_walk import ShownValue, objects_below, objects_
 from torchtransient.plugins.spectral_colours import as_colours, keeps_coefficients, same_spectra
 from torchtransient.scene.build import BuiltScene
 from torchtransient.scene.description import Plain
-from torchtransient.scene.motions import PLUGIN as MOTION
+from torchtransient.scene.motions import moved_names
 from torchtransient.scene.nodes import children, name_children, node_kind, split_merged_shapes
 from torchtransient.scene.parameters import read_value
 from torchtransient.scene.values import Slot, SlotTable, as_float, fit_shape, flat_drjit_copy
@@ -447,7 +447,7 @@ class XmlWriter:
         self.state, self.folder = state, folder
         self._direct = {index for _, index in children(state, state.root)}
         self._names = [node.props.id() for node in state.nodes]
-        self._moving = {node.props.get("of", "") for node in state.nodes if node.props.plugin_name() == MOTION}
+        self._moving = moved_names(state)
         self._written: dict[int, ElementTree.Element] = {}
         self._kinds: dict[int, str] = {}
         self._count = 0

@@ -110,7 +110,7 @@ def test_plan():
     with pytest.raises(SceneError, match=r"Give film=Moments\(3\)"):
         tt.plan(make_room(), "moments")
     with pytest.raises(ArgumentError, match="on which moments have no effect; ask for outputs"):
-        tt.plan(make_room(), film=Moments(2))
+        tt.plan(make_room(), "transient", film=Moments(2))
 
 
 def test_a_plan_keeps_the_settings_of_the_scene():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -99,6 +100,38 @@ def test_density_of_speckle():
     assert torch.autograd.gradcheck(lambda x: sensor.log_prob(y, x), x.clone().requires_grad_())
     dark = torch.cat([x, torch.zeros_like(x)], -3)
     torch.testing.assert_close(sensor.log_prob(torch.cat([y, torch.zeros_like(y)], -3), dark), torch.from_numpy(wanted))
+
+
+@pytest.mark.parametrize("looks", [1, 2.5, 12, 60])
+def test_density_of_shot_noise(looks):
+    """Noncentral chi-squared, from no light to bright lines, with derivatives."""
+    sensor = BeatNoise(3.0, looks)
+    x = torch.tensor([0.0, 1e-3, 0.2, 4.0, 900.0], dtype=torch.float64).reshape(1, 5, 1, 1)
+    for factor in (0.3, 1.0, 2.5):
+        y = factor * sensor.expected(x)
+        wanted = stats.ncx2.logpdf(2 * looks * y.numpy(), 2 * looks, 6 * looks * x.numpy()) + np.log(2 * looks)
+        central = stats.chi2.logpdf(2 * looks * y[:, :1].numpy(), 2 * looks) + np.log(2 * looks)
+        total = torch.from_numpy(np.concatenate([central, wanted[:, 1:]], 1).sum(1))
+        torch.testing.assert_close(sensor.log_prob(y, x), total, rtol=1e-8, atol=1e-6)
+    assert torch.autograd.gradcheck(lambda x: sensor.log_prob(y, x), (x + 0.01).requires_grad_())
+    dark = torch.zeros(1, 3, 1, 1, requires_grad=True)
+    sensor.log_prob(torch.full((1, 3, 1, 1), 2.0), dark).sum().backward()
+    # At no light by looks (y - 1) of the photons.
+    torch.testing.assert_close(dark.grad, torch.full_like(dark, 3.0 * looks))
+
+
+def test_scores_of_shot_noise():
+    """The mean of the slope of the likelihood is zero, its mean square the Fisher information of the power."""
+    sensor, n = BeatNoise(1.0, 2), torch.full((20 * DRAWS, 1, 1, 1), 3.0, dtype=torch.float64, requires_grad=True)
+    y = sensor.sample(n, torch.Generator().manual_seed(11))
+    (slope,) = torch.autograd.grad(sensor.log_prob(y, n).sum(), n)
+    slope = slope.flatten()
+    error = float(slope.std()) / len(slope) ** 0.5
+    assert abs(float(slope.mean())) < 4 * error
+    # Fisher information by differences of the mean log-likelihood.
+    h = 0.05
+    ahead, here, behind = (float(sensor.log_prob(y, n.detach() + s * h).mean()) for s in (1, 0, -1))
+    assert float(slope.square().mean()) == pytest.approx(-(ahead - 2 * here + behind) / h**2, rel=0.05)
 
 
 def test_likelihood_finds_the_power():

@@ -56,11 +56,15 @@ def second_pair(index: Any) -> Any:
     """Return numbers of Sobol's points that, beside those of ``index``, spread evenly in four dimensions.
 
     A linear map of the bits, triangular, so that of every aligned block of ``2^m`` indices both pairs are nets. Of 16,
-    64 and 256 points the four coordinates are a (t, m, 4)-net of t = 1, 2 and 2, where Sobol's first four have 2, 2
-    and 3 (of 1024 points 4 and 2): the best of some hundred products of three shifts.
+    64, 256, 1024 points the four coordinates are a (t, m, 4)-net of t = 1, 2, 2, 3, where Sobol's first four have 2, 2,
+    3, 2; of ``2^12`` to ``2^20`` points t is 4 to 6, of ``2^23`` 7. The best of some million products of shifts: each
+    step brings higher bits down, without which many points would fill the same few boxes again and again.
     """
     x = mi.UInt32(index)
-    for shift, mask in ((3, 0x0F0F0F0F), (3, 0x33333333), (5, 0x24924924)):
+    for shift, mask in (
+        (3, 0x0F0F0F0F), (3, 0x33333333), (5, 0x24924924), (8, 0xFFFF00FF), (10, 0xFFFF00FF), (7, 0xFFFFFFFF),
+        (6, 0x8F9CE4D7),
+    ):  # fmt: skip
         x ^= (x & mi.UInt32(mask)) >> shift
     return x
 

@@ -37,6 +37,20 @@ def sees_one_line(sensor: Any) -> bool:
     return all(one.class_name() == "RadianceMeter" for one in sensors_of(sensor))
 
 
+def has_clip_planes(camera: Any) -> bool:
+    """Return True for projective cameras."""
+    return near_clip(camera) is not None
+
+
+def clip_planes_at(camera: Any, place: Any) -> tuple[Any, Any]:
+    """Return the points of both clip planes that a camera sees at places of the film in [0, 1]^2, through the middle of
+    its lens.
+    """
+    _, near, far = _axis_and_clips(camera)
+    o, way = SensorPlaces._line(camera, (place.x, place.y), mi.Point2f(0.5))
+    return o + way * near, o + way * far
+
+
 class SensorPlaces:
     """Places of the film by the points that they see.
 

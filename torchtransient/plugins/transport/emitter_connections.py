@@ -8,7 +8,7 @@ rarely drawn is attached at the vertex before (``_sun_ahead``). Arguments that a
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 from operator import or_
 
 import drjit as dr
@@ -18,7 +18,13 @@ from torchtransient.plugins.node_walk import carries_derivatives
 from torchtransient.plugins.polarized import first_column, intensity, product, scatter_unpolarized
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.transport.carry import slope_only
-from torchtransient.plugins.transport.geometry_terms import damped_motion, displacement, material_point, slide_on_shape
+from torchtransient.plugins.transport.geometry_terms import (
+    damped_motion,
+    displacement,
+    material_point,
+    point_of_light,
+    slide_on_shape,
+)
 from torchtransient.plugins.transport.strategy import Connection, Event, EventTerm, Local, Proposal, mis_weight
 
 
@@ -166,7 +172,7 @@ class EmitterSampled(Connection):
 
     def _by_faces(self, context, ref, ds, weight, active):
         """Return the sample with the solid angle of its face; Mitsuba takes that of the interpolated normal."""
-        _, _, there, n = self._found_by_ray(context, ref, ds, active & context.contents.smooth_lights.lists(ds.emitter))
+        _, _, there, n = point_of_light(context, ref, ds, active & context.contents.smooth_lights.lists(ds.emitter))
         cos = dr.abs_dot(ds.n, ds.d)
         ratio = dr.select(there & (cos > 0), dr.abs_dot(n, ds.d) / cos, 1)
         ds.pdf = dr.select(ratio > 0, ds.pdf / ratio, 0)
@@ -274,7 +280,8 @@ class EmitterSampled(Connection):
             slope = slope + slope_only(vertex.carry.η * length)
         term = EventTerm(value=value, slope=slope, opl=opl, active=lit, arrival=v.arrival(self.name))
         if context.velocities is not None:
-            end = context.velocities.of_light(light.ds.emitter, light.p, lit)
+            found = partial(self._found, context, si, light)
+            end = context.velocities.of_light(light.ds.emitter, light.p, lit, found)
             set_rate(vertex, term, end, d, vertex.carry.η * towards.eta, wanted)
         return [term]
 
@@ -310,24 +317,10 @@ class EmitterSampled(Connection):
             self._follow_shape(context, si, light)
         return light
 
-    @staticmethod
-    def _found_by_ray(context, ref, ds, active):
-        """Trace a ray to the point of a light, whose shape the hit knows.
-
-        Returns:
-            (ray, PreliminaryIntersection3f, mask of rays that find the light, normal of the face there).
-        """
-        with dr.suspend_grad():
-            ray = ref.spawn_ray(ds.d)
-            pi = context.segment.next_surface(context, ray, active)
-            there = active & pi.is_valid()
-            found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
-            return ray, pi, there & (found.emitter(context.scene) == ds.emitter), found.n
-
     def _found(self, context, si, light):
-        """Return :meth:`_found_by_ray` for the point of ``light``, traced once."""
+        """Return :func:`~.geometry_terms.point_of_light` for the point of ``light``, traced once."""
         if light.found is None:
-            light.found = self._found_by_ray(context, si, light.ds, light.surface)
+            light.found = point_of_light(context, si, light.ds, light.surface)
         return light.found
 
     def _follow_shape(self, context, si, light):

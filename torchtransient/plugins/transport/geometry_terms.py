@@ -46,6 +46,27 @@ def material_point(pi, ray, active, meshes=None, surfaces=None):
     return si, dr.norm(dr.select(active, area, mi.Vector3f(0, 0, 1)))
 
 
+def point_of_light(context, ref, ds, active):
+    """Trace a ray to the point of a light, whose shape the hit knows.
+
+    Args:
+        ref: Interaction3f that the light is seen from.
+        ds: the point, with ``p`` and ``emitter`` as of a DirectionSample3f.
+        active: mask of lanes.
+
+    Returns:
+        (ray, PreliminaryIntersection3f, mask of rays that find the light, normal of the face there).
+    """
+    with dr.suspend_grad():
+        # Towards the point itself: a ray in direction ``ds.d`` leaves from beside ``ref``, and passes beside the point.
+        ray = ref.spawn_ray_to(ds.p)
+        ray.maxt = dr.inf
+        pi = context.segment.next_surface(context, ray, active)
+        there = active & pi.is_valid()
+        found = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+        return ray, pi, there & (found.emitter(context.scene) == ds.emitter), found.n
+
+
 def slide_on_shape(pi, ray, drag, active):
     """Return how a hit that slides on its shape, held in place, changes as its ray is shifted.
 

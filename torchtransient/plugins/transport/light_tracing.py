@@ -51,7 +51,7 @@ class SensorSampled(Connection):
         return Proposal(d=ds.d, active=active & (ds.pdf > 0), ds=ds, importance=importance, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
 
-    def end_velocity(self, context, proposal):
+    def end_velocity(self, context, vertex, proposal):
         return context.velocities.of_sensor(proposal.ds.p)
 
     def connect(self, context, path, vertex, proposal, answer, zeros):

@@ -469,9 +469,13 @@ class Connection(Strategy):
         """
         raise NotImplementedError
 
-    def end_velocity(self, context: Any, proposal: Any) -> Any:
+    def end_velocity(self, context: Any, vertex: Any, proposal: Any) -> Any:
         """Return the velocity of the point that a proposal leads to (Vector3f, m/s)."""
-        return context.velocities.of_light(proposal.ds.emitter, proposal.ds.p, proposal.active)
+        return context.velocities.of_sampled_light(context, vertex.at, proposal.ds, proposal.active)
+
+    def rate_beyond(self, proposal: Any) -> Any:
+        """Return the rate of the way beyond that point, m/s: of a connection that goes on from there."""
+        return 0
 
     def density(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
         """Return the density with which the strategy samples a point of a light, None if it samples no points.

@@ -14,7 +14,8 @@ of the whole image by time, with its weights and outlines: those are poses at se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -23,9 +24,10 @@ import mitsuba as mi
 from torchtransient.checks import some_of
 from torchtransient.errors import SceneError
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance, moved_by
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
+from torchtransient.plugins.transport.geometry_terms import point_of_light
 
 # Rows of the table before those of the bodies: rest, and the sensor.
 REST, SENSOR, FIRST = 0, 1, 2
@@ -39,6 +41,7 @@ class Movers:
         shapes, emitters, media: bodies of that kind and the numbers of their motions.
         sensors: number of the motion by the sensor's pointer.
         meshes: meshes with velocities at their vertices.
+        winds: (medium, volume of its velocities).
 
     Raises:
         SceneError: for motions of what is not there, of several at once, or that has none.
@@ -46,7 +49,7 @@ class Movers:
 
     def __init__(self, scene: Any) -> None:
         shapes = shapes_of_scene(scene)
-        pairs = _motions(scene, shapes)
+        pairs, self.winds = _motions(scene, shapes), _winds(scene, shapes)
         self.motions = list({motion.ptr: motion for _, motion in pairs}.values())
         numbers = {motion.ptr: FIRST + n for n, motion in enumerate(self.motions)}
         found: dict[int, int] = {}
@@ -60,6 +63,9 @@ class Movers:
 
         self.shapes, self.emitters, self.media = of_kind(mi.Shape), of_kind(mi.Emitter), of_kind(mi.Medium)
         self.sensors = {sensor.ptr: number for sensor, number in of_kind(mi.Sensor)}
+        for medium, _ in self.winds:
+            if found.setdefault(medium.ptr, REST) != REST:
+                raise SceneError(f"{medium.id()!r}: expected one velocity, got a rigid_motion and a volume.")
         # What is part of a shape moves with it, and so does the medium inside.
         for medium, number in _inside(self.shapes, shapes):
             if found.setdefault(medium.ptr, number) == number:
@@ -73,15 +79,14 @@ class Movers:
                     self.emitters.append((part, found[shape.ptr]))
         self.meshes = [shape for shape in shapes if has_velocities(shape)]
         own = {shape.ptr for shape in scene.shapes()}
-        wrong = [mesh.id() for mesh in self.meshes if mesh.is_emitter() or mesh.ptr not in own]
-        if wrong:
+        if wrong := [mesh.id() for mesh in self.meshes if mesh.ptr not in own]:
             raise SceneError(
-                f"{some_of(wrong)}: {VELOCITY} of a light, or inside of a shape group, is not supported; expected a "
-                "mesh of the scene that does not shine. Lights and instances take a 'velocity' of type 'rigid_motion'."
+                f"{some_of(wrong)}: {VELOCITY} inside of a shape group is not supported; expected a mesh of the scene. "
+                "Instances take a 'velocity' of type 'rigid_motion'."
             )
 
     def __bool__(self) -> bool:
-        return bool(self.motions or self.meshes)
+        return bool(self.motions or self.meshes or self.winds)
 
 
 def unmeasured(keys: Sequence[str]) -> str:
@@ -135,6 +140,23 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
             if any(mi.has_flag(body.flags(), flag) for flag in far):
                 raise SceneError(f"{body.id()!r}: expected a near light; light from infinity has no place that moves.")
     return pairs
+
+
+def _winds(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
+    """Return (medium, volume) of the media whose velocities are volumes. Raises SceneError for others."""
+    media = {medium.id(): medium for medium in _media_of(scene, shapes)}
+    winds = [(moved_by(held), held) for _, held in objects_of(scene)]
+    for name, volume in winds:
+        if name is None:
+            continue
+        if name not in media:
+            raise SceneError(f"{volume.id()!r}: expected the name of a medium, got {name!r}; other bodies are rigid.")
+        if volume.channel_count() != 3:
+            raise SceneError(
+                f"{volume.id()!r}: expected velocities in three channels, m/s, got {volume.channel_count()}. A "
+                "gridvolume of them has raw=true and data (Z, Y, X, 3)."
+            )
+    return [(media[name], volume) for name, volume in winds if name is not None]
 
 
 def _inside(moving: list[tuple[Any, int]], shapes: list[Any]) -> list[tuple[Any, int]]:
@@ -201,8 +223,12 @@ class Velocities:
             PointerTable([body for body, _ in found], [number for _, number in found]) if found else None
             for found in (movers.shapes, movers.emitters, movers.media)
         )
+        self._winds = [volume for _, volume in movers.winds]
+        numbers = range(1, 1 + len(self._winds))
+        self._wind_of = PointerTable([body for body, _ in movers.winds], list(numbers)) if self._winds else None
         self._instances = any(is_instance(shape) for shape, _ in movers.shapes)
         self._meshes = PointerTable.marking(movers.meshes)
+        self._mesh_lights = PointerTable.marking([mesh.emitter() for mesh in movers.meshes if mesh.is_emitter()])
 
     def tables(self) -> list[Any]:
         """Return the arrays that were computed from parameters."""
@@ -231,13 +257,45 @@ class Velocities:
         """Return the velocity of the sensor's point ``p``."""
         return self._row(mi.UInt32(SENSOR), p, mi.Bool(True)) if self.sensor_moves else mi.Vector3f(0)
 
-    def of_light(self, emitter: Any, p: Any, active: Any) -> Any:
-        """Return the velocity of the point ``p`` of a light; ``emitter`` is None for one outside of the scene."""
-        return mi.Vector3f(0) if emitter is None else self._listed(self._emitters, emitter, p, active)
+    def of_light(self, emitter: Any, p: Any, active: Any, found: Callable[[], Any]) -> Any:
+        """Return the velocity of the point ``p`` of a light.
+
+        Args:
+            found: function that returns :func:`.geometry_terms.point_of_light`, called where vertices of lights move.
+        """
+        v = self._listed(self._emitters, emitter, p, active)
+        if self._mesh_lights is None:
+            return v
+        with dr.suspend_grad():
+            ray, pi, there, _ = found()
+            there = active & there & self._mesh_lights.lists(emitter)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, there)
+        si.p = mi.Point3f(p)
+        return v + dr.select(there, mi.Vector3f(si.shape.eval_attribute_3(VELOCITY, si, there)), 0)
+
+    def of_sampled_light(self, context: Any, ref: Any, ds: Any, active: Any) -> Any:
+        """Return the velocity of a sampled point of a light, zero for one outside of the scene.
+
+        Args:
+            ref: Interaction3f that the light is seen from.
+            ds: the point, with ``p`` and ``emitter``, None outside of the scene.
+        """
+        if ds.emitter is None:
+            return mi.Vector3f(0)
+        return self.of_light(ds.emitter, ds.p, active, partial(point_of_light, context, ref, ds, active))
 
     def of_medium(self, medium: Any, p: Any, active: Any) -> Any:
         """Return the velocity of a medium at the point ``p``."""
-        return self._listed(self._media, medium, p, active)
+        v = self._listed(self._media, medium, p, active)
+        if self._wind_of is None:
+            return v
+        with dr.suspend_grad():
+            number = self._wind_of.look_up(medium, active)
+        for n, wind in enumerate(self._winds, 1):
+            on, at = active & (number == n), dr.zeros(mi.Interaction3f)
+            at.p = dr.select(on, mi.Point3f(p), 0)
+            v += dr.select(on, mi.Vector3f(wind.eval_3(at, on)), 0)
+        return v
 
     def of_surface(self, si: Any, active: Any) -> Any:
         """Return the velocity of the material point at a SurfaceInteraction3f."""
@@ -275,5 +333,6 @@ class Velocities:
         """Return the rate of the whole path of an event, Float."""
         if proposal is None or connection.unwarp:
             return vertex.rate
-        v = connection.end_velocity(context, proposal)
-        return vertex.rate + vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)
+        v = connection.end_velocity(context, vertex, proposal)
+        longer = vertex.η * answer.eta * dr.dot(v - vertex.velocity, proposal.d)
+        return vertex.rate + longer + connection.rate_beyond(proposal)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 import torch
@@ -25,9 +25,25 @@ _OFFSETS = 257
 _SAME_BIN = 1e-6
 
 
+class HasBeats(Protocol):
+    """`RenderOutput`, `Result` of a file: ``beats`` with ``chirps`` and ``axis``."""
+
+    @property
+    def beats(self) -> Tensor | None: ...
+    @property
+    def chirps(self) -> Chirps | None: ...
+    @property
+    def axis(self) -> TimeAxis | None: ...
+
+
 @in_single
 def range_and_speed(
-    beats: Tensor, chirps: Chirps, axis: TimeAxis, *, threshold: float = 0.0, bins: Bins = "sums"
+    beats: Tensor | HasBeats,
+    chirps: Chirps | None = None,
+    axis: TimeAxis | None = None,
+    *,
+    threshold: float = 0.0,
+    bins: Bins = "sums",
 ) -> tuple[Tensor, Tensor]:
     """Find distance and speed of approach by the largest bin of the up and of the down chirp.
 
@@ -37,9 +53,9 @@ def range_and_speed(
     1 / 150 where it is four.
 
     Args:
-        beats: power spectra (..., 2, T, H, W), up and down, with or without noise.
-        chirps: the chirps.
-        axis: axis over ``opl +- k rate``.
+        beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some.
+        chirps: the chirps; None for those of a result.
+        axis: axis over ``opl +- k rate``; likewise.
         bins: "sums" over the width of a bin, as films make them (``temporal_filter="box"``), or "samples" of the
             spectrum, as a transform and `CoherentReceiver` give them.
         threshold: power of the largest bin that is no return, and any below; in a unit of ``beats``.
@@ -57,9 +73,11 @@ def range_and_speed(
     both, they may be those of two. A line beyond the axis is taken for the middle of its first or last bin.
     """
     me = "range_and_speed"
-    check_bins(beats, me)
-    of_class(f"{me}: chirps", chirps, Chirps)
-    check_time_axis(axis, me)
+    if not isinstance(beats, Tensor) and isinstance(held := getattr(beats, "beats", None), Tensor):
+        chirps, axis = chirps or beats.chirps, axis or beats.axis
+        beats = held
+    beats = check_bins(beats, me)  # type: ignore[arg-type]
+    chirps, axis = of_class(f"{me}: chirps", chirps, Chirps), check_time_axis(axis, me)
     if not is_one_of(bins, KINDS_OF_BINS):
         raise ArgumentError(f"{me}: expected bins to be one of {', '.join(KINDS_OF_BINS)}, got {shown(bins)}.")
     level = check_number(threshold, "threshold", me, low=-math.inf)

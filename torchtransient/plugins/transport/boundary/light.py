@@ -78,7 +78,8 @@ class LightPass(BoundaryPass):
         path = start(lit, ray, τ - term.film.start_opl, dr.detach(middle.η))
         path.prev_p = dr.select(light.far, b.p, b.V)
         if context.velocities is not None:
-            path.prev_v = context.velocities.of_light(ds.emitter, ds.p, active & ~light.far)
+            seen = Local(p=ds.p, emitter=ds.emitter)
+            path.prev_v = context.velocities.of_sampled_light(context, at_point(b.beside, ray), seen, active & ~far)
         β = light.Le * mi.UnpolarizedSpectrum(T) * dr.select(most > 0, dr.rcp(most), 0)
         path.β, path.active = attenuated(mi.Spectrum(1), dr.select(active, β, 0)), active
         path.leg = lit.segment.depart(lit, ray, place, path.β, sampler, active)

@@ -32,6 +32,7 @@ from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shap
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
+from torchtransient.plugins.transport.boundary.clip_planes import clipped_shapes
 from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
 from torchtransient.plugins.transport.scene_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
@@ -92,6 +93,7 @@ class MovingEdges:
         scene: scene that is searched for textures with steps and for bodies that run into each other, or None.
         words: gaps that only the table of parameters names, whatever the scene.
         has_term: there is a boundary term.
+        sensors: sensors of the scene that see the edges.
     """
 
     def __init__(
@@ -101,10 +103,11 @@ class MovingEdges:
         scene: Any = None,
         words: Sequence[str] = (),
         has_term: bool = True,
+        sensors: Sequence[Any] = (),
     ) -> None:
         self.always, self.bent, self.words = tuple(always), tuple(bent), tuple(words)
         self.has_term = has_term
-        self._scene = scene
+        self._scene, self._sensors = scene, tuple(sensors)
         self._steps: dict[int, list[str]] = {}
 
     def lacking(self, node: Any, key: str, effect: ParameterEffect) -> tuple[Gap, ...]:
@@ -125,7 +128,8 @@ class MovingEdges:
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
-            found += self._crossings(None if effect.role == "sensor" else node)
+            moving = None if effect.role == "sensor" else node
+            found += self._crossings(moving) + self._clipped(moving)
         if effect.role == "sun" and self._scene is not None and _is_in_view(self._scene, node):
             found += (Gap("at the rim of the sun where it is itself in view", "Keep it out of the picture."),)
         return tuple(dict.fromkeys(found))
@@ -171,6 +175,19 @@ class MovingEdges:
         return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
 
 
+    @cached_property
+    def _clipped_shapes(self) -> list[Any]:
+        return [] if self._scene is None else clipped_shapes(self._scene, self._sensors)
+
+    def _clipped(self, shape: Any) -> tuple[Gap, ...]:
+        """Return the gap of clip planes that cut a shape in view; relative to a sensor that moves (None) any does."""
+        cut = [one for one in self._clipped_shapes if shape is None or one.ptr == shape.ptr]
+        if not cut:
+            return ()
+        where = f"where the clip planes of the camera cut {_listed_shapes(cut)}"
+        return (Gap(where, "Take a near_clip and a far_clip between which all lies that is in view."),)
+
+
 def missing(reason: str, remedy: str, *, is_asked_for: bool = False) -> MovingEdges:
     """Return the gaps of an integrator without a boundary term.
 
@@ -201,6 +218,10 @@ def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = Non
     if rims := [emitter.get_shape() or emitter for emitter in scene.emitters() if _has_rim(emitter)]:
         where = f"at the rim of the light of {_listed_shapes(rims)}"
         always.append(Gap(where, "Let the light fade out, by a beam_width below the cutoff_angle for instance."))
+    shapeless = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    if stepped := [one for one in shapeless if any(map(_has_steps, objects_below(one, mi.Texture)))]:
+        where = f"at the steps in the light of {_listed_shapes(stepped)}"
+        always.append(Gap(where, "Take a smooth texture there, of filter_type 'bilinear'."))
     for sensor in sensors:
         if sees_one_line(sensor):
             if lights := [emitter for emitter in scene.emitters() if _is_met_by_connections_alone(emitter)]:
@@ -216,7 +237,7 @@ def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = Non
     if smooth := _smooth_shapes(scene):
         always += _seen_through_delta_lobes(scene, sensors, smooth, max_depth)
         bent = edges_in_mirrors(scene)
-    return MovingEdges(always, bent, scene)
+    return MovingEdges(always, bent, scene, sensors=sensors)
 
 
 def rims_without_edges(scene: Any) -> list[Gap]:

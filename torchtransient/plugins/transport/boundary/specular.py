@@ -401,6 +401,8 @@ class SpecularPass(BoundaryPass):
             "ray": path.ray, "β": β, "η": path.η, "τ": path.τ, "prev_p": path.prev_p, "prev_n": path.prev_n,
             "depth": chain.count, "active": active, "medium": medium,
         }  # fmt: skip
+        if context.velocities is not None:
+            first |= {"rate": path.rate, "prev_v": path.prev_v}
         return both_sides(context, mode, sampler, view, b, past, first, factor, speeds, (mi.Bool(True), mi.Bool(True)))
 
 
@@ -464,6 +466,12 @@ class SensorThroughChain(Connection):
         ds = Local(p=seen.o, n=mi.Normal3f(0), d=-seen.d, dist=seen.way, delta=mi.Bool(True), emitter=None)
         return Proposal(d=-seen.d, active=active, ds=ds, seen=seen, through=through, depth=depth, u=sampler.next_2d(),
                         sampler=sampler)  # fmt: skip
+
+    def end_velocity(self, context, vertex, proposal):
+        return proposal.through.prev_v
+
+    def rate_beyond(self, proposal):
+        return proposal.through.rate
 
     def connect(self, context, path, vertex, proposal, answer, zeros):
         seen, through, ds = proposal.seen, proposal.through, proposal.ds

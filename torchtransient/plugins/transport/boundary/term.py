@@ -30,14 +30,11 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.errors import GradientError
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import topology_of
 from torchtransient.plugins.integrators.job import passes_of, seed_array
-from torchtransient.plugins.mitsuba_compat import is_instance
 from torchtransient.plugins.sensors.seen_from import SensorPlaces
 from torchtransient.plugins.transport.boundary.light import LightPass
-from torchtransient.plugins.transport.boundary.moving_edges import has_delta_lobe
 from torchtransient.plugins.transport.boundary.primary import PrimaryPass
 from torchtransient.plugins.transport.boundary.specular import (
     RAYS,
@@ -107,7 +104,6 @@ class BoundaryTerm:
         self.places = SensorPlaces(self.sensor, self.film, self.radius)
         self.is_meter = self.places.is_meter
         if sees_chains(context, self.sensor):
-            _check_chains_rest(context)
             with context.contents.hidden_from_mitsuba():
                 self.chains = Chains(integrator, context, self.places, self.independent(self._seed_of_chains, RAYS))
             self.through = SensorThroughChain(self.chains) if context.max_depth > 2 else None
@@ -180,16 +176,3 @@ class BoundaryTerm:
             weight = rfilter.eval(h.x) * rfilter.eval(h.y) * (n * n / (integral * integral))
         inside = dr.all((cell >= 0) & (cell < size))
         return mi.UInt32(dr.select(inside, cell.y, 0)), mi.UInt32(dr.select(inside, cell.x, 0)), weight, inside
-
-
-def _check_chains_rest(context):
-    """Raise GradientError where the film measures rates, and mirrors or the sensor have a velocity."""
-    velocities = context.velocities
-    if velocities is None:
-        return
-    bends = [shape for shape in context.scene.shapes() if is_instance(shape) or has_delta_lobe(shape)]
-    if velocities.sensor_moves or any(map(velocities.moves, bends)):
-        raise GradientError(
-            "films of rates: derivatives at edges that are seen in mirrors or through glass are those of mirrors, "
-            "glass and sensors without a velocity. Take the velocity away, or leave moving edges out: boundary=False."
-        )
