@@ -262,16 +262,6 @@ def test_lengths_over_a_box():
     assert tiny == TimeAxis(6.0, 2.0, 1)
 
 
-def test_normals_of_length_one_keep_their_digits():
-    points = [[0, 0, 0], [1.0, 0, 0]]
-    kept = torch.tensor([[0, 0, 1 + 0.9e-12], [0, 0, 1 - 0.9e-12]], dtype=F64)
-    assert torch.equal(lined(points, normals=kept).sensor_normals, kept)
-    given = torch.tensor([[0, 0, 1 + 1e-11], [0.0, 0.6, 0.4]], dtype=F64)
-    expected = given / given.norm(dim=1, keepdim=True)
-    found = lined(points, normals=given).sensor_normals
-    assert torch.equal(found, expected) and not torch.equal(found, given)
-
-
 @together(
     "make, error",
     [

@@ -236,15 +236,6 @@ def test_the_frame_of_a_mesh_is_the_smallest_rectangle_around_it():
     np.testing.assert_allclose(placed.normal, [1, 0, 0], atol=1e-12)
 
 
-def test_grids_run_along_their_own_sides():
-    points, _ = Wall.plane(4.0, 2.0).grid((2, 3), (0.25, 0.5, 0.75, 1.0), cell_centers=False)
-    # Rows along v from the middle to the upper edge, columns along u.
-    np.testing.assert_allclose(points[..., 0], [[-1, 1]] * 3, atol=1e-5)
-    np.testing.assert_allclose(points[..., 1], [[0, 0], [0.5, 0.5], [1, 1]], atol=1e-5)
-    alone, _ = Wall.plane(4.0, 2.0).grid((1, 2), (0.25, 0.5, 0.75, 1.0), cell_centers=False)
-    np.testing.assert_allclose(alone[..., 0], [[0], [0]], atol=1e-12)
-
-
 def test_normals_of_triangles_are_of_length_one_or_zero():
     corners = np.array([[[0.0, 0, 0], [2, 0, 0], [0, 3, 0]], [[0, 0, 0], [0, 3, 0], [2, 0, 0]], [[0, 0, 0]] * 3,
                         [[0, 0, 0], [0, 0, 2], [0, 5, 0]]])  # fmt: skip
@@ -267,12 +258,6 @@ def test_rays_meet_what_is_before_them_up_to_the_edges():
     found, _ = first_hits(np.array([[0.5, 1.0, -2.0]]), -down, corners)
     assert found.tolist() == [2.0]
     assert np.isinf(first_hits(np.array([[0.5, 1.0, -2.0]]), np.array([1.0, 0, 0]), corners)[0]).all()
-
-
-def test_of_equally_near_triangles_the_first_counts():
-    plate = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]])
-    corners = np.stack([plate - np.array([0, 0, 1.0]), plate, plate[::-1], plate])
-    assert first_hits(np.array([[0.5, -0.5, 2.0]]), np.array([0.0, 0, -1]), corners)[1].tolist() == [1]
 
 
 def split(share):

@@ -314,7 +314,7 @@ def plan(
     loaded = load(scene)
     named = {"frequencies": frequencies, "gates": gates, "rates": rates, "chirps": chirps}
     given = requested_film(film, named)
-    wanted = _checked_outputs(outputs or ("transient" if given is None else given.output))
+    wanted = _checked_outputs(outputs, given)
     inventory = scene_inventory(loaded, sensor)
     own_axis = None if given is None else given.attributes().get("axis")
     if own_axis is not None:
@@ -437,7 +437,9 @@ def known_outputs() -> tuple[str, ...]:
     return (*(kind.output for kind in FILMS), *_ANY_FILM)
 
 
-def _checked_outputs(outputs: Sequence[str] | str) -> tuple[str, ...]:
+def _checked_outputs(outputs: Sequence[str] | str | None, given: FilmLayout | None) -> tuple[str, ...]:
+    if outputs is None:
+        outputs = "transient" if given is None else given.output
     wanted = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
     films, known = tuple(kind.output for kind in FILMS), known_outputs()
     if not wanted or not all(is_one_of(name, known) for name in wanted):
