@@ -78,7 +78,7 @@ SMOKE_TESTS := tests/test_axes.py tests/test_scalar_state.py tests/test_public_n
 	tests/cli/test_doctor.py tests/files tests/geometry tests/parametrize/test_poses.py \
 	tests/parametrize/test_state.py tests/vis/test_scans.py tests/data/storage \
 	tests/data/augmentation/test_image_types.py tests/training/test_checkpoint.py \
-	tests/reconstruction/test_hidden_volume.py tests/sensing/devices/test_devices.py
+	tests/reconstruction/test_hidden_volume.py tests/sensing/test_devices.py
 
 test-lowest:
 	test -x $(LOWEST)/bin/python || $(PYTHON) -m venv $(LOWEST)

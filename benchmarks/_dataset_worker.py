@@ -29,8 +29,8 @@ import numpy as np
 import torch
 from _dataset_cases import NoOne, captures, described, moving_boxes, several_views
 
-from torchtransient.data.generation.settings import Settings
-from torchtransient.data.generation.shard_making import ShardMaker
+from torchtransient.data.run_settings import RunSettings
+from torchtransient.data.shard_making import ShardMaker
 from torchtransient.scene.variant import active_variant
 
 CPU = time.process_time
@@ -42,7 +42,7 @@ class Shards:
 
     def __init__(self, recipe: Any, folder: str, count: int) -> None:
         self.recipe, self.folder, self.count = recipe, Path(folder), count
-        self.maker = ShardMaker(Settings(recipe, folder, 10**6, "exact", "blosc2", 0))
+        self.maker = ShardMaker(RunSettings(recipe, folder, 10**6, "exact", "blosc2", 0))
         measured = self.maker.measure(range(1), NoOne())
         self.megabytes = measured.sample_bytes / MB
         self.described = {"per_shard": count, "about": measured.about, "recipe": recipe.to_dict()}

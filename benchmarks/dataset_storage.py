@@ -22,10 +22,7 @@ import torch
 from _runner import arguments, environment, interleave, report, summary  # before the package, which it chooses
 
 import torchtransient as tt
-from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.storage.manifest import verify
-from torchtransient.data.storage.shard_file import Shard, ShardWriter
-from torchtransient.data.storage.web_dataset import export_web_dataset, read_web_dataset
+from torchtransient.data import Shard, ShardWriter, TransientDataset, export_web_dataset, read_web_dataset, verify
 
 WINDOW = slice(496, 560)
 PHOTONS = 500

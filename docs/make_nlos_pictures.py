@@ -31,7 +31,7 @@ def frames_row(capture: tt.nlos.Capture) -> np.ndarray:
     light = capture.transient.sum((0, 2, 3)).cumsum(0)
     share = light / light[-1]
     first, last = int((share > 0.02).nonzero()[0]), int((share > 0.9).nonzero()[0])
-    shown = tt.vis.wall_frames(capture, scale=3)
+    shown = tt.vis.frames(capture, scale=3)
     chosen = [shown[int(k)] for k in np.linspace(first, last, FRAMES)]
     gap = np.full((chosen[0].shape[0], 4, 3), 255, np.uint8)
     return np.concatenate([part for frame in chosen for part in (frame, gap)][:-1], axis=1)
@@ -50,7 +50,7 @@ def main(names: list[str]) -> None:
         figures = {
             "layout": tt.vis.scan_layout(scan, hidden=hidden, title=f"nlos_{name}"),
             "transients": tt.vis.transients_grid(capture, rows=4, columns=4),
-            "peak": tt.vis.peak_time_map(capture),
+            "peak": tt.vis.peak_time_picture(capture),
         }
         for kind, figure in figures.items():
             figure.savefig(OUT / f"{name}_{kind}.png", dpi=60)

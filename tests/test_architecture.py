@@ -52,12 +52,6 @@ HEAVY = {
     "matplotlib", "h5py", "kornia", "scipy", "imageio", "imageio_ffmpeg", "PIL", "click", "rich", "hdf5plugin",
     "zstandard", "webdataset", "ray", "bokeh", "playwright", "tensorboard", "IPython",
 }  # fmt: skip
-# The rooms of `sensing`: each reads those below it, and what `sensing` offers stands in its `__init__`.
-SENSING = {
-    "base": 0, "numerics": 1, "response": 2, "counts": 2,
-    "optics": 3, "timing": 3, "itof": 3, "dead_time": 3, "estimation": 3,
-    "cameras": 4, "coherent": 4, "spad": 4, "correlated_noise": 5, "pixels": 6, "chain": 7, "devices": 8,
-}  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES = {"file": 800, "function": 160}
 
@@ -171,33 +165,6 @@ def test_sizes():
                 assert node.end_lineno - node.lineno < MOST_LINES["function"], f"{dotted(path)}.{node.name}"
 
 
-def violations_in_sensing(path, package=PACKAGE):
-    """What is wrong with the imports of one file of `sensing`, a line each."""
-    room, *below = path.relative_to(package / "sensing").parts
-    if room == "__init__.py":
-        return
-    if not below or room not in SENSING:
-        yield f"{room} stands in no room of `sensing`; see SENSING in this test"
-        return
-    for line, name in imports(path, package):
-        if not name.startswith("torchtransient.sensing."):
-            continue
-        other = name.split(".")[2]
-        if other not in SENSING:
-            yield f"{path.name}:{line} {name}: import it from the file that it stands in"
-        elif other != room and SENSING[other] >= SENSING[room]:
-            yield f"{path.name}:{line} '{room}' (level {SENSING[room]}) imports '{other}' (level {SENSING[other]})"
-
-
-def test_rooms_of_sensing():
-    folder = PACKAGE / "sensing"
-    found = {room.name for room in folder.iterdir() if any(room.glob("*.py"))}
-    assert found == set(SENSING)
-    assert [line for path in sorted(folder.rglob("*.py")) for line in violations_in_sensing(path)] == []
-    tested = {room.name for room in (TESTS / "sensing").iterdir() if any(room.glob("test_*.py"))}
-    assert tested <= set(SENSING)
-
-
 def from_tests(path):
     """What a file takes from the tests: imports of their modules, and paths into their folder."""
     own = {p.stem for p in TESTS.glob("*") if not p.name.startswith("_")} | {"tests"}
@@ -263,9 +230,9 @@ ALWAYS = {"NotImplementedError", "AttributeError", "SystemExit"}
 BARE = {
     "checks.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "capture/capture.py": {"TypeError"},  # caught where tensors are made, and told
-    "data/reading/sample_draws.py": {"IndexError"},  # the protocol of sequences, which ends loops
-    "data/storage/shard_file.py": {"ValueError"},  # caught where files are opened, and told with their names
-    "data/storage/web_dataset.py": {"ValueError"},  # likewise
+    "data/sample.py": {"IndexError"},  # the protocol of sequences, which ends loops
+    "data/shards.py": {"ValueError"},  # caught where files are opened, and told with their names
+    "data/exports.py": {"ValueError"},  # likewise
     "files/captures/matlab.py": {"ValueError"},  # likewise
     "files/plain_data.py": {"ValueError"},  # likewise
     "files/result_file.py": {"ValueError"},  # likewise
@@ -273,7 +240,7 @@ BARE = {
     "losses/loss_module.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
-    "vis/video.py": {"IndexError"},  # the protocol of sequences
+    "vis/videos.py": {"IndexError"},  # the protocol of sequences
 }
 
 

@@ -28,8 +28,6 @@ def test_errors_have_the_bases_of_python():
 
 
 PICTURES = {
-    "cyclic_map": ("matplotlib", lambda vis, cube: vis.cyclic_map("hsv")),
-    "rainbow_map": ("matplotlib", lambda vis, cube: vis.rainbow_map()),
     "gradient_picture": ("matplotlib", lambda vis, cube: vis.gradient_picture(cube[:, 0])),
     "streak": ("matplotlib", lambda vis, cube: vis.streak(cube, row=0)),
     "a time under frames": ("PIL", lambda vis, cube: vis.frames(cube, axis=AXIS, stamp=True)[0]),

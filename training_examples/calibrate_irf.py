@@ -130,7 +130,7 @@ class Zones(nn.Module):
     def forward(self, bins: int) -> Tensor:
         """(zones, T): the model's histograms."""
         edges = torch.arange(bins + 1, dtype=torch.float64)
-        sigma = self.log_fwhm_bins.exp() / sensing.response.response_shapes.FWHM_PER_SIGMA
+        sigma = self.log_fwhm_bins.exp() / sensing.responses.FWHM_PER_SIGMA
         cdf = sensing.emg_cdf(
             edges.expand(len(self.arrival_bins), -1), self.arrival_bins[:, None], sigma, self.log_tail_bins.exp()
         )

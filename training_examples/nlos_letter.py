@@ -23,13 +23,15 @@ import json
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn import functional
 from tqdm import tqdm
@@ -347,12 +349,84 @@ def run(what: str, kind: str, seed: int, settings: Settings, folder: Path) -> Fi
     arrays_of |= {key.replace(" ", "_"): mesh.numpy() for key, mesh in (meshes | {"truth": truth}).items()}
     counts = measurement.counts.to(torch.int32).numpy()
     np.savez_compressed(folder / f"{name}.npz", counts=counts, faces=faces.numpy(), losses=fit.losses, **arrays_of)
-    tt.vis.plot_shape_fit(
-        measurement.scan, meshes | {"truth": truth}, faces, transients=expected, axis=measurement.axis,
-            losses=fit.losses, errors=fit.errors,
-        path=folder / f"{name}.png",
-    )  # fmt: skip
+    draw(fit, measurement, meshes | {"truth": truth}, faces.numpy(), expected, folder / f"{name}.png")
     return fit
+
+
+# -------------------------------------------------------------------------------------------------------- the figure
+
+
+def draw(
+    fit: Fit, measurement: Measurement, meshes: Mapping[str, Tensor], faces: Any, expected: Mapping[str, Tensor],
+    path: Path,
+) -> None:  # fmt: skip
+    """Write the fit as a picture: the letter from the wall and from above, three transients, loss and errors."""
+    colours = dict(zip(meshes, ("0.55", "tab:blue", "tab:orange", "tab:purple"), strict=False))
+    colours[list(meshes)[-1]] = "tab:green"
+    figure = Figure(figsize=(11.0, 7.4), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.25, 1.0)).flat
+    front, above = upper.subplots(1, 2)
+    vertices = {name: mesh.numpy() for name, mesh in meshes.items()}
+    draw_views(front, above, measurement.scan, vertices, faces, colours)
+    *panels, last = lower.subplots(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.2))
+    axis = measurement.axis
+    together = -(-axis.num_bins // 128)  # finer bins are added up
+    whole = axis.num_bins // together * together
+    edges = axis.edges_opl.numpy()[: whole + 1 : together]
+    for n, panel in enumerate(panels):
+        for name, cube in expected.items():
+            row, column = (int((2 * n + 1) * size / 6) for size in cube.shape[1:])
+            values = cube[:whole, row, column].detach().cpu().numpy().reshape(-1, together).sum(1)
+            panel.stairs(values, edges, color=colours.get(name, "0.75"), linewidth=1.1, label=name)
+        panel.set_title(f"point {column}, {row}", fontsize=9)
+        panel.set_xlabel("optical path length (m)", fontsize=8)
+        panel.tick_params(labelsize=7)
+        panel.margins(x=0)
+    panels[0].set_ylabel("counts", fontsize=8)
+    panels[0].legend(fontsize=7, frameon=False)
+    for n, (name, errors) in enumerate(fit.errors.items()):
+        last.plot(errors, color=f"C{n}", linewidth=1.2, label=name)
+    last.set_yscale("log")
+    last.set_xlabel("step", fontsize=8)
+    last.tick_params(labelsize=7, which="both")
+    last.grid(True, color="0.9", linewidth=0.6)
+    twin = last.twinx()
+    twin.plot(fit.losses, color="0.6", linewidth=0.8, linestyle="--", label="loss")
+    twin.set_yscale("log")
+    twin.tick_params(labelsize=7, colors="0.6", which="both")
+    lines = [*last.get_lines(), *twin.get_lines()]
+    last.legend(lines, [line.get_label() for line in lines], fontsize=7, frameon=False)
+    last.set_title("errors, and the loss (dashed)", fontsize=9)
+    figure.savefig(path, dpi=120)
+
+
+def draw_views(front: Any, above: Any, scan: Any, meshes: Mapping[str, Any], faces: Any, colours: Any) -> None:
+    """Draw meshes as the wall sees them, along its axes u and v, and from above, along u and its normal."""
+    wall = tt.nlos.Wall.of(scan.wall)
+    frame = np.stack([axis / np.linalg.norm(axis) for axis in (wall.half_u, wall.half_v, wall.normal)], axis=1)
+    points = (scan.sensor_points.numpy().reshape(-1, 3) - wall.center) @ frame
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    rims = unique[count == 1]
+    for panel, (i, j) in ((front, (0, 1)), (above, (0, 2))):
+        panel.scatter(points[:, i], points[:, j], s=1.5, color="0.8", linewidths=0)
+        # The truth first and broad, so that what was found shows on it.
+        for n, name in enumerate(sorted(meshes, key=list(meshes)[-1].__ne__)):
+            corners, width = ((meshes[name] - wall.center) @ frame)[:, [i, j]], 1.3 if n else 3.5
+            fill = PolyCollection(list(corners[faces]), facecolor=colours[name], edgecolor="none", alpha=0.15)
+            panel.add_collection(fill)
+            panel.add_collection(LineCollection(list(corners[rims]), color=colours[name], linewidth=width, label=name))
+            panel.autoscale_view()
+        panel.set_aspect("equal")
+        panel.set_xlabel("along the wall (m)")
+    front.set_ylabel("up (m)")
+    front.set_title("seen from the wall", fontsize=10)
+    front.legend(fontsize=8, frameon=False, loc="upper left")
+    above.set_ylabel("distance from the wall (m)")
+    above.set_title("seen from above", fontsize=10)
+
+
+# ------------------------------------------------------------------------------------------------------- command line
 
 
 def summary(fits: Sequence[Fit]) -> dict[str, Any]:

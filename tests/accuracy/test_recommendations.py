@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from torchtransient.accuracy import AccuracyReport
-from torchtransient.accuracy.errors_of_estimates import ErrorTally, Reference, Tail
-from torchtransient.accuracy.measure import Estimates, Task, measure
+from torchtransient.accuracy.cost import Estimates, Task, measure
+from torchtransient.accuracy.errors_of_estimates import Tail
 from torchtransient.accuracy.report import Choice, CostPoint
 from torchtransient.accuracy.statistics import student_t_quantile
 from torchtransient.errors import ArgumentError, StorageError, UnitError
@@ -69,12 +69,6 @@ def test_two_points_of_as_many_samples():
     assert (found.spp, found.error) == (16, 0.4)
 
 
-@pytest.mark.parametrize("error", [0.0, 1.0, 5])
-def test_errors_are_shares(report, error):
-    with pytest.raises(UnitError, match="recommend: error"):
-        report.recommend(error)
-
-
 def test_what_no_setting_reaches(report):
     with pytest.raises(ArgumentError, match=r"got 1\.00%; the least is 6\.25%, of 256 spp \[independent, box\]\."):
         report.recommend(0.01)
@@ -88,15 +82,6 @@ def test_what_no_setting_reaches(report):
     unknown = AccuracyReport([point(SLOW, 4, 1.0, math.nan)], "")
     with pytest.raises(ArgumentError, match="no curve of transient has an error that is known"):
         unknown.recommend(0.1)
-
-
-def test_errors_that_rise_and_errors_of_zero():
-    """The fewest samples whose error is small enough, wherever the curve goes from there."""
-    bumpy = [point(SLOW, n, n, e) for n, e in zip(SPP, (0.4, 0.1, 0.3, 0.05), strict=True)]
-    assert AccuracyReport(bumpy, "").recommend(0.2).spp == 8
-    exact = [point(SLOW, 4, 1.0, 0.4), point(SLOW, 16, 4.0, 0.0)]
-    found = AccuracyReport(exact, "").recommend(0.2)
-    assert (found.spp, found.error, found.seconds) == (16, 0.0, 4.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -210,20 +195,6 @@ def test_without_a_finest_setting_there_is_no_total_error():
     assert math.isnan(only.total_error) and math.isnan(only.bias) and only.error == only.relative_error
 
 
-def test_a_reference_that_is_noisy_says_so():
-    """A scalar against a reference of few samples: squared errors are off by more than their runs scatter."""
-    off, said = [], []
-    for seed in range(300):
-        rng = np.random.default_rng(seed)
-        tally = ErrorTally(None, Reference(*rng.normal(0, 1.0, (2, 1))))
-        for run in rng.normal(5.0, 0.1, (8, 1)):
-            tally.add(run)
-        found = tally.result()
-        off.append(found.squared - (25.0 + 0.01))
-        said.append(found.squared_standard_error)
-    assert np.sqrt(np.mean(np.square(said))) == pytest.approx(np.std(off), rel=0.2)
-
-
 def test_time_of_the_processor_is_told_apart():
     def run(spp, seed):
         time.sleep(0.05)
@@ -231,20 +202,6 @@ def test_time_of_the_processor_is_told_apart():
 
     (p,) = measure({SLOW: {"values": Task(run)}}, (4,), repeats=2, progress=False).points
     assert p.seconds >= 0.05 and p.cpu_seconds < 0.02
-
-
-def test_what_brings_arrays_to_one_shape_is_not_timed():
-    def halves(x):
-        time.sleep(0.05)
-        return np.repeat(x, 2) / 2
-
-    task = Task(lambda spp, seed: Estimates({"transient": np.array([2.0, 4.0])}, spp), to_common={"transient": halves})
-    fine = Task(lambda spp, seed: Estimates({"transient": np.array([1.0, 1.0, 3.0, 1.0])}, spp))
-    report = measure({SLOW: {"values": fine}, BIASED: {"values": task}}, (4,), repeats=2, progress=False,
-                     finest={"values": SLOW})  # fmt: skip
-    wide = report.points[1]
-    assert wide.total_squared_error == pytest.approx(0.5) and wide.total_error == pytest.approx(math.sqrt(0.5 / 3))
-    assert wide.squared_error == 0 and wide.seconds < 0.04
 
 
 def test_a_file_and_back(tmp_path, report):

@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy import special, stats
+from scipy import stats
 
 from torchtransient.accuracy import statistics as st
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.testing.finite_differences import central_difference
-
-
-@pytest.mark.parametrize(
-    "a, b, x", [(0.5, 0.5, 0.3), (2.0, 0.5, 0.999), (15.0, 0.5, 1e-3), (1.5, 0.5, 1e-12), (3.5, 9, 0.2)]
-)
-def test_incomplete_beta(a, b, x):
-    np.testing.assert_allclose(st._incomplete_beta(a, b, x), special.betainc(a, b, x), rtol=1e-12)
 
 
 @pytest.mark.parametrize("t, dof", [(0.0, 3), (1.0, 1), (-2.5, 4), (12.0, 7), (-4.0, 250), (2.2, 3.7)])
@@ -118,15 +111,10 @@ def test_richardson_cancels_the_second_order():
     [
         (lambda: st.z_test([1.0], 1.0), ShapeError),
         (lambda: st.z_test(np.zeros((3, 4)), np.zeros(5)), ShapeError),
-        (lambda: st.two_sample_z_test(np.zeros((3, 4)), np.zeros((3, 5))), ShapeError),
         (lambda: st.z_test(np.zeros((3, 4)), 0.0, alpha=2.0), UnitError),
         (lambda: st.log_log_slope([1, 2], [1, 2]), ShapeError),
-        (lambda: st.log_log_slope([1, 2, 3], [1, 0, 2]), UnitError),
-        (lambda: st.log_log_slope([2, 2, 2], [1, 3, 2]), UnitError),
         (lambda: central_difference(lambda x, _: x, 1.0, 0.0, [0, 1]), UnitError),
-        (lambda: central_difference(lambda x, _: x, 1.0, 0.1, [0]), UnitError),
         (lambda: central_difference(lambda x, _: x, 1.0, 0.1, [0, 0]), UnitError),
-        (lambda: central_difference(lambda x, _: np.zeros(2 if x > 1 else 3), 1.0, 0.1, [0, 1]), ShapeError),
     ],
 )
 def test_errors(call, error):

@@ -92,7 +92,7 @@ def test_volumes_and_pictures_of_counts(dtype):
     for method in ("fk", "bp", "phasor"):
         torch.testing.assert_close(reconstruct(capture, method).values, reconstruct(precise, method).values)
     vis.transients_grid(capture)
-    vis.peak_time_map(capture)
+    vis.peak_time_picture(capture)
 
 
 def test_polarized_light_behind_a_slab_keeps_its_signs():

@@ -7,20 +7,18 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
 from support.pages import Page
 from torchtransient.cli.dataset import command
 from torchtransient.cli.main import main
-from torchtransient.data.recipes.checks import SAMPLES
-from torchtransient.data.recipes.distribution import Distribution
-from torchtransient.data.recipes.kept_scene import FIRST_RETURN
-from torchtransient.data.recipes.written import read_distribution
-from torchtransient.data.storage.chunks import chunk_shape
-from torchtransient.data.storage.encodings import MANTISSA_BITS, STORES
-from torchtransient.data.storage.shard_writing import FORMAT, SEAL, SEAL_BYTES
+from torchtransient.data import Distribution
+from torchtransient.data.checks import SAMPLES
+from torchtransient.data.maker import FIRST_RETURN
+from torchtransient.data.serialization import read_distribution
+from torchtransient.data.shard_format import MANTISSA_BITS, STORES, chunk_shape
+from torchtransient.data.shards import FORMAT, SEAL, SEAL_BYTES
 from torchtransient.rendering.labels import LABELS
 
 VARIANT = "llvm_ad_mono"
@@ -110,57 +108,6 @@ def test_costs_and_pictures(names, folder):
     assert pages[:-1] == here[:-1] and pages[-1].startswith("2000 samples ") and here[-1].startswith("6 samples ")
     assert (folder / "rooms.png").stat().st_size > 5000
     assert f"and at {SAMPLES} samples" in TEXT
-
-
-@pytest.mark.slow
-def test_what_is_read(names):
-    rooms = names["rooms"]
-    assert len(rooms) == 6 and set(names["item"]) == {"transient", "steady", "depth", "values", "outside", "index"}
-    assert names["numbers"].tolist() == list(range(6)) and names["failed"] == {}
-    window = names["window"]
-    assert (window.axis.start_opl, window.axis.num_bins) == (6.0, 80) and set(window[0]) == {
-        "transient", "depth", "outside", "index",
-    }  # fmt: skip
-    assert torch.equal(window[3]["transient"], rooms[3]["transient"][:, 20:100])
-    assert torch.equal(names["corner"][1]["transient"], rooms[1]["transient"][:, :64, :4, 4:])
-    assert names["stream"].num_samples == 6
-    assert names["transient"].shape == (1, 64, 8, 8) and names["bins"]["num_bins"] == 160
-    assert names["albedo"].shape == names["there"].shape == (1,) and names["there"].all()
-
-
-@pytest.mark.slow
-def test_augmented(names):
-    turned, plain = names["turned"], names["images"][0]
-    assert turned["transient"].shape == (1, 160, 6, 6) and set(turned) == set(plain)
-    assert torch.equal(names["augmented"][0]["depth"].nan_to_num(), turned["depth"].nan_to_num())
-    first, same = names["pair"][1], plain["depth"]
-    assert torch.equal(first, same) or torch.equal(first, same.flip(-1))
-    # Every pixel four times.
-    assert torch.equal(names["finer"]["depth"].nan_to_num(), plain["depth"].repeat_interleave(2, -1)
-                       .repeat_interleave(2, -2).nan_to_num())  # fmt: skip
-    assert names["smooth"].shape == plain["transient"].shape
-    assert torch.equal(names["filtered"][0]["measurement"], names["smooth"])
-
-
-@pytest.mark.slow
-def test_measurements(names):
-    counts = names["counts"]
-    assert counts.shape == (1, 160, 8, 8) and np.array_equal(counts, np.round(counts)) and counts.max() > 0
-    first, again = (names["noisy"][0]["measurement"] for _ in range(2))
-    assert not torch.equal(first, again)
-    first, again = (names["fixed"][0]["measurement"] for _ in range(2))
-    assert torch.equal(first, again) and not torch.equal(first, names["mean"])
-    assert set(names["fixed"][0]) == {"depth", "measurement", "outside", "index"}
-
-
-@pytest.mark.slow
-def test_online_and_exports(names, folder):
-    assert names["online"].drawn >= 12 and names["batch"]["index"].min() >= 6
-    assert [path.name for path in names["tars"]] == ["samples-000000.tar"]
-    assert torch.equal(names["first"]["transient"], names["rooms"][0]["transient"])
-    capture = tt.nlos.read_capture(folder / names["captures"][1])
-    bins = names["letters"].settings.time_axis.num_bins
-    assert capture.transient.shape == (1, bins, 4, 4) and capture.scan.kind == "confocal"
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, DelayedBSDFs, _distribution
 from torchtransient.plugins.guards import no_collection
 from torchtransient.pulses import Pulse
-from torchtransient.sensing.response.pulse import pulse_kernel
+from torchtransient.sensing.impulse_response import pulse_kernel
 from torchtransient.units import SPEED_OF_LIGHT
 
 VARIANT = "llvm_ad_mono"

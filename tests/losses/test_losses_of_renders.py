@@ -207,18 +207,3 @@ def test_two_seeds_are_the_squared_error_of_a_render_without_noise(draws):
     assert bool((deviations(two, wanted).abs() < 4).all())
     # what is claimed can be told from what is not: the spread is far below the bias of one seed
     assert float(deviations(one, wanted)[0]) > 8
-
-
-@pytest.mark.slow
-def test_the_noise_of_two_seeds_is_independent(renderer, converged):
-    """Residuals of two seeds are not correlated; those of one seed are the same."""
-    light = converged[0]
-    seeds = range(5000, 5064)
-    x = torch.full((len(seeds),), 0.45)
-    residual = renderer({GREY: x}, seed=list(seeds)).transient.detach().double() - light
-    lit = residual.square().mean(0) > 0
-    one, other = residual[0::2][:, lit], residual[1::2][:, lit]
-    products = (one * other).sum(1) / (one.square().sum(1) * other.square().sum(1)).sqrt()
-    assert abs(float(products.mean())) < 4 * float(products.std()) / len(products) ** 0.5
-    again = renderer({GREY: x[:2]}, seed=[5000, 5000]).transient
-    assert torch.equal(again[0], again[1])

@@ -91,15 +91,6 @@ def test_items_may_have_more_dimensions():
         loss(volume, measured)
 
 
-def test_compares_by_any_loss():
-    volume, counts = draw(1, 1, 4, 3, 3), torch.ones(1, 1, 4, 3, 3, dtype=torch.float64)
-    found = losses.measurement_consistency(volume, counts, lambda v: 2 * v, compare=losses.poisson_nll)
-    torch.testing.assert_close(found, losses.poisson_nll(2 * volume, counts))
-    shift = functools.partial(losses.wasserstein_loss, bin_width_opl=0.1)
-    found = losses.measurement_consistency(volume, counts, lambda v: 2 * v, compare=shift)
-    torch.testing.assert_close(found, losses.wasserstein_loss(2 * volume, counts, 0.1))
-
-
 def test_an_operator_of_the_library_learns_a_volume():
     """Descent along the gradient of `A = FK`'s adjoint, which is a volume of a measured wavefield; its tables move."""
     scan = Scan.grid(Wall.plane(1.0, 1.0), (4, 4), kind="confocal")

@@ -116,17 +116,6 @@ def test_neighbours_that_do_not_count_are_looked_at():
 
 
 @every
-def test_backward_inside_autocast(loss):
-    grads = []
-    for enabled in (False, True):
-        leaf = wavy().float().requires_grad_()
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
-            loss(leaf, RING).backward()
-        grads.append(leaf.grad)
-    torch.testing.assert_close(*grads, rtol=0, atol=0)
-
-
-@every
 def test_derivatives_and_batches(loss):
     batch = torch.stack([wavy(0), 2 * wavy(1)])
     assert torch.autograd.gradcheck(lambda v: loss(v, RING, reduction="none"), wavy().requires_grad_())

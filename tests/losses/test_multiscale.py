@@ -159,23 +159,6 @@ def of_a_record(input, target, *, mask, reduction):
     return (input - target).square().sum(2)
 
 
-@pytest.mark.slow
-def test_a_fit_of_many_scales_ends_at_the_mean():
-    """Of the Poisson likelihood, whose least is the mean of the counts at every scale."""
-    counts = torch.poisson(torch.full((1, 1, 64, 4, 4), 2.0), generator=torch.Generator().manual_seed(0))
-    level = torch.tensor(1.0, requires_grad=True)
-    optimizer = torch.optim.LBFGS([level], line_search_fn="strong_wolfe")
-
-    def closure():
-        optimizer.zero_grad()
-        value = losses.multiscale_loss(level * torch.ones_like(counts), counts, losses.poisson_nll)
-        value.backward()
-        return value
-
-    optimizer.step(closure)
-    assert float(level.detach()) == pytest.approx(float(counts.mean()), abs=0.02)
-
-
 NO_COMPARES = {
     "bin_width_opl=0.1": functools.partial(losses.wasserstein_loss, bin_width_opl=0.1),
     "dead_bins=3": functools.partial(losses.first_photon_nll, cycles=100, dead_bins=3.0),

@@ -221,9 +221,8 @@ def test_renders_of_the_library():
     """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
     from torchtransient.capture import Capture, Scan, Wall
     from torchtransient.files import Result
-    from torchtransient.reconstruction.hidden_volume import HiddenVolume
-    from torchtransient.reconstruction.voxels import VoxelGrid
-    from torchtransient.sensing.itof.itof_reading import ItofReading
+    from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
+    from torchtransient.sensing import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)
     scan = Scan.grid(Wall.plane(1.0, 1.0), (2, 2), kind="confocal")

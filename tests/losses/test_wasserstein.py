@@ -34,14 +34,6 @@ def test_a_shift_in_metres(shift, height):
     assert float(found) == pytest.approx(WIDTH * shift, rel=1e-12)
 
 
-def test_equals_the_distance_of_sorted_photons():
-    """Records of equal counts: photons in the order of their arrival, one by one."""
-    generator = torch.Generator().manual_seed(2)
-    a, b = (torch.randint(0, 40, (500,), generator=generator).sort().values for _ in range(2))
-    found = losses.wasserstein_loss(*(record(*torch.bincount(x, minlength=40).double()) for x in (a, b)), WIDTH)
-    assert float(found) == pytest.approx(WIDTH * float((a - b).abs().double().mean()), rel=1e-12)
-
-
 def test_agrees_with_scipy():
     a, b = draw(25, 0), draw(25, 1) ** 4
     found = losses.wasserstein_loss(a, b, WIDTH, reduction="none")

@@ -50,19 +50,6 @@ def test_small_errors_of_far_depths_and_many_pixels():
     assert float(metrics.depth_mae(x, torch.zeros_like(x))) == pytest.approx(float(x[0, 0]), rel=1e-7)
 
 
-def test_options_of_depth():
-    x = torch.ones(2, 2)
-    for threshold in (1.0, 0.5, math.nan, "1.25", True):
-        with pytest.raises(UnitError, match="threshold"):
-            metrics.depth_delta(x, x, threshold=threshold)
-    for beyond in (0, -1, math.nan, math.inf, None):
-        with pytest.raises(UnitError, match="beyond_m"):
-            metrics.depth_gross_errors(x, x, beyond_m=beyond)
-    assert math.isnan(float(metrics.depth_median_error(x, x, mask=torch.zeros(2, 2, dtype=torch.bool))))
-    reading = SimpleNamespace(depth_m=GUESS)
-    assert float(metrics.depth_mae(reading, TRUTH)) == float(metrics.depth_mae(GUESS, TRUTH))
-
-
 # ------------------------------------------------------------------------------------------------------------- phases
 
 
@@ -99,19 +86,6 @@ def test_phasors_are_compared_by_phase():
         metrics.phase_mae(y, x)
     with pytest.raises(UnitError, match=r"torch\.angle"):
         metrics.phase_mae(x, y.real)
-
-
-@pytest.mark.parametrize(
-    ("weight", "error"),
-    [(torch.tensor([-1.0, 1.0]), UnitError), (torch.tensor([math.nan, 1.0]), UnitError), (1.0, UnitError),
-     (torch.ones(3), ShapeError), (torch.ones(2, dtype=torch.complex64), UnitError)],
-)  # fmt: skip
-def test_weights_that_are_none(weight, error):
-    with pytest.raises(error, match="weight"):
-        metrics.phase_mae(torch.ones(2), torch.ones(2), weight=weight)
-    for period in (0.0, -1.0, math.nan, "pi"):
-        with pytest.raises(UnitError, match="period"):
-            metrics.phase_mae(torch.ones(2), torch.ones(2), period=period)
 
 
 # ------------------------------------------------------------------------------------------------------- polarization

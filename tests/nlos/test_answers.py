@@ -10,7 +10,6 @@ import json
 import warnings
 
 import mitsuba as mi
-import numpy as np
 import pytest
 import torch
 
@@ -25,15 +24,15 @@ from torchtransient.errors import (
     TorchTransientError,
     UnitError,
 )
-from torchtransient.nlos import answers, defaults, work
-from torchtransient.nlos.renderer import LASER_ORIGIN, ORIGIN, POINTS, SPOTS
 from torchtransient.rendering.renderer import TransientRenderer
 
-VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
 WALL = tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7)
 HIDDEN = tt.scenes.nlos_z()
 VERTICES = "letter.vertex_positions"
+# Keys of the points of a scan in its scene.
+POINTS, SPOTS = "wall.sensor.points", "wall.sensor.laser_points"
+ORIGIN, LASER_ORIGIN = "wall.sensor.sensor_origin", "wall.sensor.laser_origin"
 POINT_TENSORS = {POINTS: "sensor_points", SPOTS: "laser_points", ORIGIN: "sensor_origin", LASER_ORIGIN: "laser_origin"}
 # A square whose normals point away from the wall.
 SQUARE = [[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.5, 0.5, 1.0], [-0.5, 0.5, 1.0]]
@@ -67,7 +66,7 @@ def physics_of(act):
 def test_bins_that_nobody_gave(parameters):
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""
     made = renderer(parameters, time_axis=None)(seed=0)
-    assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), defaults.BIN_WIDTH_OPL)
+    assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), tt.units.seconds_to_opl(16e-12))
     assert made.axis == simulated(time_axis=None).axis
     torch.testing.assert_close(made.total().detach(), made.steady.detach(), rtol=1e-2 if parameters else 1e-5, atol=0)
     phasors = renderer(frequencies=[1.0], time_axis=None)(seed=0)
@@ -77,18 +76,6 @@ def test_bins_that_nobody_gave(parameters):
 def test_depths_are_said_by_bounces():
     with pytest.raises(ArgumentError, match="max_depth: bounces= says"):
         renderer(max_depth=5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spp", [np.int64(8), np.uint16(8), torch.tensor(8)])
-def test_samples_of_any_library(spp):
-    expected = renderer(spp=8)(seed=0)
-    for made in (renderer(spp=spp)(seed=0), renderer()(seed=0, spp=spp), simulated(spp=spp)):
-        assert made.metadata["spp"] == 8 and type(made.metadata["spp"]) is int
-        torch.testing.assert_close(made.transient.sum(), expected.transient.sum(), rtol=1e-5, atol=0)
-    for wrong in (np.float32(8), np.bool_(True), torch.tensor([8, 8])):
-        with pytest.raises(UnitError, match="spp"):
-            renderer(spp=wrong)
 
 
 @pytest.mark.slow
@@ -124,14 +111,6 @@ def test_captures_know_the_points_of_their_call(key):
     getattr(made, POINT_TENSORS[key]).sum().backward()
     assert bool((moved.grad == 1).all())
     assert made.wall is of.wall and made != of and layer.scan is of
-
-
-def test_spots_of_confocal_scans_follow_their_points():
-    layer = renderer([POINTS])
-    moved = scan().sensor_points.reshape(-1, 3) + torch.tensor([0.125, 0.0, 0.0])
-    made = layer({POINTS: moved}, seed=0).scan
-    assert made.kind == "confocal" and made.laser_points is made.sensor_points
-    assert torch.equal(made.sensor_points.reshape(-1, 3), moved)
 
 
 @pytest.mark.slow
@@ -180,57 +159,6 @@ def test_points_that_are_no_scan():
 # ------------------------------------------------------------------------------------------------------------- sensors
 
 
-class Plain(torch.nn.Module):
-    """A module that knows nothing of generators."""
-
-    def forward(self, transient):
-        return 2 * transient
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["exhaustive"])
-def test_sensors_without_a_generator(kind):
-    of, generator = scan(kind), torch.Generator().manual_seed(0)
-    bare, doubled = simulated(of=of), simulated(of=of, sensor=Plain(), generator=generator)
-    torch.testing.assert_close(doubled.transient, 2 * bare.transient, rtol=1e-5, atol=1e-9)
-    layer = renderer(of=of, sensor=Plain(), variant=VARIANT)
-    torch.testing.assert_close(layer(seed=0, generator=generator).transient, doubled.transient, rtol=1e-5, atol=1e-9)
-
-
-class Open(torch.nn.Module):
-    """A module that takes any settings."""
-
-    def forward(self, transient, **settings):
-        self.settings = settings
-        return transient
-
-
-class Asked(sensing.Sensor):
-    """Remembers what it was given."""
-
-    def expected(self, x):
-        self.asked = tuple(x.shape), x.device.type
-        return x
-
-
-def test_generators_go_to_who_takes_them():
-    light, generator = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(0)), torch.Generator()
-    sensor = Open()
-    assert torch.equal(answers.measured(light, scan(), sensor, generator), light)
-    assert sensor.settings == {"generator": generator}
-    assert torch.equal(answers.measured(light, scan(), Plain(), generator), 2 * light)
-
-
-def test_sensors_are_tried_where_they_are():
-    """On the device of their tensors, or on the processor where they have none."""
-    for buffers in ({}, {"weight": torch.ones(40, 1, 1, device="meta")}):
-        sensor = Asked()
-        for name, tensor in buffers.items():
-            sensor.register_buffer(name, tensor)
-        assert answers.checked_module(sensor, AXIS) is sensor
-        assert sensor.asked == ((1, 40, 1, 1), "meta" if buffers else "cpu")
-
-
 def response(axis):
     return sensing.ImpulseResponse(sensing.GaussianResponse(200e-12), axis)
 
@@ -251,8 +179,6 @@ def correlation(axis):
     ],
 )  # fmt: skip
 def test_sensors_that_do_not_fit_are_said_before_the_render(monkeypatch, sensor, error, message):
-    for kind in (work.HiddenWork, work.SceneWork):
-        monkeypatch.setattr(kind, "render", None)
     monkeypatch.setattr(TransientRenderer, "forward", None)
     with pytest.raises(error, match=message):
         simulated(sensor=sensor)

@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.nlos.mesh_file import mesh_file
+from torchtransient.nlos.scene import mesh_file
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.0, 0.05, 60)
@@ -81,7 +81,7 @@ def test_files_that_are_no_meshes(tmp_path):
 def test_defaults_are_those_of_every_route():
     """Bins of 16 ps, 4096 samples, light around one corner."""
     scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(), 2, kind="confocal")
-    from torchtransient.nlos.description import read_description
+    from torchtransient.nlos.setup_files import read_description
 
     described = read_description("\nhidden: {letter: {scene: nlos_z}}\nscan: {kind: confocal, size: 2}\n")
     forecast = tt.nlos.forecast(tt.scenes.nlos_z(), scan)

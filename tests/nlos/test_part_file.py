@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -145,15 +144,6 @@ def test_a_full_disk_loses_nothing(path, monkeypatch):
         np.testing.assert_array_equal(kept.rows(0, 4), np.concatenate([rows(0), rows(1)]))
 
 
-def test_a_disk_that_is_really_full(path):
-    if not os.path.exists("/dev/full"):
-        pytest.skip("the system has no /dev/full")
-    path.with_name(path.name + ".npy").symlink_to("/dev/full")
-    with PartFile(path, "key") as kept, pytest.raises(StorageError, match="could not be read or written"):
-        keep(kept, 0)
-    assert not path.exists()
-
-
 @pytest.mark.slow
 def test_one_process_at_a_time(path):
     script = (
@@ -191,38 +181,3 @@ def test_files_of_another_form(path):
         with pytest.raises(StorageError, match="belongs to another simulation"):
             opened()
     assert path.exists()
-
-
-def test_parts_of_one_row_and_of_none(path):
-    with PartFile(path, "key") as kept:
-        kept.keep(0, 2, rows(0, count=1), total=3, seconds=0.0, about=ABOUT)
-    with PartFile(path, "key") as kept:
-        np.testing.assert_array_equal(kept.rows(2, 1), rows(0, count=1))
-    path.write_text(json.dumps({**json.loads(path.read_text()), "done": {"0": [0, 0, 0]}}))
-    with pytest.raises(StorageError, match="is not the part file of a simulation"), PartFile(path, "key"):
-        pass
-
-
-def test_a_lock_that_cannot_be_opened(path):
-    lock = path.with_name(path.name + ".lock")
-    lock.mkdir()
-    with pytest.raises(StorageError, match=rf"part file: '{lock}' could not be opened: "), PartFile(path, "key"):
-        pass
-
-
-@pytest.mark.skipif(os.name == "nt", reason="the system keeps files that are open")
-def test_a_lock_is_held_until_its_file_is_gone(path, monkeypatch):
-    """Who takes it in between has the lock of a file that is nobody's any more."""
-    real, asked = Path.unlink, []
-
-    def unlink(file, **settings):
-        if file.suffix == ".lock":
-            with file.open("a+") as other, pytest.raises(BlockingIOError):
-                part_file._hold(other)
-            asked.append(file.name)
-        real(file, **settings)
-
-    with PartFile(path, "key") as kept:
-        keep(kept, 0)
-        monkeypatch.setattr(Path, "unlink", unlink)
-    assert asked == [f"{path.name}.lock"]

@@ -8,7 +8,7 @@ import torch
 from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.nlos.point_rows import RowLayout
+from torchtransient.nlos.part_file import RowLayout
 
 WALL = Wall.plane(2.0, 1.6)
 SCANS = {
@@ -43,12 +43,3 @@ def test_there_and_back(kind, front, phasor, steady):
     assert (back.channels, back.polarized) == (made.channels, made.polarized)
     if not phasor:
         assert back.transient.data_ptr() == torch.from_numpy(rows).data_ptr()
-
-
-def test_rows_of_captures_that_lie_as_films_do_are_no_copies():
-    scan = SCANS["exhaustive"]
-    numbers = np.arange(12 * 42, dtype=np.float32).reshape(12, 42)
-    layout = RowLayout((3, 7, 1, 2), (), False, ("a", "b", "c"), False)
-    capture = Capture(**layout.capture(numbers, scan, TimeAxis(0.5, 0.1, 7), None))
-    assert np.shares_memory(layout.rows(capture), numbers)
-    np.testing.assert_array_equal(layout.rows(capture), numbers)

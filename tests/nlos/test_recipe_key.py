@@ -6,7 +6,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient.errors import SceneError, StorageError
-from torchtransient.nlos.scene_files import files_of
+from torchtransient.nlos.work import files_of
 
 VARIANT = "llvm_ad_mono"
 MESH = "v -0.4 -0.4 {z}\nv -0.4 0.4 {z}\nv 0.4 0.4 {z}\nf 1 2 3\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,8 +16,8 @@ from tools.point_captures import point_capture
 from torchtransient.capture import Wall
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError
-from torchtransient.nlos.methods import METHODS, default_wavelength
-from torchtransient.nlos.reconstruct import camera_of
+from torchtransient.nlos.methods import default_wavelength
+from torchtransient.volume_methods import METHODS
 
 RECONSTRUCTION = Page("docs/nlos_reconstruction.md")
 PAGE, TEXT = RECONSTRUCTION.path, RECONSTRUCTION.text
@@ -108,32 +107,6 @@ def test_channels_and_batches():
         assert volume.picture().shape == one.shape[1:]
 
 
-@pytest.mark.parametrize(
-    ("name", "method", "kind", "dtype"),
-    [("FK", "fk", "confocal", torch.float64), ("MidpointFK", "midpoint-fk", "single", torch.float32),
-     ("DirectionalLCT", "directional-lct", "confocal", torch.float32)],
-)  # fmt: skip
-def test_channels_share_one_operator(monkeypatch, name, method, kind, dtype):
-    """Whose tables cost as much as a channel; with the values and places of the operator alone."""
-    one = point_capture(scanned(kind), [PLATE], time_axis=AXIS).to(dtype)
-    operator = getattr(tt.nlos, name)(one.scan, time_axis=AXIS, dtype=dtype)
-    expected, kept = operator.reconstruct(one), (operator.depths >= 0.4) & (operator.depths <= 0.8)
-    made = []
-
-    class Counted(getattr(tt.nlos, name)):
-        def __init__(self, *arguments, **options):
-            made.append(options)
-            super().__init__(*arguments, **options)
-
-    monkeypatch.setattr(sys.modules["torchtransient.nlos.reconstruct"], name, Counted)
-    three = tt.nlos.Capture(one.transient.expand(3, *one.transient.shape[1:]), AXIS, one.scan)
-    volume = tt.nlos.reconstruct(three, method, depths=(0.4, 0.8))
-    assert len(made) == 1 and volume.values.dtype == dtype and len(volume.values) == 3
-    found = volume.values if volume.directions is None else volume.directions
-    assert torch.equal(found, expected.index_select(-3, kept.nonzero()[:, 0]).expand_as(found))
-    assert volume.grid == operator.grid.at_depths(operator.depths[kept])
-
-
 def test_mistakes_have_types(tmp_path):
     capture = point_capture(scanned("confocal"), [PLATE], time_axis=AXIS)
     grid = tt.nlos.default_grid(capture)
@@ -157,43 +130,6 @@ def test_mistakes_have_types(tmp_path):
         tt.nlos.read_volume(capture.write(tmp_path / "capture.npz"))
     with pytest.raises(ShapeError, match="directions"):
         tt.nlos.normals_of(tt.nlos.reconstruct(capture))
-
-
-PAIR = (0, 1)
-STRANGE = (
-    {}, [], "", "x", 0, -1, 2.5, True, float("nan"), 1j, object(), torch.zeros(2), PAIR, ("a", "b"), (1, 0), b"x",
-)  # fmt: skip
-
-
-def test_strange_arguments_have_types_too():
-    captures = {kind: point_capture(scanned(kind, 4), [PLATE], time_axis=AXIS) for kind in ("confocal", "single")}
-    confocal, single = captures.values()
-    calls = {
-        "method": lambda v: tt.nlos.reconstruct(confocal, v),
-        "grid": lambda v: tt.nlos.reconstruct(confocal, "bp", grid=v),
-        "depths": lambda v: tt.nlos.reconstruct(confocal, "fk", depths=v),
-        "target": lambda v: tt.nlos.reconstruct(confocal, "lct", target=v),
-        "filter": lambda v: tt.nlos.reconstruct(confocal, "fbp", filter=v),
-        "planes": lambda v: tt.nlos.default_grid(single, planes=v),
-        "times": lambda v: camera_of("transient", v),
-        "camera": lambda v: camera_of(v, (0, 1, 3)),
-        "bins": lambda v: tt.nlos.sum_bins(single, v),
-        "capture": lambda v: tt.nlos.sum_bins(v, 2),
-        "any capture": lambda v: tt.nlos.default_grid(v),
-    }
-    for name, call in calls.items():
-        for value in STRANGE:
-            if name == "depths" and value is PAIR:
-                continue
-            with pytest.raises(tt.errors.TorchTransientError):
-                call(value)
-    for times in ((0, 1), (0, 1, 2.7), (0, 1, -1), (0, 1, 0), (0, float("inf"), 3), 5):
-        with pytest.raises((SceneError, UnitError), match="times"):
-            camera_of("transient", times)
-    assert len(camera_of("confocal", (0, 1, 3.0)).times) == 3
-    for planes in (2.5, 0, -3):
-        with pytest.raises(SceneError, match="planes"):
-            tt.nlos.default_grid(single, planes=planes)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 1), (1, 5)])

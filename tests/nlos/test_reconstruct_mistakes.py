@@ -12,10 +12,10 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.errors import ShapeError, StorageError, TorchTransientError, UnitError
-from torchtransient.nlos import volume_memory
-from torchtransient.nlos.volume_memory import least_bytes
-from torchtransient.reconstruction.cone_operator import FALL
+from torchtransient.errors import StorageError, TorchTransientError, UnitError
+from torchtransient.nlos import methods as volume_memory
+from torchtransient.nlos.methods import least_bytes
+from torchtransient.reconstruction.light_cone import FALL
 from torchtransient.volume_methods import FILTERS, METHODS, SETTINGS, SLAB_SNR, TARGETS
 
 N = tt.nlos
@@ -207,11 +207,3 @@ def test_a_volume_of_terabytes_is_refused_at_once():
     for name in ("bp", "fbp"):
         with pytest.raises(StorageError, match="TiB at least for 9000 x 9000 x 9000"):
             N.reconstruct(capture, name, grid=grid, progress=False)
-
-
-def test_a_filter_that_does_not_fit_is_refused_before_backprojection(monkeypatch):
-    capture = captured("fbp")
-    monkeypatch.setattr(N.Backprojection, "adjoint_", lambda *_: pytest.fail("computed"))
-    uneven = N.VoxelGrid.before(capture.scan, [0.2, 0.3, 0.5])
-    with pytest.raises(ShapeError, match="evenly spaced"):
-        N.reconstruct(capture, "fbp", grid=uneven, filter="laplacian", progress=False)

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 import torchtransient as tt
 from support.scalars import no_gradient_is_lost
@@ -15,7 +14,6 @@ from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.nlos import scene_scan
 from torchtransient.nlos.scene_scan import Ends
 
-VARIANT = "llvm_ad_mono"
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -57,69 +55,6 @@ def test_rays_past_the_wall_end_where_it_would_go_on():
     assert found.points[3][2] != 0.0 and found.shapes == ends.shapes
 
 
-def test_rays_past_a_wall_that_is_higher_than_wide():
-    tall = np.array([[x, y, 0.0] for y in range(6) for x in range(2)], dtype=float)
-    ends = looking(tall, met=[k != 11 for k in range(12)])
-    ends.points[9] = [1.0, 4.0, 0.5]
-    with pytest.warns(TorchTransientWarning, match="1 of the sensor's 12 rays"):
-        found, _ = scene_scan._on_extended_wall(ends, (6, 2))
-    # Number 9 is the pixel before it in its column, number 10 the one beside it, which comes later.
-    assert found.points[11][2] == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("target, words", [
-    # Upwards, along the plane, and towards the back of what the neighbour is on.
-    ((3.0, 0.0, 5.0), "1 of them not even"), ((3.0, 0.25, 2.0), "1 of them not even"),
-])  # fmt: skip
-def test_rays_that_would_never_meet_the_wall(target, words):
-    targets = GRID.copy()
-    targets[3] = target
-    ends = looking(targets, met=[k != 3 for k in range(12)])
-    with pytest.raises(SceneError, match=f"1 of the sensor's 12 rays meet nothing in the scene, {words}"):
-        scene_scan._on_extended_wall(ends, (3, 4))
-
-
-def test_rays_that_meet_nothing_at_all_and_everything():
-    with pytest.raises(SceneError, match="meets nothing in the scene with any of its 12 rays"):
-        scene_scan._on_extended_wall(looking(GRID, met=[False] * 12), (3, 4))
-    ends = looking(GRID)
-    found, there = scene_scan._on_extended_wall(ends, (3, 4))
-    assert found is ends and there.tolist() == list(range(12))
-
-
-def test_beams_meet_something():
-    scene_scan._check_all_meet(looking(GRID))
-    ends = looking(GRID, met=[k not in (4, 9) for k in range(12)])
-    with pytest.raises(SceneError, match=r"2 of the laser's 12 beams meet nothing .* number 4, from \[0\.5  0\.25 2\."):
-        scene_scan._check_all_meet(ends)
-
-
-@pytest.mark.parametrize("who, what", [("sensor", "sensor points"), ("laser", "laser spots")])
-@pytest.mark.parametrize("origin, size", [((1.5, 2.0, 1.0), 5.0), ((0.0, 0.0, 8.0), np.sqrt(89.0))])
-def test_rays_end_at_their_points_to_a_thousandth(who, what, origin, size):
-    # The extent of the scan, or the longest way to it.
-    points = np.array([[0.0, 0, 0], [3.0, 0, 0], [3.0, 4.0, 0]])
-    ends = looking(points, origin=origin)
-    for share, taken in ((0.99, True), (1.01, False)):
-        moved = points + np.array([[0, 0, 0], [0, share * 1e-3 * size, 0], [0, 0, 0]])
-        if taken:
-            scene_scan._check_same(ends, moved, points, who)
-            continue
-        with pytest.raises(SceneError, match=f"1 of 3 {what} are not what the {who} .* number 1, .* meets 'wall'"):
-            scene_scan._check_same(ends, moved, points, who)
-    ends = looking(points, origin=origin, met=[True, True, False])
-    with pytest.raises(SceneError, match=f"1 of 3 {what} .* number 2, .* meets nothing. Move {who}_origin"):
-        scene_scan._check_same(ends, np.where([[True], [True], [False]], points, 0.0), points, who)
-
-
-def test_some_rays_of_many():
-    ends = looking(GRID, met=[k != 5 for k in range(12)])
-    some = ends.of(np.array([5, 2]))
-    assert some.shapes == ["", "wall"] and some.missed().tolist() == [0] and ends.missed().tolist() == [5]
-    np.testing.assert_allclose(some.points[1], GRID[2])
-    np.testing.assert_allclose(some.directions, ends.directions[[5, 2]])
-
-
 def boxed(low, high, area=1.0, name="thing"):
     def surface_area():
         if area is None:
@@ -150,47 +85,7 @@ def test_things_reach_before_the_wall(low, high, before):
     assert not scene_scan.reaches_before([], GRID, normals)
 
 
-def test_things_have_areas():
-    box = ((0, 0, 1), (1, 1, 2))
-    scene_scan._check_areas([boxed(*box, area=0.0, name="a"), boxed(*box, area=2.0, name="b")])
-    scene_scan._check_areas([boxed(*box, area=0.0), boxed(*box, area=None)])
-    with pytest.raises(SceneError, match=r"finite area, got 'a' \(2 m\^2\), 'b' \(inf m\^2\)"):
-        scene_scan._check_areas([boxed(*box, area=2.0, name="a"), boxed(*box, area=np.inf, name="b")])
-    with pytest.raises(SceneError, match=r"an area that light falls on, got 'a' \(0 m\^2\), 'b' \(0 m\^2\)"):
-        scene_scan._check_areas([boxed(*box, area=0.0, name="a"), boxed(*box, area=0.0, name="b")])
-
-
-def test_tolerances_of_a_scan():
-    points = torch.tensor([[0.0, 0, 0], [3.0, 4.0, 0]], dtype=torch.float64)
-    near = tt.nlos.Scan.points(points, kind="confocal", sensor_origin=(0, 0, 1.0), laser_origin=(0, 0, 1.0))
-    assert scene_scan.tolerance_of(replace(near, sensor_origin=(0.0, 0.0, 0.5))) == pytest.approx(np.sqrt(25.25) * 1e-3)
-    assert scene_scan.tolerance_of(replace(near, sensor_origin=(1.5, 2.0, 0.5))) == pytest.approx(5e-3)
-    assert scene_scan.tolerance_of(replace(near, sensor_origin=(0.0, 0.0, 12.0))) == pytest.approx(13e-3)
-    with no_gradient_is_lost():
-        carrying = replace(near, sensor_points=points.clone().requires_grad_(), laser_points=points.clone())
-        assert scene_scan.tolerance_of(carrying) == scene_scan.tolerance_of(near)
-
-
 # ---------------------------------------------------------------------------------------------------- numbers of bounds
-
-
-@pytest.mark.parametrize("origin, way", [
-    # Behind the plane and away from it, along it from behind, and on it.
-    ((0.5, 0.25, -1.0), (0.0, 0.6, -0.8)), ((0.5, 0.25, -1.0), (1.0, 0.0, 0.0)), ((0.5, 0.25, 0.0), (0.0, 0.0, -1.0)),
-])  # fmt: skip
-def test_rays_that_leave_the_wall_behind(origin, way):
-    ends = looking(GRID, met=[k != 3 for k in range(12)])
-    ends.origins[3], ends.directions[3] = origin, way
-    with pytest.raises(SceneError, match="1 of the sensor's 12 rays meet nothing in the scene, 1 of them not even"):
-        scene_scan._on_extended_wall(ends, (3, 4))
-
-
-def test_a_thousandth_of_a_scan_is_near_enough():
-    points = np.array([[0.0, 0, 0], [600.0, 800.0, 0]])
-    ends = looking(points, origin=(300.0, 400.0, 1.0))
-    scene_scan._check_same(ends, points + np.array([[0, 0, 1.0], [0, 0, 0]]), points, "sensor")
-    with pytest.raises(SceneError, match="1 of 2 sensor points"):
-        scene_scan._check_same(ends, points + np.array([[0, 0, np.nextafter(1.0, 2)], [0, 0, 0]]), points, "sensor")
 
 
 def surface(flipped, twosided):
@@ -216,18 +111,6 @@ def test_rays_end_on_the_side_that_they_come_from(flipped, twosided):
     np.testing.assert_allclose(ends.points[[0, 2]], [[0.5, 0, 1.5], [0.25, 0, 1.5]])
     np.testing.assert_allclose(ends.normals[[0, 2]], [[0, 0, -1], [0, 0, -1]], atol=1e-7)
     np.testing.assert_allclose(ends.directions, [[0, 0, 1]] * 3)
-
-
-def test_things_without_a_name_have_that_of_their_class():
-    box = ((0, 0, 1), (1, 1, 2))
-    with pytest.raises(SceneError, match=r"an area that light falls on, got 'Thing' \(0 m\^2\)"):
-        scene_scan._check_areas([boxed(*box, area=0.0, name="")])
-    unnamed = SimpleNamespace(shapes=lambda: [boxed((0, 0, -1), (1, 1, 0), name="wall"), boxed(*box, name="")])
-    scene_scan._check_hidden(unnamed, looking(GRID))
-    met = looking(GRID)
-    met.shapes[5] = "Thing"
-    with pytest.raises(SceneError, match="at least one shape beside the wall, got none"):
-        scene_scan._check_hidden(unnamed, met)
 
 
 @pytest.mark.parametrize("moved", ["sensor_points", "laser_points"])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -15,16 +12,13 @@ import torch
 import torchtransient as tt
 from support.scalars import no_gradient_is_lost
 from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
-from torchtransient.nlos import variant_choice, work
-from torchtransient.nlos.variant_choice import VariantChoice
-from torchtransient.nlos.work import Film, HiddenWork
+from torchtransient.nlos import work
 
 N = tt.nlos
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.9, 0.02, 100)
 WALL = N.Wall.plane(2.0, 1.6, albedo=0.9)
 Z = tt.scenes.nlos_z()
-simulation = importlib.import_module("torchtransient.nlos.simulation")
 pytestmark = pytest.mark.usefixtures("no_leftovers")
 
 
@@ -46,33 +40,6 @@ def complete(**changed):
 # --------------------------------------------------------------------------------------------------------------- parts
 
 
-@pytest.mark.parametrize(("count", "tiles", "runs"), [
-    (7, 4, [(0, 2), (2, 4), (4, 6), (6, 7)]), (7, 3, [(0, 3), (3, 6), (6, 7)]), (7, 1, [(0, 7)]),
-    (2, 9, [(0, 1), (1, 2)]),
-])  # fmt: skip
-def test_parts_of_equal_sizes_share_a_scene(monkeypatch, count, tiles, runs):
-    made, checked = [], []
-
-    def renderer(hidden, of, parameters, **settings):
-        made.append((len(of.sensor_points.reshape(-1, 3)), parameters))
-        return SimpleNamespace(says_black=True)
-
-    monkeypatch.setattr(work, "CaptureRenderer", renderer)
-    monkeypatch.setattr(work, "load", lambda *_, **settings: settings["variant"])
-    monkeypatch.setattr(work, "check_scan", lambda *given: checked.append(given))
-    of = scan((count, 1))
-    film = Film(AXIS, None, 8)
-    found = HiddenWork(Z, of, {"bounces": (3,), "energy": 1.0}, film, VariantChoice(VARIANT, "asked for"), tiles)
-    assert [found.run(number) for number in range(found.count)] == runs
-    of_parts = [found._of(number) for number in range(found.count)]
-    sizes = sorted({last - first for first, last in runs}, reverse=True)
-    assert made == [(size, (work.POINTS,) if len(runs) > 1 else ()) for size in sizes]
-    assert [of_parts[0] is one for one in of_parts] == [last - first == sizes[0] for first, last in runs]
-    assert not any(one.says_black for one in of_parts)
-    # A scan in one part is looked at by what renders it.
-    assert len(checked) == (len(runs) > 1)
-
-
 def test_points_that_carry_gradients_are_simulated_without():
     plain = scan()
     points = plain.sensor_points.clone().requires_grad_()
@@ -87,14 +54,6 @@ def test_points_that_carry_gradients_are_simulated_without():
     assert points.grad is None
 
 
-@pytest.mark.parametrize("settings", [{"tiles": 2, "part": True}])
-def test_seconds_are_those_of_rendering(tmp_path, settings):
-    settings = settings | ({"part": tmp_path / "a.part"} if "part" in settings else {})
-    began = time.perf_counter()
-    seconds = simulated(**settings).metadata["seconds"]
-    assert 0 < seconds < time.perf_counter() - began
-
-
 def test_a_part_file_of_one_part(tmp_path, monkeypatch, capsys):
     """Kept as those of many are; what is finished is not timed again."""
     path = tmp_path / "a.part"
@@ -106,73 +65,13 @@ def test_a_part_file_of_one_part(tmp_path, monkeypatch, capsys):
     assert torch.equal(first.transient, again.transient) and "samples a point" in told and "about" not in told
 
 
-def test_what_is_left_of_a_simulation_is_timed(tmp_path, monkeypatch, capsys):
-    real, numbers = work.HiddenWork.render, []
-
-    def render(self, number, seed, *, spp=None, progress=False):
-        if spp is None and number == 1 and not numbers:
-            numbers.append(number)
-            raise KeyboardInterrupt
-        return real(self, number, seed, spp=spp, progress=progress)
-
-    monkeypatch.setattr(work.HiddenWork, "render", render)
-    with pytest.raises(KeyboardInterrupt):
-        simulated(part=tmp_path / "a.part", tiles=2, progress=True)
-    capsys.readouterr()
-    simulated(part=tmp_path / "a.part", tiles=2, progress=True)
-    assert "about" in capsys.readouterr().err
-
-
-def test_sums_have_two_places_in_a_file(tmp_path):
-    path = tmp_path / "a.part"
-    N.simulate(complete(), spp=3, part=path, tiles=3, keep_part=True, progress=False)
-    assert np.load(path.with_name("a.part.npy")).shape[0] == 2 * 6
-
-
-def test_passes_are_no_more_than_samples():
-    made = simulation._scene_work(complete(), None, None, 2, (None, None), None, 4)
-    assert made.count == 2 and made.film.spp == 2
-    # Of other numbers of samples, as a forecast asks.
-    assert made.render(0, 0, spp=3).metadata["spp"] == 3 and made.render(0, 0).metadata["spp"] == 1
-
-
 # ------------------------------------------------------------------------------------------------- scenes and variants
-
-
-def test_variants_of_scenes_are_as_asked_for():
-    """In the call, or else when the scene was loaded."""
-    of_scene = tt.load(complete(), variant="llvm_ad_rgb")
-    chosen = [
-        simulation._scene_work(scene, None, None, 4, (None, None), variant, 1).variant
-        for scene, variant in ((of_scene, None), (of_scene, VARIANT), (tt.load(complete()), None), (complete(), None))
-    ]
-    assert [one.name for one in chosen] == ["llvm_ad_rgb", VARIANT, VARIANT, VARIANT]
-    assert ["as asked for" in one.why for one in chosen] == [True, True, False, False]
-
-
-@pytest.mark.parametrize(("active", "loaded"), [("llvm_ad_rgb", "llvm_ad_rgb"), ("scalar_rgb", "llvm_ad_mono")])
-def test_spectra_are_looked_at_in_the_active_variant(monkeypatch, active, loaded):
-    asked = []
-    grey = SimpleNamespace(colours=[], measured=[], bands=[])
-    monkeypatch.setattr(variant_choice, "load", lambda scene, variant: asked.append(variant))
-    monkeypatch.setattr(variant_choice, "scene_inventory", lambda scene: grey)
-    with mi.variant_context(active):
-        found = variant_choice.choose_variant(None, None)
-    assert asked == [loaded] and found.name == "llvm_ad_mono"
 
 
 def test_an_active_polarized_variant_stays():
     with mi.variant_context("llvm_ad_mono_polarized"):
-        found = variant_choice.choose_variant(None, None)
+        found = work.choose_variant(None, None)
     assert found.name == "llvm_ad_mono_polarized" and "active" in found.why
-
-
-@pytest.mark.parametrize(("scene", "is_one"), [
-    ({"integrator": {"type": "direct"}}, True), ({"mine": {"type": "transient_nlos_path"}}, True),
-    ({"type": "scene", "a": {"type": "sphere"}}, False), ({"a": {}}, False),
-])  # fmt: skip
-def test_scenes_have_an_integrator(scene, is_one):
-    assert simulation._is_complete(scene) is is_one
 
 
 def test_names_of_files_are_scenes(tmp_path):

@@ -131,14 +131,6 @@ def test_copies_are_renderers_of_their_own(renderer, how):
     assert original(renderer, WALL_POSE).grad.abs().max() > 0
 
 
-def test_a_plain_renderer_is_copied_as_before(plain):
-    for twin in (copy.deepcopy(plain), pickle.loads(pickle.dumps(plain))):
-        assert type(twin) is tt.TransientRenderer
-        assert torch.equal(light(twin), light(plain))
-        register(twin, COLOUR, Albedo())
-        assert not torch_parametrize.is_parametrized(plain)
-
-
 def test_state_dict_and_optimiser_go_on(renderer, scene):
     optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)
 

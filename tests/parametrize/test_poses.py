@@ -191,12 +191,3 @@ def test_the_last_row_of_a_base_is_exact_but_for_rounding():
         base[3, 1] = off
         with contextlib.nullcontext() if off < 1e-8 else pytest.raises(UnitError, match="last row 0, 0, 0, 1"):
             AxisAnglePose(base)
-
-
-def test_wrong_shapes():
-    for function in (pose_from_axis_angle, pose_from_twist, AxisAnglePose()):
-        with pytest.raises(ShapeError, match="six numbers"):
-            function(torch.zeros(7))
-    for function in (axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse):
-        with pytest.raises(ShapeError, match=r"\(\.\.\., 4, 4\)"):
-            function(torch.zeros(3, 3))

@@ -12,10 +12,9 @@ from torch.nn.utils import parametrizations as torchs_own
 from torch.nn.utils import parametrize as torch_parametrize
 
 from support.sweeps import together
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
+from torchtransient.errors import SceneError, ShapeError, TorchTransientError
 from torchtransient.parametrize import (
     Albedo,
-    AxisAnglePose,
     Bounded,
     IndexOfRefraction,
     Positive,
@@ -119,16 +118,6 @@ def test_removing_keeps_what_is_frozen():
     assert not remove(register(module, "w", Albedo()), "w").w.requires_grad
 
 
-@pytest.mark.parametrize("key", [None, 3, torch.ones(2), ("w",)])
-def test_keys_that_are_none(key):
-    for call in (lambda: register(Weights(), key, Albedo()), lambda: original(Weights(), key),
-                 lambda: remove(Weights(), key)):  # fmt: skip
-        with pytest.raises(UnknownKeyError, match="as a text"):
-            call()
-    with pytest.raises(ArgumentError, match="a module with parameters"):
-        register("w", "w", Albedo())
-
-
 HOW = {
     "copy": copy.copy,
     "deepcopy": copy.deepcopy,
@@ -168,55 +157,3 @@ def test_a_copy_is_parametrized_alone():
     register(twin, "known", Albedo())
     assert len(module.parametrizations.w) == 1 and len(twin.parametrizations.w) == 2
     assert "known" in module._buffers and not torch_parametrize.is_parametrized(module, "known")
-
-
-def test_a_class_with_its_own_copies_keeps_them():
-    class Own(Weights):
-        def __deepcopy__(self, memo):
-            return "its own"
-
-        def __copy__(self):
-            return "another"
-
-    module = register(Own(), "w", Albedo())
-    assert copy.deepcopy(module) == "its own" and copy.copy(module) == "another"
-
-
-def test_what_a_class_keeps_beside_its_dictionary_is_copied():
-    class Slotted(Weights):
-        __slots__ = ("more",)
-
-    module = Slotted()
-    module.more = [3]
-    twin = copy.deepcopy(register(module, "w", Albedo()))
-    assert twin.more == [3] and twin.more is not module.more and torch.equal(twin.w, module.w)
-
-
-def its_own(*_):
-    return str, ("its own",)
-
-
-@pytest.mark.parametrize("method", ["__reduce__", "__reduce_ex__"])
-def test_a_class_with_its_own_pickles_keeps_them(method):
-    module = register(type("Own", (Weights,), {method: its_own})(), "w", Albedo())
-    assert pickle.loads(pickle.dumps(module)) == "its own"
-
-
-def test_keys_that_are_not_there_or_not_alone():
-    pair = nn.ModuleDict({"a": Weights(), "b": Weights()})
-    with pytest.raises(UnknownKeyError, match=r"ModuleDict has several modules with a parameter 'w'; there are a.w, b"):
-        register(pair, "w", Albedo())
-    with pytest.raises(UnknownKeyError, match=r"ModuleDict has no parameter 'v'; there are a.w, b.w\."):
-        register(pair, "v", Albedo())
-    with pytest.raises(UnknownKeyError, match=r"Tanh has no parameter 'w'; it has none\."):
-        register(nn.Tanh(), "w", Albedo())
-    many = nn.ModuleList(Weights() for _ in range(9))
-    with pytest.raises(UnknownKeyError, match=r"there are 0.w, .*, 7.w \.\.\.\.$"):
-        register(many, "v", Albedo())
-
-
-def test_under_autocast():
-    for kind, value in ((Albedo(), (0.25, 0.75)), (AxisAnglePose(), torch.eye(4).tolist())):
-        with torch.autocast("cpu", torch.bfloat16):
-            module = register(Weights(value), "w", kind)
-            assert torch.allclose(module.w, torch.tensor(value), atol=1e-6) and module.w.dtype == torch.float32

@@ -9,8 +9,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction.scan_operator import ScanOperator
-from torchtransient.reconstruction.transient_operator import TransientOperator, reconstructed
+from torchtransient.reconstruction.transient_operator import ScanOperator, TransientOperator, reconstructed
 
 AXIS = tt.TimeAxis(0.0, 0.05, 16)
 SCAN = tt.nlos.Scan.grid(tt.nlos.Wall.plane(0.4, 0.3), (4, 3), kind="confocal")

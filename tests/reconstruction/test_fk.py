@@ -10,7 +10,7 @@ from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.reconstruction import FK, PlanarScan, confocal_operator, fk
+from torchtransient.reconstruction import FK, PlanarScan, fk
 
 F64 = torch.float64
 BINS, SIDE, WIDTH = 128, 16, 0.04
@@ -177,30 +177,6 @@ def test_what_it_cannot_take_is_refused():
         operator.reconstruct(stokes)
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
         fk(torch.zeros(8, SIDE, SIDE))
-
-
-def test_gradients_of_a_batch_by_torch_func():
-    operator = FK(SCAN, time_axis=TimeAxis(0.5, 0.1, 12), floor=0.25, dtype=F64)
-    light = torch.rand(3, *operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
-
-    def objective(h):
-        return operator.reconstruct(h).square().sum()
-
-    together = torch.func.vmap(torch.func.grad(objective))(light)
-    for one, expected in zip(light, together, strict=True):
-        torch.testing.assert_close(torch.func.grad(objective)(one), expected)
-    _, tangent = torch.func.jvp(objective, (light[0],), (light[1],))
-    assert float(tangent) == pytest.approx(float((together[0] * light[1]).sum()), rel=1e-9)
-    curved = torch.func.jvp(torch.func.grad(objective), (light[0],), (light[1],))[1]
-    assert torch.isfinite(curved).all()
-
-
-def test_rows_of_a_piece_fill_it(monkeypatch):
-    monkeypatch.setattr(confocal_operator, "CPU_CHUNK", 100)
-    monkeypatch.setattr(confocal_operator, "GPU_CHUNK", 1000)
-    for device, rows in (("cpu", (100, 100, 14, 1, 1)), ("meta", (1000, 1000, 142, 1, 4))):
-        found = [confocal_operator.chunk_rows(n, torch.device(device)) for n in (0, 1, 7, 2000, 250)]
-        assert tuple(found) == rows
 
 
 def test_voxels_stand_at_half_the_middle_of_each_bin():

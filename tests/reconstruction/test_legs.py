@@ -124,22 +124,6 @@ def test_legs_of_every_pair_of_an_exhaustive_scan():
         torch.testing.assert_close(found[:, spot, sensor], expected, rtol=0, atol=1e-12)
 
 
-def test_a_bin_that_is_left_and_none():
-    light = torch.tensor([[1.0], [2.0], [3.0]], dtype=torch.float64)
-    found = subtract_legs(of_legs([0.75], [0.25], TimeAxis(0.0, 0.5, 3), light))
-    assert found.axis == TimeAxis(0.0, 0.5, 1) and found.transient.flatten().tolist() == [3.0]
-    with pytest.raises(UnitError, match="shortest legs, 1 m, got one up to 1 m"):
-        subtract_legs(of_legs([0.75], [0.25], TimeAxis(0.0, 0.5, 2), light[:2]))
-
-
-@pytest.mark.parametrize("off, first", [(0.9e-6, 0.0), (-0.9e-6, 0.0), (1.1e-6, 0.55e-6), (-1.1e-6, 0.5 - 0.55e-6)])
-def test_zeros_to_a_millionth_of_a_bin_are_zero(off, first):
-    light = torch.ones(8, 1, dtype=torch.float64)
-    found = subtract_legs(of_legs([0.75], [0.25], TimeAxis(1.0 + 0.5 * off, 0.5, 8), light))
-    assert found.axis.start_opl == pytest.approx(first, abs=1e-12)
-    assert (found.axis.start_opl == 0.0) is (first == 0.0) and found.axis.num_bins == (7 if first > 0.1 else 8)
-
-
 def test_batches_and_channels_are_moved_alike():
     axis = TimeAxis(1.0, 0.5, 6)
     light = torch.rand(3, 2, 6, 1, 2, dtype=torch.float32, generator=torch.Generator().manual_seed(0))

@@ -10,7 +10,6 @@ from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction import LCT, DiffusionDeconvolution, DirectionalLCT
-from torchtransient.reconstruction.cone_operator import ConeOperator
 
 F64 = torch.float64
 # v = r^2 from 0 to 4 m^2 in bins of 0.25 m^2; steps of 0.5 m along x are one of them, of 1 m along y four.
@@ -42,70 +41,6 @@ def test_a_point_of_v_lights_the_wall_at_its_squared_distance(kind, place):
                 if 0 <= tap < 16:
                     expected[tap, row, column] += weight * dy**power_y * dx**power_x * scale
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
-
-
-def test_components_of_vectors_are_x_y_and_the_depth_in_the_middle():
-    operator = made(DirectionalLCT)
-    assert operator.moments == ((0, 1), (1, 0), (0, 0))
-    # Depths of 0.125 to 1.875 m.
-    assert operator.scales == pytest.approx((1.0, 1.0, 1.0))
-    torch.testing.assert_close(operator.relative_depth, operator.depths, rtol=1e-14, atol=0)
-
-
-def test_frequencies_are_means_of_five_neighbours():
-    window = made(LCT).cone.window()
-    taps = torch.fft.irfft(window.to(torch.complex128), n=2 * (len(window) - 1))
-    torch.testing.assert_close(taps[:3], TAPS[2:], rtol=0, atol=1e-15)
-    torch.testing.assert_close(taps[-2:], TAPS[:2], rtol=0, atol=1e-15)
-    assert float(taps[3:-2].abs().max()) < 1e-15
-
-
-@pytest.mark.parametrize("start", [0.0, 0.75])
-@pytest.mark.parametrize("target, power", [("diffuse", 4), ("retroreflective", 2)])
-def test_resampling_of_constants(start, target, power):
-    axis = TimeAxis(start, 0.5, 8)
-    operator = LCT(SCAN, time_axis=axis, v_bins=13, target=target, dtype=F64)
-    edges = torch.linspace((start / 2) ** 2, ((start + 4) / 2) ** 2, 14, dtype=F64)
-    radii = (start + 0.5 * torch.arange(9, dtype=F64)) / 2
-
-    def resampled(rows, values, transposed, to_v):
-        return operator._resampled(torch.ones(rows, 3, 4, dtype=F64), values, transposed=transposed, to_v=to_v)[:, 2, 1]
-
-    # Strengths of one per m^3: means of 1 / (2 sqrt u) over bins of u.
-    torch.testing.assert_close(resampled(8, "volume", False, True), edges.sqrt().diff() / edges.diff())
-    # Their light: r^-p dv of a voxel's area, 0.5 m^2, in bins of time; and back to one.
-    middle = (radii[1:] + radii[:-1]) / 2
-    light = middle**-power * (radii**2).diff() * 0.5
-    torch.testing.assert_close(resampled(13, "data", True, False), light)
-    torch.testing.assert_close(operator._resampled(
-        light[:, None, None].expand(-1, 3, 4), "data_inverse", transposed=False, to_v=True
-    )[:, 2, 1], torch.ones(13, dtype=F64))  # fmt: skip
-    # One for each bin of u: 2 z of every depth.
-    torch.testing.assert_close(resampled(13, "volume_inverse", True, False), 2 * middle)
-
-
-def test_entries_of_resampling_are_overlaps_of_intervals():
-    axis = TimeAxis(0.75, 0.5, 8)
-    cone = LCT(SCAN, time_axis=axis, v_bins=13, dtype=F64).cone
-    squares = ((0.75 + 0.5 * torch.arange(9, dtype=F64)) / 2) ** 2
-    edges = torch.linspace(float(squares[0]), float(squares[-1]), 14, dtype=F64)
-    low = torch.maximum(edges[:-1, None], squares[:-1])
-    high = torch.minimum(edges[1:, None], squares[1:])
-    for of_depth, expected in ((False, high - low), (True, high.clamp_min(0).sqrt() - low.sqrt())):
-        v, t, size = cone.overlaps(of_depth=of_depth)
-        dense = torch.zeros(13, 8, dtype=F64).index_put((v, t), size, accumulate=True)
-        torch.testing.assert_close(dense, expected.clamp_min(0), rtol=0, atol=1e-14)
-        assert len(size) == 20 and (size > 0).all()
-
-
-@pytest.mark.parametrize("kind", [LCT, DirectionalLCT])
-def test_noise_is_the_mean_power_of_the_kernels_over_the_ratio(kind):
-    operator = made(kind, snr=4.0)
-    count = operator.cone.padded // 2 + 1
-    power = sum((y.abs() * x.abs()).square() for y, x in operator.kernels(0, count))
-    assert power.shape == (count, 6, 8)
-    assert operator.mean_power() == pytest.approx(float(power.mean()), rel=1e-12)
-    torch.testing.assert_close(operator._power(2, 5), power[2:5] + float(power.mean()) / 4, rtol=1e-12, atol=0)
 
 
 def with_kernels(operator, along_y, along_x):
@@ -151,14 +86,6 @@ def test_inverses_of_vectors_of_numbers_are_vectors():
     torch.testing.assert_close(parts[2], alone)
 
 
-@pytest.mark.parametrize("kind, target, powers", [
-    (LCT, "diffuse", 4), (LCT, "retroreflective", 2), (DirectionalLCT, "diffuse", 5),
-    (DirectionalLCT, "retroreflective", 3),
-])  # fmt: skip
-def test_light_falls_by_the_target_and_the_length_of_offsets(kind, target, powers):
-    assert made(kind, target=target).fall() == powers
-
-
 def test_transforms_hold_the_cone_behind_the_record():
     # 4 x 0.5 m and 3 x 1 m: 13 m^2 behind 4 m^2, 4.25 times as many bins.
     assert made(LCT).cone.padded == fast_length(68, multiple=2)
@@ -184,8 +111,3 @@ def test_slabs_that_only_weaken_are_undone_up_to_noise(passes):
     light = torch.rand(2, *operator.data_shape, dtype=F64, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(operator(light), 0.75 * light)
     torch.testing.assert_close(operator.reconstruct(light), 0.75 / (0.75**2 + 0.2) * light)
-
-
-def test_operators_of_cones_say_what_their_volumes_are_made_of():
-    with pytest.raises(TypeError, match="abstract"):
-        ConeOperator(SCAN, time_axis=AXIS, dtype=F64, target="diffuse", snr=1.0, v_bins=None)

@@ -10,7 +10,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction import MidpointFK, midpoint_fk
-from torchtransient.reconstruction.midpoint_fk import Midpoints
+from torchtransient.reconstruction.fk import Midpoints
 
 F64 = torch.float64
 WALL = Wall.plane(1.0, 1.0)
@@ -58,7 +58,6 @@ def test_moveout_brings_a_point_below_the_middle_to_its_confocal_time():
     assert int(seen.sum()) > 300
     mean = (moved * AXIS.centers_opl[:, None]).sum(0)[seen] / moved.sum(0)[seen]
     assert float((mean - 2 * z).abs().max()) < 0.005
-
 
 
 @pytest.mark.parametrize("name", SCANS)
@@ -134,44 +133,3 @@ def test_what_it_cannot_take_is_refused():
         MidpointFK(SCANS["single"], time_axis=TimeAxis(-0.1, 0.02, 32))
     with pytest.raises(UnitError, match="dtype"):
         MidpointFK(SCANS["single"], time_axis=AXIS, dtype=torch.float16)
-
-
-def spots_at(*places):
-    """An exhaustive scan of spots at places (x, y, z) in pitches along the wall, metres across, from the first of 5 x 4
-    sensor points that are 0.25 m and 0.5 m apart.
-    """
-    y, x = torch.meshgrid(0.5 * torch.arange(4, dtype=F64), 0.25 * torch.arange(5, dtype=F64), indexing="ij")
-    points = torch.stack([x, y, torch.zeros_like(x)], -1)
-    spots = torch.tensor(places, dtype=F64) * torch.tensor([0.25, 0.5, 1.0], dtype=F64)
-    return Scan.points(points, kind="exhaustive", laser_points=spots, sensor_origin=(0, 0, 2), laser_origin=(0, 0, 2))
-
-
-@pytest.mark.parametrize("inside, outside", [
-    # Half a pitch beside the rectangle on each of its sides, a thousandth of the smaller pitch before or behind it.
-    ((-0.5, 1.0, 0.0), (-0.502, 1.0, 0.0)), ((4.5, 1.0, 0.0), (4.502, 1.0, 0.0)),
-    ((2.0, -0.5, 0.0), (2.0, -0.502, 0.0)), ((2.0, 3.5, 0.0), (2.0, 3.502, 0.0)),
-    ((2.0, 1.0, 2.4e-4), (2.0, 1.0, 2.6e-4)), ((2.0, 1.0, -2.4e-4), (2.0, 1.0, -2.6e-4)),
-])  # fmt: skip
-def test_spots_stand_in_the_sensors_rectangle_and_plane(inside, outside):
-    middle = (2.25, 1.5, 0.0)
-    midpoints = Midpoints(spots_at(middle, inside), time_axis=AXIS, dtype=F64)
-    grid, scan = midpoints.wall.points.reshape(-1, 3), midpoints.scan
-    middles = ((scan.laser_points[:, None] + scan.sensor_points.reshape(1, -1, 3)) / 2).reshape(-1, 3)
-    # Each on the nearest place of the grid in both directions.
-    found = (grid[midpoints.place] - middles).abs()
-    for axis in (0, 1):
-        nearest = (grid[:, axis] - middles[:, None, axis]).abs().amin(1)
-        assert float((found[:, axis] - nearest).max()) < 1e-9
-    # Of each pair the squared distance of its points, in metres.
-    apart = (scan.laser_points[:, None] - scan.sensor_points.reshape(1, -1, 3)).square().sum(-1).flatten()
-    torch.testing.assert_close(midpoints.distance_squared, apart, rtol=0, atol=1e-12)
-    with pytest.raises(ShapeError, match="within their rectangle"):
-        Midpoints(spots_at(middle, outside), time_axis=AXIS)
-
-
-def test_places_have_shares_in_as_many_pairs():
-    midpoints = Midpoints(spots_at((0.0, 0.0, 0.0), (2.0, 2.0, 0.0)), time_axis=AXIS, dtype=F64)
-    pairs = torch.bincount(midpoints.place, minlength=80)
-    assert midpoints.wall.size == (8, 10) and int(pairs.max()) == 2 and int(pairs.sum()) == 40
-    torch.testing.assert_close(midpoints.share, 1 / pairs.clamp_min(1).double(), rtol=0, atol=0)
-    assert midpoints.wall.pitch == (0.25, 0.125)

@@ -12,7 +12,7 @@ from support import grid_operators, scan_operators
 from support.marks import long
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.reconstruction import (
     FK,
     LCT,
@@ -21,7 +21,6 @@ from torchtransient.reconstruction import (
     DirectionalLCT,
     FilteredBackprojection,
     LaplacianFilter,
-    LinearOperator,
     MidpointFK,
     PhasorField,
     PhasorFilter,
@@ -49,7 +48,6 @@ def field(**options):
 
 OTHERS = {
     "axis": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, start_opl=0.12))),
-    "bins": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=replace(AXIS, num_bins=17))),
     "scan": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(MOVED, time_axis=AXIS)),
     "hidden side": (
         lambda: FK(CONFOCAL, time_axis=AXIS),
@@ -57,7 +55,6 @@ OTHERS = {
     ),
     "class": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: LCT(CONFOCAL, time_axis=AXIS)),
     "floor": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, floor=0.25)),
-    "target": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, target="retroreflective")),
     "floor of midpoints": (
         lambda: MidpointFK(SINGLE, time_axis=AXIS),
         lambda: MidpointFK(SINGLE, time_axis=AXIS, floor=1.0),
@@ -80,12 +77,7 @@ OTHERS = {
         lambda: Backprojection(SINGLE, GRID.points, time_axis=AXIS),
         lambda: Backprojection(SINGLE, GRID.points.flip(0), time_axis=AXIS),
     ),
-    "depths": (
-        lambda: Backprojection(SINGLE, GRID, time_axis=AXIS),
-        lambda: Backprojection(SINGLE, GRID.at_depths((0.1, 0.21)), time_axis=AXIS),
-    ),
     "filter": (fbp, lambda: fbp(filter=LaplacianFilter())),
-    "cycles": (fbp, lambda: fbp(filter=PhasorFilter(0.2, 4.0))),
     "pulse": (field, lambda: field(pulse=PhasorFilter(0.21, 3.0))),
 }  # fmt: skip
 
@@ -124,23 +116,6 @@ def test_scans_that_a_file_rounds_are_the_same():
         kind(replace(scan, **rounded), time_axis=AXIS).load_state_dict(kind(scan, time_axis=AXIS).state_dict())
 
 
-@pytest.mark.parametrize("state", [None, 3, torch.zeros(3), torch.tensor([255, 3], dtype=torch.uint8), {"a": 1}])
-def test_states_that_are_none(state):
-    with pytest.raises(StorageError, match="expected the state of an operator"):
-        FK(CONFOCAL, time_axis=AXIS).load_state_dict({"_extra_state": state})
-
-
-@every
-def test_replicas_of_data_parallel(name):
-    operator = OPERATORS[name]
-    replica = operator._replicate_for_data_parallel()
-    replica._buffers = {key: None if table is None else table.clone() for key, table in operator._buffers.items()}
-    y = torch.ones(operator.data_shape, dtype=torch.float64)
-    if name.startswith("inverse"):
-        y = y.to(torch.complex128) if not operator.real_data else y
-    torch.testing.assert_close(replica.adjoint(y), operator.adjoint(y), rtol=0, atol=0)
-
-
 # ----------------------------------------------------------------------------------- parameters, operators of one's own
 
 
@@ -172,12 +147,6 @@ def test_operators_without_tables_have_a_precision():
         double.points  # noqa: B018
 
 
-def test_tables_of_two_precisions_follow():
-    operator = FK(CONFOCAL, time_axis=AXIS)
-    operator.register_buffer("kept", torch.ones(3, dtype=torch.float64))
-    assert operator.double().dtype == torch.float64 and operator.weights.dtype == torch.float64
-
-
 @pytest.mark.parametrize("kind", [nn.Parameter, lambda t: t.requires_grad_()])
 def test_parameters_of_a_class_would_get_no_gradient(kind):
     operator = Doubled(CONFOCAL, time_axis=AXIS)
@@ -193,16 +162,6 @@ def test_parameters_of_a_class_would_get_no_gradient(kind):
             function(x)
     operator.weight.requires_grad_(False)
     assert torch.equal(operator(x), x)
-
-
-def test_operators_say_both_maps():
-    class Half(LinearOperator):
-        def map_(self, x):
-            return x
-
-    for kind in (LinearOperator, TransientOperator, Half):
-        with pytest.raises(TypeError, match="abstract"):
-            kind()
 
 
 # --------------------------------------------------------------------------------------------------- time zero, devices

@@ -1,15 +1,12 @@
 """Which points are a regular grid on a flat wall, where its sides are, and which side is hidden."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-from torchtransient.capture import Scan
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction import PlanarScan
-from torchtransient.reconstruction.planar_scan import hidden_side
 
 F64 = torch.float64
 # Three rows, four columns, 0.5 m and 0.25 m apart, turned and moved.
@@ -48,37 +45,6 @@ def test_what_is_no_grid_of_points(shape):
         of(points)
 
 
-@pytest.mark.parametrize("kind", [torch.complex128, torch.bool])
-def test_grids_of_other_numbers(kind):
-    with pytest.raises(ShapeError, match="Method: sensor points: expected real numbers"):
-        of(points_of().to(kind))
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("place", [(1, 2), (2, 3), (0, 1)])
-@pytest.mark.parametrize("pitches", [(0.5, 0.25), (0.25, 0.5)])
-def test_points_may_be_a_thousandth_of_the_smaller_pitch_off(axis, place, pitches):
-    for share, taken in ((0.9, True), (-0.9, True), (1.1, False), (-1.1, False)):
-        points = points_of(4, 5, *pitches)
-        points[place] += 1e-3 * 0.25 * share * TURN[:, axis]
-        if taken:
-            of(points)
-            continue
-        with pytest.raises(ShapeError, match=r"got some 0\.000275 m off it \(pitch .* angle 90\.00 degrees\)"):
-            of(points)
-
-
-def test_points_are_off_by_a_length_in_space():
-    some, far = points_of(4, 5), points_of(4, 5)
-    some[1, 1:4] += 0.8e-3 * 0.25 * TURN[:, 1]
-    assert of(some).size == (4, 5)
-    far[1, 2] += 0.8e-3 * 0.25 * (TURN[:, 0] + TURN[:, 1])
-    with pytest.raises(ShapeError, match=r"0\.0002828 m off it|0\.000283 m off it"):
-        of(far)
-    wall = of(points_of())
-    assert not wall.matches(of(points_of() + 0.8e-3 * 0.25 * (TURN[:, 0] + TURN[:, 1])))
-
-
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_rows_and_columns_may_lean_by_a_thousandth(sign):
     wall = of(points_of(lean=0.9e-3 * sign))
@@ -106,37 +72,3 @@ def test_the_normal_is_that_of_the_wall():
     mixed[:, 0] *= -1
     torch.testing.assert_close(of(points_of(), mixed).normal, TURN[:, 2], rtol=0, atol=1e-14)
     torch.testing.assert_close(of(points_of(), torch.zeros(3, 4, 3)).normal, TURN[:, 2], rtol=0, atol=1e-14)
-
-
-def test_scans_alone_have_walls():
-    with pytest.raises(ShapeError, match="Method: scan: expected a Scan, got"):
-        PlanarScan.of_scan(points_of(), "Method")
-
-
-def test_the_same_wall_to_a_thousandth_of_the_smallest_pitch():
-    wall = of(points_of())
-    for share, same in ((0.9, True), (1.1, False)):
-        moved = of(points_of() + 1e-3 * 0.25 * share * TURN[:, 1])
-        assert wall.matches(moved) is same and moved.matches(wall) is same
-    assert not wall.matches(of(points_of(), -TURN[:, 2].expand(3, 4, 3)))
-    assert not wall.matches(of(points_of(3, 5))) and not wall.matches(of(points_of(2, 4)))
-    # Half of the pitch, so that only the first point is the same one.
-    assert not wall.matches(of(points_of(dy=0.25))) and not wall.matches(of(points_of(dx=0.5)))
-
-
-@pytest.mark.parametrize("heights, sign", [
-    # In parts of a millionth of the wall's extent: in the wall, behind it, on both sides.
-    ((-0.5, -0.5), 1.0), ((-2.0, -2.0), -1.0), ((-2.0, -0.5), 1.0), ((-0.5, -2.0), 1.0), ((-2.0, 9.0), 1.0),
-    ((9.0, 9.0), 1.0), ((-1.1, -1.1), -1.0), ((-0.9, -0.9), 1.0),
-])  # fmt: skip
-def test_the_hidden_side_is_where_sensor_and_laser_stand(heights, sign):
-    points, normal = points_of(), TURN[:, 2]
-    extent = float((points.reshape(-1, 3).amax(0) - points.reshape(-1, 3).amin(0)).norm())
-    middle = points.mean((0, 1))
-    sensor, laser = (middle + 1e-6 * extent * h * normal + 0.1 * TURN[:, 0] for h in heights)
-    scan = Scan.points(points, kind="confocal", sensor_origin=sensor, laser_origin=laser)
-    for side in (-1.0, 1.0):
-        # The other way around the same origins stand on the other side.
-        mirrored = replace(scan, sensor_origin=2 * middle - sensor, laser_origin=2 * middle - laser)
-        given = scan if side > 0 else mirrored
-        torch.testing.assert_close(hidden_side(given, side * normal), sign * side * normal, rtol=0, atol=0)

@@ -16,14 +16,12 @@ from torchtransient.reconstruction import (
     DiffusionDeconvolution,
     DirectionalLCT,
     FilteredBackprojection,
-    HiddenVolume,
     MidpointFK,
     PhasorField,
     PlanarScan,
     VoxelGrid,
     subtract_legs,
 )
-from torchtransient.reconstruction.operator_state import plain
 
 F64 = torch.float64
 CONFOCAL, SINGLE = grid_operators.SCAN, grid_operators.SINGLE
@@ -119,16 +117,3 @@ def test_captures_without_legs_depend_on_their_light_alone():
     with no_gradient_is_lost():
         found = subtract_legs(capture)
     assert not found.transient.requires_grad and found.scan.sensor_points.requires_grad
-
-
-def test_pictures_of_volumes_are_detached():
-    grid = VoxelGrid.before(SCANS["confocal"], DEPTHS)
-    values = torch.ones(1, *grid.shape, requires_grad=True)
-    assert not HiddenVolume(values, grid, "fk").picture().requires_grad
-
-
-def test_settings_with_gradients_are_told_by_their_numbers():
-    setting = torch.tensor([3.0, -7.0, 2.0], dtype=F64)
-    with no_gradient_is_lost():
-        assert plain(setting.clone().requires_grad_()) == plain(setting)
-    assert plain(setting)["size"] == 7.0 and plain(setting)["shape"] == [3]

@@ -91,14 +91,6 @@ def test_gradients_of_empty_volumes_are_finite():
         assert torch.isfinite(gradient).all()
 
 
-def test_soft_depth_goes_to_the_planes_of_the_maximum():
-    grid = grid_of(torch.linspace(0.4, 0.8, 81, dtype=F64))
-    volume, depth = slanted(grid, 0.1, 0.05, 0.02)
-    # A symmetric peak has its mean at its top.
-    assert (soft_depth(volume, grid) - depth).abs().max() < 1e-3
-    assert (soft_depth(1e-12 * volume, grid) - soft_depth(volume, grid)).abs().max() < 1e-9
-
-
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (0.25, 0.2)])
 def test_normals_of_planes(slopes):
     grid = grid_of(torch.linspace(0.3, 0.9, 61, dtype=F64))
@@ -162,29 +154,6 @@ SURFACES = {
     "normals_from_volume": normals_from_volume,
     "normals_from_depth": lambda v, grid: normals_from_depth(v[..., 0, :, :], grid),
 }
-each = pytest.mark.parametrize("name", SURFACES)
-
-
-@pytest.mark.parametrize("name", ["depth_map", "soft_depth", "normals_from_volume"])
-@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
-def test_half_precision_is_computed_in_single(name, half):
-    grid = grid_of(torch.linspace(0.3, 0.9, 512, dtype=F64))
-    volume = slanted(grid, 0.2, 0.1, 0.1)[0].to(half)
-    found, expected = SURFACES[name](volume, grid), SURFACES[name](volume.double(), grid)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5)
-    single = volume.float()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        torch.testing.assert_close(SURFACES[name](single, grid), SURFACES[name](volume, grid), rtol=0, atol=0)
-
-
-@each
-def test_autocast_does_not_reach_in(name):
-    grid = grid_of(UNEVEN)
-    volume = torch.rand(2, *grid.shape, generator=torch.Generator().manual_seed(1))
-    expected = SURFACES[name](volume, grid)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        torch.testing.assert_close(SURFACES[name](volume, grid), expected, rtol=0, atol=0)
 
 
 def test_planes_that_single_precision_does_not_tell_apart():
@@ -214,13 +183,6 @@ def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
     assert slope.isfinite().all()
 
 
-def test_confidence_of_the_dark_has_no_slope():
-    dark = torch.zeros(2, 8, 3, 3, requires_grad=True)
-    (slope,) = torch.autograd.grad(depth_map(dark, UNEVEN).confidence.sum(), dark, create_graph=True)
-    (again,) = torch.autograd.grad(slope.sum(), dark, allow_unused=True)
-    assert not slope.any() and (again is None or not again.any())
-
-
 @pytest.mark.parametrize("scale", [1e-38, 1e-25, 1e-12, 1.0, 1e12, 1e25])
 def test_nothing_depends_on_the_unit_of_the_volume(scale):
     grid = grid_of(UNEVEN)
@@ -228,28 +190,6 @@ def test_nothing_depends_on_the_unit_of_the_volume(scale):
     for name in ("depth_map", "soft_depth", "normals_from_volume"):
         found, expected = SURFACES[name](volume * scale, grid), SURFACES[name](volume, grid)
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-
-
-@each
-@pytest.mark.parametrize("lead", [(0,), (2, 0)])
-def test_batches_may_be_empty(name, lead):
-    grid = grid_of(UNEVEN)
-    like = SURFACES[name](torch.rand(grid.shape), grid)
-    volume = torch.zeros(*lead, *grid.shape, requires_grad=True)
-    found = SURFACES[name](volume, grid)
-    assert found.shape == (*lead, *like.shape)
-    assert torch.autograd.grad(found.sum(), volume)[0].shape == volume.shape
-    if name in ("depth_map", "soft_depth"):
-        assert SURFACES[name](torch.zeros(8, 0, 3), UNEVEN).shape == (0, 3)
-
-
-def test_depths_that_are_none():
-    for function in (depth_map, soft_depth):
-        for depths in ([1.0, 2.0, math.inf], [math.nan, 1.0, 2.0]):
-            with pytest.raises(UnitError, match="finite depths"):
-                function(torch.rand(3, 2, 2), depths)
-        with pytest.raises(ShapeError, match="expected depths"):
-            function(torch.rand(0, 2, 2), [])
 
 
 @pytest.mark.parametrize("level", [-2.0, 0.0])
@@ -292,28 +232,6 @@ def test_normals_of_any_volume_are_sums_up_to_the_highest_value():
     torch.testing.assert_close(normals_from_depth(depth, grid), expected, rtol=0, atol=1e-12)
 
 
-def test_two_of_everything_have_normals_and_one_row_has_depths():
-    volume, grid = lumpy(1, (2, 2, 2))
-    assert normals_from_volume(volume, grid).isfinite().all()
-    (dy, dx), depth = grid.pitch, torch.tensor([[0.5, 0.6], [0.8, 0.7]], dtype=F64)
-    expected = (0.1 / dx * grid.along_x + 0.3 / dy * grid.along_y - grid.normal)
-    found = normals_from_depth(depth, grid)[:, 0, 0]
-    torch.testing.assert_close(found, expected / expected.norm(), rtol=0, atol=1e-12)
-    for size in ((1, 3, 3), (3, 1, 3), (3, 3, 1)):
-        _, flat = lumpy(0, (3, 3, 3))
-        flat = VoxelGrid(flat.depths[: size[0]], size[1:], flat.pitch, first=flat.first, along_x=flat.along_x,
-                         along_y=flat.along_y, normal=flat.normal)  # fmt: skip
-        with pytest.raises(ShapeError, match="two planes, rows and columns at least"):
-            normals_from_volume(torch.rand(size), flat)
-        if size[0] == 1:
-            continue
-        # One row has no slope along y.
-        normal = normals_from_depth(torch.linspace(0.3, 0.9, 3, dtype=F64).reshape(size[1:]), flat)
-        across = flat.along_y if size[1] == 1 else flat.along_x
-        assert float((normal * across[:, None, None]).sum(0).abs().max()) < 1e-15
-        assert float((normal * flat.normal[:, None, None]).sum(0).max()) > -0.99
-
-
 def test_depths_of_any_volume_are_tops_of_parabolas():
     volume, grid = lumpy(2, (8, 5, 7))
     z, plain = grid.depths.numpy(), volume.numpy()
@@ -330,22 +248,6 @@ def test_depths_of_any_volume_are_tops_of_parabolas():
     assert torch.equal(found.mask, share >= 0.9) and 0 < int(found.mask.sum()) < 35
 
 
-def test_masks_at_the_threshold_and_below_zero():
-    volume = torch.tensor([1.0, 0.25, 0.125, 0.0, -3.0]).reshape(1, 1, 5)
-    found = depth_map(volume, [0.1], threshold=0.25)
-    assert found.mask[0].tolist() == [True, True, False, False, False]
-    assert found.confidence[0].tolist() == [1.0, 0.25, 0.125, 0.0, 0.0]
-    # A threshold of zero takes what is above zero.
-    assert depth_map(volume, [0.1], threshold=0.0).mask[0].tolist() == [True, True, True, False, False]
-
-
-def test_tops_of_the_smallest_numbers_are_within_half_a_step():
-    # Where products are rounded to whole units of 1.4e-45, a top would be half a metre behind its plane.
-    one = torch.tensor(1.4e-45)
-    volume = torch.stack([0 * one, one, one]).reshape(3, 1, 1)
-    assert float(depth_map(volume, [0.0, 1.0, 1.6]).depth) == pytest.approx(1.3, abs=1e-6)
-
-
 def test_soft_depths_are_means_under_their_weights():
     volume, grid = lumpy(3)
     volume[:, 0, 1] = -volume[:, 0, 1]
@@ -358,27 +260,3 @@ def test_soft_depths_are_means_under_their_weights():
     torch.testing.assert_close(
         soft_depth(volume, grid), soft_depth(volume, grid.depths, sharpness=20.0), rtol=0, atol=0
     )
-
-
-def test_volumes_and_depths_that_do_not_fit():
-    grid = grid_of(UNEVEN)
-    for function in (depth_map, soft_depth, normals_from_volume):
-        for shape in ((8, 9, 8), (8, 8, 9), (7, 9, 9), (8, 9)):
-            with pytest.raises(ShapeError, match=r"expected a volume \(\.\.\., 8, 9, 9\), got \("):
-                function(torch.zeros(shape), grid)
-        with pytest.raises(ShapeError, match="got None"):
-            function(None, grid)
-        with pytest.raises(ShapeError, match=r"got torch.int64\. Give volume\.float\(\)"):
-            function(torch.zeros(grid.shape, dtype=torch.int64), grid)
-    for function in (depth_map, soft_depth):
-        assert function(torch.ones(2, 3, 1), [0.1, 0.2]) is not None
-        for shape in ((3, 2), (3, 2, 1), (2, 3)):
-            with pytest.raises(ShapeError, match=r"expected a volume \(\.\.\., 2, Y, X\), got \("):
-                function(torch.ones(shape), [0.1, 0.2])
-    for depth in (torch.zeros(9), torch.zeros(9, 8), None):
-        with pytest.raises(ShapeError, match=r"expected depths \(\.\.\., 9, 9\), got"):
-            normals_from_depth(depth, grid)
-    with pytest.raises(ShapeError, match=r"depths of real numbers, got torch\.int64"):
-        normals_from_depth(torch.zeros(9, 9, dtype=torch.int64), grid)
-    with pytest.raises(ShapeError, match="normals_from_volume: expected a VoxelGrid, which knows its axes"):
-        normals_from_volume(torch.zeros(8, 9, 9), UNEVEN)

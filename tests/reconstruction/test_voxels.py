@@ -1,7 +1,6 @@
 """Where the voxels of a grid stand."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,25 +137,6 @@ def test_without_normals_voxels_stand_where_sensor_and_laser_do(turned, side):
         assert torch.equal(grid.normal, torch.linalg.cross(grid.along_x, grid.along_y))
 
 
-def test_numbers_of_other_kinds():
-    box = [[0, 0, 0], [1, 1, 1]]
-    assert VoxelGrid.bounds(box, np.int64(2)) == VoxelGrid.bounds(box, 2.0) == VoxelGrid.bounds(box, (2, 2, 2))
-    assert VoxelGrid.bounds(box, torch.tensor([2, 3, 4])).shape == (4, 3, 2)
-    for size in ("2", None, [[1, 2, 3]], {}):
-        with pytest.raises(ShapeError, match="size"):
-            VoxelGrid.bounds(box, size)
-    for size in (2.5, True, math.nan, -1):
-        with pytest.raises((SceneError, ShapeError), match="size"):
-            VoxelGrid.bounds(box, size)
-    grid = VoxelGrid.before(SCAN, [0.1])
-    for name, value in (("size", 2), ("pitch", 0.1), ("size", (2, 2, 2)), ("pitch", None), ("size", "ab")):
-        with pytest.raises(ShapeError, match=f"VoxelGrid: {name}"):
-            replace(grid, **{name: value})
-    for name in ("first", "along_x", "normal"):
-        with pytest.raises(UnitError, match=f"{name} of finite"):
-            replace(grid, **{name: [math.nan, 0.0, 0.0]})
-
-
 def test_voxels_stand_where_their_axes_say():
     # Along axes of the world in another order, so that nothing can be exchanged.
     grid = VoxelGrid(
@@ -168,39 +148,6 @@ def test_voxels_stand_where_their_axes_say():
         depth = (0.25, 1.0, 4.0)[k]
         assert grid.points[k, j, i].tolist() == [10.0 + depth, 20.0 + 2.0 * i, 30.0 + 0.5 * j]
     assert repr(grid) == "VoxelGrid((3, 2, 3), 0.5 x 2 m apart, depths 0.25 to 4 m)"
-
-
-def test_grids_are_equal_when_all_of_them_is():
-    grid = VoxelGrid([0.25, 1.0], (2, 3), (0.5, 2.0), first=[0, 0, 0], along_x=[1, 0, 0], along_y=[0, 1, 0],
-                     normal=[0, 0, 1])  # fmt: skip
-    assert grid == replace(grid) and grid != "grid"
-    for change in (
-        {"depths": [0.25, 1.5]}, {"depths": [0.25]}, {"size": (3, 2)}, {"pitch": (0.5, 1.0)}, {"pitch": (1.0, 2.0)},
-        {"first": [0, 0, 1e-9]}, {"along_x": [-1, 0, 0]}, {"along_y": [0, -1, 0]}, {"normal": [0, 0, -1]},
-        {"along_x": [0, 1, 0], "along_y": [1, 0, 0]},
-    ):  # fmt: skip
-        assert grid != replace(grid, **change)
-
-
-@pytest.mark.parametrize("name", ["along_x", "along_y", "normal"])
-def test_axes_are_of_length_one_at_right_angles_to_a_millionth(name):
-    axes = dict(zip(("along_x", "along_y", "normal"), torch.eye(3, dtype=F64), strict=True))
-    for off, taken in ((0.4e-6, True), (-0.4e-6, True), (2e-5, False), (-2e-5, False)):
-        given = dict(axes)
-        given[name] = given[name] * (1 + off)
-        if taken:
-            VoxelGrid([1.0], (1, 1), (1.0, 1.0), first=[0, 0, 0], **given)
-            continue
-        with pytest.raises(ShapeError, match="length one at right angles"):
-            VoxelGrid([1.0], (1, 1), (1.0, 1.0), first=[0, 0, 0], **given)
-
-
-@pytest.mark.parametrize("name", ["first", "along_x", "along_y", "normal"])
-def test_vectors_of_other_shapes(name):
-    grid = VoxelGrid.before(SCAN, [0.1])
-    for value in ([0.0, 1.0], 1.0, "x", [[0.0, 0.0, 1.0]]):
-        with pytest.raises(ShapeError, match=rf"expected {name} as a vector \(3,\)"):
-            replace(grid, **{name: value})
 
 
 def test_lists_of_points_have_no_number_of_voxels_and_no_cells():
@@ -271,9 +218,3 @@ def test_planes_of_a_bent_wall_are_parallel_to_its_mean_one():
     assert grid.pitch == pytest.approx((1.5, 0.4)) and grid.size == (4, 5)
     with pytest.raises(ShapeError, match="without size and extent: expected sensor points on a regular"):
         VoxelGrid.before(scan, [0.5])
-
-
-@pytest.mark.parametrize("depths", [[0.1, math.inf], [-math.inf, 0.1], [math.nan, 0.1], [0.1, 0.3, 0.2]])
-def test_depths_are_finite_and_increase(depths):
-    with pytest.raises(UnitError, match="finite depths that increase"):
-        VoxelGrid.before(SCAN, [0.1]).at_depths(depths)

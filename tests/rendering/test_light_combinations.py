@@ -9,7 +9,7 @@ import torch
 import torchtransient as tt
 from support.marks import long_rows
 from tools.small_room import make_room
-from torchtransient.sensing.response.pulse import apply_pulse
+from torchtransient.sensing import apply_pulse
 
 BANDS = {
     "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},

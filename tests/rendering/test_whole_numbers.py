@@ -16,7 +16,7 @@ from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError
 from torchtransient.nlos.scene import _range as bounces_of
 from torchtransient.rendering.cameras import camera_of
 from torchtransient.rendering.labels import scene_labels
-from torchtransient.sensing.itof.itof_codes import phase_steps
+from torchtransient.sensing.itof.codes import phase_steps
 
 WHOLE = [np.int64(3), np.array(3), torch.tensor(3, dtype=torch.uint8)]
 NONE = [1.5, float("nan"), "x", "3", True, torch.tensor(True), 1j, [], {}, torch.tensor(3.0)]

@@ -5,19 +5,16 @@ from __future__ import annotations
 import copy
 import inspect
 import re
-import warnings
-from functools import partial
 
 import pytest
 import torch
 from torch import nn
 
-from support.refused import complaint
-from support.sensing.arguments import CALLS, COUNTS, DECIDE, LIGHT, OTHERS, PHASOR, RESPONSE, STOKES
+from support.sensing.arguments import CALLS, COUNTS, DECIDE, OTHERS, PHASOR
 from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import GradientError, ShapeError, TorchTransientError, UnitError
+from torchtransient.errors import GradientError
 
 every_call = together("name", sorted(CALLS))
 
@@ -99,23 +96,6 @@ def test_functions_measure_half_precision_in_single(name, dtype):
         assert found.dtype == (dtype if name in KEEP_HALF else exact.dtype)
 
 
-def test_large_numbers_in_half_precision():
-    """Squares, sums and rates beyond 65504, of numbers below it."""
-    big = torch.tensor([3e4], dtype=torch.float16)
-    noise = sensing.phase_noise_rad(big, 2 * big, 4, read_noise_e=300.0)
-    assert torch.equal(noise, sensing.phase_noise_rad(big.float(), 2 * big.float(), 4, read_noise_e=300.0))
-    albedo = torch.full((2, 2), 0.5, dtype=torch.float16)
-    sun = {"spectral_irradiance_w_m2_nm": 1.3, "filter_bandwidth_m": 1e-8, "wavelength_m": 7e-7}
-    rate = sensing.ambient_photon_rate(sensing.Optics(f_number=2.0), albedo, **sun)
-    assert rate.dtype == torch.float32
-    # one over 2^22: the products are those of float32
-    exact = sensing.ambient_photon_rate(sensing.Optics(f_number=2.0), 0.5, **sun)
-    assert rate[0, 0].item() == pytest.approx(exact, rel=1e-6) and exact > 65504
-    stokes = torch.tensor([3e4, 6e4, 6e4, 0.0], dtype=torch.float16).reshape(4, 1, 1, 1, 1)
-    assert sensing.unphysical_part(stokes).item() == pytest.approx(6e4 * 2**0.5 - 3e4, rel=1e-3)
-    assert torch.isfinite(sensing.project_physical(stokes)).all()
-
-
 # what tensors of maps and frames go into, besides constructors
 TAKE_ARRAYS = ("ambient_photon_rate", "crlb", "measured_code", "read_itof", "return_rates")
 
@@ -150,11 +130,6 @@ def test_a_repr_shows_the_numbers(name):
         if value.ndim == 0 and (name, argument) not in ANOTHER_WORD:
             assert re.search(rf"=\(?{re.escape(f'{float(value):g}')}[,)\n]", text), f"{argument} in {text}"
     assert repr(copy.deepcopy(module).to("meta")).startswith(name)
-
-
-def test_a_repr_without_memory():
-    spad = sensing.FreeRunningSPAD(10, 3e-9, bin_width_s=1e-9, learnable=True).to("meta")
-    assert "cycles=10" in repr(spad)
 
 
 def test_buffers_are_learnt_by_functional_call():
@@ -238,63 +213,6 @@ def test_calibrations_are_learnt(name):
     known = sensing.ItofCalibration(**{name: learnt})
     with pytest.raises(GradientError, match="sine code"):
         sensing.ItofCorrelation(sensing.square_code(4), 20e6, axis, calibration=known)
-
-
-def wrong_for(value):
-    """What may stand in the place of a tensor, or of a number, by mistake."""
-    whole = value.real.round().long() if value.is_complex() else value.round().long()
-    yield from (None, object(), ["a"], "x", 2**70, whole, whole > 0, value.to_sparse())
-    yield value.real if value.is_complex() else value + 1j
-    if value.ndim:
-        yield value[..., :0, :, :] if value.ndim >= 4 else value[:0]
-
-
-@pytest.mark.slow
-@together("name", sorted(CALLS))
-def test_what_is_no_tensor_of_numbers_is_said_in_one_sentence(name):
-    call, (numbers, rest) = getattr(sensing, name), CALLS[name]
-    wrong = []
-    for argument, value in numbers.items():
-        for given in wrong_for(value):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                attempt = partial(call, **{**numbers, argument: given}, **rest)
-                taken, said = complaint(attempt, TorchTransientError, given)
-            if taken and (isinstance(given, (str, list)) or type(given) is object):
-                said = f"{given!r} is taken"
-            wrong += [f"{argument}: {said}"] if said else []
-    assert not wrong, "; ".join(wrong)
-
-
-@together(
-    "make, error, said",
-    [
-        (lambda: sensing.Compose(0), TorchTransientError, "Compose: expected several sensors, got 0"),
-        (lambda: sensing.ComposedResponse(0), ShapeError, "ComposedResponse: expected several responses"),
-        (lambda: sensing.ComposedResponse([RESPONSE], oversampling=2**70), ShapeError, "oversampling to be odd"),
-        (lambda: sensing.PixelGroups(0, 0), TorchTransientError, "PixelGroups: expected several sensors, got 0"),
-        (lambda: sensing.fixed_pattern(-1, 2), UnitError, r"fixed_pattern: expected shape in \[0, inf\]"),
-        (lambda: sensing.fixed_pattern((2**40, 2**40), 2), UnitError, "at most 2\\^63 - 1 numbers"),
-        (lambda: sensing.sine_code(2**70), ShapeError, "expected at most 16777216 taps"),
-        (lambda: sensing.square_code(2**70), ShapeError, "expected at most 16777216 taps"),
-        (lambda: sensing.fourier_codes(2**70, 2), UnitError, "num_bins to be a whole number of at most 16777216"),
-        (lambda: sensing.FourierCode(4, {2**70: (0.5, 0.1)}), UnitError, "whole number of at most 16777216"),
-        (lambda: sensing.FourierCode(4, 5), TorchTransientError, "FourierCode: expected a dictionary"),
-        (lambda: sensing.FourierCode(4, {1: (0.5,)}), ShapeError, r"as \(amplitude, phase in radians\)"),
-        (lambda: sensing.defocus_psf(2**70), UnitError, "defocus_psf: expected a disc of at most 32768 points"),
-        (lambda: sensing.hamiltonian_code(torch.ones(3)), ShapeError, "expected 3 or 4 taps"),
-        (lambda: sensing.demosaic(torch.ones(1, 1, 4, 4), 2), ShapeError, "demosaic: block"),
-        (lambda: sensing.project_physical(STOKES, None), ShapeError, "stokes: dim: expected a whole number"),
-        (lambda: sensing.poisson(LIGHT, 5), TorchTransientError, "poisson: expected generator to be a torch.Generator"),
-        (lambda: sensing.poisson(1j * LIGHT), UnitError, "poisson: expected mean as real numbers, got torch"),
-        (lambda: sensing.phase_of(LIGHT), UnitError, "phase_of: expected phasor as complex numbers, got torch.float64"),
-        (lambda: sensing.background_per_bin(LIGHT[:, :0]), ShapeError, "one bin or more along time"),
-        (lambda: sensing.offset_of(LIGHT, 4, readout=torch.ones(2)), TorchTransientError, "expected readout to be one"),
-    ],
-)
-def test_what_sensors_do_not_take(make, error, said):
-    with pytest.raises(error, match=said):
-        make()
 
 
 def test_whole_numbers_and_truth_values_are_numbers():

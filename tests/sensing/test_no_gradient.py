@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
@@ -11,18 +9,8 @@ from support.marks import long
 from support.sensing.all_entries import each
 from support.sensing.contract import nothing_with_a_gradient_as_a_number, parts
 from torchtransient import TimeAxis, sensing
-from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing.base.pixel_maps import check_map, kept_map
-from torchtransient.sensing.base.policies import straight_through
-from torchtransient.sensing.chain.first_photon_moves import multinomial_log_prob
-from torchtransient.sensing.counts.moved_counts import Moves, move_counts
-from torchtransient.sensing.dead_time.clocked import subdivision_levels
-from torchtransient.sensing.dead_time.renewal import split_dead_time, stationary_phases
-from torchtransient.sensing.estimation.depth import background_per_bin
-from torchtransient.sensing.numerics.draws import check_rates, halve, sample_first_photons, sample_multinomial, thin
-from torchtransient.sensing.numerics.time_convolution import convolve_time
-from torchtransient.sensing.pixels.coincidence import _mean_survival
-from torchtransient.sensing.spad.spad import sample_detections
+from torchtransient.sensing import straight_through
+from torchtransient.sensing.chain.compose import multinomial_log_prob
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 12)
@@ -99,75 +87,7 @@ def test_chains_make_no_number_of_what_is_learnt(name):
     assert all(s is not None and bool(s.isfinite().all()) and bool((s != 0).any()) for s in slopes)
 
 
-TRIGGERS = {
-    "one exponential": learnt_afterpulses,
-    "two": lambda: learnt_afterpulses([0.05, 0.02], [3e-10, 2e-9]),
-    "power law": lambda: sensing.Afterpulsing(
-        0.1, dead_time_s=150 * PS, delays=sensing.PowerLawDelays(1.2, 5e-9, learnable=True), axis=AXIS, learnable=True
-    ),
-    "crosstalk": lambda: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True),
-    "crosstalk over edges": lambda: sensing.Crosstalk(0.05, learnable=True),
-}
-
-
-@pytest.mark.parametrize("name", TRIGGERS)
-def test_draws_of_what_detections_trigger_have_no_gradient(name):
-    """Whether grad mode is on or off; one by one and, of a large image, by a table."""
-    module = TRIGGERS[name]()
-    large = torch.poisson(torch.full((1, 12, 80, 80), 2.0), generator=generator())
-    with nothing_with_a_gradient_as_a_number():
-        for counts in (counts_of(5.0).float(), large):
-            drawn = module.trigger(counts, generator(1))
-            assert not drawn.requires_grad and bool((drawn >= counts).all()) and bool((drawn > counts).any())
-        assert 0 < module.share() < 0.5
-
-
-def test_values_that_are_refused_are_told_with_a_gradient_too():
-    """The number in the message is made of no tensor with a gradient."""
-    negative = torch.full((2, 2), -1.0, requires_grad=True)
-    budget = sensing.PixelElectronics()
-    budget.gain = torch.nn.Parameter(torch.tensor([[1.0, 2.0], [3.0, -4.0]]))
-    with nothing_with_a_gradient_as_a_number():
-        with pytest.raises(UnitError, match="got -1"):
-            check_map(negative, "gain", "here")
-        with pytest.raises(UnitError, match=r"gain in .*got -4"):
-            kept_map(budget, "gain")
-        with pytest.raises(UnitError, match="got -1 to -1"):
-            check_rates(negative, "here")
-        with pytest.raises(TorchTransientError, match="photons in a bin, got 1e"):
-            subdivision_levels(torch.full((2, 3), 1e12, requires_grad=True), 1)
-
-
 # ----------------------------------------------------------------------------------------------------------- draws
-
-
-def test_functions_that_draw():
-    rate = light()
-    share = torch.rand(1, 12, 2, 3, generator=generator(1), dtype=torch.float64).requires_grad_()
-    counts = counts_of(4.0).requires_grad_()
-    few, all_ = torch.tensor([0.3, 0.2]).double().requires_grad_(), torch.tensor([0.3, 0.7]).double().requires_grad_()
-    with nothing_with_a_gradient_as_a_number():
-        drawn = [
-            sensing.poisson(rate, generator()),
-            sensing.poisson(rate.float() + 1e7, generator()),
-            sample_detections(rate, 50, generator=generator()),
-            sample_detections(rate, 50, 1.5, generator=generator()),
-            sample_first_photons(50, rate, generator()),
-            sample_multinomial(50, rate / 10, generator()),
-            thin(counts, share, generator()).number,
-            thin(counts, share.flatten()[:1], generator()).number,
-            halve(counts, share, generator()),
-            *(move_counts(counts, Moves(-1, shares, "zero"), generator())[0] for shares in (few, all_)),
-            *(move_counts(counts, Moves(-1, shares, "periodic"), generator(), tally=True)[0] for shares in (few, all_)),
-            move_counts(counts * 1000, Moves(-1, all_, "periodic"), generator())[0],
-        ]
-    assert not any(value.requires_grad for value in drawn)
-
-
-def test_the_background_of_a_histogram_has_no_gradient():
-    x = light()
-    level = background_per_bin(x)
-    assert not level.requires_grad and torch.equal(level, x.detach().median(-3).values)
 
 
 def test_straight_through_has_the_gradient_of_the_mean_alone():
@@ -241,26 +161,6 @@ def test_moves_under_a_score_have_no_gradient_of_their_mean():
         assert all(bool((g != 0).any()) for g in torch.autograd.grad(score.log_prob(()), learnt))
 
 
-def test_a_dead_time_just_below_a_whole_number_keeps_its_derivative():
-    dead = torch.tensor(3 - 1e-10, dtype=torch.float64, requires_grad=True)
-    whole, part = split_dead_time(dead)
-    assert whole == 3 and float(part.detach()) == 0.0
-    assert float(torch.autograd.grad(part, dead)[0]) == 1.0
-
-
-def test_what_is_rounded_to_zero_keeps_its_derivative():
-    """A transform leaves 1e-17 where there is no light: its derivative is that of the plain sum, everywhere."""
-    kernel = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
-    x = torch.zeros(1, 12, 1, 1, dtype=torch.float64)
-    x[0, 3], x[0, 7] = 5.0, 3e3
-    direct, by_fft = (
-        torch.autograd.functional.jacobian(lambda v, m=m: convolve_time(v, kernel, -1, method=m), x)
-        for m in ("direct", "fft")
-    )
-    torch.testing.assert_close(by_fft, direct)
-    assert bool((convolve_time(x, kernel, -1, method="fft") >= 0).all())
-
-
 def test_the_normal_surrogate_of_a_free_running_detector():
     """Its derivative is that of the mean, and of the size of what is beside it as of independent bins."""
     spad = sensing.FreeRunningSPAD(400, 150 * PS, axis=AXIS, grad="gaussian")
@@ -269,26 +169,6 @@ def test_the_normal_surrogate_of_a_free_running_detector():
     size = (spad.variance(x) + 1e-4).log() / 2
     wanted = torch.autograd.grad((mean + (y - mean).detach() * size).sum(), x)[0]
     torch.testing.assert_close(torch.autograd.grad(y.sum(), x)[0], wanted)
-
-
-def test_a_solve_leaves_its_arguments_as_they_are():
-    """The derivative by the light alone: the dead time requires no gradient afterwards."""
-    rate = torch.rand(2, 5, dtype=torch.float64, generator=generator()).requires_grad_()
-    part = torch.tensor(0.3, dtype=torch.float64)
-    lines = stationary_phases(rate, part, 2)
-    assert bool(torch.autograd.grad(lines[:, 0].sum(), rate)[0].isfinite().all())
-    assert not part.requires_grad
-
-
-def test_codes_hold_no_gradient():
-    """Where no gradient is asked for they are made of parameters, and hold copies."""
-    knots = torch.tensor([[0.0, 0.4], [0.1, 0.7]], dtype=torch.float64)
-    values = torch.tensor([[1.0, -1.0], [0.5, -0.5]], dtype=torch.float64)
-    shifts = torch.nn.Parameter(torch.tensor([0.0, 0.25], dtype=torch.float64))
-    with torch.no_grad():
-        code = sensing.PiecewiseLinearCode(torch.nn.Parameter(knots), torch.nn.Parameter(values), shifts)
-    assert not code.shifts.requires_grad
-    assert not code.evaluate(torch.tensor([0.2, 0.9])).requires_grad
 
 
 WIDE = {"bin_width_s": 1e-9}
@@ -336,14 +216,3 @@ def test_detections_in_the_dark_have_derivatives(name):
         assert bool(value.isfinite().all())
         (slope,) = torch.autograd.grad(value.sum(), x, retain_graph=True)
         assert bool(slope.isfinite().all())
-
-
-def test_the_share_of_a_bin_that_a_detector_is_armed():
-    """(1 - exp(-x)) / x, in the dark a straight line."""
-    x = torch.tensor([0.0, 0.9e-5, 1.1e-5, 0.3, 40.0], dtype=torch.float64, requires_grad=True)
-    with torch.autograd.set_detect_anomaly(True):
-        value = _mean_survival(x)
-        (slope,) = torch.autograd.grad(value.sum(), x)
-    exact = torch.tensor([1.0, 1 - 0.45e-5, 1 - 0.55e-5, -math.expm1(-0.3) / 0.3, 1 / 40], dtype=torch.float64)
-    torch.testing.assert_close(value.detach(), exact, rtol=3e-11, atol=0)  # the next term is x^2 / 6
-    assert slope.tolist()[:3] == pytest.approx([-0.5] * 3, rel=1e-5)

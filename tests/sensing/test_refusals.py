@@ -1,4 +1,4 @@
-"""What is refused, by whom, and in which words: one line for each thing that sensing cannot do."""
+"""Arguments that would give plausible, wrong numbers: shapes, units, axes, NaN; and what a subclass lacks."""
 
 from __future__ import annotations
 
@@ -8,246 +8,245 @@ import pytest
 import torch
 
 from support.sweeps import together
-from torchtransient import TimeAxis, sensing
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, StorageError, TorchTransientError, UnitError
-from torchtransient.sensing.base.pixel_maps import check_map
-from torchtransient.sensing.base.policies import ScoreFunction
-from torchtransient.sensing.base.sensor import RandomSensor, Sensor
-from torchtransient.sensing.base.wrapped_detector import WrappedDetector
-from torchtransient.sensing.correlated_noise.afterpulsing import AfterpulseDelays
-from torchtransient.sensing.correlated_noise.afterpulsing_spad import _LossyChain
-from torchtransient.sensing.counts.added_counts import AddedCounts
-from torchtransient.sensing.counts.moved_counts import MovedCounts, Moves
-from torchtransient.sensing.dead_time.renewal import _check_residual
-from torchtransient.sensing.devices.devices import Device
-from torchtransient.sensing.numerics.draws import sample_multinomial
-from torchtransient.sensing.optics.polarization import demosaic, mosaic_rows
-from torchtransient.sensing.response.responses import Response
+from torchtransient import FrequencyAxis, Pulse, TimeAxis, sensing
+from torchtransient.errors import ArgumentError, GradientError, ShapeError, TorchTransientError, UnitError
 
-PS = 1e-12
-WIDTH = {"bin_width_s": 100 * PS}
+PS, F = 1e-12, 20e6
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 6)
+WIDTH = {"bin_width_s": 100 * PS}
 LIGHT = torch.full((1, 6, 2, 3), 0.2)
-SPADS = [sensing.SynchronousSPAD(7), sensing.SynchronousSPAD(9)]
-WHICH = torch.tensor([[0, 1, 1], [1, 0, 0]])
+STOKES = torch.ones(4, 1, 1, 2, 2)
+FRAMES = torch.ones(1, 4, 2, 3)
+PULSE = sensing.GaussianResponse(300 * PS)
+SINE, SQUARE = sensing.sine_code(4), sensing.square_code(4)
+LENS = sensing.Optics(f_number=2.0)
+ROWS = sensing.linear_analyzers([0.0, 45.0])
+SUN = {"spectral_irradiance_w_m2_nm": 0.9, "filter_bandwidth_m": 1e-8, "wavelength_m": 9e-7}
+BOUND = {"distance_m": 0.05, "signal": 3.0}
+MAPS = [torch.full((1, 2, 3), v, dtype=torch.float64) for v in (0.05, 3.0)]
+PHASOR = torch.ones(1, 1, 2, 3, dtype=torch.complex64)
 
 
-class Bare(Sensor):
-    """Nothing is defined."""
+def budget(**given):
+    light = {"pulse_energy_j": 1e-9, "wavelength_m": 905e-9, "repetition_rate_hz": 10e6, "cycles": 1000, "axis": AXIS}
+    return sensing.PhotonBudget(LENS, **{**light, **given})
 
 
-class Drawn(RandomSensor):
-    """A mean and draws, and nothing of their noise."""
+def ran_away(value):
+    response = sensing.GaussianResponse(60 * PS, learnable=True)
+    torch.nn.init.constant_(response.log_fwhm_s, value)
+    return sensing.ImpulseResponse(response, **WIDTH)(LIGHT)
 
-    def expected(self, x):
+
+def mean(distance, signal):
+    return sensing.return_rates(PULSE, AXIS, distance_m=distance, signal=signal).movedim(-1, -3)
+
+
+class Backward(torch.autograd.Function):
+    """No derivative in forward mode."""
+
+    @staticmethod
+    def forward(ctx, x):
         return 2 * x
 
-    def sample(self, x, generator=None):
-        return 2 * x
+    @staticmethod
+    def backward(ctx, g):
+        return 2 * g
 
 
-class Cut(Sensor):
+class Cut(sensing.Sensor):
     """Loses its gradient."""
 
     def expected(self, x):
         return x.detach()
 
 
-class Unplaced(Response):
-    """No distribution."""
-
-    def __init__(self):
-        super().__init__(0.0, False)
+def one_backward(*maps):
+    return Backward.apply(mean(*maps))
 
 
-def scored(losses, **keywords):
-    with ScoreFunction() as score:
-        sensing.ShotNoise(grad="score")(LIGHT.clone().requires_grad_())
-    return score.surrogate(losses, **keywords)
+def calibrated(**numbers):
+    return sensing.ItofCorrelation(SINE, F, AXIS, calibration=sensing.ItofCalibration(**numbers))
 
 
-def camera(**keywords):
-    given = {"frequencies_hz": (20e6, 60e6), **keywords}
-    return sensing.ItofCorrelation(sensing.sine_code(3), axis=AXIS, **given)
+def other_state(camera, **changed):
+    return camera.load_state_dict({**camera.state_dict(), **changed})
 
 
-def map_of(rows=2, columns=3):
-    return sensing.ItofCalibration(phase_map_rad=torch.full((rows, columns), 0.1))
+SHAPES = [
+    lambda: sensing.crlb(PULSE, AXIS, distance_m=torch.ones(2), signal=torch.ones(3)),
+    lambda: sensing.covariance_bound(mean, []),
+    lambda: sensing.covariance_bound(lambda *p: mean(*p)[0], MAPS),
+    lambda: sensing.log_matched_filter(LIGHT, PULSE.kernel(100 * PS)),
+    lambda: sensing.first_return(LIGHT, torch.ones(6)),
+    lambda: sensing.center_of_mass(LIGHT, background=torch.ones(1, 1, 2, 3)),
+    lambda: sensing.ml_position(LIGHT, PULSE, TimeAxis.from_seconds(0.0, 100 * PS, 5)),
+    lambda: sensing.peak_position(LIGHT[:, :0]),
+    lambda: sensing.distance_to_points(torch.ones(4, 5), torch.ones(2, 3, 3)),
+    lambda: sensing.distance_to_points(torch.ones(2, 4, 5), torch.ones(3, 4)),
+    lambda: sensing.ItofCorrelation(sensing.sine_code(2), F, AXIS),
+    lambda: sensing.hamiltonian_code(6),
+    lambda: sensing.measured_code(torch.ones(10)),
+    lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]),
+    lambda: sensing.PiecewiseLinearCode(torch.ones(2, 3), torch.ones(2, 4)),
+    lambda: sensing.correlate(LIGHT, torch.ones(4, 5)),
+    lambda: sensing.tap_phasor(FRAMES, 3),
+    lambda: sensing.decode_code(FRAMES[:, :2], sensing.sine_code(2)),
+    lambda: sensing.read_itof(torch.ones(1, 8, 2, 3), F, 4),
+    lambda: sensing.read_itof(FRAMES, F, 4, code=sensing.sine_code(3)),
+    lambda: sensing.read_itof(FRAMES, F, 4, calibration=sensing.ItofCalibration(depth_map_m=torch.zeros(3, 2))),
+    lambda: sensing.read_itof(FRAMES, F, 4, noise=sensing.ItofNoise(std_e=torch.ones(3, 2))),
+    lambda: sensing.unwrap_depth(torch.ones(1, 3, 1, 1), (F, 50e6)),
+    lambda: calibrated(phase_map_rad=torch.ones(3)),
+    lambda: calibrated(phase_offset_rad=[0.1, 0.2]),
+    lambda: calibrated(phase_map_rad=torch.zeros(2, 2, 3)),
+    lambda: calibrated(phase_map_rad=torch.zeros(2, 3), depth_map_m=torch.zeros(3, 2)),
+    lambda: calibrated(phase_map_rad=torch.zeros(3, 2)).expected(LIGHT),
+    lambda: other_state(calibrated(), phases_rad=torch.ones(2)),
+    lambda: sensing.taps_from_phasor(LIGHT, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
+    lambda: sensing.analyze(torch.ones(3, 1, 1, 2, 2), ROWS),
+    lambda: sensing.analyze(STOKES, torch.ones(2, 3)),
+    lambda: sensing.stokes_from(torch.ones(3, 1, 1, 2, 2), ROWS),
+    lambda: sensing.mosaic_rows([[0, 45], [90]]),
+    lambda: sensing.Analyzers(torch.ones(2, 2, 4)),
+    lambda: sensing.PolarizationMosaic(torch.ones(2, 4)),
+    lambda: sensing.demosaic(torch.ones(1, 1, 1, 5)),
+    lambda: sensing.project_physical(torch.ones(3, 2)),
+    lambda: sensing.blur_image(LIGHT, torch.ones(3, 4)),
+    lambda: sensing.blur_image(LIGHT, torch.ones(9, 9)),
+    lambda: sensing.SpatialPSF(torch.ones(3)),
+    lambda: sensing.LensBlur(0.8, size=4),
+    lambda: sensing.gate_profiles(torch.ones(2, 2), torch.ones(2), AXIS, rise_s=1e-10, fall_s=1e-10),
+    lambda: sensing.GatedIntegration([1e-10], [1e-10, 2e-10], AXIS),
+    lambda: sensing.PixelElectronics(gain_map=torch.ones(3, 2))(LIGHT),
+    lambda: sensing.apply_pulse(LIGHT[:, :5], AXIS, Pulse.gaussian(0.1)),
+    lambda: sensing.apply_pulse(LIGHT, AXIS, Pulse.gaussian(0.1), keep=TimeAxis(0.01, AXIS.bin_width_opl, 3)),
+    lambda: sensing.SynchronousSPAD(10, gate=torch.ones(2, 6)),
+    lambda: sensing.SynchronousSPAD(10, gate=torch.ones(5))(LIGHT),
+    lambda: sensing.TDC(torch.ones(5))(LIGHT),
+    lambda: sensing.TDC(torch.tensor(1.0)),
+    lambda: sensing.CodedHistogram(torch.ones(4)),
+    lambda: sensing.MeasuredResponse(torch.ones(1), PS),
+    lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.1]),
+    lambda: sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=4),
+    lambda: sensing.convolve_time(LIGHT, torch.ones(2, 2)),
+    lambda: sensing.PixelGroups.by_value(torch.ones(3), lambda value: sensing.SynchronousSPAD(7)),
+    lambda: sensing.adjoint(sensing.ShotNoise(), LIGHT[:, :5], LIGHT.shape),
+    lambda: sensing.ShotNoise()(LIGHT[0]),
+]  # fmt: skip
+UNITS = [
+    lambda: sensing.crlb(PULSE, AXIS, distance_m=-0.6, signal=3.0),
+    lambda: sensing.crlb(PULSE, AXIS, distance_m=0.6, signal=math.nan),
+    lambda: sensing.crlb(PULSE, AXIS, distance_m=0.6, signal=torch.ones(2) + 1j),
+    lambda: sensing.covariance_bound(lambda *p: -mean(*p), MAPS),
+    lambda: sensing.covariance_bound(mean, MAPS, cycles=2),
+    lambda: sensing.log_matched_filter(LIGHT, -torch.ones(3)),
+    lambda: sensing.range_deviation_m(1e-10, -torch.ones(2)),
+    lambda: sensing.FourierCode(4, {1: (0.8, 0), 3: (0.3, 0)}),
+    lambda: sensing.square_code(4, light_duty=1.2),
+    lambda: sensing.binary_code(0.1, [[(0, 0.5), (0.4, 0.6)]] * 3),
+    lambda: sensing.binary_code(0.1, [[(0.4, 0.2)]] * 2),
+    lambda: sensing.PiecewiseLinearCode(torch.tensor([[0.5, 0.2]] * 2), torch.zeros(2, 2)),
+    lambda: sensing.PiecewiseLinearCode(torch.tensor([[0.1, 0.2]] * 2), torch.full((2, 2), 1.1)),
+    lambda: SINE.bin_means(torch.tensor([1.0, 0.0])),
+    lambda: sensing.measured_code(torch.zeros(3, 10)),
+    lambda: sensing.ReversedCode(sensing.hamiltonian_code(4)),
+    lambda: sensing.tap_weights(SINE, 20.0, AXIS),
+    lambda: sensing.tap_weights(SINE, (), AXIS),
+    lambda: sensing.tap_weights(SINE, F, AXIS, within_bin="left"),
+    lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
+    lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SQUARE, frequencies_hz=F),
+    lambda: sensing.offset_of(FRAMES, 4, "differential"),
+    lambda: sensing.read_itof(FRAMES.short(), F, 4, noise=sensing.ItofNoise(read_noise_e=2.0)),
+    lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=-1.0),
+    lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=7000.0),
+    lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), weights=(1, 0)),
+    lambda: sensing.unambiguous_range_m((F, 50.5e3 + 0.5)),
+    lambda: calibrated(phase_offset_rad=90.0),
+    lambda: calibrated(depth_map_m=torch.full((2, 3), 12.0)),
+    lambda: calibrated(phase_map_rad=torch.full((2, 3), math.nan)),
+    lambda: calibrated(direction=2),
+    lambda: other_state(calibrated(), weights=calibrated().weights + 1e-3),
+    lambda: sensing.linear_analyzers([0.0], 0.01),
+    lambda: sensing.linear_analyzers([900.0]),
+    lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, pixel_area_m2=1e-10),
+    lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
+    lambda: sensing.Optics(solid_angle_sr=6.3),
+    lambda: sensing.ambient_photon_rate(LENS, 0.5, **{**SUN, "spectral_irradiance_w_m2_nm": 1300.0}),
+    lambda: sensing.ambient_photon_rate(LENS, 1.5, **SUN),
+    lambda: budget(pulse_energy_j=0.2),
+    lambda: budget(wavelength_m=0.94),
+    lambda: budget(repetition_rate_hz=10.0, cycles=100_000),
+    lambda: budget(cycles=None, exposure_s=1e-9),
+    lambda: budget(repetition_rate_hz=2e9)(LIGHT),
+    lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
+    lambda: sensing.defocus_psf(0.01, oversampling=2),
+    lambda: sensing.SpatialPSF(torch.tensor([[3.0, -1.0, 1.0]])),
+    lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9),
+    lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT),
+    lambda: sensing.PixelElectronics(gain_e_per_dn=2.0),
+    lambda: sensing.PixelElectronics(gain_e_per_dn=4.0, bits=4, black_level_dn=15.01),
+    lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
+    lambda: sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS),
+    lambda: sensing.SynchronousSPAD(True),
+    lambda: sensing.FreeRunningSPAD(10, 50 * PS, **WIDTH),
+    lambda: sensing.coates(LIGHT, 10, 0.7),
+    lambda: sensing.paralyzable_histogram(LIGHT, -0.5),
+    lambda: sensing.first_photon_log_prob(LIGHT + 9, LIGHT, 10),
+    lambda: sensing.TDC(torch.full((6,), 100.0)),
+    lambda: sensing.TDC(torch.tensor([1.0, -1.0])),
+    lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.6, 0.5]),
+    lambda: ran_away(math.nan),
+    lambda: ran_away(-2.0),
+    lambda: sensing.DetectionJitter(PULSE, AXIS, grad="straight_through")(LIGHT * math.nan),
+    lambda: sensing.ShotNoise()(PHASOR),
+    lambda: sensing.ShotNoise()(LIGHT.long()),
+    lambda: sensing.phase_of(LIGHT),
+]  # fmt: skip
+OTHERS = [
+    (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ArgumentError),
+    (lambda: sensing.ItofCorrelation(SINE, F, 50e-12), ArgumentError),
+    (lambda: sensing.ShotNoise("straight_through")(LIGHT, generator=0), ArgumentError),
+    (lambda: sensing.ShotNoise(grad="sometimes"), ArgumentError),
+    (lambda: sensing.read_itof(FRAMES, F, 4, readout="double"), ArgumentError),
+    (lambda: sensing.decode_code(FRAMES, sensing.TwoTapCode(sensing.sine_code(2))), ArgumentError),
+    (lambda: sensing.crlb(PULSE, AXIS, **BOUND, unknown=["distance", "albedo"]), ArgumentError),
+    (lambda: sensing.Compose(sensing.ShotNoise()), ArgumentError),
+    (lambda: sensing.Compose([torch.relu]), ArgumentError),
+    (lambda: sensing.covariance_bound(one_backward, MAPS), GradientError),
+    (lambda: sensing.adjoint(Cut(), LIGHT, LIGHT.shape), GradientError),
+    (lambda: sensing.Moves(0, torch.ones(2, 6) / 2, "zero").log_prob(torch.ones(2, 1)), GradientError),
+    (lambda: sensing.detections_with_dead_time(torch.full((1, 6, 1, 1), 1e12), 1.5), TorchTransientError),
+]  # fmt: skip
 
 
-def described(**parts):
-    stages = ({"kind": "SynchronousSPAD", "cycles": 5},)
-    return Device(**{"name": "a", "description": "b", "sources": (), "stages": stages, **parts})
-
-
-REFUSED = {
-    "complex map": (lambda: check_map(torch.ones(2, 2, dtype=torch.complex64), "gain", "here"), UnitError,
-                    "here: expected gain as real numbers, got torch.complex64"),
-    "truth values as a map": (lambda: check_map(torch.ones(2, 2, dtype=torch.bool), "gain", "here"), UnitError,
-                              "here: expected gain as real numbers, got torch.bool"),
-    "baseline": (lambda: scored(torch.ones(1), baseline="mean"), ArgumentError, "baseline 'leave_one_out' or a number"),
-    "no gaussian": (lambda: Drawn(grad="gaussian")(LIGHT), GradientError, "^Drawn: grad='gaussian' is not supported"),
-    "no score": (lambda: Drawn(grad="score").log_prob(LIGHT, LIGHT), GradientError,
-                 "^Drawn: grad='score' is not supported"),
-    "edges of a gate": (lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9), UnitError,
-                        "^GatedIntegration: expected edges in seconds that fit a window of 6e-10 s"),
-    "falling edge of a gate": (lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=1e-10, fall_s=6.1e-9),
-                               UnitError, "^GatedIntegration: expected edges in seconds"),
-    "no map of sensors": (lambda: sensing.PixelGroups.by_value(torch.ones(3), lambda value: SPADS[0]), ShapeError,
-                          r"PixelGroups\.by_value: expected a map"),
-    "list of sensors' values": (lambda: sensing.PixelGroups.by_value([[1.0]], lambda value: SPADS[0]), ShapeError,
-                                r"PixelGroups\.by_value: expected a map"),
-    "gates of other numbers": (
-        lambda: sensing.PixelGroups([sensing.GatedIntegration(d, 1e-10, AXIS, rise_s=1e-11)
-                                     for d in ([1e-10], [1e-10, 2e-10])], WHICH)(LIGHT),
-        ShapeError, "PixelGroups: expected sensors that give equal bins"),
-    "likelihood of a blur": (
-        lambda: sensing.PixelGroups([sensing.ImpulseResponse(sensing.GaussianResponse(PS), **WIDTH)] * 2, WHICH)
-        .log_prob(LIGHT, LIGHT), GradientError, r"PixelGroups\.log_prob: expected random sensors, got ImpulseResponse"),
-    "long laws of delays": (
-        lambda: sensing.MeasuredDelays(torch.ones(3), 1e-9).kernel(0.0, 3e-9 / (1 << 23), 5), UnitError,
-        "^MeasuredDelays: expected delays of at most 8388608 bins, got 838861"),
-    "no law of delays": (lambda: sensing.Afterpulsing(0.1, dead_time_s=0.0, delays=3.0, **WIDTH), UnitError,
-                         "Afterpulsing: expected delays to be PowerLawDelays"),
-    "several probabilities of a law": (
-        lambda: sensing.Afterpulsing([0.1], dead_time_s=0.0, delays=sensing.MeasuredDelays(torch.ones(3), 1e-9),
-                                     **WIDTH), ShapeError, "expected one probability of delays, got 1"),
-    "exponentials of a law": (
-        lambda: sensing.Afterpulsing(0.1, dead_time_s=0.0, delays=sensing.MeasuredDelays(torch.ones(3), 1e-9),
-                                     **WIDTH).tau_s, UnitError, r"Afterpulsing\.tau_s: expected exponentials"),
-    "score of moves of every bin": (
-        lambda: Moves(0, torch.ones(2, 6) / 2, "zero").log_prob(torch.ones(2, 1)), GradientError,
-        r"MovedCounts: expected shares \(L,\) under grad='score'"),
-    "carriers that do not converge": (
-        lambda: _LossyChain._checked(torch.ones(2), torch.tensor([0.0, 2e-7])), TorchTransientError,
-        "relative residual of 1e-07 of trapped carriers, got 2e-07"),
-    "phases that do not converge": (lambda: _check_residual(torch.tensor([1e-10, 2e-9])), TorchTransientError,
-                                    "relative residual of 1e-09, got 2e-09"),
-    "phases that are no number": (lambda: _check_residual(torch.tensor([math.nan])), TorchTransientError, "got nan"),
-    "name of a device": (lambda: described(name=3), StorageError, "expected name as a text, got 3"),
-    "description of a device": (lambda: described(description=None), StorageError, "expected description as a text"),
-    "source of a device": (lambda: described(sources="page 3"), StorageError, "expected sources as a list"),
-    "stages of a device": (lambda: described(stages={"kind": "ShotNoise"}), StorageError, "expected stages as a list"),
-    "number as a source": (lambda: described(sources=(3,)), StorageError, "expected sources as texts, got 3"),
-    "transpose without gradient": (lambda: sensing.adjoint(Cut(), LIGHT, LIGHT.shape), GradientError,
-                                   "adjoint: expected a sensor with gradients, but Cut has none"),
-    "knots and values of two shapes": (lambda: sensing.PiecewiseLinearCode(torch.ones(2, 3), torch.ones(2, 4)),
-                                       ShapeError, r"expected knots and values \(N, J >= 2\)"),
-    "one knot": (lambda: sensing.PiecewiseLinearCode(torch.ones(2, 1), torch.ones(2, 1)), ShapeError, "J >= 2"),
-    "knots in one row": (lambda: sensing.PiecewiseLinearCode(torch.arange(3) / 4, torch.ones(3)), ShapeError, "J >= 2"),
-    "values above one": (
-        lambda: sensing.PiecewiseLinearCode(torch.tensor([[0.1, 0.2]] * 2), torch.tensor([[1.0, -1.0], [0.3, -1.1]])),
-        UnitError, r"expected values in \[-1, 1\], got up to 1\.1"),
-    "opening of a turn": (lambda: sensing.binary_code(0.1, [[(0.2, 1.2)]] * 2), UnitError,
-                          "openings and light of 0 to 1 turn"),
-    "opening backwards": (lambda: sensing.binary_code(0.1, [[(0.4, 0.2)]] * 2), UnitError,
-                          "openings and light of 0 to 1 turn"),
-    "light all the time": (lambda: sensing.binary_code(1.0, [[(0.2, 0.4)]] * 2), UnitError,
-                           "openings and light of 0 to 1 turn"),
-    "weights of no picture": (lambda: sample_multinomial(3, torch.ones(2, 3)), ShapeError,
-                              r"sample_multinomial: expected \(\.\.\., T, H, W\)"),
-    "empty kernel": (lambda: sensing.convolve_time(LIGHT, torch.ones(0)), ShapeError,
-                     r"convolve_time: expected a kernel \(K,\) with K >= 1, got \(0,\)"),
-    "kernel of two dimensions": (lambda: sensing.convolve_time(LIGHT, torch.ones(2, 2)), ShapeError, "convolve_time"),
-    "even spread": (lambda: sensing.blur_image(LIGHT, torch.ones(1, 2)), ShapeError, "blur_image: expected a PSF"),
-    "high even spread": (lambda: sensing.blur_image(LIGHT, torch.ones(2, 1)), ShapeError, "blur_image: expected a PSF"),
-    "flat spread": (lambda: sensing.blur_image(LIGHT, torch.ones(3)), ShapeError, "blur_image: expected a PSF"),
-    "small disc": (lambda: sensing.defocus_psf(0.01, oversampling=2), UnitError,
-                   "a tenth of a pixel or more, got 0.01"),
-    "dark spread": (lambda: sensing.SpatialPSF(torch.zeros(3, 3)), UnitError, "SpatialPSF: expected finite values"),
-    "negative spread": (lambda: sensing.SpatialPSF(torch.tensor([[3.0, -1.0, 1.0]])), UnitError, "SpatialPSF"),
-    "infinite spread": (lambda: sensing.SpatialPSF(torch.tensor([[3.0, math.inf, 1.0]])), UnitError, "SpatialPSF"),
-    "even lens": (lambda: sensing.LensBlur(0.8, size=4), ShapeError, "LensBlur: expected an odd size, got 4"),
-    "codes in one row": (lambda: sensing.CodedHistogram(torch.ones(4)), ShapeError, r"codes \(K, T\), got \(4"),
-    "codes as a list": (lambda: sensing.CodedHistogram([[1.0]]), ShapeError, r"expected codes \(K, T\), got list"),
-    "infinite codes": (lambda: sensing.CodedHistogram(torch.tensor([[1.0, math.inf]])), UnitError, "finite codes"),
-    "one measured count": (lambda: sensing.MeasuredResponse(torch.ones(1), PS), ShapeError, r"T >= 2, got \(1,\)"),
-    "counts as a list": (lambda: sensing.MeasuredResponse([1.0, 2.0], PS), ShapeError, "T >= 2, got list"),
-    "peak in the middle": (lambda: sensing.MeasuredResponse(torch.tensor([0.0, 3.0, 1.0]), PS, align="peak"),
-                           ShapeError, "align 'center_of_mass' or 'start', got 'peak'"),
-    "even oversampling": (lambda: sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=4), ShapeError,
-                          "oversampling to be odd and >= 1, got 4"),
-    "no oversampling": (lambda: sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=-1), ShapeError,
-                        "oversampling to be odd and >= 1, got -1"),
-    "one share of two tails": (lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.1]), ShapeError,
-                               "as many fractions as tails_s, got 1 and 2"),
-    "no tails": (lambda: sensing.TailedResponse(PS, [], []), ShapeError, "as many fractions as tails_s, got 0 and 0"),
-    "shares of more than all": (lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.6, 0.5]), UnitError,
-                                r"fractions with sum <= 1, got 1\.1"),
-    "negative dead time": (lambda: sensing.paralyzable_histogram(LIGHT, -0.5), UnitError, "dead_bins >= 0, got -0.5"),
-    "endless dead time": (lambda: sensing.paralyzable_histogram(LIGHT, math.inf), UnitError, "dead_bins >= 0, got inf"),
-    "wide jitter of sweeps": (lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT), UnitError,
-                              "SweepJitter: expected jitter below the window of 6e-10 s"),
-    "codes of no dimension": (lambda: sensing.TDC(torch.tensor(1.0)), ShapeError, r"TDC: expected code_widths \(T,\)"),
-    "codes of a list": (lambda: sensing.TDC([1.0, 1.0]), ShapeError, r"TDC: expected code_widths \(T,\)"),
-    "no codes": (lambda: sensing.TDC(torch.ones(0)), ShapeError, r"TDC: expected code_widths \(T,\)"),
-    "half a sphere and more": (lambda: sensing.Optics(solid_angle_sr=6.3), UnitError,
-                               r"solid_angle_sr in \(0, 6\.28319\]"),
-    "one angle": (lambda: sensing.linear_analyzers(30.0), ShapeError,
-                  "linear_analyzers: expected a list of angles, got 30"),
-    "one angle as a tensor": (lambda: sensing.linear_analyzers(torch.tensor(30.0)), ShapeError, "a list of angles"),
-    "block of one angle": (lambda: mosaic_rows(30.0), ShapeError, "mosaic_rows: expected rows of angles, got 30"),
-    "block of one row": (lambda: mosaic_rows([30.0, 60.0]), ShapeError, "mosaic_rows: expected rows of angles"),
-    "raw light as a list": (lambda: demosaic([1.0]), ShapeError, r"demosaic: expected raw as a tensor, got .*1\.0"),
-    "transpose of no sensor": (lambda: sensing.adjoint(torch.nn.Identity(), LIGHT, LIGHT.shape), ArgumentError,
-                               r"adjoint: expected a sensor of tt\.sensing, got .*Identity"),
-    "samples of two lengths": (lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]), ShapeError,
-                               "measured_code: expected samples as rows of numbers of one length"),
-    "no solid angle": (lambda: sensing.Optics(solid_angle_sr=0.0), UnitError, "solid_angle_sr in"),
-}  # fmt: skip
-
-
-@together("name", REFUSED)
-def test_what_is_refused(name):
-    call, error, words = REFUSED[name]
-    with pytest.raises(error, match=words):
+@together("call", SHAPES)
+def test_shapes(call):
+    with pytest.raises(ShapeError, match="expected"):
         call()
 
 
-UNDEFINED = {
-    "expected": lambda: Bare()(LIGHT),
-    "expected of draws": lambda: RandomSensor()(LIGHT),
-    "sample": lambda: RandomSensor().sample(LIGHT),
-    "rate": lambda: WrappedDetector(SPADS[0], None).rate(LIGHT),
-    "seen": lambda: AfterpulseDelays().seen(1e-9),
-    "mean_yet_to_come": lambda: AfterpulseDelays().mean_yet_to_come(torch.ones(2), 1e-9, 1e-9),
-    "draw": lambda: AfterpulseDelays().draw(3, 1e-9, None),
-    "end_s": lambda: AfterpulseDelays().end_s(),
-    "extra": lambda: AddedCounts().extra(LIGHT),
-    "trigger": lambda: AddedCounts().trigger(LIGHT, None),
-    "share": lambda: AddedCounts().share(),
-    "moves": lambda: MovedCounts().moves(LIGHT),
-    "cdf": lambda: Unplaced().cdf(torch.ones(2)),
-    "support_s": lambda: Unplaced().support_s(),
-}
+@together("call", UNITS)
+def test_units(call):
+    with pytest.raises(UnitError, match=r"expected|overlap"):
+        call()
 
 
-@pytest.mark.parametrize("name", UNDEFINED)
-def test_what_a_subclass_has_to_define(name):
-    with pytest.raises(NotImplementedError, match=f"has to define {name.split()[0]}"):
-        UNDEFINED[name]()
+@together("call, error", OTHERS)
+def test_other_objects(call, error):
+    with pytest.raises(error, match="expected"):
+        call()
 
 
-def test_the_state_of_a_camera_of_other_frequencies():
-    state = camera(calibration=map_of()).state_dict()
-    one = camera(calibration=map_of(), frequencies_hz=20e6)
-    with pytest.raises(ShapeError, match=r"load_state_dict: expected phases_rad \(1, H, W\), got \(2, 2, 3\)"):
-        one.load_state_dict(state)
-    two = camera(calibration=map_of(3, 4))
-    two.load_state_dict(state)
-    assert two.phases_rad.shape == (2, 2, 3)
-    with pytest.raises(ShapeError, match="phases_rad"):
-        camera().load_state_dict({**camera().state_dict(), "phases_rad": torch.ones(2)})
-
-
-def test_limits_that_are_reached_are_taken():
-    """What is refused begins behind them."""
+def test_limits_are_taken():
     assert sensing.Optics(solid_angle_sr=2 * math.pi).etendue_m2_sr > 0
-    sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6e-9, fall_s=5.9e-9)
-    assert sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=1).oversampling == 1
+    assert budget(exposure_s=3600.0, cycles=None).exposure_s == 3600.0
     assert not sensing.TailedResponse(PS, [PS, 2 * PS], [0.6, 0.4]).has_core
     assert torch.equal(sensing.paralyzable_histogram(LIGHT, 0.0), LIGHT)
-    assert sensing.defocus_psf(0.5).tolist() == [[1.0]]
-    for half in (torch.tensor([0.2]), torch.tensor([1e-7])):
-        _LossyChain._checked(half, half * 0 + 1e-7)
-    _check_residual(torch.tensor([1e-9], dtype=torch.float64))
+
+
+def test_a_subclass_lacks_its_mean():
+    with pytest.raises(NotImplementedError, match="has to define expected"):
+        sensing.RandomSensor()(LIGHT)
+    with pytest.raises(GradientError, match="grad='score' is not supported"):
+        sensing.RandomSensor().log_prob(LIGHT, LIGHT)

@@ -7,8 +7,9 @@ import torch
 
 from torchtransient import stokes as light
 from torchtransient.errors import UnitError
-from torchtransient.sensing import Compose, PixelElectronics
-from torchtransient.sensing.optics.polarization import (
+from torchtransient.sensing import (
+    Compose,
+    PixelElectronics,
     PolarizationMosaic,
     mosaic_rows,
     project_physical,

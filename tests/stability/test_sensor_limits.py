@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchtransient import losses, sensing
-from torchtransient.sensing.numerics.time_convolution import sum_before
+from torchtransient.sensing.time_convolution import sum_before
 
 PS = 1e-12
 

@@ -6,7 +6,7 @@ import torch
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.testing import closed_forms_nlos
+from torchtransient.testing import closed_forms
 
 WALL = Wall.plane(2.0, 1.6, albedo=0.9)
 AXIS = TimeAxis(1.2, 0.02, 100)
@@ -15,7 +15,7 @@ AXIS = TimeAxis(1.2, 0.02, 100)
 def confocal_plane(depth=0.8, size=(16, 12), wall_albedo=0.9, albedo=0.7):
     """Confocal capture of an infinite plane `depth` metres before a wall and parallel to it, the same everywhere."""
     scan = Scan.grid(WALL, size, kind="confocal")
-    bins = torch.from_numpy(closed_forms_nlos.confocal_plane(AXIS.edges_opl, depth, albedo, wall_albedo)).float()
+    bins = torch.from_numpy(closed_forms.confocal_plane(AXIS.edges_opl, depth, albedo, wall_albedo)).float()
     return Capture(bins[None, :, None, None].expand(1, -1, *scan.shape).clone(), AXIS, scan)
 
 

@@ -17,7 +17,7 @@ SCRIPT = """
 import sys
 import torchtransient
 from support.fake_recipe import FakeRecipe
-from torchtransient.data.generation.generate import generate
+from torchtransient.data import generate
 {before}
 if __name__ == "__main__":
     print(generate({recipe!r}, {folder!r}, progress=False, **{arguments!r}))

@@ -272,10 +272,10 @@ def _runs() -> dict[str, Case]:
         "data.SpatialFilter": Case(d.SpatialFilter, torch.nn.Identity(), images_at_once=3),
         "data.spatial_filter": Case(d.spatial_filter, torch.nn.Identity(), LIGHT, images_at_once=3),
         "data.generate": Case(
-            until(f"{DATA}.generation.generate._folder", d.generate), FakeRecipe(), "x", n=3, workers=1, per_shard=3
+            until(f"{DATA}.generation._folder", d.generate), FakeRecipe(), "x", n=3, workers=1, per_shard=3
         ),
         "data.OnlineDataset": Case(
-            until(f"{DATA}.reading.online.Producers", d.OnlineDataset),
+            until(f"{DATA}.online.Producers", d.OnlineDataset),
             FakeRecipe(),
             capacity=8,
             workers=1,
@@ -307,7 +307,7 @@ def _runs() -> dict[str, Case]:
         ),
         "training.ranks": Case(entered(t.ranks), threads=1),
         "threads": Case(until("torchtransient.rendering.threads._set", tt.threads), n=1),
-        "data.export_web_dataset": Case(until(f"{DATA}.storage.web_dataset.path_of", d.export_web_dataset), "x", "y"),
+        "data.export_web_dataset": Case(until(f"{DATA}.exports.path_of", d.export_web_dataset), "x", "y"),
         "training.Seeds": Case(t.Seeds, seed=3),
         "training.Seeds.generator": Case(t.Seeds(0).generator, step=3, sample=3),
         "training.Ranks.mean": Case(t.Ranks().mean, value=1.0),
@@ -322,27 +322,21 @@ def _pictures() -> dict[str, Case]:
     transient, steady = LIGHT[..., :4, :4], LIGHT[:, 0, :4, :4]
     rates = LIGHT[..., :4, :4].expand(4, 8, 4, 4).unsqueeze(0)
     frames = v.frames(transient, axis=AXIS)
-    cells = [v.Cell(f"{n}", {"a": np.zeros((2, 2, 3))}) for n in range(4)]
     monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
         "vis.FitMonitor": Case(
             v.FitMonitor, {"a": torch.ones(2)}, target=LIGHT, pixels=[(1, 1)], truth={"a": [0.5, 0.6]}, every=3
         ),
         "vis.FitMonitor.step": Case(monitor.step, loss=1.0, step=3),
-        "vis.contact_sheet": Case(v.contact_sheet, cells, columns=3),
         "vis.plot_overview": Case(v.plot_overview, transient, steady, AXIS, path=folder() / "o.png", pixel=(1, 1)),
         "vis.phasor_picture": Case(v.phasor_picture, phasor, frequencies=BAND, which=(1,), percentile=90.0),
         "vis.phasor_video": Case(v.phasor_video, phasor, video, which=1, steps=3, fps=10.0, frequencies=BAND, scale=1),
         "vis.polarization_picture": Case(v.polarization_picture, STOKES, frame=3, floor=0.1),
-        "vis.peak_time_map": Case(v.peak_time_map, capture("exhaustive"), laser=(1, 1), limits=(2.0, 2.5)),
         "vis.transients_grid": Case(v.transients_grid, capture("exhaustive"), rows=2, columns=2, laser=(1, 1)),
-        "vis.wall_frames": Case(v.wall_frames, capture("exhaustive"), laser=(1, 1)),
-        "vis.wall_video": Case(v.wall_video, capture("exhaustive"), video, laser=(1, 1), fps=10.0),
         "vis.frame_grid": Case(v.frame_grid, transient, bins=(1, 3), count=3, columns=3, exposure=1.0),
         "vis.histogram": Case(v.histogram, transient, pixels=[(1, 1)]),
         "vis.streak": Case(v.streak, transient, exposure=1.0),
         "vis.frames": Case(v.frames, transient, exposure=1.0, scale=1, every=3),
-        "vis.side_by_side": Case(v.side_by_side, [frames, frames], gap=3),
         "vis.write_video": Case(v.write_video, video, list(frames), count=8, fps=10.0),
         "vis.view": Case(v.view, transient, max_megabytes=3.0, samples=2),
         "vis.video": Case(v.video, transient, video, fps=10.0),
@@ -350,14 +344,11 @@ def _pictures() -> dict[str, Case]:
         "vis.peak_time_picture": Case(v.peak_time_picture, transient, axis=AXIS, limits=(1.0, 2.0)),
         "vis.rainbow": Case(v.rainbow, transient, axis=AXIS, exposure=1.0, period_opl=1.0),
         "vis.gradient_picture": Case(v.gradient_picture, steady, percentile=90.0, limit=1.0),
-        "vis.domain_colors": Case(v.domain_colors, phasor[0, 0].numpy(), percentile=90.0),
         "vis.exposure_of": Case(v.exposure_of, steady, quantile=0.9),
-        "vis.exposure_of_video": Case(v.exposure_of_video, transient, quantile=0.9),
         "vis.tone_map": Case(v.tone_map, steady, exposure=1.0, gamma=2.0, stops=5.0),
         "vis.range_doppler": Case(
             v.range_doppler, rates, axis=AXIS, rate_axis=tt.RateAxis(-1.0, 0.5, 4), pixel=(1, 1), decades=3.0
         ),
-        "vis.speed_picture": Case(v.speed_picture, rates, rate_axis=tt.RateAxis(-1.0, 0.5, 4), limit=1.0),
         "vis.volume_views": Case(v.volume_views, torch.rand(4, 4, 4), gamma=2.0),
     }
 

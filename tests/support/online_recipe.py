@@ -33,7 +33,8 @@ class UnpicklableError(Exception):
 @dataclass(frozen=True)
 class OnlineRecipe:
     """``fail``, ``bug``, ``die``, ``hang``, ``odd``: numbers of samples that fail as scenes do, raise something else,
-    end their process by signal 9, never end, or have another shape. ``once``: a folder in which a death is noted, so
+    end their process by signal 9, never end, or have another shape; ``late``: those
+    with light outside of the window. ``once``: a folder in which a death is noted, so
     that it happens once. ``group``: samples by number modulo it are rendered together. ``pids``: a folder where each
     producer leaves its process number.
     """
@@ -44,6 +45,7 @@ class OnlineRecipe:
     die: tuple = ()
     hang: tuple = ()
     odd: tuple = ()
+    late: tuple = ()
     unpicklable: tuple = ()
     once: str = ""
     pids: str = ""
@@ -94,7 +96,8 @@ class FakeMaker:
             time.sleep(1000.0)
         shape = (2, *recipe.shape[1:]) if index in recipe.odd else recipe.shape
         values = {"wall.reflectance": np.float32([index, 0.5, 0.25]), "box.filename": f"{index % 3}.ply"}
-        return FakeSample(index, index, arrays_of(index, shape), values)
+        outside = (0.25, 0.5) if index in recipe.late else (0.0, 0.0)
+        return FakeSample(index, index, arrays_of(index, shape), values, outside)
 
     def close(self):
         pass

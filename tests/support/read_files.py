@@ -174,14 +174,14 @@ def _foreign(layout: str) -> Reader:
 
 def _shards(folder: Path) -> list[Path]:
     from support.stored_samples import sample, write
-    from torchtransient.data.storage.chunks import COMPRESSIONS
+    from torchtransient.data.shard_format import COMPRESSIONS
 
     samples = [sample(0, (1, 256, 4, 4)), ValueError("dark"), sample(2, (1, 256, 4, 4))]
     return [write(folder / f"{name}.h5", samples, compression=name) for name in COMPRESSIONS]
 
 
 def _read_shard(path: Path) -> str | None:
-    from torchtransient.data.storage.shard_file import Shard
+    from torchtransient.data import Shard
 
     with Shard(path) as shard:
         fault = shard.verify()
@@ -194,7 +194,7 @@ def _read_shard(path: Path) -> str | None:
 
 def _data_sets(folder: Path) -> list[Path]:
     from support.stored_samples import sample, write
-    from torchtransient.data.storage.manifest import build_manifest
+    from torchtransient.data import build_manifest
 
     place = folder / "set"
     place.mkdir()
@@ -210,9 +210,8 @@ def _data_sets(folder: Path) -> list[Path]:
 
 def _read_data_set(path: Path) -> None:
     """The mutant in the place of the file that it was made of, whose name it ends with."""
-    from torchtransient.data.generation.settings import read_description
-    from torchtransient.data.reading.transient_dataset import TransientDataset
-    from torchtransient.data.storage.manifest import build_manifest, verify
+    from torchtransient.data import TransientDataset, build_manifest, verify
+    from torchtransient.data.run_settings import read_description
 
     source = path.parent / "sources" / "set"
     place = path.parent / "changed"
@@ -230,7 +229,7 @@ def _read_data_set(path: Path) -> None:
 
 def _tars(folder: Path) -> list[Path]:
     from support.stored_samples import sample, write
-    from torchtransient.data.storage.web_dataset import export_web_dataset
+    from torchtransient.data import export_web_dataset
 
     (folder / "shards").mkdir()
     write(folder / "shards" / "shard-000000.h5", [sample(i, (1, 256, 4, 4)) for i in range(2)])
@@ -238,7 +237,7 @@ def _tars(folder: Path) -> list[Path]:
 
 
 def _read_tar(path: Path) -> None:
-    from torchtransient.data.storage.web_dataset import read_web_dataset
+    from torchtransient.data import read_web_dataset
 
     for _ in read_web_dataset(path):
         pass

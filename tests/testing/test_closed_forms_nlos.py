@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.testing.closed_forms_nlos import confocal_plane, hidden_patch
+from torchtransient.testing.closed_forms import confocal_plane, hidden_patch
 
 DOWN = (0.0, 0.0, -1.0)
 

@@ -128,28 +128,6 @@ def test_places_are_apart_where_numbers_come_twice():
     assert parts[0] + parts[1] == batches.places(1)
 
 
-def test_large_seeds_and_few_workers():
-    batches = Batches(3, 1, seed=2**64)
-    assert next(iter(batches.loader([1.0, 2.0, 3.0]))) == batches.samples(0)[0] + 1
-    with pytest.raises(UnitError, match="workers"):
-        batches.loader([1.0, 2.0, 3.0], workers=-1)
-
-
-@pytest.mark.parametrize("options", [{"num_workers": 2}, {"batch_size": 3}, {"shuffle": True}])
-def test_what_the_loader_does_not_take(options):
-    with pytest.raises(UnitError, match="are said by the batches"):
-        Batches(3, 1).loader([1.0, 2.0, 3.0], **options)
-
-
-def test_streams_have_an_order_of_their_own():
-    class Stream(torch.utils.data.IterableDataset):
-        def __iter__(self):
-            yield from range(3)
-
-    with pytest.raises(UnitError, match="DataLoader\\(stream"):
-        Batches(3, 1).loader(Stream())
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -163,8 +141,3 @@ def test_streams_have_an_order_of_their_own():
 def test_what_they_do_not_take(arguments, message):
     with pytest.raises(UnitError, match=message):
         Batches(**arguments)
-
-
-def test_steps_that_are_none():
-    with pytest.raises(UnitError, match="step"):
-        Batches(3, 1).step = -1

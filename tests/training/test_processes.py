@@ -11,7 +11,6 @@ import torch.distributed as dist
 import torchtransient as tt
 from torchtransient.errors import DeviceError, UnitError
 from torchtransient.training import ranks, worker_init
-from torchtransient.training.processes import Ranks
 
 
 @pytest.fixture(autouse=True)
@@ -41,10 +40,10 @@ def test_alone():
 def test_cores_are_shared(monkeypatch):
     torchrun(monkeypatch, 0, 1)
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    monkeypatch.setattr("torchtransient.training.processes._cores", lambda: 7)
+    monkeypatch.setattr("torchtransient.training.batches._cores", lambda: 7)
     with ranks():
         assert tt.threads().drjit == 3
-    monkeypatch.setattr("torchtransient.training.processes._cores", lambda: 1)
+    monkeypatch.setattr("torchtransient.training.batches._cores", lambda: 1)
     with ranks():
         assert tt.threads().drjit == 1
 
@@ -73,16 +72,6 @@ def test_broken_settings(monkeypatch):
             pass
 
 
-@pytest.mark.parametrize("changed", [{"RANK": 3}, {"RANK": 1}, {"LOCAL_RANK": 5}, {"LOCAL_RANK": 1}])
-def test_ranks_beyond_their_number(monkeypatch, changed):
-    """Which would wait for others that never come, or leave nobody to write."""
-    torchrun(monkeypatch, 0, 1)
-    for name, value in changed.items():
-        monkeypatch.setenv(name, str(value))
-    with pytest.raises(UnitError, match="RANK below WORLD_SIZE"), ranks():
-        pass
-
-
 def test_groups_that_cannot_be_joined(monkeypatch):
     torchrun(monkeypatch, 0, 2)
     for name in ("MASTER_ADDR", "MASTER_PORT"):
@@ -94,12 +83,6 @@ def test_groups_that_cannot_be_joined(monkeypatch):
         pass
 
 
-def test_means_over_ranks(monkeypatch):
-    """Of three that have the same number."""
-    monkeypatch.setattr(dist, "all_reduce", lambda total: total.mul_(3))
-    assert Ranks(2, 3).mean(2.5) == 2.5
-
-
 def test_a_group_of_others_is_left_alone(tmp_path):
     dist.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
     try:
@@ -108,12 +91,6 @@ def test_a_group_of_others_is_left_alone(tmp_path):
         assert dist.is_initialized()
     finally:
         dist.destroy_process_group()
-
-
-@pytest.mark.parametrize("value", [torch.ones(2), "1", None, [1.0]])
-def test_means_of_what_is_no_number(value):
-    with ranks() as found, pytest.raises(UnitError, match="one number to take the mean of"):
-        found.mean(value)
 
 
 @pytest.mark.parametrize(("seen", "shown"), [(None, "1"), ("4,6", "6")])

@@ -7,7 +7,7 @@ import torch
 
 import torchtransient as tt
 from tools.small_room import VARIANT, make_room
-from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.errors import UnitError
 from torchtransient.training import Seeds
 
 
@@ -99,21 +99,3 @@ def test_generators():
 def test_what_they_do_not_take(call, message):
     with pytest.raises(UnitError, match=message):
         call()
-
-
-def test_a_purpose_is_a_text():
-    with pytest.raises(ArgumentError, match="purpose as a text"):
-        Seeds(0, 3)
-
-
-@pytest.mark.parametrize("samples", [[0, 2**32], [2**32, 0], torch.tensor([3, 2**32])], ids=str)
-def test_samples_are_below_the_number_of_seeds(samples):
-    with pytest.raises(UnitError, match=r"expected samples below 2\^32, got 4294967296"):
-        Seeds(1)(0, samples)
-
-
-@pytest.mark.parametrize("samples", [torch.ones(2, 2, dtype=torch.int64), torch.ones(2), 1j * torch.ones(2),
-                                     torch.ones(2) > 0, torch.tensor(3)])  # fmt: skip
-def test_samples_are_a_row_of_whole_numbers(samples):
-    with pytest.raises(UnitError, match=r"samples as whole numbers of shape \(B,\), got torch\."):
-        Seeds(0)(1, samples)

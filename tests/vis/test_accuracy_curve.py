@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import PIL.Image
 import pytest
-from matplotlib.ticker import NullFormatter
 
 from torchtransient.errors import ShapeError
 from torchtransient.vis import accuracy_curve
@@ -65,33 +64,6 @@ def test_nothing_above_zero_is_nothing_drawn(drawn):
     _, panels = drawn([Curve("transient", "path", [0], [0.0], [0.0])])
     for panel in panels.flat:
         assert lines(panel) == {"path": ([], [])}
-
-
-def test_words(drawn):
-    _, panels = drawn(CURVES)
-    assert [panel.get_title(loc="left") for panel in panels.flat] == ["transient", "", "gradient", ""]
-    assert [panel.get_ylabel() for panel in panels.flat] == ["squared relative error", ""] * 2
-    assert [panel.get_xlabel() for panel in panels.flat] == ["", "", "seconds per render", "samples per pixel"]
-    assert [panel.get_legend() is not None for panel in panels.flat] == [False, True] * 2
-    assert [text.get_text() for text in panels[0, 1].get_legend().texts] == ["path", "guided", "slope -1"]
-
-
-def test_ticks(drawn):
-    """Samples where there are some; seconds at 1, 2 and 5 of each decade, up to 30 % beyond what was measured."""
-    _, panels = drawn(CURVES)
-
-    def ticks(panel):
-        assert isinstance(panel.xaxis.get_minor_formatter(), NullFormatter)
-        return list(panel.get_xticks()), [label.get_text() for label in panel.get_xticklabels()]
-
-    assert ticks(panels[0, 1]) == ([4, 16, 64], ["4", "16", "64"])
-    assert ticks(panels[0, 0]) == ([0.5, 1, 2], ["0.5", "1", "2"])
-    assert ticks(panels[1, 0]) == ([2], ["2"])
-    _, wide = drawn([Curve("a", "b", [1, 2], [0.013, 19.0], [1.0, 1.0])])
-    for seconds, wanted in (([0.3, 3.5], [0.5, 1, 2]), ([0.6, 9.0], [0.5, 1, 2, 5, 10]),
-                            ([2.7, 40.0], [5, 10, 20, 50])):
-        assert ticks(drawn([Curve("a", "b", [1, 2], seconds, [1.0, 1.0])])[1][0, 0])[0] == wanted
-    assert ticks(wide[0, 0])[1] == ["0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]
 
 
 def collections(panel):

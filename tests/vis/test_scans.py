@@ -9,12 +9,10 @@ from mpl_toolkits.mplot3d import art3d
 
 import torchtransient as tt
 from support.captures import AXIS, WALL, confocal_plane, tilted
-from support.cubes import read_gif, read_png
+from support.cubes import read_png
 from torchtransient import scenes
-from torchtransient.axes import FrequencyAxis
-from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, TorchTransientError, UnitError
-from torchtransient.vis.hidden_shapes import hidden_polygons
+from torchtransient.nlos import Capture, Scan
 
 ORIGIN = (-0.5, 0.0, 0.25)
 
@@ -42,11 +40,13 @@ def curves(figure):
     return [panel.patches[0].get_data().values for panel in figure.axes]
 
 
+# --------------------------------------------------------------------------------------------------- transients
+
+
 @pytest.mark.slow
 def test_curves_stand_where_their_points_do(tmp_path):
     capture, index = tilted()
     figure = tt.vis.transients_grid(capture, tmp_path / "a.png", rows=3, columns=4)
-    assert len(figure.axes) == 12
     shown = [int(np.argmax(values)) for values in curves(figure)]
     # columns 2, 6, 10 and 14 of 16 in each row; the light of farther ones comes later
     expected = index[0, [2, 6, 10, 14]].tolist()
@@ -71,9 +71,8 @@ def test_more_panels_than_points_show_every_point_once():
     ]
 
 
-@pytest.mark.slow
-def test_lists_are_an_image_of_points_against_time(tmp_path):
-    figure = tt.vis.transients_grid(of_list(), tmp_path / "list.png")
+def test_lists_are_an_image_of_points_against_time():
+    figure = tt.vis.transients_grid(of_list())
     shown = np.asarray(figure.axes[0].images[0].get_array())
     assert shown.shape == (5, AXIS.num_bins)
     for k in range(5):
@@ -84,39 +83,14 @@ def test_lists_are_an_image_of_points_against_time(tmp_path):
 
 
 def test_a_spot_of_an_exhaustive_capture():
+    """The one that is chosen, or the middle one."""
     capture = exhaustive()
-    figure = tt.vis.transients_grid(capture, laser=(0, 3), rows=1, columns=1)
-    assert int(np.argmax(curves(figure)[0])) == 3 and "spot (0, 3)" in figure.get_suptitle()
-    middle = tt.vis.transients_grid(capture, rows=1, columns=1)
-    assert int(np.argmax(curves(middle)[0])) == 6 and "spot (1, 2)" in middle.get_suptitle()
-    peak = tt.vis.peak_time_map(capture, laser=(2, 0))
-    np.testing.assert_allclose(np.asarray(peak.axes[0].images[0].get_array()), 1.85)
-
-
-def test_peak_times_stand_as_the_wall(tmp_path):
-    capture, index = tilted()
-    capture.transient[:, :, 0] = 0.0
-    figure = tt.vis.peak_time_map(capture, tmp_path / "peak.png")
-    shown = np.ma.filled(np.asarray(figure.axes[0].images[0].get_array(), dtype=float), np.nan)
-    assert shown.shape == (12, 16)
-    assert np.isnan(shown[-1]).all(), "the lowest row is at the bottom"
-    np.testing.assert_allclose(shown[0], AXIS.centers_opl[index[-1]].numpy())
-    assert read_png(tmp_path / "peak.png").std() > 10
-
-
-def test_frames_show_one_bin_of_the_wall(tmp_path):
-    capture, index = tilted()
-    capture.transient[:, :, 0] = 0.0
-    shown = tt.vis.wall_frames(capture, exposure=1.0, stamp=False, scale=1)
-    assert len(shown) == AXIS.num_bins
-    for number in (0, int(index[0, 3]), int(index[0, 12])):
-        expected = 255 * capture.transient[0, number].flip(0).numpy()
-        np.testing.assert_array_equal(shown[number][..., 0], expected)
-    path = tt.vis.wall_video(capture.crop(1.4, 1.6), tmp_path / "wall.gif", fps=10, exposure=1.0, scale=4)
-    images, _ = read_gif(path)
-    assert len(images) == 10 and images[0].shape[1] == 64
-    lit = [image[:48].max() > 128 for image in images]
-    assert lit == [bool(part.max() > 0) for part in capture.crop(1.4, 1.6).transient[0]]
+    for laser, bin_ in (((0, 3), 3), (None, 6)):
+        figure = tt.vis.transients_grid(capture, laser=laser, rows=1, columns=1)
+        assert int(np.argmax(curves(figure)[0])) == bin_
+    chosen = tt.vis.peak_time_picture(capture.single((2, 0)))
+    np.testing.assert_allclose(np.asarray(chosen.axes[0].images[0].get_array()), 1.85)
+    np.testing.assert_allclose(np.asarray(tt.vis.peak_time_picture(capture).axes[0].images[0].get_array()), 1.65)
 
 
 def test_polarized_captures_show_their_intensity():
@@ -126,18 +100,41 @@ def test_polarized_captures_show_their_intensity():
     assert max(v.max() for v in curves(tt.vis.transients_grid(polarized, rows=2, columns=2))) == 1.0
 
 
+# ------------------------------------------------------------------------------------------------------- layout
+
+
+def layout(scan, **options):
+    return tt.vis.scan_layout(scan, **options).axes[0]
+
+
+def limits(panel):
+    return np.array([panel.get_xlim(), panel.get_ylim(), panel.get_zlim()])
+
+
 def test_the_layout_shows_wall_points_and_origins(tmp_path):
     scan = Scan.grid(WALL, (6, 5), kind="exhaustive", laser_grid=3)
     figure = tt.vis.scan_layout(scan, tmp_path / "layout.png", hidden=scenes.nlos_corner())
     (panel,) = figure.axes
-    labels = [text.get_text() for text in panel.get_legend().get_texts()]
-    assert labels == ["sensor points (30)", "laser spots (9)", "sensor", "laser"]
-    np.testing.assert_allclose(np.stack(panel.collections[4]._offsets3d)[:, 0], scan.sensor_points[0, 0])
-    assert panel.get_xlim()[0] <= -1 and panel.get_zlim()[1] >= 1.5
+    places = [np.stack(one._offsets3d, 1) for one in panel.collections[-4:]]
+    for found, wanted in zip(
+        places, (scan.sensor_points, scan.laser_points, scan.sensor_origin, scan.laser_origin), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted.reshape(-1, 3), rtol=1e-6)
     picture = read_png(tmp_path / "layout.png").astype(int)
     blue = (picture[..., 2] > picture[..., 0] + 80).sum()
     red = (picture[..., 0] > picture[..., 2] + 120).sum()
     assert blue > 100 and red > 50
+
+
+def test_the_box_of_a_layout_holds_all_of_it():
+    """One scale for the three axes, a tenth larger than the scan and the hidden cube."""
+    scan = Scan.grid(WALL, (6, 5), kind="exhaustive", sensor_origin=(-0.5, 0, 0.04), laser_origin=(1.5, 0.1, 0.06))
+    hidden = {"a": {"type": "cube", "to_world": scenes.transforms.translate([0.0, 0.3, 2.0])}}
+    panel = layout(scan, hidden=hidden)
+    low, high = np.array([-1, -0.8, 0]), np.array([1.5, 1.3, 3.0])
+    middle, size = (low + high) / 2, high - low
+    np.testing.assert_allclose(limits(panel), np.stack([middle - 0.55 * size, middle + 0.55 * size], 1), atol=1e-6)
+    np.testing.assert_allclose(panel._box_aspect / panel._box_aspect[0], size / size[0])
 
 
 def test_the_layout_of_a_curved_wall_and_of_a_capture():
@@ -146,14 +143,32 @@ def test_the_layout_of_a_curved_wall_and_of_a_capture():
     i = np.arange(20).reshape(4, 5)[:, :4].ravel()
     faces = np.concatenate([np.stack([i, i + 1, i + 6], 1), np.stack([i, i + 6, i + 5], 1)])
     scan = Scan.grid((vertices, faces), 4, kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
-    assert len(tt.vis.scan_layout(scan).axes[0].collections) == 4
-    single = confocal_plane()
-    assert tt.vis.scan_layout(single, title="name").axes[0].get_title() == "name"
+    assert len(layout(scan).collections) == 4
+    assert layout(confocal_plane(), title="name").get_title() == "name"
 
 
 VERTICES = np.array([[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.5, 0.5, 1.5]])
 FACES = np.array([[0, 2, 1]])
 MESH = scenes.triangle_mesh(VERTICES, FACES)
+
+
+@pytest.fixture
+def corners(monkeypatch):
+    """Corners (N, 3) of the hidden faces that a layout draws."""
+    drawn = []
+
+    class Kept(art3d.Poly3DCollection):
+        def __init__(self, polygons, **options):
+            drawn.append(polygons)
+            super().__init__(polygons, **options)
+
+    monkeypatch.setattr(art3d, "Poly3DCollection", Kept)
+
+    def of(hidden):
+        layout(confocal_plane(), hidden=hidden)
+        return np.concatenate(drawn[-1])
+
+    return of
 
 
 @pytest.mark.parametrize(
@@ -163,21 +178,9 @@ MESH = scenes.triangle_mesh(VERTICES, FACES)
         {"white": {"type": "diffuse"}, "a": MESH | {"bsdf": {"type": "ref", "id": "white"}}},
     ],
 )  # fmt: skip
-def test_the_layout_draws_what_simulations_take(hidden, monkeypatch):
+def test_the_layout_draws_what_simulations_take(hidden, corners):
     """However triangles are given, they are drawn where they are."""
-    drawn = []
-
-    class Kept(art3d.Poly3DCollection):
-        def __init__(self, polygons, **options):
-            drawn.append(polygons)
-            super().__init__(polygons, **options)
-
-    monkeypatch.setattr(art3d, "Poly3DCollection", Kept)
-    panel = tt.vis.scan_layout(confocal_plane(), hidden=hidden).axes[0]
-    (found,) = drawn[-1]
-    assert isinstance(panel.collections[1], Kept)
-    np.testing.assert_allclose(found, VERTICES[[0, 2, 1]])
-    assert panel.get_zlim()[1] > 1.5
+    np.testing.assert_allclose(corners(hidden), VERTICES[[0, 2, 1]])
     tt.nlos.capture_scene(hidden, confocal_plane().scan)
 
 
@@ -185,114 +188,61 @@ def test_the_layout_draws_what_simulations_take(hidden, monkeypatch):
     ("shape", "low", "high"),
     [
         ({"type": "sphere", "center": [0.4, 0, 0.8], "radius": 0.2}, [0.2, -0.2, 0.6], [0.6, 0.2, 1.0]),
+        ({"type": "sphere"}, [-1, -1, -1], [1, 1, 1]),
         ({"type": "disk"}, [-1, -1, 0], [1, 1, 0]),
         ({"type": "cube"}, [-1, -1, -1], [1, 1, 1]),
+        ({"type": "cylinder"}, [-1, -1, 0], [1, 1, 1]),
         ({"type": "cylinder", "p0": [1, 0, 0], "p1": [3, 0, 0], "radius": 0.5}, [1, -0.5, -0.5], [3, 0.5, 0.5]),
     ],
 )
-def test_round_things_are_as_large_as_they_are(shape, low, high):
+def test_shapes_are_as_large_as_they_are(shape, low, high, corners):
     for matrix in (np.eye(4), scenes.transforms.translate([0.0, 0.1, 2.0]) @ scenes.transforms.scale(0.5)):
-        (faces,) = hidden_polygons({"ball": shape | {"to_world": matrix}}, "x")
-        points = np.concatenate(faces)
+        points = corners({"ball": shape | {"to_world": matrix}})
         expected = np.array([low, high]) @ matrix[:3, :3].T + matrix[:3, 3]
-        np.testing.assert_allclose([points.min(0), points.max(0)], expected, atol=1e-12)
+        np.testing.assert_allclose([points.min(0), points.max(0)], expected, atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------------ refused
 
 
 @pytest.mark.parametrize(
-    ("hidden", "message"),
+    "hidden",
     [
-        (3, "expected hidden as shapes by name"),
-        ("a.obj", "mesh files are not drawn"),
-        ({"body": {"type": "obj", "filename": "a.obj"}}, "hidden 'body': shapes that are drawn are .*'obj'"),
-        ({"body": 3}, "'body': expected a dictionary"),
-        ({"body": {}}, "'body': expected a dictionary"),
-        (SimpleNamespace(vertices=VERTICES), "expected hidden as shapes by name"),
-        (SimpleNamespace(faces=FACES), "expected hidden as shapes by name"),
-        ([VERTICES, FACES, None], "expected hidden as shapes by name"),
-        ((VERTICES, [[0, 1, 7]]), "expected faces of whole numbers from 0 to 2"),
-        ({"ball": {"type": "sphere", "to_world": 3}}, "'ball': to_world"),
-        ({"ball": {"type": "sphere", "radius": "x"}}, "'ball': radius"),
+        3, "a.obj", {"body": {"type": "obj", "filename": "a.obj"}}, {"body": 3}, {"body": {}},
+        SimpleNamespace(vertices=VERTICES), [VERTICES, FACES, None], (VERTICES, [[0, 1, 7]]),
+        {"ball": {"type": "sphere", "to_world": 3}}, {"ball": {"type": "sphere", "radius": "x"}},
     ],
-)
-def test_layouts_of_what_is_no_hidden_thing(hidden, message):
-    with pytest.raises(TorchTransientError, match=message):
-        tt.vis.scan_layout(confocal_plane(), hidden=hidden)
-
-
-@pytest.mark.parametrize("given", [WALL, None, torch.zeros(3), {}, "scan"])
-def test_layouts_of_what_is_no_scan(given):
-    with pytest.raises(ShapeError, match="expected a Scan or a Capture"):
-        tt.vis.scan_layout(given)
-
-
-@pytest.mark.parametrize(
-    ("draw", "error", "message"),
-    [
-        (lambda: tt.vis.transients_grid(torch.zeros(1, 2, 3, 4)), ArgumentError, "expected a Capture"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), style="lines"), ArgumentError, "'lines'"),
-        (lambda: tt.vis.transients_grid(of_list(), style="curves"), ShapeError, "a list of 5"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), rows=0), ShapeError, "at least one row"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), laser=1), ShapeError, "a confocal one"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), limits=(9.0, 10.0)), UnitError, "hold no bin"),
-        (lambda: tt.vis.transients_grid(exhaustive(), laser=(3, 0)), ShapeError, "index"),
-        (lambda: tt.vis.peak_time_map(of_list()), ShapeError, "a grid of sensor points"),
-        (lambda: tt.vis.wall_frames(of_list()), ShapeError, "a grid of sensor points"),
-        (lambda: tt.vis.wall_video(confocal_plane(), "no/folder/a.gif"), StorageError, "folder"),
-        (lambda: tt.vis.transients_grid(confocal_plane(), "no/folder/a.png"), StorageError, "cannot write"),
-    ],
-)
-def test_what_is_refused(draw, error, message):
-    with pytest.raises(error, match=message):
-        draw()
-
-
-def test_batches_and_phasors_are_refused():
-    capture = confocal_plane()
-    with pytest.raises(ShapeError, match="a batch"):
-        tt.vis.transients_grid(Capture.stack([capture, capture]))
-    phasor = torch.zeros(1, 1, *capture.scan.shape, dtype=torch.complex64)
-    only = Capture(None, None, capture.scan, phasor=phasor, frequencies=FrequencyAxis((1.0,)))
-    with pytest.raises(ShapeError, match="phasors alone"):
-        tt.vis.peak_time_map(only)
-    many = Capture(capture.transient.expand(5, -1, -1, -1), AXIS, capture.scan)
-    with pytest.raises(ShapeError, match="one channel or three"):
-        tt.vis.transients_grid(many)
-
-
-WRONG = (
-    "x", b"x", True, [], [1], (1, 2, 3, 4), {}, {"a": 1}, float("nan"), float("inf"), -1, 0, 1.5, 2**33, 1j,
-    np.zeros((2, 2)), torch.tensor([1.0, 2.0]), ["a", "b", "c"], object(), (1.0, "x"), (None, None),
 )  # fmt: skip
+def test_layouts_of_what_is_no_hidden_thing(hidden):
+    with pytest.raises(TorchTransientError, match="scan_layout: "):
+        layout(confocal_plane(), hidden=hidden)
 
 
-@pytest.mark.slow
+def phasors_alone():
+    scan = confocal_plane().scan
+    phasor = torch.zeros(1, 1, *scan.shape, dtype=torch.complex64)
+    return Capture(None, None, scan, phasor=phasor, frequencies=tt.FrequencyAxis((1.0,)))
+
+
 @pytest.mark.parametrize(
-    ("draw", "right", "arguments"),
+    ("draw", "error"),
     [
-        (
-            tt.vis.transients_grid,
-            {"capture": confocal_plane(size=(2, 1))},
-            "capture style rows columns laser limits path",
-        ),
-        (tt.vis.transients_grid, {"capture": exhaustive()}, "laser"),
-        (tt.vis.peak_time_map, {"capture": confocal_plane(size=(2, 1))}, "capture laser limits path"),
-        (tt.vis.wall_frames, {"capture": confocal_plane(size=(2, 1))}, "capture laser every"),
-        (
-            tt.vis.wall_video,
-            {"capture": confocal_plane(size=(2, 1)).crop(1.5, 1.6), "path": "a.gif"},
-            "capture path fps",
-        ),
-        (tt.vis.scan_layout, {"scan": exhaustive().scan}, "scan path hidden"),
+        (lambda v: v.scan_layout(WALL), ShapeError),
+        (lambda v: v.transients_grid(torch.zeros(1, 2, 3, 4)), ArgumentError),
+        (lambda v: v.transients_grid(confocal_plane(), style="lines"), ArgumentError),
+        (lambda v: v.transients_grid(of_list(), style="curves"), ShapeError),
+        (lambda v: v.transients_grid(confocal_plane(), rows=0), ShapeError),
+        (lambda v: v.transients_grid(confocal_plane(), laser=1), ShapeError),
+        (lambda v: v.transients_grid(confocal_plane(), limits=(9.0, 10.0)), UnitError),
+        (lambda v: v.transients_grid(exhaustive(), laser=(3, 0)), ShapeError),
+        (lambda v: v.transients_grid(Capture.stack([confocal_plane()] * 2)), ShapeError),
+        (lambda v: v.transients_grid(phasors_alone()), ShapeError),
+        (lambda v: v.peak_time_picture(phasors_alone()), ShapeError),
+        (lambda v: v.peak_time_picture(of_list()), ShapeError),
+        (lambda v: v.frames(of_list()), ShapeError),
+        (lambda v: v.transients_grid(confocal_plane(), "no/folder/a.png"), StorageError),
     ],
 )
-def test_only_errors_of_this_library(tmp_path, monkeypatch, draw, right, arguments):
-    """Whatever is handed to a picture of a capture: it is drawn, or a typed error says why not."""
-    monkeypatch.chdir(tmp_path)
-    for argument in arguments.split():
-        refused = 0
-        for value in WRONG:
-            try:
-                draw(**right | {argument: value})
-            except TorchTransientError:
-                refused += 1
-        assert refused >= 10, argument
+def test_what_is_refused(draw, error):
+    with pytest.raises(error):
+        draw(tt.vis)

@@ -14,7 +14,7 @@ import torchtransient as tt
 from support.cubes import AXIS, sweep
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.files import read_result, write_result
-from torchtransient.vis.sources import as_tensor, images_of, phasor_of, steady_of, stokes_of, transient_of
+from torchtransient.vis.sources import images_of, phasor_of, steady_of, stokes_of, transient_of
 
 
 @dataclass
@@ -128,14 +128,6 @@ def test_which_shapes_are_what():
         phasor_of(turned[:3])
     back = np.arange(30.0).reshape(1, 5, 2, 3)[..., ::-1]
     assert transient_of(back)[0].tolist() == back.tolist()
-
-
-def test_which_numbers_are_kept():
-    for dtype, kept in (
-        (torch.float16, torch.float32), (torch.int64, torch.float32), (torch.float32, torch.float32),
-        (torch.float64, torch.float64), (torch.complex128, torch.complex128), (torch.complex64, torch.complex64),
-    ):  # fmt: skip
-        assert as_tensor(torch.ones(2, dtype=dtype), "x").dtype == kept
 
 
 def test_bins_of_stokes_vectors():

@@ -5,6 +5,9 @@ from __future__ import annotations
 import builtins
 import math
 import re
+import subprocess
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,12 +50,15 @@ def test_numbers_of_both_signs():
     assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < 0.04
 
 
-def test_counts_are_exact():
-    x = torch.arange(255.0)
+@pytest.mark.parametrize("most", [254, 255, 65534])
+def test_counts_are_exact(most):
+    x = torch.arange(most + 1.0)
     table = table_of("counts", [x])
     assert table.error == 0
     assert torch.equal(decoded(table, x), x)
+    assert torch.isnan(decoded(table, torch.tensor([math.nan, math.inf]))).all()
     assert table_of("counts", [x + 1.5]).error > 0
+    assert table_of("counts", [x + 65535 - most]).error > 0
 
 
 def test_phases_and_ratios():
@@ -136,6 +142,7 @@ def test_samples_of_a_loader():
     assert of_loader.html.count('id="codes-') == of_list.html.count('id="codes-') == 3
 
 
+LATER = SimpleNamespace(transient=cases.front(1), axis=tt.TimeAxis(3.0, 0.1, 24))
 REFUSED = {
     "a batch": (lambda: tt.vis.view(torch.ones(2, 3, 5, 4, 4)), ShapeError, "expected light"),
     "nothing": (lambda: tt.vis.view([]), ShapeError, "at least one sample"),
@@ -146,6 +153,9 @@ REFUSED = {
     "two sizes": (lambda: tt.vis.view((cases.front(1), cases.front(1, 4, 4))), ShapeError, "one kind"),
     "frequencies": (lambda: tt.vis.view(cases.phasors()[0], frequencies=[1.0]), ShapeError, "5 frequencies"),
     "rates as a tensor": (lambda: tt.vis.view(cases.rates()[0]), ShapeError, "rate_axis"),
+    "rates of four channels": (lambda: tt.vis.view(cases.noise(4, 6, 5, 4, 4)), ShapeError, "rate_axis"),
+    "three rates of four channels": (lambda: tt.vis.view(cases.noise(4, 3, 5, 4, 4)), ShapeError, "rate_axis"),
+    "two axes": (lambda: tt.vis.view((cases.result(transient=cases.front(1)), LATER)), ShapeError, "one axis"),
     "a steady picture": (lambda: tt.vis.view(torch.ones(3, 4, 4)), ShapeError, "steady"),
     "real phasors": (lambda: tt.vis.view(torch.ones(1, 2, 4, 4), frequencies=[1, 2]), ArgumentError, "complex"),
     "a word": (lambda: tt.vis.view({"albedo": 1}), ArgumentError, "expected"),
@@ -161,6 +171,12 @@ def test_refusals(name):
     call, error, words = REFUSED[name]
     with pytest.raises(error, match=words):
         call()
+
+
+def test_the_server_starts_without_torch():
+    """Its import takes longer than to open the file."""
+    code = "import sys, torchtransient.vis.pages.server, torchtransient.cli.view; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
 
 
 def test_bokeh_is_missing(monkeypatch):

@@ -52,7 +52,11 @@ class Tail:
 
     @classmethod
     def of(cls, runs: Sequence[NDArray[np.float32]]) -> Tail:
-        """Of more than 8 runs, arrays of equal shape."""
+        """Estimate the tail of runs.
+
+        Args:
+            runs: more than 8 arrays of equal shape.
+        """
         wide = np.stack(runs).astype(np.float64)
         if not np.isfinite(wide).all():
             return cls(math.nan, math.nan, math.nan)
@@ -68,7 +72,7 @@ class Tail:
 
     @property
     def heavy(self) -> bool:
-        """Return whether the runs tell no variance: few of them decide about it, and more would find a larger one."""
+        """True where the runs tell no variance: few of them decide about it, and more would find a larger one."""
         return not (self.index >= _LEAST_INDEX and self.largest <= _MOST_OF_ONE)
 
 
@@ -82,8 +86,7 @@ class Reference:
 
 @dataclass
 class ErrorTally:
-    """Adds up the error of independent runs of one estimate. `time_dim` names the axis of time bins, None if there is
-    none."""
+    """Sum of errors of independent runs of one estimate. `time_dim`: axis of time bins, None if there is none."""
 
     time_dim: int | None = None
     reference: Reference | None = None
@@ -96,7 +99,14 @@ class ErrorTally:
     _squares: NDArray[np.float32] | None = None
 
     def add(self, run: ArrayLike) -> None:
-        """One independent run. Raises ShapeError when its shape differs from the reference's or the run before."""
+        """Add one independent run.
+
+        Args:
+            run: array of the shape of the others.
+
+        Raises:
+            ShapeError: for another shape than that of the reference or the run before.
+        """
         x = np.asarray(run, dtype=np.float32)
         if self.reference is not None:
             noise, power, mean = self._against_reference(x)

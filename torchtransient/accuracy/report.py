@@ -26,8 +26,10 @@ _DEVIATE = 1.96
 
 @dataclass(frozen=True)
 class Choice:
-    """What is compared: a sampler and a temporal filter by their plugin names, and where they are compared too, an
-    integrator, a depth (-1: no limit) and the width of a bin in metres of optical path. Empty or None: the renderer's.
+    """Settings that are compared.
+
+    A sampler and a temporal filter by their plugin names, and where they are compared too, an integrator, a depth (-1:
+    no limit) and the width of a bin in metres of optical path. Empty or None: the renderer's.
     """
 
     sampler: str
@@ -49,8 +51,8 @@ class CostPoint:
     `quantity`: "transient", "phasor", a name of `quantities` or the key of a gradient. `spp`: samples per pixel really
     drawn. `seconds`, `cpu_seconds`: medians of wall and CPU time of one run (forward for values, forward and backward
     for gradients). The errors are those of `ErrorEstimate`. `tail`: of a gradient, the tail of its distribution; where
-    it is heavy the errors are NaN. The total errors are those against the finest setting, bias included; of them
-    `total_error` is relative, and so is `bias`, 0 within its noise. All are NaN where they were not measured.
+    it is heavy the errors are NaN. The total errors are those against the finest setting, bias included; `total_error`
+    is relative, and so is `bias`, 0 within its noise. All are NaN where they were not measured.
     """
 
     choice: Choice
@@ -140,7 +142,7 @@ class AccuracyReport:
     settings: dict[str, Any] = field(default_factory=dict)
 
     def quantities(self) -> list[str]:
-        """Names of what was measured, values first."""
+        """Return the names of the measured quantities, values first."""
         return list(dict.fromkeys(point.quantity for point in self.points))
 
     def curves(self) -> Iterator[tuple[str, Choice, list[CostPoint]]]:
@@ -150,16 +152,27 @@ class AccuracyReport:
             yield quantity, choice, self.curve(quantity, choice)
 
     def curve(self, quantity: str, choice: Choice) -> list[CostPoint]:
-        """Points of one curve in rising spp; empty where there is none."""
+        """Return the points of one curve in rising spp; empty where there is none.
+
+        Args:
+            quantity: its name.
+            choice: the settings.
+        """
         found = [p for p in self.points if (p.quantity, p.choice) == (quantity, choice)]
         return sorted(found, key=lambda p: p.spp)
 
     def slope(self, quantity: str, choice: Choice) -> Slope | None:
-        """Line through log squared error against log spp; -1 for independent samples. None with fewer than three
-        points.
+        """Fit a line through log squared error against log spp; -1 for independent samples.
 
-        Its standard error is that of the scatter about the line, or what the standard errors of the points make where
-        that is larger: of few points the scatter is known by chance alone.
+        Its standard error is that of the scatter about the line, or that of the points where it is larger: of few
+        points the scatter is known by chance alone.
+
+        Args:
+            quantity: its name.
+            choice: the settings.
+
+        Returns:
+            The line, None with fewer than three points.
         """
         good = [p for p in self.curve(quantity, choice) if p.squared_error > 0]
         if len(good) < 3:
@@ -176,7 +189,14 @@ class AccuracyReport:
 
         Bounds are factors, the exponential of the relative standard error of the squared error times Student's t. A
         few runs hardly know that standard error: of the noise it is pooled over the points of the curve, which have
-        the same number of entries. NaN where there is none.
+        the same number of entries.
+
+        Args:
+            point: of this report.
+            total: of the total error.
+
+        Returns:
+            (low, high), NaN where there is none.
         """
         if total:
             value, degrees = point.total_error, float(point.repeats - 1)
@@ -196,9 +216,12 @@ class AccuracyReport:
         return value / factor, value * factor
 
     def pareto(self, quantity: str | None = None) -> list[CostPoint]:
-        """Points of a quantity (None: the first) that none is both quicker and closer than, in rising seconds.
+        """Return the points of a quantity that no other is both quicker and closer than, in rising seconds.
 
         Closer by `CostPoint.error`: with the bias of a small depth, a filter and a wide bin where it was measured.
+
+        Args:
+            quantity: its name, None for the first.
         """
         quantity = self._quantity("pareto", quantity)
         known = [p for p in self.points if p.quantity == quantity and p.error >= 0]
@@ -311,10 +334,17 @@ class AccuracyReport:
         return _samples_needed(points, wanted)
 
     def gain(self, quantity: str, choice: Choice) -> float:
-        """Squared error times seconds of the first choice over that of `choice`: above 1 means less error in equal
+        """Return the squared error times seconds of the first choice over that of another: above 1, less error in equal
         time.
 
-        Geometric mean over the runs with equal position in the list of samples; NaN where an error is not positive.
+        Geometric mean over the runs with equal position in the list of samples.
+
+        Args:
+            quantity: its name.
+            choice: the other choice.
+
+        Returns:
+            The factor, NaN where an error is not positive.
         """
         curves = {c: curve for name, c, curve in self.curves() if name == quantity}
         if choice not in curves:
@@ -393,12 +423,26 @@ class AccuracyReport:
         return dict(plain)
 
     def to_json(self, path: str | Path) -> None:
-        """Write `to_dict()` to `path`; StorageError when the file cannot be written."""
+        """Write `to_dict()` to a file.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            StorageError: when it cannot be written.
+        """
         write_text(path, json.dumps(self.to_dict(), indent=2) + "\n", "accuracy report")
 
     @classmethod
     def from_json(cls, path: str | Path) -> AccuracyReport:
-        """Return the report of a file that `to_json` wrote. Raises StorageError for other files."""
+        """Return the report of a file that `to_json` wrote.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            StorageError: for other files.
+        """
         source = check_source(path, "accuracy report")
         try:
             data = json.loads(source.read_text(encoding="utf-8"))
@@ -408,8 +452,16 @@ class AccuracyReport:
             raise StorageError(f"{source}: expected a file of AccuracyReport.to_json, got another: {error}.") from error
 
     def plot(self, path: str | Path) -> None:
-        """Log-log picture of squared relative error with 95 % bands, a row per quantity: the noise against samples
-        with its slopes, and against seconds the error with its bias, where that was measured, and the Pareto front.
+        """Draw squared relative error with 95 % bands, logarithmic, a row per quantity.
+
+        The noise against samples with its slopes, and against seconds the error with its bias, where that was measured,
+        and the Pareto front.
+
+        Args:
+            path: of the picture.
+
+        Raises:
+            StorageError: when it cannot be written.
         """
         from torchtransient.vis.accuracy_curve import plot_accuracy
 

@@ -55,7 +55,14 @@ class ZTest:
 
 
 def standard_error(runs: ArrayLike) -> Array:
-    """Return the standard error of the mean over independent runs (K, ...), K >= 2, in the shape (...) of one."""
+    """Return the standard error of the mean over independent runs.
+
+    Args:
+        runs: (K, ...), K >= 2.
+
+    Returns:
+        (...).
+    """
     data = _runs("runs", runs)
     return np.asarray(data.std(axis=0, ddof=1) / math.sqrt(data.shape[0]), dtype=np.float64)
 
@@ -103,11 +110,17 @@ def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3,
 
 
 def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
-    """Return the first indices of groups of neighbouring bins that each hold at least `minimum` of `expected` (T,).
+    """Return the first indices of groups of neighbouring bins that each hold a minimum.
 
     Few events in a bin are not normally distributed; pool both sides of a test with `np.add.reduceat(values, starts,
-    axis=-1)`. What is left at the end joins the last group. Raises UnitError when all bins together hold less than
-    `minimum`.
+    axis=-1)`. Bins left at the end join the last group.
+
+    Args:
+        expected: (T,).
+        minimum: of a group.
+
+    Raises:
+        UnitError: when all bins together hold less.
     """
     energy = np.asarray(expected, dtype=np.float64)
     if energy.ndim != 1:
@@ -135,8 +148,14 @@ class Slope:
 
 
 def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
-    """Least squares line through (log x, log y), both (N,), N >= 3, positive. The variance of Monte Carlo has slope -1
-    in spp."""
+    """Fit a line through (log x, log y) by least squares. The variance of Monte Carlo has slope -1 in spp.
+
+    Args:
+        x, y: (N,), N >= 3, positive.
+
+    Raises:
+        ShapeError, UnitError: for other numbers.
+    """
     xs, ys = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if xs.ndim != 1 or xs.shape != ys.shape or xs.size < 3:
         raise ShapeError(f"log_log_slope: expected two rows of the same length >= 3, got {xs.shape} and {ys.shape}")
@@ -153,7 +172,12 @@ def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
 
 
 def student_t_deviate(t: float, dof: float) -> float:
-    """Return the normal deviate with the same tail probability as Student's `t` with `dof` degrees of freedom."""
+    """Return the normal deviate with the tail probability of Student's t.
+
+    Args:
+        t: the deviate.
+        dof: degrees of freedom.
+    """
     if math.isinf(t):
         return t
     tail = 0.5 * _incomplete_beta(dof / 2.0, 0.5, dof / (dof + t * t))
@@ -163,8 +187,11 @@ def student_t_deviate(t: float, dof: float) -> float:
 
 
 def student_t_quantile(z: float, dof: float) -> float:
-    """Return the t with ``dof`` degrees of freedom whose tail probability is that of the normal deviate ``z`` > 0: the
-    inverse of :func:`student_t_deviate`, z itself for infinite ``dof``.
+    """Return Student's t with the tail probability of a normal deviate, the inverse of :func:`student_t_deviate`.
+
+    Args:
+        z: normal deviate, above zero.
+        dof: degrees of freedom; infinite ones return z itself.
     """
     if math.isinf(dof):
         return z

@@ -53,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
     setting.
     """
     from torchtransient.files.result_file import check_folder
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     film = film_of_options(options)
     if options["plot"]:

@@ -65,7 +65,7 @@ def generate(recipe: Path, out: Path, **options: Any) -> None:
     The folder holds shard-*.h5, manifest.json, recipe.json, log.jsonl (what happened) and latest.png (the last sample).
     Samples that fail are named in their files with the reason.
     """
-    from torchtransient.data.generation.generate import generate as make
+    from torchtransient.data import generate as make
 
     resume, quiet = not options.pop("no_resume"), options.pop("quiet")
     try:
@@ -81,8 +81,8 @@ def generate(recipe: Path, out: Path, **options: Any) -> None:
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def verify(folder: Path, quiet: bool) -> None:
     """Compare every byte of the data set in FOLDER with its checksums. Status 1 where something is wrong or missing."""
-    from torchtransient.data.storage.file_names import RECIPE_FILE
-    from torchtransient.data.storage.manifest import verify as check
+    from torchtransient.data import verify as check
+    from torchtransient.data.run_settings import RECIPE_FILE
     from torchtransient.errors import StorageError
 
     found = check(folder, progress=not quiet)
@@ -98,7 +98,7 @@ def verify(folder: Path, quiet: bool) -> None:
 @click.argument("folder", type=PATH)
 def info(folder: Path) -> None:
     """Say what the data set in FOLDER holds."""
-    from torchtransient.data.generation.summary import summary
+    from torchtransient.data.overview import summary
 
     click.echo(summary(folder))
 
@@ -110,7 +110,7 @@ def info(folder: Path) -> None:
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Which ones are drawn.")
 def show(folder: Path, out: Path | None, count: int, seed: int) -> None:
     """Draw samples of the data set in FOLDER."""
-    from torchtransient.data.generation.summary import drawn_sheet
+    from torchtransient.data.overview import drawn_sheet
 
     target = out or folder / "samples.png"
     drawn = drawn_sheet(folder, target, count, seed)
@@ -150,8 +150,7 @@ def export(folder: Path, out: Path, kind: str, quiet: bool) -> None:
     """Write the data set in FOLDER for other programs: tar files of WebDataset, or, of captures around a corner, a file
     of y-tal for each.
     """
-    from torchtransient.data.storage.tal_export import export_tal
-    from torchtransient.data.storage.web_dataset import export_web_dataset
+    from torchtransient.data import export_tal, export_web_dataset
     from torchtransient.errors import StorageError
 
     try:
@@ -168,6 +167,6 @@ def read_recipe(path: Path) -> Any:
     Args:
         path: the file.
     """
-    from torchtransient.data.recipes.recipe import Recipe
+    from torchtransient.data import Recipe
 
     return Recipe.read(path)

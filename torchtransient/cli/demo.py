@@ -99,9 +99,9 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     from torchtransient.files.result_file import write_result
     from torchtransient.scene.variant import DEFAULT_VARIANT
     from torchtransient.vis.fit_monitor import FitMonitor
-    from torchtransient.vis.overview import plot_overview
     from torchtransient.vis.pages.layout import import_bokeh
-    from torchtransient.vis.view import view
+    from torchtransient.vis.pages.page import view
+    from torchtransient.vis.pictures import plot_overview
 
     import_bokeh()  # missing packages before the work
     try:

@@ -13,7 +13,7 @@ from torchtransient.cli.options import assignments, video_options
 # Pictures of a capture: option, function of `tt.vis`, what it shows.
 PICTURES = {
     "transients": ("transients_grid", "histograms of points over the wall"),
-    "peak_time": ("peak_time_map", "when most light arrives"),
+    "peak_time": ("peak_time_picture", "when most light arrives"),
     "layout": ("scan_layout", "wall, points and origins"),
 }
 # What the file may say and the command line replaces.
@@ -53,7 +53,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.files.capture_file import check_capture_target
-    from torchtransient.nlos.arguments import checked_seed
+    from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     beside = scene / f"{scene.resolve().name}.h5" if scene.is_dir() else scene.with_suffix(".h5")
@@ -116,15 +116,15 @@ def _drawable(hidden: Any) -> tuple[dict[str, Any], list[str]]:
     """Return the shapes that a layout can show, and the names of the others."""
     if not isinstance(hidden, dict):
         return {}, ["the shapes of the scene"]
-    from torchtransient.vis.hidden_shapes import DRAWN
+    from torchtransient.vis.scans import DRAWN
 
     drawn = {name: shape for name, shape in hidden.items() if shape.get("type") in DRAWN}
     return drawn, [name for name in hidden if name not in drawn]
 
 
 def _check_pictures(options: dict[str, Any]) -> None:
-    from torchtransient.vis.overview import check_picture
-    from torchtransient.vis.video_file import check_video
+    from torchtransient.vis.files import check_picture
+    from torchtransient.vis.videos import check_video
 
     for name in PICTURES:
         if options[name]:
@@ -150,5 +150,5 @@ def _write_pictures(capture: Any, setup: dict[str, Any], options: dict[str, Any]
     if options["video"]:
         look = {name: options[name] for name in ("fps", "exposure", "curve", "accumulate", "every")}
         stamp = not options["no_stamp"]
-        tt.vis.wall_video(capture, options["video"], stamp=stamp, progress=not options["quiet"], **look)
+        tt.vis.video(capture, options["video"], stamp=stamp, progress=not options["quiet"], **look)
         click.echo(f"{options['video']}: the wall as the light arrives")

@@ -284,7 +284,7 @@ def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -
         ArgumentError: for films without a video.
     """
     from torchtransient.vis.phasors import phasor_video
-    from torchtransient.vis.video import video
+    from torchtransient.vis.videos import video
 
     if isinstance(film, Phasors):
         phasor_video(output, path, progress=progress)
@@ -347,8 +347,8 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
         StorageError: for a place that cannot be written.
         UsageError: for a picture that does not show what the film measures.
     """
-    from torchtransient.vis.overview import check_picture
-    from torchtransient.vis.video_file import check_video
+    from torchtransient.vis.files import check_picture
+    from torchtransient.vis.videos import check_video
 
     for name in PICTURES:
         if not options[name]:

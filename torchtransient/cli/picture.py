@@ -25,7 +25,7 @@ def command(result: Path, target: Path, kind: str, **options: Any) -> None:
     the hues of all bins mixed. streak: a row or column over time. frames: a sheet of moments. histogram: one pixel.
     polarization: intensity, degrees and angle. phasor: real part, phase and amplitude.
     """
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     check_picture(target)
     for name, kinds in (("pixel", ("histogram", "overview")), ("row", ("streak",)), ("column", ("streak",))):

@@ -195,7 +195,7 @@ def _check_together(options: dict[str, Any]) -> None:
 
 
 def _picture(options: dict[str, Any], target: Path) -> Path | None:
-    from torchtransient.vis.overview import check_picture
+    from torchtransient.vis.files import check_picture
 
     if options["no_picture"]:
         return None
@@ -206,8 +206,8 @@ def _picture(options: dict[str, Any], target: Path) -> Path | None:
 
 def _prepared(capture: Any, options: dict[str, Any]) -> Any:
     """Return the capture as the method takes it: cut, summed, without its slab, on its device."""
-    from torchtransient.nlos.preparation import moved_to, sum_bins, without_slab
-    from torchtransient.reconstruction.proportions import check_record
+    from torchtransient.nlos.reconstruct import moved_to, sum_bins, without_slab
+    from torchtransient.reconstruction.capture_checks import check_record
 
     if options["record"] is not None:
         check_record(capture.axis, options["record"][1], "--record")

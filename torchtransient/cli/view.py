@@ -16,8 +16,11 @@ _PAGE_BYTES = 600_000_000
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The page.  [default: RESULT.html]")
 @click.option("--megabytes", type=click.FloatRange(min=2), default=20.0, show_default=True, help="Size of the page.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of the server for large files.  [default: any]")
+@click.option("--server", "served", is_flag=True, help="Read an HDF5 result as it is looked at, whatever its size.")
 @click.option("--open", "opens", is_flag=True, help="Show it in the browser.")
-def command(results: tuple[Path, ...], output: Path | None, megabytes: float, port: int, opens: bool) -> None:
+def command(
+    results: tuple[Path, ...], output: Path | None, megabytes: float, port: int, served: bool, opens: bool
+) -> None:
     """Show RESULTS, one file of a render, a capture or a volume, or two of a kind beside each other, in a browser.
 
     Writes one HTML page that needs no server and no network. Light of more than 600 MB in an HDF5 file is shown by a
@@ -26,11 +29,12 @@ def command(results: tuple[Path, ...], output: Path | None, megabytes: float, po
     import webbrowser
 
     from torchtransient.vis.pages.server import cube_bytes, serving
-    from torchtransient.vis.view import view
 
     if len(results) > 2:
         raise click.UsageError(f"expected one file or two, got {len(results)}.")
-    if output is None and len(results) == 1 and cube_bytes(results[0]) > _PAGE_BYTES:
+    if served and (output is not None or len(results) == 2):
+        raise click.UsageError("--server shows one file, and writes no page.")
+    if served or (output is None and len(results) == 1 and cube_bytes(results[0]) > _PAGE_BYTES):
         with serving(results[0], results[0].name, port) as (server, address):
             click.echo(f"{address}\n{results[0]} is read as it is looked at. Ctrl-C ends this.")
             if opens:
@@ -40,6 +44,8 @@ def command(results: tuple[Path, ...], output: Path | None, megabytes: float, po
             except KeyboardInterrupt:
                 click.echo("ended.")
         return
+    from torchtransient.vis.pages.page import view  # which takes longer to import than a server to start
+
     started = time.monotonic()
     target = results[0].with_suffix(".html") if output is None else output
     title = " | ".join(result.name for result in results)

@@ -18,8 +18,7 @@ from torchtransient.array_files.array_file import array_of, damage_said, read_ar
 from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
 from torchtransient.files.plain_data import notes_of, text_of
-from torchtransient.reconstruction.hidden_volume import HiddenVolume
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
 
 FORMAT = "torchtransient volume 2"
 # Those of the first version have no checksums.

@@ -26,7 +26,15 @@ Reduction = Literal["none", "sum", "mean"]
 
 
 def check_reduction(reduction: Reduction, where: str) -> None:
-    """Raise ArgumentError unless `reduction` is one of the three."""
+    """Check the name of a reduction.
+
+    Args:
+        reduction: one of `Reduction`.
+        where: begins the message.
+
+    Raises:
+        ArgumentError: for other names.
+    """
     if not is_one_of(reduction, get_args(Reduction)):
         raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {shown(reduction)}.")
 
@@ -34,7 +42,13 @@ def check_reduction(reduction: Reduction, where: str) -> None:
 def check_pair(
     input: object, target: object, where: str, *, complex_too: bool = False, names: str = "input and target"
 ) -> tuple[Tensor, Tensor]:
-    """Return both in their `working_dtype`.
+    """Return both tensors in their `working_dtype`.
+
+    Args:
+        input, target: dense tensors of one shape.
+        where: begins the message.
+        complex_too: take complex tensors.
+        names: of the two in the message.
 
     Raises:
         ShapeError: for other types than dense tensors, and for two shapes, broadcastable or not.
@@ -50,7 +64,15 @@ def check_pair(
 
 
 def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
-    """Return the tensors. Raises ShapeError for other types and for sparse tensors."""
+    """Return the tensors.
+
+    Args:
+        tensors: any objects.
+        where: begins the message.
+
+    Raises:
+        ShapeError: for other types and for sparse tensors.
+    """
     kinds = [
         str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
     ]
@@ -63,8 +85,15 @@ def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
 def working_dtype(tensors: tuple[Tensor, ...], where: str, *, complex_too: bool = False) -> torch.dtype:
     """Return the dtype of a comparison: that of the most precise floating tensor, float32 at least.
 
-    Integer and boolean tensors (counts, frames) have no say. Raises UnitError if all are, and for complex tensors
-    unless `complex_too`.
+    Integer and boolean tensors (counts, frames) have no say.
+
+    Args:
+        tensors: to be compared.
+        where: begins the message.
+        complex_too: take complex tensors.
+
+    Raises:
+        UnitError: if all are integer or boolean, and for complex tensors unless `complex_too`.
     """
     dtypes = [x.dtype for x in tensors if x.dtype.is_floating_point or x.dtype.is_complex]
     if not dtypes:
@@ -134,7 +163,16 @@ def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
 
 
 def check_number(name: str, value: object, where: str) -> float:
-    """Return one finite number. Raises UnitError, also for a tensor with a gradient, which a number would drop."""
+    """Return one finite number.
+
+    Args:
+        name: of the number.
+        value: number of any type.
+        where: begins the message.
+
+    Raises:
+        UnitError: for other values, also for a tensor with a gradient, which a number would drop.
+    """
     if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
         raise UnitError(
             f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
@@ -149,7 +187,17 @@ def _tangent(x: Tensor) -> Tensor | None:
 
 
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
-    """Return a whole number of at least 1; 3.0 is one. Raises UnitError for no number, `error` for others."""
+    """Return a whole number of at least 1; 3.0 is one.
+
+    Args:
+        name: of the number.
+        value: number of any type.
+        where: begins the message.
+        error: raised for numbers that are not whole or below 1.
+
+    Raises:
+        UnitError: for no number.
+    """
     number = math.nan if isinstance(value, bool) else check_number(name, value, where)
     if not 1 <= number <= MOST or number != int(number):
         raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
@@ -159,7 +207,14 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
     """Return the mask expanded to the shape of `like`.
 
-    Raises ShapeError unless it broadcasts, and UnitError unless it is boolean (0.5 would count as True).
+    Args:
+        mask: boolean tensor, or None.
+        like: tensor that is masked.
+        where: begins the message.
+
+    Raises:
+        ShapeError: unless it broadcasts.
+        UnitError: unless it is boolean (0.5 would count as True).
     """
     if mask is None:
         return None
@@ -176,23 +231,47 @@ def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
 
 
 def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
-    """Return `x` where the mask counts, and `fill` without gradient elsewhere."""
+    """Return `x` where the mask counts, and `fill` without gradient elsewhere.
+
+    Args:
+        x: any shape.
+        mask: of the same shape, None for all.
+        fill: value of masked elements.
+    """
     # where on the input: a NaN that is replaced after the arithmetic still has a NaN gradient
     return x if mask is None else torch.where(mask, x, torch.full_like(x, fill))
 
 
 def squared_modulus(x: Tensor) -> Tensor:
-    """Return `|x|^2`, real or complex, with a finite slope at zero."""
+    """Return `|x|^2`, with a finite slope at zero.
+
+    Args:
+        x: real or complex, any shape.
+    """
     return x.real.square() + x.imag.square() if x.is_complex() else x.square()
 
 
 def real_product(x: Tensor, y: Tensor) -> Tensor:
-    """Return `Re(x conj(y))` of two real or two complex tensors."""
+    """Return `Re(x conj(y))`.
+
+    Args:
+        x, y: two real or two complex tensors of one shape.
+    """
     return x.real * y.real + x.imag * y.imag if x.is_complex() else x * y
 
 
 def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None = None) -> Tensor:
-    """Return the values, their sum, or their mean over what counts; 0 where nothing counts."""
+    """Return the values, their sum, or their mean over the elements that count; 0 where nothing counts.
+
+    Args:
+        value: of each element.
+        reduction: "none", "sum" or "mean".
+        where: begins the message.
+        mask: of the same shape, None for all.
+
+    Raises:
+        ArgumentError: for another reduction.
+    """
     check_reduction(reduction, where)
     value = counted(value, mask)
     if reduction == "none":
@@ -205,7 +284,16 @@ def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None 
 
 
 def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
-    """Mean of `|x|` over the counted elements of each item (`layouts.item_dims`), detached; broadcasts to `x`."""
+    """Return the mean of `|x|` over the counted elements of each item, detached.
+
+    Args:
+        x: any shape.
+        dims: of an item, see `layouts.item_dims`.
+        mask: of the same shape, None for all.
+
+    Returns:
+        Tensor that broadcasts to `x`.
+    """
     size = counted(x.detach(), mask).abs()
     if not dims:  # torch takes no dimensions for all of them
         return size
@@ -215,7 +303,13 @@ def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> T
 
 
 def item_scale(x: Tensor, other: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> Tensor:
-    """Return `item_mean` of `x`, or that of `other` where `x` is all zero, or 1 where both are."""
+    """Return `item_mean` of `x`, or that of `other` where `x` is all zero, or 1 where both are.
+
+    Args:
+        x, other: of one shape.
+        dims: of an item.
+        mask: of the same shape, None for all.
+    """
     own, others = item_mean(x, dims, mask), item_mean(other, dims, mask)
     scale = torch.where(own > 0, own, others)
     return torch.where(scale > 0, scale, torch.ones_like(scale))

@@ -24,10 +24,16 @@ _LAYOUTS = "-3 of (..., C, T, Y, X), -2 of lists (..., C, T, N), -5 of exhaustiv
 
 
 def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
-    """Return the dimension of time of `x` as a negative number.
+    """Return the dimension of time as a negative number.
 
-    Raises ShapeError if it is out of range, or not given for an ambiguous shape; `instead`: an alternative to `dim=`
-    for the message.
+    Args:
+        x: a record.
+        dim: as given, None for images of four bins or more.
+        where: begins the message.
+        instead: alternative to `dim=` for the message.
+
+    Raises:
+        ShapeError: if it is out of range, or not given for an ambiguous shape.
     """
     if dim is None:
         if x.ndim not in (4, 5) or x.shape[_IMAGES] < _FEWEST_BINS:
@@ -45,7 +51,15 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
 
 
 def check_dim(dim: int, where: str) -> int:
-    """Return `dim` as a whole number. Raises ShapeError."""
+    """Return a dimension as a whole number.
+
+    Args:
+        dim: number of any type.
+        where: begins the message.
+
+    Raises:
+        ShapeError: for other values.
+    """
     number = as_whole(dim)
     if number is None or abs(number) > MOST:
         raise ShapeError(
@@ -55,7 +69,16 @@ def check_dim(dim: int, where: str) -> int:
 
 
 def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
-    """Return `time_dim` of a record. Raises ShapeError for records without bins."""
+    """Return `time_dim` of a record with bins.
+
+    Args:
+        x: a record.
+        dim: as given.
+        where: begins the message.
+
+    Raises:
+        ShapeError: for records without bins.
+    """
     place = time_dim(x, dim, where)
     if not x.shape[place]:
         raise ShapeError(f"{where}: expected one or more bins in dimension {place}, got {tuple(x.shape)}.")
@@ -63,7 +86,16 @@ def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
 
 
 def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
-    """Return the width of a bin, metres of path, in the precision of `like`. Raises UnitError, also for None."""
+    """Return the width of a bin in the precision of a tensor.
+
+    Args:
+        width_opl: metres of path.
+        like: the record.
+        where: begins the message.
+
+    Raises:
+        UnitError: for None, and lengths below 0.3 fs.
+    """
     if width_opl is None:
         raise UnitError(
             f"{where}: expected bin_width_opl, metres of optical path, with tensors, got None. Give "
@@ -73,14 +105,29 @@ def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
 
 
 def item_dims(x: Tensor, dim: int | None, where: str, instead: str = "") -> tuple[int, ...]:
-    """Return the dimensions of an item, from its channels on. Without `dim`, a tensor (N,) is one item."""
+    """Return the dimensions of an item, from its channels on. Without `dim`, a tensor (N,) is one item.
+
+    Args:
+        x: a record.
+        dim: of time, as given.
+        where: begins the message.
+        instead: alternative to `dim=` for the message.
+
+    Raises:
+        ShapeError: as `time_dim`.
+    """
     if dim is None and x.ndim < 2:
         return tuple(range(-x.ndim, 0))
     return tuple(range(max(time_dim(x, dim, where, instead) - 1, -x.ndim), 0))
 
 
 def as_columns(x: Tensor, dim: int) -> Tensor:
-    """Reshape a tensor with time in dimension `dim` < 0 to (..., T, N, 1), the layout of sensors."""
+    """Reshape a record to (..., T, N, 1), the layout of sensors.
+
+    Args:
+        x: a record.
+        dim: of time, below zero.
+    """
     if dim == _IMAGES:
         return x
     place = dim + x.ndim

@@ -48,7 +48,7 @@ from torchtransient.losses.layouts import as_columns, bins_dim, item_dims, time_
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, TRANSIENT, Light, Transient, reads
 from torchtransient.sensing.dead_time.renewal import check_dead_bins
-from torchtransient.sensing.spad.spad import exposed_cycles, first_photon_log_prob
+from torchtransient.sensing.spad import exposed_cycles, first_photon_log_prob
 
 # Mean, relative to the counts of a bin, below which its logarithm is continued by the tangent. Bins of so small a mean
 # hold less than one count in 1e9, and a slope of 1e9 has a square that single precision holds.
@@ -499,7 +499,12 @@ def _dark_level(
 
 @contextmanager
 def parts_of(input: object, averaged: Tensor | float) -> Iterator[None]:
-    """Context in which likelihoods compare parts of a prediction `input`, averaged over that many bins."""
+    """Context in which likelihoods compare parts of a prediction.
+
+    Args:
+        input: the prediction.
+        averaged: number of bins that each part averages.
+    """
     token = _OF_HALF.set(averaged if isinstance(input, Tensor) and input.dtype == torch.float16 else None)
     try:
         yield
@@ -508,7 +513,13 @@ def parts_of(input: object, averaged: Tensor | float) -> Iterator[None]:
 
 
 def divisor(value: Tensor, mask: Tensor | None, reduction: Reduction) -> Tensor | float:
-    """Return the number that the reduction of these values divides by."""
+    """Return the number that the reduction of values divides by.
+
+    Args:
+        value: of each element.
+        mask: of the same shape, None for all.
+        reduction: "none", "sum" or "mean".
+    """
     if reduction != "mean":
         return 1
     return max(value.numel(), 1) if mask is None else mask.sum().clamp_min(1)

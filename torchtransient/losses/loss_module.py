@@ -52,7 +52,12 @@ class LossModule(nn.Module):
         cls.__init__ = initialize  # type: ignore[method-assign,assignment]
 
     def loss(self, *tensors: Any, mask: Tensor | None) -> Tensor:
-        """Return the function of tensors with the options held."""
+        """Return the function of tensors with the options held.
+
+        Args:
+            tensors: of the function.
+            mask: elements that count, None for all.
+        """
         options = {name: getattr(self, name) for name in self._signature.parameters}
         return self.function(*tensors, mask=mask, **options)
 

@@ -137,12 +137,26 @@ class MeasurementConsistency(LossModule, function=measurement_consistency, by_pl
 
 
 def takes_dim(compare: object) -> bool:
-    """Return True for a function with an argument `dim`."""
+    """Return True for a function with an argument `dim`.
+
+    Args:
+        compare: function of two tensors.
+    """
     return "dim" in inspect.signature(cast(Callable[..., Any], compare)).parameters
 
 
 def shared_dim(compare: object, dim: int | None, like: Tensor, where: str) -> int | None:
-    """Return the dimension of time, as given or as `compare` holds it. Raises ArgumentError if both differ."""
+    """Return the dimension of time, as given or as `compare` holds it.
+
+    Args:
+        compare: function or module that compares.
+        dim: as given, or None.
+        like: the record.
+        where: begins the message.
+
+    Raises:
+        ArgumentError: if both are there and differ.
+    """
     held = getattr(compare, "dim", None)
     if not isinstance(compare, nn.Module) and takes_dim(compare):
         held = inspect.signature(cast(Callable[..., Any], compare)).parameters["dim"].default

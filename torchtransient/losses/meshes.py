@@ -223,7 +223,15 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
 
 
 def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
-    """Distance (N,) of points (N, 3) to the nearest of triangles (F, 3, 3), exact and differentiable."""
+    """Return the distance of points to the nearest of triangles, exact and differentiable.
+
+    Args:
+        points: (N, 3), metres.
+        triangles: (F, 3, 3), metres.
+
+    Returns:
+        (N,), metres.
+    """
     # relative to the extent: squares of small lengths vanish in single precision
     middle = triangles.detach().mean((0, 1))
     points, triangles = points - middle, triangles - middle

@@ -132,7 +132,7 @@ def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned
 
 
 def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known: set[str], where: str) -> None:
-    """Replace results by their tensors, and options that are not given by those of the results."""
+    """Replace results by their tensors, and options that are not given by the settings of results."""
     results = {name: arguments[name] for name in measures if _is_result(arguments.get(name))}
     taken = {name: _attribute(x, measures[name], list(results.values()), name, where) for name, x in results.items()}
     for attribute, settings in _AXES.items():

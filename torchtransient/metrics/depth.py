@@ -58,7 +58,11 @@ def depth_mae(
 def depth_rmse(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Root mean square error of depths, `sqrt(mean((input - target)^2))`, metres; arguments as in `depth_mae`."""
+    """Root mean square error of depths, `sqrt(mean((input - target)^2))`, metres.
+
+    Args:
+        input, target, mask, reduction: as in `depth_mae`.
+    """
     where = "depth_rmse"
     x, y, counts = _compared(input, target, mask, where)
     return Tally((x - y).double().square(), counts, _MAP, Finish(Kind.ROOT)).result(reduction, where).to(x.dtype)
@@ -68,7 +72,11 @@ def depth_rmse(
 def depth_bias(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean error of depths, `mean(input - target)`, metres, positive if too far; arguments as in `depth_mae`."""
+    """Mean error of depths, `mean(input - target)`, metres, positive if too far.
+
+    Args:
+        input, target, mask, reduction: as in `depth_mae`.
+    """
     where = "depth_bias"
     x, y, counts = _compared(input, target, mask, where)
     return Tally(x - y, counts, _MAP).result(reduction, where)
@@ -101,9 +109,12 @@ def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None
 def depth_abs_rel(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean relative error of depths, `mean(|input - target| / target)`; arguments as in `depth_mae`.
+    """Mean relative error of depths, `mean(|input - target| / target)`.
 
     Pixels with a target of zero or below do not count. Source: Eigen, Puhrsch and Fergus 2014.
+
+    Args:
+        input, target, mask, reduction: as in `depth_mae`.
     """
     where = "depth_abs_rel"
     x, y, counts = _compared(input, target, mask, where, positive_only=True)

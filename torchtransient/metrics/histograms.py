@@ -88,7 +88,11 @@ def histogram_wasserstein_s(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Wasserstein-1 distance over time of each pixel, seconds; arguments as in `histogram_wasserstein_opl`."""
+    """Wasserstein-1 distance over time of each pixel, seconds.
+
+    Args:
+        input, target, axis, dim, mask, reduction: as in `histogram_wasserstein_opl`.
+    """
     where = "histogram_wasserstein_s"
     known = _axis(axis, where)
     moved, lit, place = _moved(input, target, known, dim, mask, where)

@@ -132,9 +132,13 @@ def transient_ssim(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`ssim` of transients as pictures; `view` and other arguments as in `transient_psnr`.
+    """`ssim` of transients as pictures.
 
     Empty bins are alike, and dominate a mean over the bins of most scenes.
+
+    Args:
+        input, target, view, value_range, dim, mask, reduction: as in `transient_psnr`.
+        window: side of the window, pixels.
     """
     where = "transient_ssim"
     x, y, given, limit = _transients(input, target, view, value_range, dim, mask, where)

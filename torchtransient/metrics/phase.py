@@ -87,7 +87,11 @@ def phase_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root mean square wrapped difference of phases (..., Y, X); arguments as in `phase_mae`."""
+    """Root mean square wrapped difference of phases (..., Y, X).
+
+    Args:
+        input, target, period, weight, mask, reduction: as in `phase_mae`.
+    """
     where = "phase_rmse"
     difference, counts = _difference(input, target, period, weight, mask, where)
     squares = difference.double().square()
@@ -107,7 +111,13 @@ def phase_bias(
     """Circular mean of the difference of phases: the angle of the mean of `exp(i (input - target))`, signed.
 
     Right across the jump, where a mean of wrapped differences is wrong; meaningless for differences spread evenly over
-    the circle. In (-period/2, period/2]; arguments as in `phase_mae`. Source: Fisher 1993.
+    the circle. Source: Fisher 1993.
+
+    Args:
+        input, target, period, weight, mask, reduction: as in `phase_mae`.
+
+    Returns:
+        In (-period/2, period/2].
     """
     where = "phase_bias"
     difference, counts = _difference(input, target, period, weight, mask, where)

@@ -79,7 +79,11 @@ def dop_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root mean square error of the degree of polarization; arguments as in `dop_mae`."""
+    """Root mean square error of the degree of polarization.
+
+    Args:
+        input, target, stokes_dim, part, floor, mask, reduction: as in `dop_mae`.
+    """
     where = "dop_rmse"
     difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
     return Tally(difference.square(), counts, _PICTURE, Finish(Kind.ROOT)).result(reduction, where)

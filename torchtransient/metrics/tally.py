@@ -102,13 +102,30 @@ class Tally:
 
 
 def check_reduction(reduction: object, where: str) -> None:
-    """Raise ArgumentError for other reductions."""
+    """Check the name of a reduction.
+
+    Args:
+        reduction: "mean", "item" or "none".
+        where: begins the message.
+
+    Raises:
+        ArgumentError: for other reductions.
+    """
     if not isinstance(reduction, Collector) and reduction not in get_args(Reduction):
         raise ArgumentError(f"{where}: expected reduction 'mean', 'item' or 'none', got {reduction!r}.")
 
 
 def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
-    """Raise UnitError for NaN and infinite numbers where `mask` counts."""
+    """Check that elements are finite where they count.
+
+    Args:
+        x: the elements.
+        mask: that counts, None for all.
+        name, where: for the message.
+
+    Raises:
+        UnitError: for NaN and infinite numbers.
+    """
     wrong = ~torch.isfinite(x) if mask is None else ~torch.isfinite(x) & mask
     if not is_true(~wrong):
         raise UnitError(
@@ -118,7 +135,18 @@ def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
 
 
 def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
-    """Return the weight of each element, 0 where masked. Raises ShapeError, UnitError."""
+    """Return the weight of each element, 0 where masked.
+
+    Args:
+        weight: tensor that broadcasts, None for ones.
+        mask: boolean tensor that broadcasts, None for all.
+        like: the elements.
+        where: begins the message.
+
+    Raises:
+        ShapeError: for tensors that do not broadcast.
+        UnitError: for weights below zero or not finite.
+    """
     mask = check_mask(mask, like, where)
     if weight is None:
         return mask

@@ -142,9 +142,15 @@ def volume_correlation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Correlation of volumes (..., Z, Y, X), voxel by voxel; arguments as in `picture_correlation`.
+    """Correlation of volumes (..., Z, Y, X), voxel by voxel.
 
-    Strict: a surface that is one plane off does not correlate. Raises UnitError for volumes on two grids.
+    Strict: a surface that is one plane off does not correlate.
+
+    Args:
+        input, target, centered, mask, reduction: as in `picture_correlation`.
+
+    Raises:
+        UnitError: for volumes on two grids.
     """
     where = "volume_correlation"
     x, y = _volumes(input, target, where)
@@ -187,9 +193,13 @@ def volume_iou(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Intersection over union of volumes (..., Z, Y, X), voxel by voxel; arguments as in `picture_iou`.
+    """Intersection over union of volumes (..., Z, Y, X), voxel by voxel.
 
-    Raises UnitError for volumes on two grids.
+    Args:
+        input, target, threshold, mask, reduction: as in `picture_iou`.
+
+    Raises:
+        UnitError: for volumes on two grids.
     """
     where = "volume_iou"
     x, y = _volumes(input, target, where)

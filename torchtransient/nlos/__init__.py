@@ -49,11 +49,11 @@ from torchtransient.files.captures.formats import write_capture as write_capture
 from torchtransient.files.volume_file import read_volume as read_volume
 from torchtransient.files.volume_file import write_volume as write_volume
 from torchtransient.nlos.methods import choose_method as choose_method
-from torchtransient.nlos.preparation import sum_bins as sum_bins
-from torchtransient.nlos.preparation import without_slab as without_slab
 from torchtransient.nlos.reconstruct import default_grid as default_grid
 from torchtransient.nlos.reconstruct import normals_of as normals_of
 from torchtransient.nlos.reconstruct import reconstruct as reconstruct
+from torchtransient.nlos.reconstruct import sum_bins as sum_bins
+from torchtransient.nlos.reconstruct import without_slab as without_slab
 from torchtransient.nlos.renderer import CaptureRenderer as CaptureRenderer
 from torchtransient.nlos.scene import capture_scene as capture_scene
 from torchtransient.nlos.setup_files import read_setup as read_setup

@@ -1,16 +1,22 @@
-"""Which captures each method for hidden volumes takes, and which one suits a capture."""
+"""Methods for hidden volumes: the captures that each takes, the one that suits a capture, the memory it needs."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import shown, with_article
-from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.checks import count, shown, with_article
+from torchtransient.errors import ArgumentError, ShapeError, StorageError
+from torchtransient.nlos.simulation import size_in_words
+from torchtransient.reconstruction import VoxelGrid
 from torchtransient.reconstruction.capture_checks import not_a_capture
-from torchtransient.reconstruction.planar_scan import PlanarScan
+from torchtransient.reconstruction.voxels import PlanarScan
+from torchtransient.rendering.memory import available_bytes
 from torchtransient.volume_methods import METHODS as METHODS
 from torchtransient.volume_methods import Method as Method
 
@@ -27,7 +33,17 @@ class Choice:
 
 
 def choose_method(capture: Capture) -> Choice:
-    """The method that suits a capture. Raises ShapeError for what is none."""
+    """Choose the method that suits a capture.
+
+    Args:
+        capture: of any kind.
+
+    Returns:
+        Name of the method, and the reason for it.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     if not isinstance(capture, Capture):
         raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
@@ -45,7 +61,15 @@ def choose_method(capture: Capture) -> Choice:
 
 
 def check_method(name: str, capture: Capture) -> Method:
-    """The method of a name. Raises ArgumentError for unknown ones and for scans that it does not take."""
+    """Return the method of a name.
+
+    Args:
+        name: one of ``METHODS``.
+        capture: that it is meant for.
+
+    Raises:
+        ArgumentError: for unknown names, and for scans that the method does not take.
+    """
     if not isinstance(name, str) or name not in METHODS:
         raise ArgumentError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
@@ -64,7 +88,11 @@ def check_method(name: str, capture: Capture) -> Method:
 
 
 def is_planar(scan: Scan) -> bool:
-    """Whether the sensor points are a regular grid of a flat wall."""
+    """Return True where the sensor points are a regular grid of a flat wall.
+
+    Args:
+        scan: of any kind.
+    """
     try:
         PlanarScan.of_scan(scan, "choose_method")
     except ShapeError:
@@ -73,8 +101,13 @@ def is_planar(scan: Scan) -> bool:
 
 
 def pitch_of(scan: Scan) -> float:
-    """How far sensor points are from their neighbours, metres: that of a grid, or the mean over a list's points. Zero
-    for one point.
+    """Return the distance of sensor points from their neighbours, metres.
+
+    Args:
+        scan: of any kind.
+
+    Returns:
+        Pitch of a grid, mean over the points of a list, zero for one point.
     """
     if is_planar(scan):
         return max(PlanarScan.of_scan(scan, "pitch_of").pitch)
@@ -88,13 +121,96 @@ def pitch_of(scan: Scan) -> float:
 
 
 def default_wavelength(capture: Capture) -> float:
-    """The shortest wavelength, metres of optical path, that shows no ghosts and that the bins hold: two pitches of
-    the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and four bins at
-    least.
+    """Return the shortest wavelength that shows no ghosts and that the bins hold.
 
-    Raises ShapeError for a capture without a transient.
+    Two pitches of the sensor points, four of confocal scans and of pairs, where the laser moves with the sensor, and
+    four bins at least.
+
+    Args:
+        capture: with a transient.
+
+    Returns:
+        Metres of optical path.
+
+    Raises:
+        ShapeError: for a capture without a transient.
     """
     if capture.axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
     turns = 4.0 if capture.scan.kind in ("confocal", "pairs") else 2.0
     return max(turns * pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)
+
+
+# Planes whose points backprojection holds at once: filters run over all rows once for each such pass. Bytes of a
+# point: float64 and the tables of an operator.
+AT_ONCE, POINT = 16, 40
+
+
+def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, options: Mapping[str, Any]) -> None:
+    """Check that the memory left on the device of a capture holds the volume of a method.
+
+    Args:
+        name: of the method.
+        capture: with a transient.
+        grid: voxels of methods that take some, else None.
+        options: of the method.
+
+    Raises:
+        StorageError: where even the least memory of the method is not there.
+    """
+    light = capture.transient
+    assert light is not None
+    needed = least_bytes(name, capture, grid, options)
+    available = available_bytes("cuda" if light.device.type == "cuda" else "llvm")
+    if light.device.type == "meta" or available is None or needed <= available:
+        return
+    if grid is not None:
+        size: tuple[int, ...] = grid.shape
+        way = "Take fewer voxels or depths"
+    else:
+        size, way = tuple(light.shape[-3:]), "Crop the capture, add up bins, or take fewer points"
+    sizes = " x ".join(map(str, size))
+    raise StorageError(
+        f"reconstruct: method '{name}' would take {size_in_words(needed)} at least for {sizes} numbers, and "
+        f"{size_in_words(available)} are available on this {light.device.type}. {way}."
+    )
+
+
+def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Mapping[str, Any]) -> int:
+    """Return a lower bound of the memory that a method takes beside its arguments.
+
+    Args:
+        name: of the method.
+        capture: with a transient.
+        grid: voxels of methods that take some, else None.
+        options: of the method.
+
+    Returns:
+        Bytes.
+    """
+    light, axis = capture.transient, capture.axis
+    assert light is not None and axis is not None
+    number = 8 if light.dtype == torch.float64 else 4
+    if grid is not None:
+        times = getattr(options.get("camera"), "times", None)
+        frames = 1 if times is None else len(times)
+        items = math.prod(light.shape[: light.ndim - len(capture.scan.shape) - 1])
+        volume = frames * items * math.prod(grid.shape)
+        if name == "phasor":
+            return 3 * number * volume
+        planes = min(AT_ONCE, len(grid.depths))
+        # The planes of the last pass beside those before them; then all planes, and the volume that they are put into.
+        return max(2 * number * volume, number * volume + POINT * planes * math.prod(grid.size))
+    rows, columns = capture.scan.sensor_shape
+    rows, columns = (2 * rows, 2 * columns) if name == "midpoint-fk" else (rows, columns)
+    plane, bins = rows * columns, axis.num_bins
+    if "taps" in METHODS[name].options:
+        taps = count("reconstruct: taps", options.get("taps", METHODS[name].options["taps"]))
+        spectrum = (rows + 1) * (columns + 1) * bins
+        # Tables are made in double precision and kept in single; then come a spectrum and the field.
+        tables = (4 + 2 * number * taps) * spectrum
+        return max(tables + 16 * taps * spectrum, tables + 2 * number * (2 * plane * (bins + 1) + plane * bins))
+    v_bins = count("reconstruct: v_bins", options.get("v_bins", bins), 4)
+    components = 3 if name == "directional-lct" else 1
+    spectra = (1 + components) * 2 * number * (v_bins + 1) * plane
+    return spectra + number * (v_bins + components * bins) * plane

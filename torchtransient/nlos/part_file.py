@@ -1,8 +1,8 @@
-"""The part file of a simulation: what is finished, on disk.
+"""The part file of a simulation: finished rows, on disk.
 
-Three files: ``NAME``, JSON that says which simulation it is and which of its rows are finished; ``NAME.npy``, the rows
+Three files: ``NAME``, JSON with the key of the simulation and the numbers of its finished rows; ``NAME.npy``, the rows
 in NumPy's own format; ``NAME.lock``, held while a process works on it. Rows are written first and named afterwards,
-with a checksum, and the JSON replaces the one before in one step: a kill at any moment, or a full disk, loses what was
+with a checksum, and the JSON replaces the one before in one step: a kill at any moment, or a full disk, loses the rows
 in progress and nothing else.
 """
 
@@ -13,25 +13,133 @@ import json
 import os
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Capture, Scan
 from torchtransient.checks import short_message
 from torchtransient.errors import StorageError
 
-FORMAT = "torchtransient part 2"
 Rows = NDArray[np.float32]
 
 
-class PartFile:
-    """Finished rows of the simulation that ``key`` stands for ("": of any, to be removed). To be used in a ``with``
-    block, which holds the lock.
+@dataclass(frozen=True)
+class RowLayout:
+    """Layout of a capture as rows of numbers, one for each sensor point.
 
-    ``about``: plain data that was kept with them, empty at first. Raises StorageError where ``path`` is something else,
-    belongs to another simulation, is damaged, or is worked on by another process.
+    A row holds the transient (or phasor, real and imaginary part in turn) of shape ``front``, then the steady image's
+    ``steady`` channels, 0 without one. ``front`` has the laser's dimensions of an exhaustive scan at its end.
+    """
+
+    front: tuple[int, ...]
+    steady: tuple[int, ...]
+    phasor: bool
+    channels: tuple[str, ...]
+    polarized: bool
+
+    @classmethod
+    def of(cls, capture: Capture) -> RowLayout:
+        """Return the layout of a capture."""
+        measured = _measured(capture)
+        rank = len(capture.scan.sensor_shape)
+        steady = () if capture.steady is None else tuple(capture.steady.shape[: capture.steady.ndim - rank])
+        return cls(
+            front=tuple(measured.shape[: measured.ndim - rank]),
+            steady=steady,
+            phasor=measured.is_complex(),
+            channels=capture.channels,
+            polarized=capture.polarized,
+        )
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> RowLayout:
+        """Return the layout that :meth:`plain` described."""
+        given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
+        return cls(**given)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the layout as data for JSON."""
+        return asdict(self)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of a row."""
+        return self._measured_columns() + self._steady_columns()
+
+    def rows(self, capture: Capture) -> Rows:
+        """Return the rows (N, columns) of a capture's sensor points, in the order of the scan."""
+        rank = len(capture.scan.sensor_shape)
+        measured = _points_first(_measured(capture), rank)
+        if self.phasor:
+            measured = torch.view_as_real(measured)
+        parts = [measured.reshape(len(measured), -1)]
+        if capture.steady is not None:
+            parts.append(_points_first(capture.steady, rank).reshape(len(measured), -1))
+        found: Rows = torch.cat(parts, 1).numpy() if len(parts) > 1 else parts[0].numpy()
+        return found
+
+    def capture(
+        self, rows: Rows, scan: Scan, axis: TimeAxis | None, frequencies: FrequencyAxis | None
+    ) -> dict[str, Any]:
+        """Return the arguments of :class:`Capture`, but its metadata, as views of ``rows`` (N, columns)."""
+        split, numbers = self._measured_columns(), torch.from_numpy(rows)
+        measured, steady = numbers[:, :split], numbers[:, split:]
+        if self.phasor:
+            # Beside a steady image the pairs of a row may begin at odd places.
+            measured = torch.view_as_complex(measured.reshape(len(numbers), -1, 2).contiguous())
+        made: dict[str, Any] = {"transient": None, "phasor": None, "steady": None}
+        made["phasor" if self.phasor else "transient"] = _points_last(measured, self.front, scan)
+        if self.steady:
+            made["steady"] = _points_last(steady, self.steady, scan)
+        settings = {"channels": self.channels, "polarized": self.polarized}
+        return made | settings | {"scan": scan, "axis": axis, "frequencies": frequencies}
+
+    def _measured_columns(self) -> int:
+        return int(np.prod(self.front, dtype=np.int64)) * (2 if self.phasor else 1)
+
+    def _steady_columns(self) -> int:
+        return int(np.prod(self.steady, dtype=np.int64)) if self.steady else 0
+
+
+def _measured(capture: Capture) -> torch.Tensor:
+    found = capture.transient if capture.transient is not None else capture.phasor
+    assert found is not None  # a simulation measures one of them
+    return found
+
+
+def _points_first(tensor: torch.Tensor, rank: int) -> torch.Tensor:
+    """(N, ...) of (..., *sensor): in memory as films are."""
+    flat = tensor.cpu().flatten(tensor.ndim - rank)
+    return flat.movedim(-1, 0).contiguous()
+
+
+def _points_last(rows: torch.Tensor, front: tuple[int, ...], scan: Scan) -> torch.Tensor:
+    """(*front, *sensor) of (N, columns)."""
+    moved = rows.reshape(len(rows), *front).movedim(0, -1)
+    return moved.reshape(*front, *scan.sensor_shape)
+
+
+FORMAT = "torchtransient part 2"
+
+
+class PartFile:
+    """Finished rows of one simulation. To be used in a ``with`` block, which holds the lock.
+
+    ``about``: plain data that was kept with them, empty at first.
+
+    Args:
+        path: of the JSON file.
+        key: of the simulation, "" for any, to be removed.
+
+    Raises:
+        StorageError: where ``path`` is another kind of file, belongs to another simulation, is damaged, or is worked on
+            by another process.
     """
 
     def __init__(self, path: Path, key: str) -> None:
@@ -95,7 +203,7 @@ class PartFile:
             self._check()
 
     def _check(self) -> None:
-        """Raise StorageError unless the rows are those that were written."""
+        """Check the rows by their checksums. Raises StorageError."""
         for first, count, checksum in self._done.values():
             if zlib.crc32(self._bytes(first, count)) != checksum:
                 raise StorageError(
@@ -104,7 +212,7 @@ class PartFile:
                 )
 
     def has(self, number: int) -> bool:
-        """Whether the part of that number is finished."""
+        """Return True where a part is finished."""
         return number in self._done
 
     @property
@@ -113,13 +221,13 @@ class PartFile:
         return max(self._done, default=None)
 
     def rows(self, first: int, count: int) -> Rows:
-        """Some rows, (count, columns)."""
+        """Return some rows, (count, columns)."""
         with self._errors_said():
             found = np.frombuffer(self._bytes(first, count), dtype=np.float32)
             return found.reshape(count, self._shape[1]).copy()
 
     def everything(self) -> Rows:
-        """All rows, read into memory."""
+        """Return all rows, read into memory."""
         with self._errors_said():
             return np.load(self._data, mmap_mode=None, allow_pickle=False)  # type: ignore[no-any-return]
 
@@ -136,10 +244,19 @@ class PartFile:
         self, number: int, first: int, rows: Rows, *, total: int, seconds: float, about: Mapping[str, Any],
         instead_of: int | None = None,
     ) -> None:  # fmt: skip
-        """Keep the part of a number: its ``rows`` (N, columns), from row ``first`` of ``total``, that took ``seconds``.
+        """Keep a part.
 
-        ``instead_of``: the number of a part that it takes the place of. Raises StorageError for a full disk, which
-        leaves what was finished before.
+        Args:
+            number: of the part.
+            first: its first row.
+            rows: (N, columns).
+            total: number of rows of the file.
+            seconds: that it took.
+            about: plain data to be kept with all parts.
+            instead_of: number of a part that it replaces.
+
+        Raises:
+            StorageError: for a full disk, which leaves the parts before.
         """
         with self._errors_said():
             if self._file is None:
@@ -163,7 +280,7 @@ class PartFile:
         self._file.truncate(self._start() + 4 * total * columns)
 
     def _start(self) -> int:
-        """Where the first row lies: behind the header, whose length it says itself."""
+        """Return the place of the first row: behind the header, which says its own length."""
         assert self._file is not None
         self._file.seek(8)
         return 10 + int.from_bytes(self._file.read(2), "little")
@@ -213,7 +330,11 @@ class PartFile:
 def delete_part_file(path: Path) -> None:
     """Delete the files of a simulation's parts, if there are any.
 
-    Raises StorageError for a file that is something else, or is worked on by another process.
+    Args:
+        path: of the JSON file.
+
+    Raises:
+        StorageError: for another kind of file, or one that another process works on.
     """
     if not path.exists():
         return

@@ -12,17 +12,24 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
-from torchtransient.capture.capture import precision_of
+from torchtransient.capture.capture import precision_of, summed
 from torchtransient.checks import Numbers, count, finite, positive, real_array, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.nlos.measured_light import checked_light
-from torchtransient.nlos.methods import Choice, check_method, choose_method, default_wavelength, is_planar
-from torchtransient.nlos.volume_memory import AT_ONCE, check_volume_fits
+from torchtransient.errors import ArgumentError, DeviceError, ShapeError, UnitError
+from torchtransient.nlos.methods import (
+    AT_ONCE,
+    Choice,
+    check_method,
+    check_volume_fits,
+    choose_method,
+    default_wavelength,
+    is_planar,
+)
 from torchtransient.reconstruction import (
     FK,
     LCT,
     Backprojection,
     ConfocalCamera,
+    DiffusionDeconvolution,
     DirectionalLCT,
     DirectLight,
     FilteredBackprojection,
@@ -35,9 +42,120 @@ from torchtransient.reconstruction import (
     VoxelGrid,
     subtract_legs,
 )
-from torchtransient.reconstruction.capture_checks import not_a_capture
-from torchtransient.reconstruction.proportions import check_proportions, check_reach, check_wavelength
+from torchtransient.reconstruction.capture_checks import (
+    check_proportions,
+    check_reach,
+    check_wavelength,
+    checked_capture,
+    not_a_capture,
+)
 from torchtransient.volume_methods import FILTERS, Method
+
+
+def checked_light(capture: Capture, who: str) -> Capture:
+    """Return a capture whose light is finite.
+
+    Args:
+        capture: with a transient.
+        who: begins the message.
+
+    Raises:
+        UnitError: for NaN and infinities, which transforms spread over the whole volume; it names their number and the
+            first point.
+    """
+    light = capture.transient
+    assert light is not None  # a capture without one has been refused
+    finite = torch.isfinite(light)
+    if bool(finite.all()):
+        return capture
+    dims = len(capture.scan.shape)
+    # All but the points: channels, batches and times.
+    dead = ~finite.reshape(-1, *light.shape[light.ndim - dims :]).all(0)
+    places = dead.nonzero().tolist()
+    first = ", ".join(map(str, places[0]))
+    what = "pairs of laser and sensor points" if capture.scan.kind == "exhaustive" else "points"
+    raise UnitError(
+        f"{who}: expected finite light, got NaN or infinity at {len(places)} of {dead.numel()} {what}, the first at "
+        f"[{first}]. Put the mean of its neighbours in the place of a dead point, or leave it out: Scan.points takes "
+        "those that are left, and fbp their light."
+    )
+
+
+def sum_bins(capture: Capture, number: int) -> Capture:
+    """Add up neighbouring bins; bins left over at the record's end are dropped.
+
+    Args:
+        capture: with a transient; phasors beside it stay.
+        number: of bins in a sum.
+
+    Returns:
+        Capture; counts stay whole (int64), half precision becomes float32.
+
+    Raises:
+        ShapeError: without a transient and for more bins than there are.
+        SceneError: for other numbers.
+    """
+    number = count("sum_bins: number", number)
+    transient, axis = checked_capture(capture, "sum_bins")
+    if number == 1:
+        return capture
+    bins = axis.num_bins // number
+    if bins < 1:
+        raise ShapeError(f"sum_bins: expected {axis.num_bins} bins at most, got {number}.")
+    dim = transient.ndim - len(capture.scan.shape) - 1
+    together = summed(transient.narrow(dim, 0, bins * number).unflatten(dim, (bins, number)), dim + 1)  # type: ignore[no-untyped-call]
+    return replace(capture, transient=together, axis=TimeAxis(axis.start_opl, axis.bin_width_opl * number, bins))
+
+
+def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
+    """Remove the foam slab on the wall of a confocal capture by :class:`DiffusionDeconvolution`.
+
+    The foam is that of Lindell and Wetzstein (2020). Intensities below zero become zero, the other Stokes components
+    stay.
+
+    Args:
+        capture: confocal, of a flat wall.
+        thickness: of the slab, metres.
+        snr: of the Wiener filter.
+
+    Returns:
+        Capture without legs, in double precision where the capture is, else in single.
+
+    Raises:
+        ShapeError, UnitError: as :class:`DiffusionDeconvolution`, and for light that is not finite.
+    """
+    checked_capture(capture, "without_slab")
+    capture = subtract_legs(capture)
+    transient, axis = checked_capture(capture, "without_slab")
+    checked_light(capture, "without_slab")
+    # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
+    slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
+    clear = slab.to(transient.device).reconstruct(transient.double())
+    if capture.polarized:
+        stokes = -len(capture.scan.shape) - 3
+        intensity, others = clear.split((1, 3), stokes)  # type: ignore[no-untyped-call]
+        clear = torch.cat([intensity.clamp_min(0), others], stokes)
+    else:
+        clear = clear.clamp_min(0)
+    return replace(capture, transient=clear.to(precision_of(transient)), phasor=None, frequencies=None, steady=None)
+
+
+def moved_to(capture: Capture, device: Any) -> Capture:
+    """Move a capture to a device.
+
+    Args:
+        capture: of any kind.
+        device: name, or a torch.device.
+
+    Raises:
+        DeviceError: for a device that torch does not have.
+    """
+    try:
+        return capture.to(device)
+    except (RuntimeError, AssertionError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise DeviceError(f"reconstruct: expected a device that torch has, got {shown(device)}: {reason}") from None
+
 
 # Planes of a volume whose depths nobody gave, and how near the first is, as a share of the last one's depth.
 MOST_PLANES, NEAREST = 64, 0.02
@@ -52,23 +170,32 @@ def reconstruct(
     progress: bool = True,
     **options: Any,
 ) -> HiddenVolume:
-    """The hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and others).
+    """Reconstruct the hidden volume of a capture, without gradients (for those, take the operators: :class:`FK` and
+    others).
 
-    ``method``: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
-    scan, and ``metadata["reason"]`` says why. For confocal grids that is f-k, which bears background: a light-cone
-    transform is as good or better where background has been taken off, phasor fields where there are few photons.
-    ``grid``: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
-    and a voxel behind each point. ``depths`` (near, far), metres: what to look at; planes of the other methods outside
-    of it are left out. ``progress``: show a bar.
+    Args:
+        capture: with a transient. First and last legs are taken off where a method cannot count them, light before time
+            zero and phasors beside a transient are left out, and of polarized captures the intensity is taken.
+        method: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
+            scan, with the reason in ``metadata["reason"]``. For confocal grids that is f-k, which bears background: a
+            light-cone transform is as good or better where background has been taken off, phasor fields where there are
+            few photons.
+        grid: voxels of bp, fbp and phasor, None for :func:`default_grid`; the other methods have a plane for each bin
+            and a voxel behind each point.
+        depths: (near, far) to look at, metres; planes of the other methods outside of it are left out.
+        progress: show a bar.
+        options: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
+            directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None
+            for the shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp),
+            ``camera`` (phasor).
 
-    ``options``: ``target``, ``floor``, ``taps`` (fk, midpoint-fk), ``target``, ``snr``, ``v_bins`` (lct,
-    directional-lct), ``taper`` (directional-lct), ``falloff`` (bp, fbp, phasor), ``wavelength`` in metres, None for the
-    shortest without ghosts, and ``cycles`` (fbp, phasor), ``filter`` "phasor" or "laplacian" (fbp), ``camera``
-    (phasor). First and last legs are taken off where a method cannot count them, light before time zero and phasors
-    beside a transient are left out, and of polarized captures the intensity is taken.
+    Returns:
+        Values, grid, method and settings; times of a film; directions of methods that find normals.
 
-    Raises ArgumentError for a method or an option that does not fit the capture or each other, ShapeError, UnitError
-    and DeviceError as the operators.
+    Raises:
+        ArgumentError: for a method or an option that does not fit the capture or each other.
+        StorageError: for a volume beyond the memory.
+        ShapeError, UnitError, DeviceError: as the operators.
     """
     if not isinstance(capture, Capture):
         raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
@@ -112,10 +239,17 @@ def default_grid(
     extent: float | Numbers | None = None,
     planes: int | None = None,
 ) -> VoxelGrid:
-    """Voxels before the wall of a capture: ``size`` (X, Y) and ``extent`` (width, height) as of `VoxelGrid.before`,
-    ``depths`` (near, far) in metres, None for all that a record reaches, and ``planes`` between them, None for one a
-    bin and 64 at most. Raises ShapeError, UnitError, and SceneError for a number of planes that is none, and where
-    sensor points on one line say nothing of an ``extent``.
+    """Make voxels before the wall of a capture.
+
+    Args:
+        capture: with a transient.
+        depths: (near, far) in metres, None for all that a record reaches.
+        size, extent: (X, Y) voxels and (width, height) in metres, as of `VoxelGrid.before`.
+        planes: between the depths, None for one a bin and 64 at most.
+
+    Raises:
+        ShapeError, UnitError: as `VoxelGrid.before`, and for phasors alone.
+        SceneError: for other numbers of planes, and where sensor points on one line say nothing of an ``extent``.
     """
     if not isinstance(capture, Capture):
         raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
@@ -145,7 +279,14 @@ def default_grid(
 
 
 def checked_depths(depths: Any) -> tuple[float, float]:
-    """(near, far), metres. Raises UnitError."""
+    """Return (near, far).
+
+    Args:
+        depths: two numbers in metres, 0 <= near < far.
+
+    Raises:
+        UnitError: for other values.
+    """
     plain = real_array(depths)
     if plain is None or plain.shape != (2,):
         raise UnitError(f"reconstruct: expected depths as (near, far) in metres, got {shown(depths)}.")
@@ -156,8 +297,16 @@ def checked_depths(depths: Any) -> tuple[float, float]:
 
 
 def normals_of(volume: HiddenVolume) -> Tensor:
-    """Unit normals (3, Y, X) in world coordinates where a volume with directions is brightest behind each pixel: of the
-    first item of a batch, summed over its channels. Raises ShapeError for a volume without directions.
+    """Return unit normals where a volume with directions is brightest behind each pixel.
+
+    Args:
+        volume: with directions; of a batch the first item, summed over its channels.
+
+    Returns:
+        (3, Y, X) in world coordinates.
+
+    Raises:
+        ShapeError: for a volume without directions.
     """
     if not isinstance(volume, HiddenVolume) or volume.directions is None:
         raise ShapeError(
@@ -197,7 +346,7 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
 
 
 def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, Any]:
-    """All options that a method has, those too that nobody gave, as plain data."""
+    """Return all options that a method has, defaults too, as plain data."""
     found = {**entry.options, **used}
     if "v_bins" in found and found["v_bins"] is None:
         found["v_bins"] = axis.num_bins
@@ -309,10 +458,15 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
 
 
 def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
-    """A virtual camera by its name, "direct", "confocal" or "transient"; ``times``: (start, stop, count), metres.
+    """Return a virtual camera by its name.
 
-    Raises ArgumentError for unknown names, where times are missing or have no meaning, and for a count that is none,
-    UnitError for times that are not three finite numbers.
+    Args:
+        name: "direct", "confocal" or "transient".
+        times: (start, stop, count), metres, of the latter two.
+
+    Raises:
+        ArgumentError: for unknown names, and where times are missing or have no meaning.
+        UnitError: for times that are not three finite numbers.
     """
     if isinstance(name, str) and name == "direct":
         if times is not None:

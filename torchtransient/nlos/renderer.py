@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
+from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import of_class
-from torchtransient.errors import ArgumentError, SceneError, TorchTransientError
-from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import black_message, checked_module, is_readable, measured
-from torchtransient.nlos.arguments import check_seeds, check_sensor, keys_and_values
-from torchtransient.nlos.scan_watch import HIDDEN, LASER_RAYS, SENSOR_RAYS, ScanWatch
-from torchtransient.nlos.scene import SENSOR, WALL, capture_scene, film_size, hidden_bounds, laser_size
-from torchtransient.nlos.scene_scan import check_scan_is_seen, tolerance_of
+from torchtransient.checks import as_whole, of_class, shown
+from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError, TorchTransientError
+from torchtransient.nlos.scene import (
+    DEFAULT_BIN_WIDTH_OPL,
+    DEFAULT_BOUNCES,
+    DEFAULT_ENERGY,
+    SENSOR,
+    WALL,
+    capture_scene,
+    film_size,
+    hidden_bounds,
+    laser_size,
+)
+from torchtransient.nlos.scene_scan import check_scan_is_seen, reaches_before, tolerance_of
 from torchtransient.rendering.arguments import checked_samples
+from torchtransient.rendering.job import SEED_RANGE, draw_seed
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import BuildOptions
@@ -26,7 +38,265 @@ from torchtransient.scene.load import Scene, load
 from torchtransient.scene.opaque import opaque
 from torchtransient.scene.parameters import needing_slope
 from torchtransient.scene.variant import active_variant
-from torchtransient.sensing import Device
+from torchtransient.sensing import Compose, Device, GradPolicy, Sensor
+from torchtransient.sensing.chain.stages import check_axis
+
+
+def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy = "expected") -> nn.Module:
+    """Return a sensor as the module that takes transients.
+
+    Args:
+        sensor: module or device.
+        axis: of the transients.
+        grad: treatment of a device's noise.
+
+    Raises:
+        UnitError: for a sensor that was made for another axis.
+        SceneError: for one whose answer has other bins.
+    """
+    module = sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
+    check_axis(module, axis)
+    if isinstance(module, Sensor | Compose):
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            given = next((tensor for tensor in (*module.parameters(), *module.buffers())), None)
+            dark = torch.zeros(1, axis.num_bins, 1, 1, device=None if given is None else given.device)
+            bins = module(dark).shape[-3]
+        if bins != axis.num_bins:
+            raise SceneError(
+                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of "
+                f"{sensor!r}. Apply a sensor with bins of its own to capture.transient."
+            )
+    return module
+
+
+def is_readable(tensor: torch.Tensor) -> bool:
+    """Return False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that).
+
+    Args:
+        tensor: of any kind.
+    """
+    try:
+        bool(tensor.any())
+    except RuntimeError:
+        return False
+    return True
+
+
+def black_message(who: str, within: str = "") -> str:
+    """Return the warning of a capture without light.
+
+    Args:
+        who: begins the message.
+        within: part of the record without light, "" for all of it.
+    """
+    return (
+        f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
+        "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
+        "'twosided' bsdf. Black albedos, energy 0, things behind the wall and bounces= that no light takes give none "
+        "either."
+    )
+
+
+def say_black(who: str, capture: Capture) -> None:
+    """Warn of a capture without light.
+
+    Args:
+        who: begins the message.
+        capture: that was rendered.
+    """
+    found = (capture.steady, capture.transient, capture.phasor)
+    light = next(tensor for tensor in found if tensor is not None)
+    if not bool(light.any()):
+        within = " within the bins" if light is capture.transient else ""
+        warnings.warn(black_message(who, within), PhysicsWarning, stacklevel=3)
+
+
+def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
+    """Apply a sensor to a transient, in which each pair of laser and sensor point is a pixel of its own.
+
+    Args:
+        transient: (..., T, [Lh, Lw,] H, W).
+        scan: of the capture.
+        sensor: module.
+        generator: of its noise.
+
+    Returns:
+        Tensor of the same shape.
+    """
+    if scan.kind == "exhaustive":
+        (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)
+        flat = transient.reshape(*transient.shape[:-4], laser_rows * laser_columns, rows * columns)
+        seen = _answer(sensor, flat, generator)
+        return seen.reshape(*seen.shape[:-2], *transient.shape[-4:])
+    result: torch.Tensor = _answer(sensor, transient, generator)
+    return result
+
+
+def _answer(sensor: nn.Module, transient: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
+    """Apply a module of ``tt.sensing``, or any other, which may take no generator."""
+    known = inspect.signature(sensor.forward).parameters.values()
+    if any(one.name == "generator" or one.kind is one.VAR_KEYWORD for one in known):
+        answer: torch.Tensor = sensor(transient, generator=generator)
+    else:
+        answer = sensor(transient)
+    return answer
+
+
+def checked_seed(who: str, value: Any) -> int:
+    """Return a seed that samplers of 32 bits tell from others.
+
+    Args:
+        who: begins the message.
+        value: whole number from 0 to 2^32 - 1.
+
+    Raises:
+        ArgumentError: for other values.
+    """
+    number = as_whole(value)
+    if number is None or not 0 <= number < SEED_RANGE:
+        raise ArgumentError(
+            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
+            "modulo 2^32, and be the same as one of these."
+        )
+    return number
+
+
+def check_seeds(who: str, value: Any) -> None:
+    """Check the seeds of a layer.
+
+    Args:
+        who: begins the message.
+        value: None, one seed, one for each entry of a batch, or the tensor that ``vmap`` has given to its entries,
+            which cannot be looked at.
+
+    Raises:
+        ArgumentError: for other values.
+    """
+    if value is None:
+        return
+    if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 1:
+        for one in value:
+            check_seeds(who, one)
+        return
+    _, of_each_entry = draw_seed(value)
+    if of_each_entry is None:
+        checked_seed(who, value)
+
+
+def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
+    """Check the types of a sensor and a generator.
+
+    Args:
+        who: begins the message.
+        sensor: module, device or None.
+        generator: torch.Generator or None.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
+    if not isinstance(sensor, nn.Module | Device | None):
+        raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
+    if not isinstance(generator, torch.Generator | None):
+        raise ArgumentError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
+
+
+def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
+    """Return parameters by key.
+
+    Args:
+        who, name: begin the message.
+        given: mapping, or a list of keys.
+
+    Raises:
+        SceneError: for other objects.
+    """
+    listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
+    keys = list(given) if listed else [given]
+    if not listed or not all(isinstance(key, str) for key in keys):
+        raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
+    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
+
+
+# What findings are about.
+SENSOR_RAYS, LASER_RAYS, HIDDEN = "sensor of a scan", "laser of a scan", "hidden things of a scan"
+
+
+@dataclass(frozen=True, eq=False)
+class ScanWatch:
+    """Check of a capture's scene with the values of a call, in one pass of rays to scan points and laser spots.
+
+    It finds things that have moved between the wall and an origin, or behind the wall. ``tolerance``: in metres,
+    distance from its point at which a ray may end. ``normals``: of the wall at the scan points (N, 3), None where they
+    may change. It runs in every render, so it does not look up the shapes that rays meet: every end in the wrong place
+    counts.
+    """
+
+    tolerance: float
+    normals: NDArray[np.float64] | None
+
+    def __call__(self, scene: Any, number: int) -> dict[str, str]:
+        """Return findings about sensor ``number`` of a scene that holds the values of a call, by their subject."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from torchtransient.interfaces import CaptureType
+        from torchtransient.plugins.around_corner.scan_table import aims_of, origin_of, scanned_points
+
+        sensor, capture = scene.sensors()[number], scene.integrator().capture
+        with dr.suspend_grad():
+            points, origin = scanned_points(scene, sensor), mi.Point3f(sensor.origin)
+            laser = origin_of(scene, sensor)
+            rays = {"sensor": _rays(origin, points - origin)}
+            if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
+                rays["laser"] = _rays(laser, aims_of(scene, sensor, capture, None))
+            tolerance = dr.opaque(mi.Float, self.tolerance)
+            off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])
+            dr.eval(points, normals, off)
+        found = {}
+        for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
+            if wrong.any():
+                found[SENSOR_RAYS if who == "sensor" else LASER_RAYS] = (
+                    f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
+                    f"values of a call: something stands between the wall and {who}_origin, or points and wall have "
+                    "parted. What the rays meet is what is rendered there."
+                )
+        wall = sensor.get_shape()
+        hidden = [shape for shape in scene.shapes() if shape.ptr != wall.ptr]
+        upright = self.normals if self.normals is not None else np.array(normals).T
+        if not reaches_before(hidden, np.array(points).T, upright):
+            found[HIDDEN] = (
+                "nothing hidden is before the wall, for the values of a call: what is behind it sends it no light, and "
+                "has no gradient that would bring it back."
+            )
+        return found
+
+
+def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
+    """Rays (Ray3f) along ways, and their lengths."""
+    import drjit as dr
+    import mitsuba as mi
+
+    length = dr.norm(way)
+    return mi.Ray3f(origin, way / length), length
+
+
+def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
+    """Return a mask of rays that meet something before their length, or nothing there; NaN is elsewhere, too."""
+    import drjit as dr
+
+    met = scene.ray_intersect_preliminary(ray, coherent=True)
+    return ~(dr.abs(met.t - length) <= tolerance)
+
+
+def _normals(scene: Any, ray: Any) -> Any:
+    """Normals where rays end, on the side that they come from."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = scene.ray_intersect(ray, +mi.RayFlags.Minimal, coherent=True)
+    return dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+
 
 # Where the points of a scan stand in the scene.
 POINTS, SPOTS = f"{WALL}.{SENSOR}.points", f"{WALL}.{SENSOR}.laser_points"
@@ -41,29 +311,36 @@ _WHAT_IS_MEASURED = frozenset(("time_axis", "frequencies", "gates", "film", "eff
 class CaptureRenderer(nn.Module):
     """Captures of hidden things as a differentiable layer: :class:`TransientRenderer` behind a relay wall.
 
-    ``hidden``, ``bounces``, ``energy``: as in :func:`~torchtransient.nlos.scene.capture_scene`. ``scan``: a
-    :class:`Scan` that knows its wall. ``parameters``: keys of ``renderer.scene.parameters()`` that get an
-    ``nn.Parameter`` each, or a mapping to start values; hidden nodes keep their names (``chair.vertex_positions``,
-    ``hidden.to_world``, ``hidden.bsdf.reflectance.value``), the wall is ``wall``. ``settings``: those of
-    :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that hold all light of
-    three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive scan; 4) among them.
-    ``sensor``: a module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
-    (``device.sensor(axis, grad=...)`` makes modules with noise).
+    Args:
+        hidden, bounces, energy: as in :func:`~torchtransient.nlos.scene.capture_scene`.
+        scan: that knows its wall.
+        parameters: keys of ``renderer.scene.parameters()`` that get an ``nn.Parameter`` each, or a mapping to start
+            values; hidden nodes keep their names (``chair.vertex_positions``, ``hidden.to_world``,
+            ``hidden.bsdf.reflectance.value``), the wall is ``wall``.
+        sensor: module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
+            (``device.sensor(axis, grad=...)`` makes modules with noise).
+        variant: of Mitsuba, None for the active one.
+        settings: of :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that
+            hold all light of three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive
+            scan; 4) among them.
+
+    Raises:
+        SceneError, ArgumentError, UnitError: for a set-up that cannot be rendered.
 
     Where points of the scan require gradients they get them: the tensors of the scan themselves, as they are when it is
     called, so that an optimizer may change them. Points that were computed of other tensors (or given in another
-    precision than the scan's float64) are what they were when the scan was made: once those tensors have changed, a
-    call raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
+    precision than the scan's float64) stay as they were when the scan was made: once those tensors have changed, a call
+    raises SceneError. So does a key of ``parameters`` that the scan brings too. :meth:`forward` returns a
     :class:`Capture`, whose scan has the points of the call. ``parameters()`` and ``state_dict()`` hold nothing of
     points that the scan brings: give optimizers the leaves themselves.
 
     Values that put something hidden between the wall and an origin, all of it behind the wall, or points off the wall
-    are rendered as they are, and said as a ``PhysicsWarning``, once a scene (the constructor raises SceneError for
-    such a set-up; ``physics="error"`` raises PhysicsError for values too, ``"ignore"`` does not look). So are captures
-    without any light.
+    are rendered as they are, with a ``PhysicsWarning``, once a scene (the constructor raises SceneError for such a
+    set-up; ``physics="error"`` raises PhysicsError for values too, ``"ignore"`` does not look). So are captures without
+    any light.
 
-    ``metadata`` of a capture: ``spp``, ``seed`` (a list of a batch), ``seconds``, ``variant``, and ``light``: how which
-    light was found in the first call.
+    ``metadata`` of a capture: ``spp``, ``seed`` (a list of a batch), ``seconds``, ``variant``, and ``light``: the
+    estimator of each number of bounces in the first call.
     """
 
     def __init__(
@@ -72,8 +349,8 @@ class CaptureRenderer(nn.Module):
         scan: Scan,
         parameters: Sequence[str] | Mapping[str, Any] = (),
         *,
-        bounces: Sequence[int] | str = defaults.BOUNCES,
-        energy: Any = defaults.ENERGY,
+        bounces: Sequence[int] | str = DEFAULT_BOUNCES,
+        energy: Any = DEFAULT_ENERGY,
         sensor: nn.Module | Device | None = None,
         variant: str | None = None,
         **settings: Any,
@@ -88,7 +365,7 @@ class CaptureRenderer(nn.Module):
         scene = load(capture_scene(hidden, scan, bounces=bounces, energy=energy), variant=variant)
         if not _WHAT_IS_MEASURED & {name for name, value in settings.items() if value is not None}:
             bounds = hidden_bounds(hidden, scene.variant)
-            settings["time_axis"] = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
+            settings["time_axis"] = scan.default_axis(bounds, DEFAULT_BIN_WIDTH_OPL)
         self.scan, self.bounces = scan, bounces
         followed = _attached(scan)
         _check_once(wanted, followed)
@@ -126,9 +403,14 @@ class CaptureRenderer(nn.Module):
         progress: bool = False,
         generator: torch.Generator | None = None,
     ) -> Capture:
-        """Render a :class:`Capture`. ``values``, ``seed``, ``spp``, ``progress`` and errors as in
-        :meth:`TransientRenderer.forward`, but that seeds outside of 0 to 2^32 - 1, which modulo 2^32 are others, raise
-        SceneError; ``generator``: for the noise of ``sensor``.
+        """Render a :class:`Capture`.
+
+        Args:
+            values, seed, spp, progress: as in :meth:`TransientRenderer.forward`; seeds are below 2^32.
+            generator: of the noise of ``sensor``.
+
+        Raises:
+            SceneError, ArgumentError: as there, and for other seeds, which modulo 2^32 are those of others.
         """
         check_seeds("CaptureRenderer", seed)
         check_sensor("CaptureRenderer", self.sensor, generator)
@@ -143,13 +425,13 @@ class CaptureRenderer(nn.Module):
         return replace(capture, metadata={**capture.metadata, "light": self._light()})
 
     def _light(self) -> str:
-        """How which light is found, as it was with the values of the first call."""
+        """Return the estimators of light, as they were with the values of the first call."""
         if self._explained is None:
             self._explained = light_of(self.renderer)
         return self._explained
 
     def _say_black(self, out: RenderOutput) -> None:
-        """Of a capture without light, unless what was said of its scan explains it."""
+        """Warn of a capture without light, unless a finding about its scan explains it."""
         watch, told = self.renderer._watch, self.renderer.scene.warned
         if not self.says_black or not watch.enabled or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
             return
@@ -183,14 +465,18 @@ class CaptureRenderer(nn.Module):
 
 
 def _lasting(scan: Scan) -> dict[str, Any]:
-    """Normals of points that have moved: those of a flat wall, None elsewhere."""
+    """Return normals of points that have moved: of a flat wall, None elsewhere."""
     found = {"sensor_normals": scan.sensor_normals, "laser_normals": scan.laser_normals}
     flat = all(n is None or bool((n == n.reshape(-1, 3)[0]).all()) for n in found.values())
     return found if flat else dict.fromkeys(found)
 
 
 def light_of(renderer: TransientRenderer) -> str:
-    """How a capture's scene, as it is built, finds which light."""
+    """Return a sentence on the estimators that find the light of a capture's scene, as it is built.
+
+    Args:
+        renderer: of the scene.
+    """
     with active_variant(renderer.scene.variant):
         from torchtransient.plugins.around_corner.division import explanation
 
@@ -200,8 +486,15 @@ def light_of(renderer: TransientRenderer) -> str:
 
 
 def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) -> None:
-    """Raise SceneError where sensor or laser of a capture's scene look at something else than the points of its scan:
-    a hidden thing in their way, a wall that is elsewhere.
+    """Check that sensor and laser of a capture's scene look at the points of its scan.
+
+    Args:
+        scene: of the capture.
+        scan: that it was made of.
+        options: of the build, None for a transient film.
+
+    Raises:
+        SceneError: for a hidden thing in their way, or a wall that is elsewhere.
     """
     with active_variant(scene.variant):
         built = scene.built(BuildOptions(transient=True) if options is None else options)
@@ -275,7 +568,17 @@ def _points_of(scan: Scan) -> dict[str, torch.Tensor]:
 def as_capture(
     out: RenderOutput, scan: Scan, sensor: nn.Module | None = None, generator: torch.Generator | None = None
 ) -> Capture:
-    """What a render of a capture's scene measured, in the scan's shape; views of its tensors."""
+    """Return the render of a capture's scene in the scan's shape, as views of its tensors.
+
+    Args:
+        out: of the renderer.
+        scan: of the capture.
+        sensor: module that the transient goes through.
+        generator: of its noise.
+
+    Raises:
+        ArgumentError: for gated, rate or beat films.
+    """
 
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
@@ -306,17 +609,32 @@ def as_capture(
 
 
 def in_film_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """From the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film."""
+    """Reshape a tensor from the scan's shape behind T to (..., T, [Lh, Lw,] H, W) of a film.
+
+    Args:
+        tensor: (..., T, *scan.shape).
+        scan: of the capture.
+    """
     laser = laser_size(scan) if scan.kind == "exhaustive" else ()
     return tensor.reshape(*tensor.shape[: tensor.ndim - len(scan.shape)], *laser, *film_size(scan))
 
 
 def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """From (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T."""
+    """Reshape a tensor from (..., T, [Lh, Lw,] H, W) of a render to the scan's shape behind T.
+
+    Args:
+        tensor: (..., T, [Lh, Lw,] H, W).
+        scan: of the capture.
+    """
     film = 4 if scan.kind == "exhaustive" else 2
     return tensor.reshape(*tensor.shape[: tensor.ndim - film], *scan.shape)
 
 
 def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
-    """The same for an image (..., H, W)."""
+    """Reshape an image (..., H, W) to (..., *scan.sensor_shape).
+
+    Args:
+        tensor: (..., H, W).
+        scan: of the capture.
+    """
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)

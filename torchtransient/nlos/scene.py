@@ -1,4 +1,4 @@
-"""From hidden things and a scan to a scene: relay wall, laser, sensor, integrator."""
+"""Scene dictionaries of captures: hidden things, relay wall, laser, sensor, integrator."""
 
 from __future__ import annotations
 
@@ -9,14 +9,94 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchtransient import scenes
+from torchtransient.array_files.array_file import read_some
 from torchtransient.capture import Scan
 from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, of_class, shown
-from torchtransient.errors import SceneError, UnitError
-from torchtransient.nlos import defaults
-from torchtransient.nlos.mesh_file import mesh_file
+from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
 from torchtransient.scene.variant import active_variant
+from torchtransient.units import seconds_to_opl
+
+# Samples of each sensor point, or of each pair of an exhaustive scan.
+DEFAULT_SPP = 4096
+# Bins of detectors with a resolution of some tens of picoseconds, as lengths of optical path in metres.
+DEFAULT_BIN_WIDTH_OPL = seconds_to_opl(16e-12)
+# Light around one corner.
+DEFAULT_BOUNCES = (3,)
+# Joules.
+DEFAULT_ENERGY = 1.0
+DEFAULT_SEED = 0
+
+
+# Plugins of Mitsuba by what names of files end with; .npz is read here.
+_PLUGINS = {".obj": "obj", ".ply": "ply", ".serialized": "serialized"}
+MESH_FILES = (*_PLUGINS, ".npz")
+
+
+def mesh_file(path: Path, where: str) -> dict[str, Any]:
+    """Return a mesh file as a shape of a scene dictionary, without a material.
+
+    Its triangles are flat, as triangles of arrays are: normals in the file do not count, and none are interpolated.
+    (Give ``{"type": "obj", "filename": ...}`` for Mitsuba's own reading.)
+
+    Args:
+        path: .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
+        where: begins the message.
+
+    Raises:
+        SceneError: for other files and missing ones.
+        StorageError: for files that cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".xml":
+        raise SceneError(
+            f"{where}: {str(path)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it as "
+            "it is: tt.nlos.simulate(path)."
+        )
+    if suffix not in MESH_FILES:
+        raise SceneError(f"{where}: expected a mesh file ({', '.join(MESH_FILES)}), got {str(path)!r}.")
+    if not path.is_file():
+        raise SceneError(f"{where}: no file {str(path)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
+    if suffix == ".npz":
+        shape = mesh_arrays_shape(*mesh_of_npz(path, where), where)
+        del shape["bsdf"]
+        return shape
+    return {"type": _PLUGINS[suffix], "filename": str(path), "face_normals": True}
+
+
+def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
+    """Read `vertices` and `faces` of an .npz file.
+
+    Args:
+        path: of the file.
+        where: begins the message.
+
+    Raises:
+        StorageError: where they cannot be read.
+    """
+    kind = "an archive of 'vertices' and 'faces' in NumPy's .npz"
+    found = read_some(path, where, ("vertices", "faces").__contains__, kind)
+    if len(found) < 2:
+        had = " alone".join([*found, ""]) or "neither"
+        raise StorageError(f"{where}: expected 'vertices' and 'faces' in '{path}', got {had}.")
+    return found["vertices"], found["faces"]
+
+
+def mesh_arrays_shape(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
+    """Call `scenes.triangle_mesh`, with errors that begin with ``where``.
+
+    Args:
+        vertices: (V, 3), metres.
+        faces: (F, 3).
+        where: begins the message.
+    """
+    try:
+        return scenes.triangle_mesh(vertices, faces)
+    except TorchTransientError as error:
+        raise type(error)(f"{where}: {error}") from error
+
 
 # Names of a capture's own nodes: those of hidden things must be others.
 WALL, SENSOR, LASER = "wall", "sensor", "laser"
@@ -32,18 +112,24 @@ _LIGHTS = (
 
 
 def capture_scene(
-    hidden: Any, scan: Scan, *, bounces: Sequence[int] | str = defaults.BOUNCES, energy: Any = defaults.ENERGY
+    hidden: Any, scan: Scan, *, bounces: Sequence[int] | str = DEFAULT_BOUNCES, energy: Any = DEFAULT_ENERGY
 ) -> dict[str, Any]:
-    """The scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own yet.
+    """Make the scene dictionary of a capture; its film has one pixel for each sensor point and no time axis of its own
+    yet.
 
-    ``hidden``: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
-    object with ``vertices`` and ``faces``, or the name of a mesh file; metres. Its nodes keep their names. ``bounces``:
-    numbers of bounces that count, without gaps, or "all"; 3 is light around one corner. ``energy``: joules of the
-    laser, a number or a Mitsuba spectrum dictionary. The scan's wall is the node ``wall``, with the sensor
-    ``wall.sensor``.
+    The scan's wall is the node ``wall``, with the sensor ``wall.sensor``. Hidden nodes keep their names.
 
-    Raises SceneError for what is no shape or emits light, for names that the capture needs itself, and for a scan
-    without a wall; UnitError for an energy below zero.
+    Args:
+        hidden: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
+            object with ``vertices`` and ``faces``, or the name of a mesh file; metres.
+        scan: that knows its wall.
+        bounces: numbers of bounces that count, without gaps, or "all"; 3 is light around one corner.
+        energy: joules of the laser, a number or a Mitsuba spectrum dictionary.
+
+    Raises:
+        SceneError: for other objects than shapes, for shapes that emit light, for names that the capture needs itself,
+            and for a scan without a wall.
+        UnitError: for an energy below zero.
     """
     of_class("capture: scan", scan, Scan)
     if scan.wall is None:
@@ -95,7 +181,14 @@ def capture_scene(
 
 
 def shapes_of(hidden: Any) -> dict[str, Any]:
-    """Hidden things, as they are given, as a dictionary of Mitsuba shapes (and what they refer to) by name."""
+    """Return hidden things as a dictionary of Mitsuba shapes (and nodes that they refer to) by name.
+
+    Args:
+        hidden: as of :func:`capture_scene`.
+
+    Raises:
+        SceneError: for other objects.
+    """
     if isinstance(hidden, (str, Path)):
         return {"hidden": mesh_file(Path(hidden), "hidden")}
     if isinstance(hidden, Mapping):
@@ -115,13 +208,21 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
 
 
 def film_size(scan: Scan) -> tuple[int, int]:
-    """(rows, columns) of the film: a list of points is one row."""
+    """Return (rows, columns) of the film: a list of points is one row.
+
+    Args:
+        scan: of the capture.
+    """
     shape = scan.sensor_shape
     return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0])
 
 
 def laser_size(scan: Scan) -> tuple[int, int]:
-    """(rows, columns) of the laser's positions, likewise; (1, 1) for a single spot."""
+    """Return (rows, columns) of the laser's positions; (1, 1) for a single spot.
+
+    Args:
+        scan: of the capture.
+    """
     shape = scan.laser_shape
     return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0] if shape else 1)
 
@@ -193,7 +294,15 @@ def _numbers(values: Any) -> np.ndarray:
 
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
-    """Corners (2, 3) of lowest and of highest coordinates of hidden things, metres; they are built for it."""
+    """Return the box around hidden things, which are built for it.
+
+    Args:
+        hidden: as of :func:`capture_scene`.
+        variant: of Mitsuba, None for the active one.
+
+    Returns:
+        (2, 3), lowest and highest coordinates, metres.
+    """
     scene = load({"type": "scene", **shapes_of(hidden)}, variant=variant)
     with active_variant(scene.variant):
         box = scene.built(BuildOptions()).scene.bbox()

@@ -21,8 +21,10 @@ _REMEDY = "tt.TransientRenderer renders other scenes, without a scan."
 
 @dataclass(frozen=True)
 class Ends:
-    """Where rays end: ``points`` and unit ``normals`` (N, 3) on the side that they come from, float64, ``shapes``: the
-    names of what they meet, "" for nothing, ``origins`` and ``directions`` (N, 3).
+    """Ends of rays.
+
+    ``points`` and unit ``normals`` (N, 3) on the side that they come from, float64, ``shapes``: names of the shapes
+    that they meet, "" for nothing, ``origins`` and ``directions`` (N, 3).
     """
 
     points: NDArray[np.float64]
@@ -32,23 +34,29 @@ class Ends:
     directions: NDArray[np.float64]
 
     def missed(self) -> NDArray[np.int64]:
-        """Indices of the rays that meet nothing."""
+        """Return the indices of the rays that meet nothing."""
         return np.flatnonzero([not name for name in self.shapes])
 
     def of(self, which: NDArray[np.int64]) -> Ends:
-        """Those of some rays."""
+        """Return the ends of some rays, by their indices."""
         arrays = (self.points, self.normals, self.origins, self.directions)
         points, normals, origins, directions = (array[which] for array in arrays)
         return Ends(points, normals, [self.shapes[i] for i in which], origins, directions)
 
 
 def scan_of_scene(scene: Any, number: int = 0) -> Scan:
-    """The scan that a built scene's sensor, laser and integrator ``transient_nlos_path`` make, without a wall.
+    """Return the scan that a built scene's sensor, laser and integrator ``transient_nlos_path`` make, without a wall.
 
-    Points are where the rays of pixel centres end, rows as the film has them; where some look past the wall, a warning
-    says so, and their points are where they would meet it if it went on. Call it inside ``active_variant``. Raises
-    SceneError for another integrator, a laser that has no spot, rays that meet nothing or the back of a wall, and
-    spots of a confocal capture that are no sensor points.
+    Points are the ends of the rays of pixel centres, rows as the film has them; where some look past the wall, a
+    warning says so, and their points are on its plane. Call it inside ``active_variant``.
+
+    Args:
+        scene: a built Mitsuba scene.
+        number: of the sensor.
+
+    Raises:
+        SceneError: for another integrator, a laser that has no spot, rays that meet nothing or the back of a wall, and
+            spots of a confocal capture that are no sensor points.
     """
     integrator, sensor = scene.integrator(), scene.sensors()[number]
     if not hasattr(integrator, "capture"):
@@ -89,8 +97,16 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
 
 
 def check_scan_is_seen(scene: Any, scan: Scan) -> None:
-    """Raise SceneError where rays of a scan's own scene end somewhere else than at its points, or nothing hidden is
-    before the wall. Call it inside ``active_variant``.
+    """Check that rays of a scan's own scene end at its points, and that something hidden is before the wall.
+
+    Call it inside ``active_variant``.
+
+    Args:
+        scene: a built Mitsuba scene.
+        scan: that it was made of.
+
+    Raises:
+        SceneError: otherwise.
     """
     sensor = scene.sensors()[0]
     points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
@@ -102,7 +118,11 @@ def check_scan_is_seen(scene: Any, scan: Scan) -> None:
 
 
 def tolerance_of(scan: Scan) -> float:
-    """How far from a point of a scan, in metres, a ray may end that looks at it."""
+    """Return the distance from a point of a scan at which a ray that looks at it may end, metres.
+
+    Args:
+        scan: of any kind.
+    """
     points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
     return SAME_POINT * max(_extent(points), float(scan.sensor_legs.detach().max()))
 
@@ -111,14 +131,14 @@ def tolerance_of(scan: Scan) -> float:
 
 
 def _sensor_ends(scene: Any, sensor: Any) -> Ends:
-    """Of the rays of pixel centres, row by row."""
+    """Ends of the rays of pixel centres, row by row."""
     from torchtransient.plugins.around_corner.scan_table import scan_rays
 
     return _ends(scene, scan_rays(sensor))
 
 
 def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.float64], Ends]:
-    """The laser's origin (3,), and where its beams end."""
+    """Return the laser's origin (3,), and the ends of its beams."""
     import drjit as dr
     import mitsuba as mi
 
@@ -189,8 +209,8 @@ def _origin(sensor: Any) -> NDArray[np.float64]:
 
 
 def _on_extended_wall(ends: Ends, size: tuple[int, int]) -> tuple[Ends, NDArray[np.int64]]:
-    """With points on the plane of the nearest pixel that meets something for those that look past it, and the indices
-    of those that do not; ``size``: rows and columns of the film.
+    """Return the ends, with rays that look past the wall continued to the plane of the nearest pixel that meets
+    something, and the indices of the rays that do meet it; ``size``: rows and columns of the film.
     """
     missed = ends.missed()
     met = np.setdiff1d(np.arange(len(ends.shapes)), missed)
@@ -257,7 +277,13 @@ def _extent(points: NDArray[np.float64]) -> float:
 
 
 def reaches_before(shapes: list[Any], points: NDArray[np.float64], normals: NDArray[np.float64]) -> bool:
-    """Whether the box of a shape reaches before the wall at one of its ``points``, with ``normals`` there (N, 3)."""
+    """Return True where the box of a shape reaches before the wall at one of its points.
+
+    Args:
+        shapes: of Mitsuba.
+        points: of the wall, (N, 3).
+        normals: there, (N, 3).
+    """
     for shape in shapes:
         box = shape.bbox()
         corners = np.array(np.meshgrid(*zip(box.min, box.max, strict=True))).reshape(3, -1).T
@@ -287,7 +313,7 @@ def _check_areas(shapes: list[Any]) -> None:
 
 
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:
-    """Raise SceneError unless rays end at ``points``; ``scanned``: those that say how large the scan is."""
+    """Check that rays end at ``points``; ``scanned``: the points that tell the size of the scan. Raises SceneError."""
     legs = np.linalg.norm(points - ends.origins, axis=-1)
     size = max(_extent(scanned), float(legs.max()))
     off = np.linalg.norm(ends.points - points, axis=-1)

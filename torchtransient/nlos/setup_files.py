@@ -1,37 +1,414 @@
-"""Captures as files: what they ask for, as arguments of :func:`~torchtransient.nlos.simulation.simulate`."""
+"""Captures in YAML, y-tal and XML files, read as the arguments of :func:`~torchtransient.nlos.simulation.simulate`.
+
+    hidden:
+      letter: {scene: nlos_letter, letter: K, depth: 1.0}      # things by name: `described_shapes`
+      ball: {shape: sphere, scale: 0.2, translate: [0.4, 0, 0.8], albedo: 0.7}
+    wall: {width: 2.0, height: 2.0, albedo: 0.5}               # metres; or file: wall.npz with vertices and faces
+    scan: {kind: confocal, size: [32, 32]}                     # as Scan.grid
+    time_axis: {bin_width_opl: 0.01}                           # metres; what is missing is found, 16 ps wide
+    spp: 4096                                                  # samples a sensor point
+    bounces: [3]                                               # which numbers of bounces count, or `all`
+    sensor: device.yaml                                        # a device of tt.sensing, or its entries
+    seed: 0
+    variant: llvm_ad_mono
+
+Only `hidden` and `scan` must be there.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from torchtransient import scenes
 from torchtransient.array_files.array_file import path_of
-from torchtransient.checks import short_errors
-from torchtransient.errors import SceneError
-from torchtransient.files.yaml_files import read_yaml
-from torchtransient.nlos.description import read_description
-from torchtransient.nlos.scene import ALL_BOUNCES
+from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.capture import Scan, Wall
+from torchtransient.capture.scan import GRID_KINDS
+from torchtransient.checks import short_errors, shown
+from torchtransient.errors import SceneError, TorchTransientError
+from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
+from torchtransient.nlos.scene import (
+    ALL_BOUNCES,
+    DEFAULT_BIN_WIDTH_OPL,
+    DEFAULT_BOUNCES,
+    DEFAULT_SEED,
+    DEFAULT_SPP,
+    mesh_arrays_shape,
+    mesh_file,
+    mesh_of_npz,
+)
 from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
 from torchtransient.scene.load import load
+from torchtransient.scenes import bounds
+from torchtransient.scenes.parts import diffuse
+from torchtransient.scenes.transforms import Matrix, rotate, scale, translate
+from torchtransient.sensing import Device
+
+# Functions of `tt.scenes` that return hidden shapes.
+SCENES: dict[str, Callable[..., dict[str, Any]]] = {
+    name: getattr(scenes, name)
+    for name in ("nlos_z", "nlos_letter", "nlos_plates", "nlos_corner", "nlos_mannequin", "nlos_room")
+}
+SHAPES = ("rectangle", "disk", "cube", "sphere")
+_KINDS = ("scene", "file", "shape", "vertices")
+_PLACEMENT = ("scale", "rotate", "translate", "to_world")
+_SURFACE = ("albedo", "bsdf", "flip_normals")
+
+
+def described_shapes(data: Any, folder: Path) -> dict[str, Any]:
+    """Return the entry `hidden` of a description as Mitsuba shapes: things by name, each with one of
+
+    - `scene`: a function of `tt.scenes` (`nlos_letter`, ...) and its arguments; its shapes are called after both;
+    - `file`: a mesh (:func:`.scene.mesh_file`);
+    - `shape`: rectangle, disk, cube or sphere, as Mitsuba defines them;
+    - `vertices` and `faces`: lists of rows;
+
+    and, but for scenes, `albedo` (a number or a list of three, 0.5) or `bsdf` (a dictionary of Mitsuba), `flip_normals`
+    and a place: `scale` (a number or three), then `rotate` ([[x, y, z], degrees], or a list of those, the first one
+    first), then `translate`; or `to_world`, a matrix of 4 x 4.
+
+    Args:
+        data: the entry.
+        folder: from which names of files are looked up.
+
+    Raises:
+        SceneError: for other entries.
+        StorageError: for mesh files that cannot be read.
+    """
+    if not isinstance(data, Mapping) or not data:
+        raise SceneError(
+            f"hidden: expected things by name, 'letter: {{scene: nlos_letter}}' for instance, got {shown(data)}."
+        )
+    shapes: dict[str, Any] = {}
+    for name, entry in data.items():
+        where = f"hidden: {name}"
+        given = [kind for kind in _KINDS if isinstance(entry, Mapping) and kind in entry]
+        if not isinstance(name, str) or not name or "." in name or len(given) != 1:
+            raise SceneError(
+                f"{where}: expected a name without dots, and one of {', '.join(_KINDS)}, got {given or shown(entry)}."
+            )
+        if given == ["scene"]:
+            shapes.update(_shapes_of_scene(name, entry, where))
+        else:
+            shapes[name] = _shape(entry, given[0], where, folder)
+    return shapes
+
+
+def _shapes_of_scene(name: str, entry: Mapping[str, Any], where: str) -> dict[str, Any]:
+    chosen = Section(entry, where, entry).choice("scene", tuple(SCENES))
+    function = SCENES[chosen]
+    known = ("scene", *inspect.signature(function).parameters)
+    arguments = dict(Section(entry, f"{where}: {chosen}", known).data)
+    del arguments["scene"]
+    if isinstance(arguments.get("albedo"), list):
+        arguments["albedo"] = tuple(arguments["albedo"])
+    try:
+        made = function(**arguments)
+    except TorchTransientError as error:
+        raise type(error)(f"{where}: {error}") from error
+    # A scene of one shape is called as it is here; parts of larger ones say which.
+    return {name if len(made) == 1 else f"{name}_{part}": shape for part, shape in made.items()}
+
+
+def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dict[str, Any]:
+    own = ("vertices", "faces") if kind == "vertices" else (kind,)
+    section = Section(entry, where, (*own, *_SURFACE, *_PLACEMENT))
+    if kind == "shape":
+        shape: dict[str, Any] = {"type": section.choice("shape", SHAPES)}
+    elif kind == "vertices":
+        shape = mesh_arrays_shape(section.get("vertices"), section.get("faces"), where)
+    else:
+        shape = mesh_file(file_beside(section.text("file"), (folder,), where), where)
+    place = _place(section)
+    if place is not None:
+        shape["to_world"] = place
+    if section.flag("flip_normals", False):
+        shape["flip_normals"] = True
+    if "bsdf" in section and "albedo" in section:
+        raise SceneError(f"{where}: albedo and bsdf exclude each other; give one.")
+    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(albedo_of(section))
+    return shape
+
+
+def _bsdf(section: Section) -> dict[str, Any]:
+    given = section.get("bsdf")
+    if not isinstance(given, Mapping) or not isinstance(given.get("type"), str):
+        raise SceneError(
+            f"{section.where}: bsdf: expected a dictionary of Mitsuba, {{type: conductor}} for instance, got "
+            f"{shown(given)}."
+        )
+    return dict(given)
+
+
+def albedo_of(section: Section, default: float = 0.5) -> Any:
+    """Return the entry `albedo`: a number, or three as a tuple.
+
+    Args:
+        section: that holds it.
+        default: where it is missing.
+    """
+    if isinstance(section.get("albedo", default), list):
+        return tuple(section.numbers("albedo", (3,)))
+    return section.number("albedo", default)
+
+
+def _place(section: Section) -> Matrix | None:
+    if "to_world" in section:
+        if any(name in section for name in ("scale", "rotate", "translate")):
+            raise SceneError(f"{section.where}: to_world excludes scale, rotate and translate.")
+        rows = section.get("to_world")
+        if not isinstance(rows, list) or len(rows) != 4:
+            raise SceneError(f"{section.where}: to_world: expected four rows of four numbers, got {shown(rows)}.")
+        return np.array([Section({"row": row}, section.where, ("row",)).numbers("row", (4,)) for row in rows])
+    matrix = None
+    if "scale" in section:
+        size = section.get("scale")
+        matrix = scale(section.numbers("scale", (3,)) if isinstance(size, list) else section.number("scale"))
+    for turn in _turns(section):
+        matrix = turn if matrix is None else turn @ matrix
+    if "translate" in section:
+        moved = translate(section.numbers("translate", (3,)))
+        matrix = moved if matrix is None else moved @ matrix
+    return matrix
+
+
+def _turns(section: Section) -> list[Matrix]:
+    given = section.get("rotate", [])
+    pairs = [given] if _is_pair(given) else given
+    if not isinstance(pairs, list) or not all(map(_is_pair, pairs)):
+        raise SceneError(
+            f"{section.where}: rotate: expected [[x, y, z], degrees], [[0, 1, 0], 30] for instance, or a list of "
+            f"those, got {shown(given)}."
+        )
+    turns = []
+    for pair in pairs:
+        part = Section({"axis": pair[0], "degrees": pair[1]}, f"{section.where}: rotate", ("axis", "degrees"))
+        turns.append(rotate(part.numbers("axis", (3,)), part.number("degrees")))
+    return turns
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and isinstance(value[0], list) and not isinstance(value[1], list)
+
+
+ENTRIES = (
+    "name", "hidden", "wall", "scan", "time_axis", "frequencies", "spp", "bounces", "sensor", "seed", "variant",
+)  # fmt: skip
+_PLANE_ENTRIES = ("width", "height", "center", "normal", "up", "albedo")
+_SCAN_ENTRIES = (
+    "kind", "size", "laser", "sensor_origin", "laser_origin", "laser_grid", "cell_centers", "extent",
+    "first_and_last_leg",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class CaptureDescription:
+    """Contents of a description file.
+
+    ``hidden``: shapes by name, Mitsuba dictionaries. ``scan``: with the wall. ``axis``: the bins, for phasors None.
+    ``frequencies``: of a phasor capture, else None. ``bounces``: the numbers of bounces that count, the laser's spot
+    being the first; None for all. ``sensor``: that measures the light, or None. ``entries``: the file.
+    """
+
+    name: str
+    hidden: Mapping[str, Any]
+    scan: Scan
+    axis: TimeAxis | None
+    frequencies: FrequencyAxis | None = None
+    spp: int = DEFAULT_SPP
+    bounces: tuple[int, ...] | None = DEFAULT_BOUNCES
+    sensor: Device | None = None
+    seed: int = DEFAULT_SEED
+    variant: str | None = None
+    entries: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read_description(source: str | Path) -> CaptureDescription:
+    """Read and check a description. Nothing is executed.
+
+    Args:
+        source: path of a YAML file, from whose folder names of files are looked up, or YAML text.
+
+    Raises:
+        SceneError: for unknown, missing and wrong entries.
+        StorageError: for files that cannot be read.
+    """
+    with short_errors("capture description"):
+        return _description(source)
+
+
+def _description(source: str | Path) -> CaptureDescription:
+    data, folder = read_yaml(source, "capture description")
+    section = Section(data, "capture description", ENTRIES)
+    hidden = described_shapes(section.get("hidden"), folder)
+    scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
+    frequencies = _frequencies(section)
+    if frequencies is not None and "time_axis" in section:
+        raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
+    return CaptureDescription(
+        name=section.text("name", _name(source)),
+        hidden=hidden,
+        scan=scan,
+        axis=None if frequencies is not None else _axis(section.get("time_axis", {}), scan, hidden),
+        frequencies=frequencies,
+        spp=section.whole("spp", DEFAULT_SPP),
+        bounces=_bounces(section),
+        sensor=_sensor(section.get("sensor", None), folder),
+        seed=section.whole("seed", DEFAULT_SEED, least=0),
+        variant=section.text("variant", None),
+        entries=data,
+    )
+
+
+def _name(source: str | Path) -> str:
+    return "capture" if isinstance(source, str) and "\n" in source else Path(source).stem
+
+
+def wall_of(data: Any, folder: Path) -> Wall:
+    """Return the relay wall of an entry 'wall'.
+
+    Args:
+        data: the entry.
+        folder: from which names of files are looked up.
+
+    Raises:
+        SceneError: for other entries.
+    """
+    if isinstance(data, Mapping) and "file" in data:
+        section = Section(data, "wall", ("file", "up", "albedo"))
+        path = file_beside(section.text("file"), (folder,), "wall")
+        if path.suffix.lower() != ".npz":
+            raise SceneError(f"wall: expected an .npz file with vertices and faces, got '{path.name}'.")
+        vertices, faces = mesh_of_npz(path, "wall")
+        return Wall.mesh(vertices, faces, **_given(section, {"up": (3,)}), albedo=albedo_of(section))
+    section = Section(data, "wall", _PLANE_ENTRIES)
+    sizes = {name: section.number(name) for name in ("width", "height") if name in section}
+    places = _given(section, {"center": (3,), "normal": (3,), "up": (3,)})
+    return Wall.plane(**sizes, **places, albedo=albedo_of(section))
+
+
+def scan_of(data: Any, wall: Wall) -> Scan:
+    """Return the scan of an entry 'scan'.
+
+    Args:
+        data: the entry.
+        wall: that is scanned.
+
+    Raises:
+        SceneError: for other entries.
+    """
+    section = Section(data, "scan", _SCAN_ENTRIES)
+    kind = section.choice("kind", GRID_KINDS)
+    lists = {"laser": (2, 3), "sensor_origin": (3,), "laser_origin": (3,), "extent": (4,)}
+    sizes = {name: _size(section, name) for name in ("size", "laser_grid") if name in section}
+    if "size" not in sizes:
+        raise SceneError("scan: expected an entry 'size', the number of sensor points [x, y], which is missing.")
+    return Scan.grid(
+        wall, sizes.pop("size"), kind=kind, **sizes, **_given(section, lists),
+        cell_centers=section.flag("cell_centers", True), first_and_last_leg=section.flag("first_and_last_leg", False),
+    )  # fmt: skip
+
+
+def _size(section: Section, name: str) -> tuple[int, int]:
+    given = section.get(name)
+    pair = given if isinstance(given, list) else [given, given]
+    if len(pair) != 2:
+        raise SceneError(f"scan: {name}: expected one number or [x, y], got {shown(given)}.")
+    parts = Section({"x": pair[0], "y": pair[1]}, f"scan: {name}", ("x", "y"))
+    return parts.whole("x"), parts.whole("y")
+
+
+def _given(section: Section, counts: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+    return {name: section.numbers(name, allowed) for name, allowed in counts.items() if name in section}
+
+
+def _axis(data: Any, scan: Scan, hidden: Mapping[str, Any]) -> TimeAxis:
+    seconds = isinstance(data, Mapping) and any(str(name).endswith("_s") for name in data)
+    start, width = ("start_s", "bin_width_s") if seconds else ("start_opl", "bin_width_opl")
+    section = Section(data, "time_axis", (start, width, "num_bins"))
+    whole = start in section and "num_bins" in section
+    if seconds:
+        if not whole:
+            raise SceneError("time_axis: expected start_s, bin_width_s and num_bins, or lengths (start_opl, ...).")
+        return TimeAxis.from_seconds(section.number(start), section.number(width), section.whole("num_bins"))
+    size = section.number(width, DEFAULT_BIN_WIDTH_OPL)
+    if whole:
+        return TimeAxis(section.number(start), size, section.whole("num_bins"))
+    if start in section or "num_bins" in section:
+        raise SceneError("time_axis: expected start_opl and num_bins together, or neither, got one of them.")
+    try:
+        return scan.default_axis(bounds(dict(hidden)), size)
+    except SceneError as error:
+        raise SceneError(f"time_axis: bins can be found for shapes alone whose size is known here; {error}") from error
+
+
+def _frequencies(section: Section) -> FrequencyAxis | None:
+    given = section.get("frequencies", None)
+    if given is None:
+        return None
+    if isinstance(given, list):
+        return FrequencyAxis(tuple(as_number(value, "frequencies") for value in given))
+    part = Section(given, "frequencies", ("first", "step", "count", "start_opl"))
+    return FrequencyAxis.uniform(
+        part.number("first"), part.number("step"), part.whole("count"), start_opl=part.number("start_opl", 0.0)
+    )
+
+
+def _bounces(section: Section) -> tuple[int, ...] | None:
+    given = section.get("bounces", list(DEFAULT_BOUNCES))
+    if given == "all":
+        return None
+    wanted = given if isinstance(given, list) else [given]
+    numbers = [as_number(value, "bounces") for value in wanted]
+    if not numbers or any(number != round(number) or number < 1 for number in numbers):
+        raise SceneError(
+            f"bounces: expected whole numbers of at least 1, [3] for instance, or 'all', got {shown(given)}."
+        )
+    return tuple(sorted({int(number) for number in numbers}))
+
+
+def _sensor(given: Any, folder: Path) -> Device | None:
+    if given is None:
+        return None
+    if not isinstance(given, Mapping | str):
+        raise SceneError(f"sensor: expected the file of a device or its entries, got {shown(given)}.")
+    if isinstance(given, str):
+        path = file_beside(given, (folder,), "sensor")
+    try:
+        if isinstance(given, Mapping):
+            return Device.from_dict(given)
+        return Device.from_json(path) if path.suffix.lower() == ".json" else Device.from_yaml(path)
+    except TorchTransientError as error:
+        raise type(error)(f"sensor: {error}") from error
+
 
 # Bounces of light that goes from spot to scan point, and around one corner.
 _WALL_TO_WALL, _AROUND_A_CORNER = 2, 3
 
 
 def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
-    """The arguments of ``simulate`` that a file stands for: ``simulate(**read_setup("capture.yaml"))``.
-
-    ``path``: a YAML file of this library (:mod:`.description`), a scene file of y-tal's renderer or its folder
-    (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
-    integrator ``transient_nlos_path``, whose ``$parameters`` are filled by ``xml_parameters``.
+    """Read a file as the arguments of ``simulate``: ``simulate(**read_setup("capture.yaml"))``.
 
     Of y-tal's settings, ``filter_bounces: b`` means light of b + 1 bounces, as mitransient 1.x computes, ``max_depth``
     the largest number of bounces, and ``discard_direct_paths`` leaves out light of less than 3. The laser brings
     ``laser_emission`` in joules; y-tal's scale, that of a projector of a certain distance and field of view, is another
     by one factor for all points.
 
-    Raises StorageError for files that cannot be read, SceneError for what they say.
+    Args:
+        path: a YAML file of this library (:func:`read_description`), a scene file of y-tal's renderer or its folder
+            (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
+            integrator ``transient_nlos_path``.
+        xml_parameters: fill the ``$parameters`` of an XML file.
+
+    Raises:
+        StorageError: for files that cannot be read.
+        SceneError: for their contents.
     """
     with short_errors("read_setup"):
         return _setup(path, xml_parameters)
@@ -84,10 +461,15 @@ def _of_tal(settings: TalSettings) -> dict[str, Any]:
 
 
 def tal_bounces(max_depth: int, filter_bounces: int, discard_direct_paths: bool) -> Sequence[int] | str:
-    """The bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
+    """Return the bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
 
-    A flat wall does not light itself, so that light of two bounces is none without a limit. Raises SceneError for
-    settings that leave nothing.
+    A flat wall does not light itself, so that light of two bounces is none without a limit.
+
+    Args:
+        max_depth, filter_bounces, discard_direct_paths: as the parameters of that name of `transient_nlos_path`.
+
+    Raises:
+        SceneError: for settings that leave nothing.
     """
     first = _AROUND_A_CORNER if discard_direct_paths else _WALL_TO_WALL
     last = max_depth

@@ -1,4 +1,4 @@
-"""``tt.nlos.simulate``: a capture with a bar, told of memory and time before, and with a file that keeps what is done.
+"""``tt.nlos.simulate``: a capture with a bar, a forecast of memory and time, and a file that keeps finished parts.
 
 With a part file, a scan of hidden things is rendered in tiles of sensor points, and a complete scene in passes over all
 of them. A part is in the file whole or not at all, so that a simulation that was killed goes on where it was; parts
@@ -11,9 +11,10 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +25,169 @@ from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers, count, of_class
-from torchtransient.errors import ArgumentError
-from torchtransient.nlos import defaults
-from torchtransient.nlos.answers import checked_module, measured, say_black
-from torchtransient.nlos.arguments import check_sensor, checked_seed
-from torchtransient.nlos.forecast import Forecast, forecast_of
-from torchtransient.nlos.part_file import PartFile
-from torchtransient.nlos.point_rows import RowLayout, Rows
-from torchtransient.nlos.renderer import in_film_shape, in_scan_shape
-from torchtransient.nlos.scene import capture_scene, hidden_bounds
-from torchtransient.nlos.variant_choice import choose_variant
-from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, seed_of
+from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
+from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
+from torchtransient.nlos.renderer import (
+    check_sensor,
+    checked_module,
+    checked_seed,
+    in_film_shape,
+    in_scan_shape,
+    light_of,
+    measured,
+    say_black,
+)
+from torchtransient.nlos.scene import (
+    DEFAULT_BIN_WIDTH_OPL,
+    DEFAULT_BOUNCES,
+    DEFAULT_ENERGY,
+    DEFAULT_SEED,
+    DEFAULT_SPP,
+    capture_scene,
+    hidden_bounds,
+)
+from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, choose_variant, seed_of
 from torchtransient.rendering.arguments import checked_samples
+from torchtransient.rendering.memory import available_bytes
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.variant import active_variant
 from torchtransient.sensing import Device
+
+# Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
+# all laser spots anew: 16 of them take three times as long as one, 4 a quarter more (256 x 256 pairs).
+PARTS, EXHAUSTIVE_PARTS = 16, 4
+# Shares of the samples that the time is estimated by, and the fewest that tell something.
+FEW, SOME, LEAST = 512, 128, 16
+_NUMBER_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Forecast of a simulation. Printing it gives a few lines.
+
+    ``scan`` in words, ``shape`` of the measured tensor, its ``bytes``, ``seconds`` (None: not estimated), ``spp``,
+    number of ``parts``, ``variant`` and its reason, ``light``: the estimators of light.
+    """
+
+    scan: str
+    shape: tuple[int, ...]
+    bytes: int
+    seconds: float | None
+    spp: int
+    parts: int
+    variant: str
+    light: str
+
+    def __str__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        parts = f", in {self.parts} parts" if self.parts > 1 else ""
+        taken = "" if self.seconds is None else f", about {duration_in_words(self.seconds)}"
+        lines = [
+            self.scan,
+            f"{shape}: {size_in_words(self.bytes)}{taken}, {self.spp} samples a point{parts}",
+            f"variant: {self.variant}",
+            f"light: {self.light}",
+        ]
+        return "\n".join(lines)
+
+
+def forecast_of(work: Work, *, timed: bool) -> Forecast:
+    """Forecast a simulation that is about to start.
+
+    Args:
+        work: to be rendered.
+        timed: with the time, from a small share of the samples.
+
+    Raises:
+        StorageError: for a capture that does not fit into memory.
+    """
+    shape = _measured_shape(work)
+    taken = math.prod(shape) * _NUMBER_BYTES * (1 if work.film.frequencies is None else 2)
+    _check_fits(taken, shape, work)
+    with active_variant(work.variant.name):
+        light = light_of(work.renderer(0))
+        seconds = _seconds(work) if timed else None
+    return Forecast(
+        scan=repr(work.scan), shape=shape, bytes=taken, seconds=seconds, spp=work.film.spp, parts=work.count,
+        variant=f"{work.variant.name}, {work.variant.why}", light=light,
+    )  # fmt: skip
+
+
+def _measured_shape(work: Work) -> tuple[int, ...]:
+    """Shape of the measured tensor."""
+    renderer = work.renderer(0)
+    stokes = (4,) if renderer.scene.variant.endswith("_polarized") else ()
+    cube = renderer._cube_shape
+    times, channels = cube[-2:]
+    channels = channels // 2 if renderer.frequencies is not None else channels
+    # The components of polarization are channels of the film.
+    channels = channels // 4 if stokes else channels
+    return (*stokes, channels, times, *work.scan.shape)
+
+
+def _seconds(work: Work) -> float:
+    """Estimate the seconds of all parts from runs of the first with few samples: a start, and a cost of each sample."""
+    # Of few samples in all, those of a part: a render that has next to nothing to do says nothing of others.
+    of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
+    few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
+    few, some = (few, some) if some > few else (of_part, of_part)
+    times = {}
+    told = work.renderer(0).scene.warned
+    before = set(told)
+    with torch.no_grad(), warnings.catch_warnings():
+        # What few samples see of a window is no warning yet.
+        warnings.simplefilter("ignore", PhysicsWarning)
+        for spp in (few, some, few, some) if some > few else (few, few):  # compiled, then timed
+            began = time.perf_counter()
+            work.render(0, 0, spp=spp)
+            times[spp] = time.perf_counter() - began
+    told &= before
+    slope = max(0.0, (times[some] - times[few]) / (some - few)) if some > few else 0.0
+    of_one = times[some] + slope * (of_part - some)
+    if work.sums:
+        return work.count * of_one
+    return of_one / _share(work)
+
+
+def _share(work: Work) -> float:
+    """The sensor points of the first part, of all."""
+    return work.run(0)[1] / math.prod(work.scan.sensor_shape)
+
+
+def _check_fits(taken: int, shape: tuple[int, ...], work: Work) -> None:
+    # The whole on the host, and what is being rendered: a part of it, or as much again.
+    share = _share(work) if work.count > 1 else 0.0
+    available = available_bytes("llvm")
+    if available is not None and taken * (1 + share) > available:
+        numbers = " x ".join(map(str, shape))
+        raise StorageError(
+            f"simulate: the capture would take {size_in_words(int(taken * (1 + share)))} ({numbers} numbers), and "
+            f"{size_in_words(available)} are available. Use fewer bins, sensor points or laser spots, or simulate "
+            "parts of the scan (Scan.single, Scan.points)."
+        )
+
+
+def size_in_words(count: int) -> str:
+    """Return bytes in words.
+
+    Args:
+        count: of bytes.
+    """
+    for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
+        if count >= scale:
+            return f"{count / scale:.4g} {unit}"
+    return f"{count / 2**10:.4g} KiB"
+
+
+def duration_in_words(seconds: float) -> str:
+    """Return seconds in words.
+
+    Args:
+        seconds: a duration.
+    """
+    if seconds < 100:
+        return f"{seconds:.2g} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def simulate(
@@ -51,7 +200,7 @@ def simulate(
     bounces: Sequence[int] | str | None = None,
     energy: Any = None,
     sensor: torch.nn.Module | Device | None = None,
-    seed: int = defaults.SEED,
+    seed: int = DEFAULT_SEED,
     variant: str | None = None,
     part: str | Path | None = None,
     tiles: int | None = None,
@@ -59,35 +208,41 @@ def simulate(
     progress: bool = True,
     generator: torch.Generator | None = None,
 ) -> Capture:
-    """What a scan measures of hidden things: a :class:`Capture`, without gradients (see :class:`CaptureRenderer`).
+    """Simulate the capture of hidden things by a scan, without gradients (see :class:`CaptureRenderer`).
 
-    ``hidden``, ``bounces`` ((3,)), ``energy`` (1 joule): as in :func:`~torchtransient.nlos.scene.capture_scene`.
-    ``time_axis`` or ``frequencies``: what is measured; without them bins of 16 ps that hold all light of three bounces.
-    ``spp``: paths for each sensor point, or for each pair of an exhaustive scan (4096).
+    Args:
+        hidden: as in :func:`~torchtransient.nlos.scene.capture_scene`. Without a ``scan``, a complete scene (as
+            :func:`tt.load` takes it) with the integrator ``transient_nlos_path``, a laser, a sensor of any kind and a
+            film with its bins. The scan is read off the scene: points are the ends of the rays of pixel centres.
+            ``bounces`` and ``energy`` stand in the scene then; ``spp`` and the bins may.
+        scan: that knows its wall.
+        time_axis, frequencies: of the film; without them bins of 16 ps that hold all light of three bounces.
+        spp: paths for each sensor point, or for each pair of an exhaustive scan (4096).
+        bounces: numbers of bounces that count, (3,).
+        energy: of the laser, 1 joule.
+        sensor: module of ``tt.sensing``, or a device, that the transient goes through at last; its answer has the same
+            bins. Devices draw their counts.
+        seed: whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to in
+            the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
+            :class:`CaptureRenderer` draws the paths of one part in the same variant (and spreads light by a tent in
+            time where a parameter can change lengths).
+        variant: of Mitsuba; None takes one channel where all spectra are grey, else the variant of :func:`tt.load`.
+        part: name of a file that keeps finished parts: with it a simulation that was killed goes on when it is called
+            again. It is deleted at the end.
+        tiles: number of parts, 16, 4 of exhaustive scans.
+        keep_part: leave the part file.
+        progress: print memory and time before it starts, and show a bar.
+        generator: of the noise of ``sensor``.
 
-    Without a ``scan``, ``hidden`` is a complete scene (what :func:`tt.load` takes) with the integrator
-    ``transient_nlos_path``, a laser, a sensor of any kind and a film with its bins. The scan is read off the scene:
-    points are where the rays of pixel centres end. ``bounces`` and ``energy`` stand in the scene then; ``spp`` and what
-    is measured may.
+    Returns:
+        Capture. ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``,
+            ``light``
+        (the estimators of light), ``parts``.
 
-    ``variant``: None takes one channel where all spectra are grey, and else the variant that :func:`tt.load` takes.
-    ``sensor``: a module of ``tt.sensing``, or a device, that the transient goes through at last, with the noise of
-    ``generator`` (devices draw their counts); its answer has the same bins.
-    ``seed``: a whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to
-    in the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
-    :class:`CaptureRenderer` draws what one part does in the same variant (and spreads it by a tent in time where a
-    parameter can change lengths).
-
-    ``part``: name of a file that keeps finished parts (16, 4 of exhaustive scans, or ``tiles``): with it a simulation
-    that was killed goes on when it is called again. It is deleted at the end, unless ``keep_part`` says to leave it.
-    ``progress``: say memory and time before it starts, and show a bar.
-
-    ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``, ``light`` (how which
-    light was found), ``parts``.
-
-    Raises ArgumentError, SceneError, ShapeError, UnitError and VariantError for what cannot be simulated; StorageError
-    where the capture does not fit into memory or the disk is full, and for a part file that belongs to another
-    simulation, is damaged, or is worked on by another process.
+    Raises:
+        ArgumentError, SceneError, ShapeError, UnitError, VariantError: for a set-up that cannot be simulated.
+        StorageError: where the capture does not fit into memory or the disk is full, and for a part file that belongs
+            to another simulation, is damaged, or is worked on by another process.
     """
     seed, path = checked_seed("simulate", seed), _part_path(part)
     check_sensor("simulate", sensor, generator)
@@ -117,10 +272,16 @@ def forecast(
     variant: str | None = None,
     **settings: Any,
 ) -> Forecast:
-    """What :func:`simulate` would take with the same arguments: memory, time, variant, how light is found. Errors as
-    there.
+    """Forecast memory, time, variant and estimators of light of :func:`simulate` with the same arguments.
+
+    Args:
+        hidden, scan, part, tiles, variant: as of :func:`simulate`.
+        settings: its other arguments.
+
+    Raises:
+        ArgumentError: for unknown arguments; others as :func:`simulate`.
     """
-    checked_seed("forecast", settings.get("seed", defaults.SEED))
+    checked_seed("forecast", settings.get("seed", DEFAULT_SEED))
     time_axis, frequencies, spp, *of_light = (
         settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")
     )
@@ -155,15 +316,15 @@ def _work(
         )
     bounces, energy = of_light
     settings: dict[str, Any] = {
-        "bounces": defaults.BOUNCES if bounces is None else bounces,
-        "energy": defaults.ENERGY if energy is None else energy,
+        "bounces": DEFAULT_BOUNCES if bounces is None else bounces,
+        "energy": DEFAULT_ENERGY if energy is None else energy,
     }
     chosen = choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
-        time_axis = scan.default_axis(bounds, defaults.BIN_WIDTH_OPL)
-    film = Film(time_axis, frequencies, defaults.SPP if spp is None else spp)
+        time_axis = scan.default_axis(bounds, DEFAULT_BIN_WIDTH_OPL)
+    film = Film(time_axis, frequencies, DEFAULT_SPP if spp is None else spp)
     return HiddenWork(hidden, scan, settings, film, chosen, parts)
 
 
@@ -196,7 +357,7 @@ def _scene_work(
 
 
 def _is_complete(scene: Mapping[str, Any]) -> bool:
-    """Whether a dictionary has an integrator: hidden things have none."""
+    """Return True for a dictionary with an integrator: hidden things have none."""
     kinds = [str(node.get("type", "")) for node in scene.values() if isinstance(node, Mapping)]
     return any("path" in kind for kind in kinds) or "integrator" in scene
 
@@ -207,7 +368,7 @@ def _part_path(part: Any) -> Path | None:
 
 def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
     if tiles is None:
-        many = defaults.EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else defaults.PARTS
+        many = EXHAUSTIVE_PARTS if getattr(scan, "kind", None) == "exhaustive" else PARTS
         return 1 if part is None else many
     return count("simulate: tiles", tiles, 1, ArgumentError)
 
@@ -300,7 +461,7 @@ def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.
 
 
 def _through(transient: Any, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None) -> torch.Tensor:
-    """What a sensor makes of a capture's transient."""
+    """Apply a sensor to a capture's transient."""
     return in_scan_shape(measured(in_film_shape(transient, scan), scan, sensor, generator), scan)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +16,106 @@ from torchtransient.capture.scan import GRID_KINDS
 from torchtransient.checks import short_errors, shown, some_of
 from torchtransient.errors import SceneError
 from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
-from torchtransient.nlos.tal_materials import material, spectrum
 from torchtransient.plugins.films.transform_bins import transform_bins
 from torchtransient.scenes.transforms import rotate, scale, translate
+
+_VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum")
+_PLUGINS = ("bsdf", "texture")
+
+
+def material(data: Any, where: str) -> dict[str, Any]:
+    """Return the BSDF of an entry `material`: `id: white`, `id: copper` with `alpha`, or `id: custom` with XML as
+    `text`.
+
+    Args:
+        data: the entry.
+        where: begins the message.
+
+    Raises:
+        SceneError: for other ids, and for XML that is more than nested BSDFs, textures and values.
+    """
+    identity = data.get("id") if isinstance(data, Mapping) else None
+    if identity == "white":
+        Section(data, where, ("id",))
+        return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    if identity == "copper":
+        alpha = Section(data, where, ("id", "alpha")).number("alpha")
+        return {"type": "roughconductor", "material": "Cu", "distribution": "beckmann", "alpha": alpha}
+    if identity == "custom":
+        return _of_xml(Section(data, where, ("id", "text")).text("text"), where)
+    raise SceneError(f"{where}: expected id: white, copper or custom, got {identity!r}.")
+
+
+def _of_xml(text: str, where: str) -> dict[str, Any]:
+    if "<!" in text.replace("<!--", ""):
+        # No entity is defined in a material: one that is would be unfolded while it is read.
+        raise SceneError(f"{where}: expected the XML of one <bsdf>, got a declaration '<!...'.")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise SceneError(f"{where}: expected the XML of one <bsdf>, got what cannot be read: {error}.") from error
+    if root.tag != "bsdf":
+        raise SceneError(f"{where}: expected the XML of one <bsdf>, got <{root.tag}>.")
+    return _plugin(root, where)
+
+
+def _plugin(element: ElementTree.Element, where: str) -> dict[str, Any]:
+    if "type" not in element.attrib:
+        raise SceneError(f"{where}: <{element.tag}> has no type.")
+    plugin: dict[str, Any] = {"type": element.attrib["type"]}
+    for number, child in enumerate(element):
+        name = child.attrib.get("name", f"{child.tag}_{number}")
+        if child.tag in _PLUGINS:
+            plugin[name] = _plugin(child, where)
+        elif child.tag in _VALUES and "name" in child.attrib and "value" in child.attrib:
+            plugin[name] = _value(child.tag, child.attrib["value"], f"{where}: {name}")
+        else:
+            raise SceneError(
+                f"{where}: <{child.tag}> in a material is not supported; expected {', '.join(_PLUGINS)} and values "
+                f"({', '.join(_VALUES)}) with a name and a value."
+            )
+    return plugin
+
+
+def _value(kind: str, text: str, where: str) -> Any:
+    if kind == "string":
+        return text
+    if kind == "boolean":
+        if text not in ("true", "false"):
+            raise SceneError(f"{where}: expected true or false, got {text!r}.")
+        return text == "true"
+    if kind == "rgb":
+        numbers = [as_number(word, where) for word in text.replace(",", " ").split()]
+        if len(numbers) not in (1, 3):
+            raise SceneError(f"{where}: expected one or three numbers, got {text!r}.")
+        return {"type": "rgb", "value": numbers * (3 // len(numbers))}
+    if kind == "spectrum":
+        return spectrum(text, where)
+    number = as_number(text, where)
+    return int(number) if kind == "integer" else number
+
+
+def spectrum(text: str, where: str) -> Any:
+    """Return a spectrum that is given as text.
+
+    Args:
+        text: one number, or wavelengths in nm with values, "400:1, 700:2".
+        where: begins the message.
+
+    Returns:
+        Number, or a Mitsuba dictionary of pairs.
+
+    Raises:
+        SceneError: for other texts.
+    """
+    words = text.replace(",", " ").split()
+    if len(words) == 1 and ":" not in words[0]:
+        return as_number(words[0], where)
+    pairs = [word.split(":") for word in words]
+    if len(pairs) < 2 or any(len(pair) != 2 for pair in pairs):
+        raise SceneError(f"{where}: expected one number or 'wavelength:value, ...', got {text!r}.")
+    return {"type": "spectrum", "value": [(as_number(a, where), as_number(b, where)) for a, b in pairs]}
+
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 _KNOWN = (
@@ -41,16 +139,16 @@ _ANALYTIC = ("rectangle", "sphere")
 
 @dataclass(frozen=True)
 class TalSettings:
-    """What a scene file of y-tal asks for. Lengths in metres.
+    """Contents of a scene file of y-tal. Lengths in metres.
 
     ``hidden``: shapes by name, Mitsuba dictionaries with absolute names of mesh files. ``scan``: with the wall, in the
-    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: those that a
-    phasor film keeps of a transform of these bins, None for histograms. ``spp``: samples a sensor point.
+    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: bins that a
+    phasor film keeps of a transform of these, None for histograms. ``spp``: samples a sensor point.
 
     ``max_depth``, ``filter_bounces``, ``discard_direct_paths``: as the parameters of that name of `transient_nlos_path`
-    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: how its
-    estimator samples, which changes noise alone. ``laser_emission``: irradiance of the projector, a number, a linear
-    sRGB triple or a spectrum. ``entries``: all that stood in the file.
+    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: settings
+    of its estimator, which change noise alone. ``laser_emission``: irradiance of the projector, a number, a linear sRGB
+    triple or a spectrum. ``entries``: the file.
     """
 
     name: str
@@ -71,13 +169,20 @@ class TalSettings:
 
 
 def read_tal_yaml(source: str | Path) -> TalSettings:
-    """Read a scene file of y-tal: a path, the folder of an experiment, or YAML text. Nothing is executed.
+    """Read a scene file of y-tal. Nothing is executed.
 
     Entries that are missing or null have y-tal's defaults. Mesh files are looked up from the file's folder, the folder
     above it (where `tal render FOLDER` is called) and the current one. The relay wall may be turned, which y-tal does
-    not support. Raises StorageError for files that cannot be read, SceneError for unknown entries, wrong values, and
-    what is not supported: a laser that is not sampled as a spot, bins that are found automatically, spots laid out by
-    a field of view, walls that are no rectangle.
+    not support.
+
+    Args:
+        source: path, folder of an experiment, or YAML text.
+
+    Raises:
+        StorageError: for files that cannot be read.
+        SceneError: for unknown entries, wrong values, and settings that are not supported: a laser that is not sampled
+            as a spot, bins that are found automatically, spots laid out by a field of view, walls that are no
+            rectangle.
     """
     with short_errors("y-tal scene"):
         return _settings(source)
@@ -254,7 +359,7 @@ def _aperture(section: Section) -> tuple[float, float, float, float]:
 
 
 def _equal_grids(section: Section) -> bool:
-    """Whether an exhaustive scan lights its sensor points, as mitransient does in one launch."""
+    """Return True where an exhaustive scan lights its sensor points, as mitransient does in one launch."""
     if not section.flag("simultaneous_scan", True):
         return False
     if not section.flag("integrator_force_equal_illumination_scanning", True):

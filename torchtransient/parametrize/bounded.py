@@ -21,11 +21,17 @@ LEAST_PRINCIPLED = 0.0317
 
 @without_autocast
 def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
-    """`low + (high - low) / (1 + exp(-x))`, of any real `x`; never beyond the bounds, and on them only where the
-    precision of `x` has nothing in between.
+    """Map all real numbers between two bounds: `low + (high - low) / (1 + exp(-x))`.
 
-    `low`, `high`: finite numbers, or tensors that broadcast to `x`, low < high. Raises UnitError, ShapeError. Values of
-    bounds are not looked at inside of `torch.func.vmap` and `torch.compile`.
+    Never beyond the bounds, and on them only where the precision of `x` has nothing in between. Values of bounds are
+    not looked at inside of `torch.func.vmap` and `torch.compile`.
+
+    Args:
+        x: any shape.
+        low, high: finite numbers, or tensors that broadcast to `x`, low < high.
+
+    Raises:
+        UnitError, ShapeError: for other bounds and tensors.
     """
     where = "bounded"
     x = floating(x, where)
@@ -42,12 +48,18 @@ def _between(x: Tensor, low: Bound, high: Bound, where: str) -> Tensor:
 
 @without_autocast
 def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margin: float | None = None) -> Tensor:
-    """The `x` of which `bounded` makes `value`.
+    """Return the `x` of which `bounded` makes `value`.
 
-    At the bounds themselves there is none: UnitError, unless `margin` says how near a value may come to them, as a
-    share of the range between 0 and 0.5; what is nearer is moved there, and no nearer than the precision of `value`
-    tells from the bound. Values beyond the bounds by more than rounding, and such as are not finite, raise UnitError in
-    any case; so do bounds between which that precision has no number.
+    Args:
+        value: any shape, between the bounds.
+        low, high: as of `bounded`.
+        margin: least distance from the bounds, as a share of the range between 0 and 0.5; nearer values are moved
+            there, and no nearer than the precision of `value` tells from the bound. None refuses the bounds themselves,
+            which have no `x`.
+
+    Raises:
+        UnitError: for values at the bounds without a margin, beyond them by more than rounding, or not finite, and for
+            bounds between which the precision has no number.
     """
     where = "bounded_inverse"
     _check_given(low, high, where)
@@ -84,10 +96,17 @@ def _step(end: Tensor) -> Tensor:
 class Bounded(Settings):
     """`bounded` as a parametrization: `forward` from all real numbers into (low, high), `right_inverse` back.
 
-    `low`, `high`: numbers or tensors that broadcast to the parameter. `margin`: as in `bounded_inverse`. The slope is
-    (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The bounds are part
-    of `state_dict`: a state that is loaded brings its own, of the same shapes. They stay float64 when the module is
-    made half. Raises ShapeError, and UnitError for bounds further apart than float32 has numbers.
+    The slope is (value - low) (high - value) / (high - low): steps of an optimiser get smaller near the bounds. The
+    bounds are part of `state_dict`: a state that is loaded brings its own, of the same shapes. They stay float64 when
+    the module is made half.
+
+    Args:
+        low, high: numbers or tensors that broadcast to the parameter.
+        margin: as in `bounded_inverse`.
+
+    Raises:
+        ShapeError: for bounds that do not broadcast.
+        UnitError: for bounds in another order, or further apart than float32 has numbers.
     """
 
     low: Tensor
@@ -109,7 +128,7 @@ class Bounded(Settings):
 
     @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Raises UnitError as `bounded_inverse`."""
+        """Return `bounded_inverse` of a value. Raises UnitError."""
         return _inverse(value, self.low, self.high, self.margin, type(self).__name__)
 
     def extra_repr(self) -> str:
@@ -121,8 +140,10 @@ class Albedo(Bounded):
 
 
 class Roughness(Bounded):
-    """`alpha` of microfacets, 0.001 to 1: `diff_rough_dielectric` and others render smaller ones as 0.001, the rest as
-    0.0001 (`low=1e-4`), where the slope is zero. Not for `principled`: `PrincipledRoughness`.
+    """`alpha` of microfacets, 0.001 to 1. Not for `principled`: `PrincipledRoughness`.
+
+    `diff_rough_dielectric` and others render smaller ones as 0.001, the rest as 0.0001 (`low=1e-4`), where the slope is
+    zero. Arguments as of `Bounded`.
     """
 
     def __init__(self, low: Any = 1e-3, high: Any = 1.0, margin: float | None = None) -> None:
@@ -130,9 +151,11 @@ class Roughness(Bounded):
 
 
 class PrincipledRoughness(Bounded):
-    """`roughness` of `principled` and `principledthin`, 0.0317 to 1: Mitsuba renders with its square, and squares below
-    0.001 as 0.001, where the slope is zero. With `anisotropic` of `a`, one of the two axes gets there at the fourth
-    root of 1e-6 / (1 - 0.9 a), 0.0563 at most: give that as `low`.
+    """`roughness` of `principled` and `principledthin`, 0.0317 to 1.
+
+    Mitsuba renders with its square, and squares below 0.001 as 0.001, where the slope is zero. With `anisotropic` of
+    `a`, one of the two axes gets there at the fourth root of 1e-6 / (1 - 0.9 a), 0.0563 at most: give that as `low`.
+    Arguments as of `Bounded`.
     """
 
     def __init__(self, low: Any = LEAST_PRINCIPLED, high: Any = 1.0, margin: float | None = None) -> None:
@@ -140,8 +163,10 @@ class PrincipledRoughness(Bounded):
 
 
 class IndexOfRefraction(Bounded):
-    """`eta` of dielectrics, inside over outside, 1 to 4: gases to germanium. Below 1 the inside is the thinner one:
-    give another `low`, greater than 0. Not for metals, whose `eta` and `k` are `Positive`.
+    """`eta` of dielectrics, inside over outside, 1 to 4: gases to germanium.
+
+    Below 1 the inside is the thinner one: give another `low`, greater than 0. Not for metals, whose `eta` and `k` are
+    `Positive`. Arguments as of `Bounded`.
     """
 
     def __init__(self, low: Any = 1.0, high: Any = 4.0, margin: float | None = None) -> None:
@@ -151,6 +176,8 @@ class IndexOfRefraction(Bounded):
 class Anisotropy(Bounded):
     """`g` of the phase functions `hg`, the mean cosine of scattering, -0.99 to 0.99: Mitsuba takes -1 to 1 without the
     ends.
+
+    Arguments as of `Bounded`.
     """
 
     def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:
@@ -204,7 +231,15 @@ def _ends(like: Tensor, low: Bound, high: Bound, where: str) -> tuple[Tensor, Te
 
 
 def checked_margin(margin: Any, where: str) -> float | None:
-    """A share between 0 and 0.5, or None. Raises UnitError."""
+    """Return a margin.
+
+    Args:
+        margin: share between 0 and 0.5, or None.
+        where: begins the message.
+
+    Raises:
+        UnitError: for other values.
+    """
     if margin is None:
         return None
     number = as_number(margin)

@@ -30,8 +30,16 @@ _TOLERANCE = 1e-4
 
 @without_autocast
 def pose_from_axis_angle(x: Tensor) -> Tensor:
-    """(..., 4, 4) of (..., 6): turned about the origin by `x[..., :3]`, axis times angle in radians, right-handed, then
-    moved by `x[..., 3:]`. Raises ShapeError.
+    """Return rigid motions: turned about the origin by `x[..., :3]`, then moved by `x[..., 3:]`.
+
+    Args:
+        x: (..., 6), axis times angle in radians, right-handed, and translation in metres.
+
+    Returns:
+        (..., 4, 4).
+
+    Raises:
+        ShapeError: for another shape.
     """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
@@ -43,9 +51,20 @@ def pose_from_axis_angle(x: Tensor) -> Tensor:
 
 @without_autocast
 def axis_angle_from_pose(pose: Tensor) -> Tensor:
-    """(..., 6) of rigid motions (..., 4, 4), angles up to pi; the inverse of `pose_from_axis_angle`. At half a turn the
-    sign of the axis is free, and derivatives jump. Raises ShapeError, UnitError for matrices that are no rigid motion
-    (a turn, with the last row 0, 0, 0, 1), to 1e-4 or what half precision has.
+    """Return the six numbers of rigid motions, the inverse of `pose_from_axis_angle`.
+
+    At half a turn the sign of the axis is free, and derivatives jump.
+
+    Args:
+        pose: (..., 4, 4).
+
+    Returns:
+        (..., 6), angles up to pi.
+
+    Raises:
+        ShapeError: for another shape.
+        UnitError: for matrices that are no rigid motion (a turn, with the last row 0, 0, 0, 1), to 1e-4 or the rounding
+            of half precision.
     """
     _check_rigid(pose, "axis_angle_from_pose")
     return _axis_angle_of(single(pose)).to(pose.dtype)
@@ -53,8 +72,17 @@ def axis_angle_from_pose(pose: Tensor) -> Tensor:
 
 @without_autocast
 def pose_from_twist(x: Tensor) -> Tensor:
-    """Exponential of SE(3), (..., 4, 4) of (..., 6): `x[..., :3]` the rotation (axis times angle, radians),
-    `x[..., 3:]` the translation per unit of time of a screw motion, at time 1. Raises ShapeError.
+    """Return the exponential of SE(3).
+
+    Args:
+        x: (..., 6), `x[..., :3]` the rotation (axis times angle, radians), `x[..., 3:]` the translation per unit of
+            time of a screw motion, at time 1, metres.
+
+    Returns:
+        (..., 4, 4).
+
+    Raises:
+        ShapeError: for another shape.
     """
     from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
@@ -67,8 +95,16 @@ def pose_from_twist(x: Tensor) -> Tensor:
 
 @without_autocast
 def twist_from_pose(pose: Tensor) -> Tensor:
-    """Logarithm of SE(3), (..., 6) of rigid motions (..., 4, 4), angles up to pi; the inverse of `pose_from_twist`.
-    Raises ShapeError, UnitError as `axis_angle_from_pose`.
+    """Return the logarithm of SE(3), the inverse of `pose_from_twist`.
+
+    Args:
+        pose: (..., 4, 4).
+
+    Returns:
+        (..., 6), angles up to pi.
+
+    Raises:
+        ShapeError, UnitError: as `axis_angle_from_pose`.
     """
     _check_rigid(pose, "twist_from_pose")
     return _twist_of(single(pose)).to(pose.dtype)

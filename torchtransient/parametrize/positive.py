@@ -19,14 +19,25 @@ _FUNCTIONS: tuple[str, ...] = get_args(PositiveFunction)
 
 @without_autocast
 def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> Tensor:
-    """`low + scale * log(1 + exp(x))`, or of `function="exp"` `low + scale * exp(x)`.
-
-    Above `low`, of any real `x`, as far as the precision of `x` has numbers: `low` itself where it has none in between
-    (float32: below -104 with low=0, below -17 with low=1), and with "exp" infinite where it ends (float32: above 88).
+    """Map all real numbers above a bound: `low + scale * log(1 + exp(x))`, or with `function="exp"` `low + scale *
+    exp(x)`.
 
     "softplus" is linear in `x` above `scale` and goes to `low` exponentially: steps of an optimiser are steps of the
-    value. With "exp" steps are factors, for values whose order of magnitude is not known. `scale` > 0, in the unit of
-    the value: what is typical of it. Raises UnitError, ShapeError.
+    value. With "exp" steps are factors, for values whose order of magnitude is not known.
+
+    Args:
+        x: any shape.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero.
+        function: "softplus" or "exp".
+
+    Returns:
+        Values above `low` as far as the precision of `x` has numbers: `low` itself where it has none in between
+            (float32:
+        below -104 with low=0, below -17 with low=1), and with "exp" infinite where it ends (float32: above 88).
+
+    Raises:
+        UnitError, ShapeError: for other settings and tensors.
     """
     base, unit = _checked(low, scale, function, "positive")
     return _above(floating(x, "positive"), base, unit, function)
@@ -40,7 +51,15 @@ def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str)
 def positive_inverse(
     value: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
 ) -> Tensor:
-    """The `x` of which `positive` makes `value`. Raises UnitError for values that are not finite and above `low`."""
+    """Return the `x` of which `positive` makes `value`.
+
+    Args:
+        value: any shape, finite, above `low`.
+        low, scale, function: as of `positive`.
+
+    Raises:
+        UnitError: for other values.
+    """
     where = "positive_inverse"
     base, unit = _checked(low, scale, function, where)
     return _inverse(floating(value, where), base, unit, function, where)
@@ -58,8 +77,12 @@ def _inverse(value: Tensor, base: float | Tensor, unit: float | Tensor, function
 
 
 class Positive(Settings):
-    """`positive` as a parametrization: `forward` from all real numbers to above `low`, `right_inverse` back. All three
-    settings are part of `state_dict`.
+    """`positive` as a parametrization: `forward` from all real numbers to above `low`, `right_inverse` back.
+
+    All three settings are part of `state_dict`.
+
+    Args:
+        low, scale, function: as of `positive`.
     """
 
     low: Tensor
@@ -78,7 +101,7 @@ class Positive(Settings):
 
     @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Raises UnitError as `positive_inverse`."""
+        """Return `positive_inverse` of a value. Raises UnitError."""
         value = floating(value, "Positive")
         return _inverse(value, self.low.to(value), self.scale.to(value), self.function, "Positive")
 

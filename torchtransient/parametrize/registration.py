@@ -17,19 +17,28 @@ from torchtransient.parametrize.bounded import Roughness
 
 @without_autocast
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
-    """`torch.nn.utils.parametrize.register_parametrization` by a key: of a renderer, or a module that holds one, a key
-    of its scene, `"box.to_world"`; of other modules a path, `"encoder.weight"`; or one behind the other where a module
-    holds several renderers. Returns the module.
+    """Register a parametrization by a key: `torch.nn.utils.parametrize.register_parametrization`.
 
     The present value is where it starts, by `right_inverse`; a parametrization without one takes it for the numbers
     behind. Optimisers are made afterwards: `module.parameters()` has the numbers behind the value (`original`), and
     `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each copy its own
-    (`CopiesParametrized`).
+    (`CopiesParametrized`). Another one on the same key is applied after those before it, and the value stays where it
+    is.
 
-    Another one on the same key is applied after those before it, and the value stays where it is. Raises SceneError,
-    and leaves everything as it was, for a kind that the key has already, and for one without `right_inverse` behind
-    others; with the errors of `right_inverse` where the two cannot have that value. Raises UnknownKeyError, the errors
-    of `right_inverse`, ShapeError where it does not fit, and SceneError for a `Roughness` of principled materials.
+    Args:
+        module: a renderer, or any module.
+        key: of a renderer, or a module that holds one, a key of its scene, `"box.to_world"`; of other modules a path,
+            `"encoder.weight"`; or one behind the other where a module holds several renderers.
+        parametrization: module of `tt.parametrize`, or any other.
+
+    Returns:
+        The module.
+
+    Raises:
+        UnknownKeyError: for a key that is not there.
+        SceneError: for a kind that the key has already, for one without `right_inverse` behind others, and for a
+            `Roughness` of principled materials; everything stays as it was.
+        ShapeError: where it does not fit; the errors of `right_inverse` where it cannot have that value.
     """
     if not isinstance(parametrization, nn.Module):
         raise ArgumentError(
@@ -97,8 +106,14 @@ def _behind(chain: Any) -> list[Tensor]:
 
 
 def original(module: nn.Module, key: str) -> nn.Parameter:
-    """The numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not. Raises
-    UnknownKeyError, and SceneError for a key without a parametrization, or of one that makes the value of several.
+    """Return the numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not.
+
+    Args:
+        module, key: as of `register`.
+
+    Raises:
+        UnknownKeyError: for a key that is not there.
+        SceneError: for a key without a parametrization, or of one that makes the value of several tensors.
     """
     owner, name = _parametrized(module, key)
     chain = _chain(owner, name)

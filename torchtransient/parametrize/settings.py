@@ -1,4 +1,4 @@
-"""What a parametrization was given, as part of its state."""
+"""Settings of a parametrization as part of its state."""
 
 from __future__ import annotations
 
@@ -31,12 +31,26 @@ class Settings(ScalarState):
 
 
 def choice_code(names: tuple[str, ...], chosen: str) -> Tensor:
-    """A choice in a `state_dict`: a number, which every format of files takes."""
+    """Return a choice as a number, which every format of files takes.
+
+    Args:
+        names: all choices.
+        chosen: one of them.
+    """
     return torch.tensor(names.index(chosen))
 
 
 def choice_of(names: tuple[str, ...], code: Any, where: str) -> str:
-    """The choice of a `state_dict`. Raises SceneError for none of `names`."""
+    """Return the choice of a `state_dict`.
+
+    Args:
+        names: all choices.
+        code: of :func:`choice_code`.
+        where: begins the message.
+
+    Raises:
+        SceneError: for other codes.
+    """
     number = int(code)
     if not 0 <= number < len(names):
         raise SceneError(f"{where}: expected the state of one of {', '.join(names)}, got number {number}.")

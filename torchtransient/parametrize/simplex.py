@@ -19,18 +19,32 @@ _SLACK = 1e-4
 
 @without_autocast
 def simplex(x: Tensor, dim: int = -1) -> Tensor:
-    """Weights between 0 and 1 with the sum 1 along `dim`, by softmax, of any real `x`. Raises ShapeError."""
+    """Map all real numbers to weights between 0 and 1 with the sum 1, by softmax.
+
+    Args:
+        x: any shape.
+        dim: of the weights.
+
+    Raises:
+        ShapeError: for a dimension that is missing or empty.
+    """
     dim = _dim(dim, "simplex")
     return torch.softmax(_checked(x, dim, "simplex"), dim)
 
 
 @without_autocast
 def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None) -> Tensor:
-    """The `x`, zero on average along `dim`, of which `simplex` makes `weights`.
+    """Return the `x`, zero on average along `dim`, of which `simplex` makes `weights`.
 
-    A weight of zero has none: UnitError, unless `margin` says how small a weight may be, a share between 0 and 0.5 of
-    an equal weight; smaller ones are raised to it, and the sum is made 1 again (never below the smallest normal number
-    of the dtype). Raises UnitError for negative weights and sums other than 1.
+    Args:
+        weights: not negative, with the sum 1 along `dim`.
+        dim: of the weights.
+        margin: least weight, a share between 0 and 0.5 of an equal weight; smaller ones are raised to it, and the sum
+            is made 1 again (never below the smallest normal number of the dtype). None refuses weights of zero, which
+            have no `x`.
+
+    Raises:
+        UnitError: for negative weights, sums other than 1, and weights of zero without a margin.
     """
     return _inverse(weights, _dim(dim, "simplex_inverse"), checked_margin(margin, "simplex_inverse"), "simplex_inverse")
 
@@ -54,8 +68,11 @@ def _inverse(weights: Tensor, dim: int, margin: float | None, where: str) -> Ten
 
 
 class Simplex(Settings):
-    """`simplex` as a parametrization along `dim`: weights of returns, materials or modes of one mixture. `dim` is part
-    of `state_dict`.
+    """`simplex` as a parametrization: weights of returns, materials or modes of one mixture.
+
+    Args:
+        dim: of the weights; part of `state_dict`.
+        margin: as of `simplex_inverse`.
     """
 
     def __init__(self, dim: int = -1, margin: float | None = None) -> None:
@@ -68,7 +85,7 @@ class Simplex(Settings):
 
     @without_autocast
     def right_inverse(self, weights: Tensor) -> Tensor:
-        """Raises UnitError as `simplex_inverse`."""
+        """Return `simplex_inverse` of weights. Raises UnitError."""
         return _inverse(weights, self.dim, self.margin, "Simplex")
 
     def get_extra_state(self) -> Tensor:

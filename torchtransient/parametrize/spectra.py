@@ -18,10 +18,19 @@ from torchtransient.parametrize.settings import Settings
 
 
 def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:
-    """(N, K) values of K cubic B-splines with equal knots over the range of N wavelengths; each row has the sum 1.
+    """Return values of cubic B-splines with equal knots over a range of wavelengths; each row has the sum 1.
 
-    A curve of coefficients (..., K) is `coefficients @ basis.T`; it has two continuous derivatives. 4 <= K <= N.
-    Raises ShapeError, UnitError.
+    A curve of coefficients (..., K) is `coefficients @ basis.T`; it has two continuous derivatives.
+
+    Args:
+        wavelengths_nm: (N,) in rising order.
+        coefficients: K, 4 <= K <= N.
+
+    Returns:
+        (N, K).
+
+    Raises:
+        ShapeError, UnitError: for other numbers.
     """
     where = "spline_basis"
     wavelengths = real_array(wavelengths_nm)
@@ -62,8 +71,9 @@ class _SmoothSpectrum(Settings):
 
     @without_autocast
     def right_inverse(self, values: Tensor) -> Tensor:
-        """Coefficients of the curve that is nearest to `values` (..., N) before the function is applied: what is
-        rougher than the splines is smoothed. Raises ShapeError, and UnitError for values outside of the range.
+        """Return coefficients of the curve that is nearest to `values` (..., N) before the function is applied.
+
+        Structure finer than the splines is smoothed. Raises ShapeError, and UnitError for values outside of the range.
         """
         name = type(self).__name__
         values = floating(values, name)
@@ -83,10 +93,14 @@ class _SmoothSpectrum(Settings):
 class PositiveSpectrum(_SmoothSpectrum):
     """A positive, smooth spectrum: `scale * exp(spline)`, of K coefficients (..., K) values (..., N) at wavelengths.
 
-    `wavelengths_nm`: (N,) in rising order, those of the plugin's `values` (`regular` spectra: its range in equal
-    steps). `coefficients`: K >= 4; fewer are smoother, one for every (last - first) / (K - 3) nanometres. `scale`: what
-    is typical of the values. For light, extinction, `eta` and `k` of metals; lines narrower than the steps are lost.
-    The splines are part of `state_dict`.
+    For light, extinction, `eta` and `k` of metals; lines narrower than the steps are lost. The splines are part of
+    `state_dict`.
+
+    Args:
+        wavelengths_nm: (N,) in rising order, the wavelengths of the plugin's `values` (`regular` spectra: its range in
+            equal steps).
+        coefficients: K >= 4; fewer are smoother, one for every (last - first) / (K - 3) nanometres.
+        scale: typical size of the values.
     """
 
     def __init__(self, wavelengths_nm: Any, coefficients: int = 8, scale: float = 1.0) -> None:
@@ -94,7 +108,12 @@ class PositiveSpectrum(_SmoothSpectrum):
 
 
 class ReflectanceSpectrum(_SmoothSpectrum):
-    """A smooth spectrum between 0 and 1, otherwise as `PositiveSpectrum`. `margin`: as of `Bounded`."""
+    """A smooth spectrum between 0 and 1, otherwise as `PositiveSpectrum`.
+
+    Args:
+        wavelengths_nm, coefficients: as of `PositiveSpectrum`.
+        margin: as of `Bounded`.
+    """
 
     def __init__(self, wavelengths_nm: Any, coefficients: int = 8, margin: float | None = None) -> None:
         super().__init__(wavelengths_nm, coefficients, Albedo(margin=margin))

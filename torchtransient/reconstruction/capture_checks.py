@@ -1,4 +1,9 @@
-"""What operators ask of their arguments and of captures; what is refused, in words."""
+"""Checks of scans, captures and settings for operators, with the remedy in the message.
+
+Proportions of wall, record, points and waves tell units apart: millimetres for metres and seconds for metres of path
+are off by a thousand and more. Refused is a factor of ten above the largest that could mean anything, so that unusual
+scans pass.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +20,37 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.checks import as_whole, of_class, positive, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.reconstruction.linear import PRECISIONS
-from torchtransient.reconstruction.planar_scan import PlanarScan, check_real
+from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid, check_real
 
 # Signal-to-noise ratios that a Wiener filter in single precision tells from none and from infinite ones.
 SNR = (1e-20, 1e20)
 
 
 def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
-    """A precision that tables are kept in. Raises UnitError for others."""
+    """Return a precision of tables.
+
+    Args:
+        dtype: float32 or float64.
+        who: begins the message.
+
+    Raises:
+        UnitError: for other types.
+    """
     if dtype not in PRECISIONS:
         raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {shown(dtype)}.")
     return dtype
 
 
 def within(name: str, value: Any, low: float, high: float) -> float:
-    """``value`` as a float. Raises UnitError unless it lies between the two, beyond which single precision has zero or
-    nothing left.
+    """Return a number that single precision does not take for zero or infinity.
+
+    Args:
+        name: begins the message.
+        value: number, any type.
+        low, high: bounds, both allowed.
+
+    Raises:
+        UnitError: beyond the bounds.
     """
     number = positive(name, value)
     if not low <= number <= high:
@@ -39,7 +59,16 @@ def within(name: str, value: Any, low: float, high: float) -> float:
 
 
 def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
-    """``value`` where it equals one of ``options``, texts or whole numbers. Raises ArgumentError for others."""
+    """Return the option that equals a value.
+
+    Args:
+        name: begins the message.
+        value: text or whole number.
+        options: texts or whole numbers.
+
+    Raises:
+        ArgumentError: for other values.
+    """
     plain = value if isinstance(value, str) else as_whole(value)
     for option in options:
         if plain is not None and plain == option:
@@ -48,18 +77,41 @@ def one_of(name: str, value: Any, options: Collection[Any]) -> Any:
 
 
 def checked_axis(time_axis: TimeAxis, who: str) -> TimeAxis:
-    """Return a time axis. Raises ArgumentError for anything else."""
+    """Return a time axis.
+
+    Args:
+        time_axis: any object.
+        who: begins the message.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     return of_class(f"{who}: time_axis", time_axis, TimeAxis)
 
 
 def checked_scan(scan: Scan, who: str) -> Scan:
-    """Return a scan. Raises ShapeError for anything else."""
+    """Return a scan.
+
+    Args:
+        scan: any object.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other objects.
+    """
     return of_class(f"{who}: scan", scan, Scan, error=ShapeError)
 
 
 def checked_points(points: Any, who: str) -> Tensor:
-    """A copy of points (..., 3), float64 on the CPU, detached. Raises ShapeError, and UnitError for some that are not
-    finite.
+    """Return a copy of points, float64 on the CPU, detached.
+
+    Args:
+        points: (..., 3), metres.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other shapes and types.
+        UnitError: for points that are not finite.
     """
     if not isinstance(points, Tensor) or points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
         got = tuple(points.shape) if isinstance(points, Tensor) else shown(points)
@@ -72,8 +124,16 @@ def checked_points(points: Any, who: str) -> Tensor:
 
 
 def check_falloff(falloff: float, nearest: float, farthest: float, dtype: torch.dtype, who: str) -> None:
-    """Raises UnitError where powers of ``nearest`` to ``farthest``, products of two distances in m^2, are beyond what a
-    precision holds.
+    """Check that powers of distances are within the range of a precision.
+
+    Args:
+        falloff: the power.
+        nearest, farthest: products of two distances, m^2.
+        dtype: of the tables.
+        who: begins the message.
+
+    Raises:
+        UnitError: beyond 0.8 of the exponents of ``dtype``.
     """
     most = abs(falloff) * max(abs(math.log10(nearest)), abs(math.log10(max(farthest, nearest))))
     if most > 0.8 * math.log10(torch.finfo(dtype).max):
@@ -84,7 +144,15 @@ def check_falloff(falloff: float, nearest: float, farthest: float, dtype: torch.
 
 
 def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
-    """The grid of a confocal scan of a flat wall that counts no legs. Raises ShapeError for others."""
+    """Return the grid of a confocal scan of a flat wall that counts no legs.
+
+    Args:
+        scan: a scan, or a grid that is returned as it is.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other scans.
+    """
     if isinstance(scan, PlanarScan):
         return scan
     if not isinstance(scan, Scan):
@@ -101,7 +169,15 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
 
 
 def refuse_pairs(scan: Scan, who: str) -> None:
-    """Raises ShapeError for a spot of its own for each sensor point."""
+    """Refuse a scan with a laser spot of its own for each sensor point.
+
+    Args:
+        scan: of any kind.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for pairs.
+    """
     if scan.kind == "pairs":
         raise ShapeError(
             f"{who}: expected a spot that stands still, follows the sensor points, or goes with each of them, got "
@@ -111,7 +187,15 @@ def refuse_pairs(scan: Scan, who: str) -> None:
 
 
 def refuse_legs(scan: Scan, who: str) -> None:
-    """Raises ShapeError for a scan that counts the first and last leg."""
+    """Refuse a scan that counts the first and last leg.
+
+    Args:
+        scan: of any kind.
+        who: begins the message.
+
+    Raises:
+        ShapeError: where legs count.
+    """
     if scan.first_and_last_leg:
         raise ShapeError(
             f"{who}: expected lengths from the spot to the sensor point, got a scan that counts the first and last leg "
@@ -120,7 +204,11 @@ def refuse_legs(scan: Scan, who: str) -> None:
 
 
 def not_a_capture(given: object) -> str:
-    """What to do where a capture is asked for and something else came."""
+    """Return the end of a message about an object that is no capture, with the remedy.
+
+    Args:
+        given: the object.
+    """
     if isinstance(given, (str, os.PathLike)):
         do = " tt.nlos.Capture.read reads files."
     elif isinstance(given, Tensor):
@@ -131,7 +219,15 @@ def not_a_capture(given: object) -> str:
 
 
 def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
-    """Transient and axis of a capture. Raises ShapeError for what is none, or has none."""
+    """Return the transient and the axis of a capture.
+
+    Args:
+        capture: any object.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other objects, and for phasors alone.
+    """
     if not isinstance(capture, Capture):
         raise ShapeError(f"{who}: {not_a_capture(capture)}")
     if capture.transient is None or capture.axis is None:
@@ -140,8 +236,15 @@ def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
 
 
 def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tensor:
-    """The transient of a capture with the axis of an operator, to a millionth of a bin: edges may have been computed in
-    another way. Raises ShapeError for another axis, polarized light and captures without a transient.
+    """Return the transient of a capture on the axis of an operator.
+
+    Args:
+        capture: of intensities.
+        time_axis: of the operator; equal to a millionth of a bin, since edges may have been computed in another way.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for another axis, polarized light and captures without a transient.
     """
     transient, axis = checked_capture(capture, who)
     if capture.polarized:
@@ -158,7 +261,11 @@ def _same_bins(a: TimeAxis, b: TimeAxis) -> bool:
 
 
 def same_light(a: Scan, b: Scan) -> bool:
-    """Whether two scans measure the same: kind, points and, where they count, legs."""
+    """Return True for scans that measure the same light: equal kind, points and, where they count, legs.
+
+    Args:
+        a, b: the scans.
+    """
     if a is b:
         return True
     if (a.kind, a.shape, a.first_and_last_leg) != (b.kind, b.shape, b.first_and_last_leg):
@@ -168,15 +275,220 @@ def same_light(a: Scan, b: Scan) -> bool:
 
 
 def telling(scan: Scan) -> list[Any]:
-    """What tells a scan's light from that of others: kind, whether legs count, points and, where they do, origins."""
+    """Return the attributes that tell a scan's light from that of others: kind, legs, points, origins where legs count.
+
+    Args:
+        scan: of any kind.
+    """
     names = ["kind", "first_and_last_leg", "sensor_points", "laser_points"]
     return [getattr(scan, name) for name in names + ["sensor_origin", "laser_origin"] * scan.first_and_last_leg]
 
 
 def check_from_zero(time_axis: TimeAxis, who: str) -> None:
-    """Raises UnitError for a time axis that begins before zero, by more than rounding."""
+    """Check that a time axis begins at zero or later, to rounding.
+
+    Args:
+        time_axis: of the transients.
+        who: begins the message.
+
+    Raises:
+        UnitError: for bins before time zero.
+    """
     if time_axis.start_opl < -1e-6 * time_axis.bin_width_opl:
         raise UnitError(
             f"{who}: expected a time axis from zero on, got {time_axis}: nothing is before the wall at times before "
             "zero. Leave those bins out with capture.crop, or say when the first bin begins, in metres of path."
         )
+
+
+MOST = 10.0
+_LENGTHS = "All lengths are in metres: millimetres are a thousandth of one"
+_BINS = "bins are metres of optical path: TimeAxis.from_seconds takes seconds, and 16 ps are 16e-12 s"
+
+
+def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None:
+    """Check that a wall and a record are of one size.
+
+    Args:
+        scan: with points in metres.
+        axis: metres of optical path.
+        who: begins the message.
+
+    Raises:
+        UnitError: for a wall ten times as wide as the record is long, for one smaller than a bin, and for records that
+            end far before time zero or begin thousands of walls behind it.
+    """
+    low, high = _box(_scanned(scan))
+    side = float((high - low).norm())
+    near, far = _legs(scan)
+    reach, record = axis.end_opl - near, axis.end_opl - axis.start_opl
+    if reach < -MOST * max(side, record):
+        raise UnitError(
+            f"{who}: expected a record that goes on after time zero and its legs, got {axis} with legs of {near:.4g} "
+            "m. When does the first bin begin?"
+        )
+    if side > MOST * max(reach, record):
+        raise UnitError(
+            f"{who}: expected a wall and a record of one size, got points up to {side:.4g} m apart and light of "
+            f"{reach:.4g} m of path at most. {_LENGTHS}; {_BINS}."
+        )
+    if 0 < side < axis.bin_width_opl:
+        raise UnitError(
+            f"{who}: expected bins that are shorter than the wall is wide, got points {side:.4g} m apart at most and "
+            f"bins of {axis.bin_width_opl:.4g} m. {_LENGTHS}; {_BINS}."
+        )
+    if axis.start_opl - far > 1e3 * MOST * max(side, axis.bin_width_opl):
+        raise UnitError(
+            f"{who}: expected a record of things near the wall, got one that begins at {axis.start_opl:.4g} m of path "
+            f"for points {side:.4g} m apart at most. {_LENGTHS}; {_BINS}."
+        )
+
+
+def check_reach(scan: Scan, points: VoxelGrid | Tensor, axis: TimeAxis, who: str, *, seen: bool = False) -> None:
+    """Check that the light of hidden points arrives within ten records.
+
+    Args:
+        scan: with points in metres.
+        points: grid, or points (..., 3), metres.
+        axis: metres of optical path.
+        who: begins the message.
+        seen: refuse points as well that the record has none of.
+
+    Raises:
+        UnitError: for points beyond.
+    """
+    corners = _corners(points) if isinstance(points, VoxelGrid) else points.reshape(-1, 3)
+    lengths = [_lengths(scan, corners, side) for side in ("nearest", "farthest")]
+    near, far = _legs(scan)
+    # Of the nearest point to the farthest one: no point of a box is nearer than the box, none farther than a corner.
+    first, last = _between_boxes(scan, corners) + near, float(lengths[1].max()) + far
+    longest = float(lengths[0].max()) + near
+    reach = max(axis.end_opl - near, axis.end_opl - axis.start_opl)
+    begin, end = (max(0.0, x - near) / 2 for x in (axis.start_opl, axis.end_opl))
+    expected = f"expected points within the record, {begin:.4g} to {end:.4g} m before the wall"
+    if longest - near > MOST * reach:
+        raise UnitError(
+            f"{who}: {expected}, got some whose light comes after {longest:.4g} m of path. {_LENGTHS}; {_BINS}."
+        )
+    if seen and (first > axis.end_opl or last < axis.start_opl):
+        raise UnitError(
+            f"{who}: {expected}, got none: their light comes after {first:.4g} to {last:.4g} m of path. {_LENGTHS}."
+        )
+
+
+def check_wavelength(wavelength: float, scan: Scan, axis: TimeAxis, who: str) -> None:
+    """Check that waves are no longer than the record and ten walls, beyond which they show nothing.
+
+    Args:
+        wavelength: metres of optical path.
+        scan: with points in metres.
+        axis: metres of optical path.
+        who: begins the message.
+
+    Raises:
+        UnitError: for longer waves.
+    """
+    low, high = _box(_scanned(scan))
+    record, side = axis.end_opl - axis.start_opl, float((high - low).norm())
+    most = min(record, MOST * side) if side > 0 else record
+    if wavelength > most:
+        raise UnitError(
+            f"{who}: expected a wavelength of {most:.4g} m at most, with a record of {record:.4g} m and a wall "
+            f"{side:.4g} m wide, got {wavelength:.4g} m. {_LENGTHS}."
+        )
+
+
+def check_thickness(thickness: float, scan: Scan | PlanarScan, who: str) -> None:
+    """Check that a slab on the wall is at most twice as thick as the scan is wide.
+
+    Args:
+        thickness: metres.
+        scan: with points in metres.
+        who: begins the message.
+
+    Raises:
+        UnitError: for thicker ones.
+    """
+    low, high = _box(_scanned(scan))
+    side = float((high - low).norm())
+    if thickness > 2 * side:
+        raise UnitError(
+            f"{who}: expected a slab that is thinner than the scan is wide, {side:.4g} m, got {thickness:.4g} m. "
+            f"{_LENGTHS}, centimetres a hundredth."
+        )
+
+
+def check_record(axis: TimeAxis | None, end_opl: float, who: str) -> None:
+    """Check that a part of a record ends at most ten records behind its beginning.
+
+    Args:
+        axis: of the record, None for any.
+        end_opl: end of the part, metres of optical path.
+        who: begins the message.
+
+    Raises:
+        UnitError: for later ends.
+    """
+    if axis is not None and end_opl - axis.start_opl > MOST * (axis.end_opl - axis.start_opl):
+        raise UnitError(
+            f"{who}: expected lengths within the record, {axis.start_opl:.4g} to {axis.end_opl:.4g} m, got "
+            f"{end_opl:.4g} m. {_LENGTHS}."
+        )
+
+
+# ------------------------------------------------------------------------------------------------------------- lengths
+
+
+def _scanned(scan: Scan | PlanarScan) -> Tensor:
+    """(N, 3) float64: all points that are lit or seen."""
+    if isinstance(scan, PlanarScan):
+        return scan.points.reshape(-1, 3)
+    return torch.cat([_plain(scan.sensor_points), _plain(scan.laser_points)])
+
+
+def _plain(points: Tensor) -> Tensor:
+    return points.detach().to("cpu", torch.float64).reshape(-1, 3)
+
+
+def _box(points: Tensor) -> tuple[Tensor, Tensor]:
+    return points.amin(0), points.amax(0)
+
+
+def _corners(grid: VoxelGrid) -> Tensor:
+    """(8, 3): the outermost voxels."""
+    rows, columns = grid.size
+    found = []
+    for depth in (grid.depths[0], grid.depths[-1]):
+        for y in (0.0, (rows - 1) * grid.pitch[0]):
+            for x in (0.0, (columns - 1) * grid.pitch[1]):
+                found.append(grid.first + y * grid.along_y + x * grid.along_x + depth * grid.normal)
+    return torch.stack(found)
+
+
+def _legs(scan: Scan | PlanarScan) -> tuple[float, float]:
+    """The shortest and the longest way from the laser and to the sensor, where they count."""
+    if isinstance(scan, PlanarScan) or not scan.first_and_last_leg:
+        return 0.0, 0.0
+    lasers, sensors = scan.laser_legs.detach(), scan.sensor_legs.detach()
+    return float(lasers.min() + sensors.min()), float(lasers.max() + sensors.max())
+
+
+def _lengths(scan: Scan, points: Tensor, side: str) -> Tensor:
+    """(N,) float64: bounds of the way from a lit point to each hidden one and on to a seen one."""
+    total = torch.zeros(len(points), dtype=torch.float64, device="cpu")
+    for wall in (scan.sensor_points, scan.laser_points):
+        low, high = _box(_plain(wall))
+        off = torch.maximum(points - high, low - points).clamp_min(0)
+        if side == "farthest":
+            off = torch.maximum((points - low).abs(), (points - high).abs())
+        total += off.norm(dim=-1)
+    return total
+
+
+def _between_boxes(scan: Scan, points: Tensor) -> float:
+    low, high = _box(points)
+    total = 0.0
+    for wall in (scan.sensor_points, scan.laser_points):
+        first, last = _box(_plain(wall))
+        total += float(torch.maximum(low - last, first - high).clamp_min(0).norm())
+    return total

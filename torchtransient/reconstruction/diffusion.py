@@ -19,11 +19,10 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import as_whole, finite, positive, shown
 from torchtransient.errors import UnitError
-from torchtransient.reconstruction.capture_checks import SNR, within
-from torchtransient.reconstruction.confocal_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.capture_checks import SNR, check_thickness, within
 from torchtransient.reconstruction.linear import each
-from torchtransient.reconstruction.planar_scan import PlanarScan
-from torchtransient.reconstruction.proportions import check_thickness
+from torchtransient.reconstruction.transient_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.volume_methods import SLAB_SNR
 
 IMAGES = 20
@@ -46,11 +45,20 @@ def slab_transmittance(
     index: float,
     extrapolation: float,
 ) -> Tensor:
-    """Light of a pencil beam that leaves a slab's far side, per metre of ``opl`` and square metre, at the squared
-    distance ``rho_squared`` (m^2) from the beam; both tensors broadcast. Zero at times of zero and before.
+    """Return the light of a pencil beam that leaves a slab's far side, the dipole sum of Contini et al., equation 36.
 
-    The dipole sum of Contini et al., equation 36, with ``IMAGES`` pairs on each side. Times are optical path lengths in
-    vacuum, c t. Valid where the slab is thick beside 1 / ``reduced_scattering``.
+    ``IMAGES`` pairs of dipoles on each side. Valid where the slab is thick beside 1 / ``reduced_scattering``.
+
+    Args:
+        opl: optical path lengths in vacuum, c t, metres; broadcasts with ``rho_squared``.
+        rho_squared: squared distance from the beam, m^2.
+        thickness: metres.
+        reduced_scattering, absorption: 1/m.
+        index: index of refraction.
+        extrapolation: length behind the sides at which the fluence vanishes, metres.
+
+    Returns:
+        Light per metre of ``opl`` and square metre, zero at times of zero and before.
     """
     diffusion = 1 / (3 * (absorption + reduced_scattering))
     source = 1 / reduced_scattering
@@ -68,21 +76,30 @@ def slab_transmittance(
 class DiffusionDeconvolution(ConfocalOperator):
     """Confocal captures through a slab that lies on the scanned wall, as a linear operator, and its Wiener inverse.
 
-    ``operator(transient)``: what arrives through the slab, (..., T, Y, X), of what would be measured at its far side;
+    ``operator(transient)``: the light (..., T, Y, X) that arrives through the slab, of the light at its far side;
     ``operator.adjoint``: its adjoint; ``operator.inverse``: the Wiener inverse, an operator itself;
     ``operator.reconstruct(transient)``: the capture without the slab, whose volume another operator finds. Linear and
-    differentiable; results of the inverse go below zero. ``passes``: how often light crosses the slab, 2 of confocal
-    captures.
+    differentiable; results of the inverse go below zero.
 
-    ``thickness`` in metres. ``properties``: (reduced scattering per metre, absorption per metre, index of refraction,
-    extrapolation length in metres, at which behind its sides the fluence vanishes); the defaults of both are those
-    of the paper's foam. ``snr``: power of the light over that of the noise where nothing is lost, at frequency zero;
-    what the slab takes more than that cannot come back. Light is kept: of all that comes through, however late and far
-    aside, the sum is one, and what comes into the record does not depend on its length. The convolutions are linear:
-    nothing wraps around in time or along the slab, between the two crossings either. Bins before time zero are taken.
+    Args:
+        scan: confocal, on a regular grid of a flat wall, without legs.
+        time_axis: of the transients; bins before time zero are taken.
+        thickness: metres.
+        properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
+            which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.
+        passes: crossings of the slab, 2 of confocal captures.
+        snr: power of the light over that of the noise where nothing is lost, at frequency zero; light that the slab
+            takes beyond that cannot come back.
+        dtype: float32 or float64.
 
-    Not supported: slabs apart from the wall, refraction at their far side, light that misses them. Raises ShapeError
-    for scans it cannot take, UnitError for quantities out of range.
+    Raises:
+        ShapeError: for other scans.
+        UnitError: for quantities out of range.
+
+    Light is kept: of all that comes through, however late and far aside, the sum is one, and the light within the
+    record does not depend on its length. The convolutions are linear: nothing wraps around in time or along the slab,
+    between the two crossings either. Not supported: slabs apart from the wall, refraction at their far side, light that
+    misses them.
     """
 
     kernel: Tensor
@@ -185,16 +202,25 @@ class DiffusionDeconvolution(ConfocalOperator):
         return SlabInverse(self)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The transient (..., T, Y, X) without the slab, of one or of a capture's (C, T, Y, X). Raises ShapeError,
-        DeviceError.
+        """Return a transient without the slab, by the Wiener inverse.
+
+        Args:
+            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., T, Y, X), of a capture (C, T, Y, X).
+
+        Raises:
+            ShapeError, DeviceError: for other transients and captures.
         """
         found: Tensor = self.inverse(self.transients(transient))
         return found
 
     def _spread(self, x: Tensor, spectrum: Tensor) -> Tensor:
-        """Convolution with the kernel, which is not negative: of light without negative values it has none either, and
-        those that the rounding of the transform leaves are 0. Signed operands keep them, and the derivative is the
-        linear map's.
+        """Convolve with the kernel, which is nowhere negative.
+
+        The result of light without negative values has none either: those that the rounding of the transform leaves are
+        0. Signed operands keep them, and the derivative is the linear map's.
         """
         found = self._filtered(x, spectrum)
         return found.clamp_(min=torch.where((x >= 0).all(), 0.0, -math.inf).to(found))

@@ -1,4 +1,4 @@
-"""Filters of filtered backprojection: what happens to transients before it, or to the volume after it."""
+"""Filters of filtered backprojection: of transients before it, or of the volume after it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ SAMPLES = 16
 class ReconstructionFilter(Protocol):
     """A linear filter of rows (..., T) in time and of volumes (..., Z, Y, X), each with its adjoint.
 
-    ``complex_volume``: whether filtered rows are complex. ``check`` raises for volumes that it cannot filter, before
-    anything is computed; ``image`` makes a picture of a filtered volume. ``samples``: how many samples per bin a
-    filtered row needs, so that lines between them follow it; ``rows(rows, width, samples)`` has them at the middles of
-    bins, evenly between these, and as far before the first and behind the last as the bins reach
-    (:func:`sample_places`).
+    ``complex_volume``: True where filtered rows are complex. ``check`` raises for volumes that it cannot filter, before
+    anything is computed; ``image`` makes a picture of a filtered volume. ``samples``: samples per bin that a filtered
+    row needs, so that lines between them follow it; ``rows(rows, width, samples)`` has them at the middles of bins,
+    evenly between these, and as far before the first and behind the last as the bins reach (:func:`sample_places`).
     """
 
     @property
@@ -50,14 +49,19 @@ class ReconstructionFilter(Protocol):
 
 @dataclass(frozen=True)
 class PhasorFilter:
-    """The virtual illumination of phasor fields (Liu et al. 2019): a pulse of a ``wavelength`` in metres under a
-    Gaussian that holds ``cycles`` of them within three standard deviations to both sides.
+    """The virtual illumination of phasor fields (Liu et al. 2019): a pulse under a Gaussian.
 
     Transients, the light of a bin in its middle, are convolved with exp(2 pi i t / wavelength) exp(-t^2 / 2 sigma^2),
     sigma = cycles wavelength / 6, whose transform is a Gaussian of height one; light before and behind the record
-    counts as none, however long the pulse is. The picture is the squared modulus. Wavelengths of twice the scan's pitch
-    and more are free of ghosts. Raises UnitError, for wavelengths below two bins and a sigma below a fourth of one as
-    well.
+    counts as none, however long the pulse is. The picture is the squared modulus.
+
+    Args:
+        wavelength: metres of optical path. Twice the scan's pitch and more are free of ghosts.
+        cycles: wavelengths within three standard deviations to both sides.
+
+    Raises:
+        UnitError: for numbers that are not above zero; by an operator for wavelengths below two bins and a sigma below
+            a fourth of one.
     """
 
     wavelength: float
@@ -134,10 +138,16 @@ class PhasorFilter:
 class LaplacianFilter:
     """The negative Laplacian of a Gaussian, on the volume (Velten et al. 2012; Laurenzis and Velten 2014).
 
-    -(d^2/dz^2 + d^2/dy^2 + d^2/dx^2) of the volume smoothed by a Gaussian of ``sigma`` voxels in each direction; the
-    derivatives are per voxel. What is outside of the volume counts as zero. The picture is what comes out, with its
-    negative lobes. Needs a :class:`VoxelGrid` of evenly spaced planes. Raises UnitError, for a ``sigma`` below 0.2 as
-    well, of which the neighbours of a voxel see nothing; ShapeError for other volumes.
+    -(d^2/dz^2 + d^2/dy^2 + d^2/dx^2) of the volume smoothed by a Gaussian; the derivatives are per voxel. Values
+    outside of the volume count as zero. The picture keeps its negative lobes. Needs a :class:`VoxelGrid` of evenly
+    spaced planes.
+
+    Args:
+        sigma: voxels in each direction, 0.2 or more: below, the neighbours of a voxel have no part.
+
+    Raises:
+        UnitError: for a sigma out of range.
+        ShapeError: by an operator, for other volumes.
     """
 
     sigma: float = 1.0
@@ -204,7 +214,16 @@ class LaplacianFilter:
 
 
 def check_sampling(pulse: PhasorFilter, bin_width_opl: float, who: str) -> None:
-    """Raises UnitError for pulses that the bins cannot hold."""
+    """Check that bins can hold a pulse.
+
+    Args:
+        pulse: of the virtual illumination.
+        bin_width_opl: metres.
+        who: begins the message.
+
+    Raises:
+        UnitError: for wavelengths below two bins, or a standard deviation below a fourth of one.
+    """
     if pulse.wavelength < 2 * bin_width_opl:
         raise UnitError(
             f"{who}: expected a wavelength of two bins at least, {2 * bin_width_opl:.4g} m, got "
@@ -218,7 +237,13 @@ def check_sampling(pulse: PhasorFilter, bin_width_opl: float, who: str) -> None:
 
 
 def sample_places(bins: int, samples: int) -> tuple[int, int]:
-    """The first place and the one behind the last of ``samples`` per bin, counted from the middle of the first bin."""
+    """Return the first place and the one behind the last of evenly spaced samples, counted from the middle of the first
+    bin.
+
+    Args:
+        bins: number of bins.
+        samples: per bin.
+    """
     return -(samples // 2), (bins - 1) * samples + samples // 2 + 1
 
 

@@ -1,21 +1,25 @@
 """Linear maps between hidden volumes and captures, with exact adjoints and derivatives that save nothing.
 
-A map is two plain functions that run without autograd, a piece at a time. What torch differentiates is one node: its
-backward pass is the adjoint, that of the adjoint the map again, and forward mode the map of the tangent. No tensor is
-kept for it, so that memory does not grow with what lies between.
+A map is two plain functions that run without autograd, a piece at a time. Torch differentiates one node: its backward
+pass is the adjoint, the backward pass of the adjoint is the map again, and forward mode is the map of the tangent. No
+tensor is kept for it, so that memory does not grow with the steps inside. States of operators are their settings, which
+are compared when they are loaded.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields, is_dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import DeviceError, GradientError, ShapeError, UnitError
+from torchtransient.errors import DeviceError, GradientError, ShapeError, StorageError, UnitError
 
 PRECISIONS = (torch.float32, torch.float64)
 
@@ -62,12 +66,12 @@ def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
 
 
 class LinearOperator(nn.Module, ABC):
-    """A linear map ``A`` from a volume to what a scan measures of it.
+    """A linear map ``A`` from a volume to the measurement that a scan makes of it.
 
     ``forward(volume)`` is ``A volume``, ``adjoint(y)`` is ``A^H y``, both differentiable in both modes, any number of
     times, for any leading dimensions (batch, channels), under ``torch.vmap``, and on the device of their tables
     (``operator.to(device)``). ``volume_shape``, ``data_shape``: the trailing dimensions of the two;
-    ``volume_name``, ``data_name``: what they are called.
+    ``volume_name``, ``data_name``: their names in messages.
 
     Classes define ``map_(x)`` and ``adjoint_(y)``, which run without autograd, take any leading dimensions, may be
     called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
@@ -77,7 +81,7 @@ class LinearOperator(nn.Module, ABC):
     size zero; then they are not called.
 
     Tables are buffers. Operators are differentiable by their operands alone: GradientError for tables and parameters of
-    a class that ask for a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
+    a class that require a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
     it the graph breaks at an operator, whose results are the same.
     """
 
@@ -91,11 +95,11 @@ class LinearOperator(nn.Module, ABC):
 
     @abstractmethod
     def map_(self, x: Tensor) -> Tensor:
-        """``A x``."""
+        """Return ``A x``, (..., *data_shape) of (..., *volume_shape)."""
 
     @abstractmethod
     def adjoint_(self, y: Tensor) -> Tensor:
-        """``A^H y``."""
+        """Return ``A^H y``, (..., *volume_shape) of (..., *data_shape)."""
 
     def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
         if x.numel():
@@ -109,12 +113,32 @@ class LinearOperator(nn.Module, ABC):
         return x.new_zeros(*lead, *shape, dtype=self.dtype if real else self.dtype.to_complex())
 
     def forward(self, volume: Tensor) -> Tensor:
-        """``A volume``: (..., *volume_shape) to (..., *data_shape). Raises ShapeError, DeviceError."""
+        """Apply the map, ``A volume``.
+
+        Args:
+            volume: (..., *volume_shape), on the device of the operator.
+
+        Returns:
+            (..., *data_shape).
+
+        Raises:
+            ShapeError, DeviceError: for another shape or device.
+        """
         volume = self._taken(self.volume_name, volume, self.volume_shape, real=self.real_volume)
         return _apply(volume, self, False)
 
     def adjoint(self, data: Tensor) -> Tensor:
-        """``A^H data``: (..., *data_shape) to (..., *volume_shape). Raises ShapeError, DeviceError."""
+        """Apply the adjoint map, ``A^H data``.
+
+        Args:
+            data: (..., *data_shape), on the device of the operator.
+
+        Returns:
+            (..., *volume_shape).
+
+        Raises:
+            ShapeError, DeviceError: for another shape or device.
+        """
         data = self._taken(self.data_name, data, self.data_shape, real=self.real_data)
         return _apply(data, self, True)
 
@@ -152,17 +176,26 @@ class LinearOperator(nn.Module, ABC):
         return self
 
     def _converted(self) -> None:
-        """What is to be made anew in another precision."""
+        """Make tables anew in another precision."""
 
     @property
     def device(self) -> torch.device | None:
-        """Where the tables are, None for an operator without any."""
+        """Device of the tables, None for an operator without any."""
         table = next((tensor for tensor in (*self.buffers(), *self.parameters())), None)
         return None if table is None else table.device
 
 
 def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
-    """``function`` of every item of the leading dimensions of ``x``, one at a time; ``dims``: those of an item."""
+    """Apply a function to every item of the leading dimensions of a tensor, one at a time.
+
+    Args:
+        function: of an item.
+        x: (..., *item).
+        dims: number of dimensions of an item.
+
+    Returns:
+        (..., *result).
+    """
     lead = x.shape[: x.ndim - dims]
     if not lead:
         return function(x)
@@ -178,3 +211,95 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
 
 def _words(shape: tuple[int, ...]) -> str:
     return ", ".join(map(str, shape))
+
+
+# Shares by which numbers may differ: those of another machine, or that a file rounds to single precision.
+SLACK = 1e-6
+# Sums of a tensor that tell it from others.
+SUMS = 4
+
+
+def packed(described: dict[str, Any]) -> Tensor:
+    """Return plain data as JSON in bytes, which files that hold tensors alone take too.
+
+    Args:
+        described: plain data.
+
+    Returns:
+        (N,) uint8 on the CPU.
+    """
+    return torch.tensor(list(json.dumps(described).encode()), dtype=torch.uint8, device="cpu")
+
+
+def unpacked(state: Any, who: str) -> Any:
+    """Return the plain data of :func:`packed`.
+
+    Args:
+        state: (N,) uint8.
+        who: begins the message.
+
+    Raises:
+        StorageError: for other objects.
+    """
+    try:
+        return json.loads(bytes(state.cpu().tolist()).decode())
+    except (AttributeError, TypeError, ValueError) as error:
+        raise StorageError(f"{who}: expected the state of an operator, as state_dict() gives it: {error}.") from None
+
+
+def plain(value: Any) -> Any:
+    """Return a setting as plain data: records by their fields, tensors by their shape, size and some sums.
+
+    Args:
+        value: number, text, tensor, record, or a list of such.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Tensor):
+        flat = value.detach().to("cpu", torch.float64).reshape(-1)
+        k = torch.arange(1, SUMS + 1, dtype=torch.float64, device="cpu")[:, None]
+        places = torch.arange(1, len(flat) + 1, dtype=torch.float64, device="cpu")
+        size = float(flat.abs().max()) if len(flat) else 0.0
+        return {"shape": list(value.shape), "size": size, "sums": (torch.cos(k * places) @ flat).tolist()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    record = {"type": type(value).__name__}
+    if is_dataclass(value):
+        record |= {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    return record
+
+
+def check_same(mine: Any, theirs: Any, who: str, what: str = "settings") -> None:
+    """Check that a state that is loaded is that of an equal operator.
+
+    Args:
+        mine, theirs: settings as :func:`plain` returns them.
+        who: begins the message.
+        what: name of the setting.
+
+    Raises:
+        ShapeError: where they differ by more than rounding.
+    """
+    if isinstance(mine, dict) and isinstance(theirs, dict) and mine.keys() == theirs.keys():
+        if "sums" in mine and mine["shape"] == theirs["shape"]:
+            slack = SLACK * max(mine["size"], theirs["size"]) * math.sqrt(max(1, math.prod(mine["shape"])))
+            if all(abs(a - b) <= slack for a, b in zip(mine["sums"], theirs["sums"], strict=True)):
+                return
+            raise ShapeError(_difference(who, what, "the same values", "others"))
+        for key in mine:
+            check_same(mine[key], theirs[key], who, key if what == "settings" else f"{what}.{key}")
+        return
+    if isinstance(mine, list) and isinstance(theirs, list) and len(mine) == len(theirs):
+        for a, b in zip(mine, theirs, strict=True):
+            check_same(a, b, who, what)
+        return
+    numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (mine, theirs))
+    if not (math.isclose(mine, theirs, rel_tol=SLACK, abs_tol=1e-3 * SLACK) if numbers else mine == theirs):
+        raise ShapeError(_difference(who, what, mine, theirs))
+
+
+def _difference(who: str, what: str, mine: Any, theirs: Any) -> str:
+    return (
+        f"{who}: expected the state of an operator like this one, with {what} {mine!r}, got one with {theirs!r}. Make "
+        "the operator as the one that was saved."
+    )

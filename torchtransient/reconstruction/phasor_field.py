@@ -5,23 +5,144 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import finite, shown, with_article
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.reconstruction.cameras import Camera, DirectLight, TransientCamera
-from torchtransient.reconstruction.capture_checks import check_falloff, refuse_pairs
+from torchtransient.checks import finite, real_array, shown, with_article
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.reconstruction.capture_checks import check_falloff, check_wavelength, refuse_pairs
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
-from torchtransient.reconstruction.planar_scan import OFF_GRID, PlanarScan
-from torchtransient.reconstruction.plane_waves import phase_pairs, waves
-from torchtransient.reconstruction.proportions import check_wavelength
-from torchtransient.reconstruction.scan_operator import ScanOperator
-from torchtransient.reconstruction.transient_operator import reconstructed
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.reconstruction.transient_operator import ScanOperator, reconstructed
+from torchtransient.reconstruction.voxels import OFF_GRID, PlanarScan, VoxelGrid
+
+
+@dataclass(frozen=True)
+class DirectLight:
+    """The image of light that met one voxel and nothing else.
+
+    Laser and sensor are focused on the voxel itself, and the picture is taken at the moment of focus. Volumes are
+    (..., Z, Y, X).
+    """
+
+    @property
+    def times(self) -> None:
+        """No video."""
+        return None
+
+    @property
+    def focuses_laser(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class ConfocalCamera:
+    """A video of voxels that laser and sensor are both focused on. Volumes are (..., N, Z, Y, X).
+
+    Args:
+        times: (N,) metres of optical path after the focus: at zero it is :class:`DirectLight`, later the other light
+            that came back.
+
+    Raises:
+        ShapeError, UnitError: for other shapes, and times that are not finite.
+    """
+
+    times: Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", _times(self.times, "ConfocalCamera"))
+
+    @property
+    def focuses_laser(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class TransientCamera:
+    """A video of the pulse that leaves the laser's spot and passes through the hidden scene. Volumes are (..., N, Z, Y,
+    X).
+
+    Needs a scan with one spot.
+
+    Args:
+        times: (N,) lengths of optical path from the spot, metres, so that a voxel lights up at its distance from it.
+
+    Raises:
+        ShapeError, UnitError: for other shapes, and times that are not finite.
+    """
+
+    times: Tensor
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", _times(self.times, "TransientCamera"))
+
+    @property
+    def focuses_laser(self) -> bool:
+        return False
+
+
+Camera = DirectLight | ConfocalCamera | TransientCamera
+
+
+def _times(values: Any, who: str) -> Tensor:
+    plain = real_array(values)
+    if plain is None or plain.ndim != 1 or len(plain) == 0:
+        raise ShapeError(f"{who}: expected times (N,) in metres of optical path, got {shown(values)}.")
+    times = torch.from_numpy(plain)
+    if not bool(torch.isfinite(times).all()):
+        raise UnitError(f"{who}: expected finite times, got {shown(plain.tolist())}.")
+    return times
+
+
+def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype, nearest: float = 0.0) -> Tensor:
+    """Return ``exp(2 pi i f r) / r^falloff`` of distances r at evenly spaced frequencies f.
+
+    Phases have the digits of double precision: single precision has none left for r of many wavelengths. A sine of each
+    frequency would be most of the work of a plane, so waves follow from each other by products, which lose F ulp.
+
+    Args:
+        distances: (...) float64, metres.
+        frequencies: (F,) float64, cycles per metre.
+        falloff: the power.
+        dtype: a complex one.
+        nearest: distances below fall off as it does, metres.
+
+    Returns:
+        (F, ...).
+    """
+    count = len(frequencies)
+    wave = _turned(distances * frequencies[0])
+    if falloff:
+        wave = wave * distances.clamp_min(nearest).pow(-falloff)
+    out = torch.empty(count, *distances.shape, dtype=dtype, device=distances.device)
+    out[0] = wave
+    if count > 1:
+        step = _turned(distances * ((frequencies[-1] - frequencies[0]) / (count - 1)))
+        for k in range(1, count):
+            wave = wave.mul_(step)
+            out[k] = wave
+    return out
+
+
+def _turned(turns: Tensor) -> Tensor:
+    return torch.polar(torch.ones_like(turns), (turns - turns.round()) * (2 * math.pi))
+
+
+def phase_pairs(turns: Tensor) -> Tensor:
+    """Return real and imaginary part of ``exp(2 pi i turns)``.
+
+    Args:
+        turns: (...) float64.
+
+    Returns:
+        (..., 2) float64.
+    """
+    return torch.view_as_real(_turned(turns))
+
 
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25
@@ -32,8 +153,20 @@ BAND = 4.0
 def phasor_image(
     capture: Capture, points: VoxelGrid, *, pulse: PhasorFilter, camera: Camera | None = None, falloff: float = 0.0
 ) -> Tensor:
-    """:meth:`PhasorField.reconstruct` of a capture by its own scan and axis: (..., C, *volume), on the device of its
-    transient. Raises as the class.
+    """Image a capture by phasor fields: :meth:`PhasorField.reconstruct` by its own scan and axis.
+
+    Args:
+        capture: with a transient, of a flat, regular grid.
+        points: planes parallel to the wall with its pitch.
+        pulse: of the virtual illumination.
+        camera: None for :class:`DirectLight`.
+        falloff: power of 1 / (r_laser r_sensor).
+
+    Returns:
+        Intensity (..., C, *volume), on the device of the transient.
+
+    Raises:
+        ShapeError, SceneError, UnitError: as the class.
     """
     options = {"pulse": pulse, "camera": camera, "falloff": falloff}
     return reconstructed(capture, PhasorField, points, who="phasor_image", **options)
@@ -44,24 +177,33 @@ class PhasorField(ScanOperator):
 
     ``adjoint`` takes a transient (..., T, *scan.shape) to the complex field (..., Z, Y, X) at the moment of focus: the
     transient convolved with the ``pulse`` of a virtual illumination, at the length laser spot - voxel - sensor point,
-    times (r_laser r_sensor)^-falloff, summed over all pairs. With ``falloff=1`` that is the Rayleigh-Sommerfeld
-    integral; with 0 its phases alone, which is :class:`FilteredBackprojection` with the same filter. ``forward``
-    is its adjoint, a real transient. ``camera``: :class:`DirectLight` (None), or :class:`ConfocalCamera`,
-    :class:`TransientCamera`, whose fields are videos (..., N, Z, Y, X).
+    times (r_laser r_sensor)^-falloff, summed over all pairs. ``forward`` is its adjoint, a real transient.
 
-    Scans: confocal, single, and exhaustive with any laser spots, all sensor points on a flat, regular grid, with or
-    without first and last legs. ``points``: planes parallel to the wall with the pitch of the sensor grid, as
-    ``VoxelGrid.before(scan, depths)`` makes them; size and place of the planes are free, `at_depths` and larger
-    ``size`` and ``extent`` of the same pitch too. The convolution is linear: nothing wraps around, neither in space nor
-    in time.
+    Args:
+        scan: confocal, single, or exhaustive with any laser spots, all sensor points on a flat, regular grid, with or
+            without first and last legs.
+        points: planes parallel to the wall with the pitch of the sensor grid, as ``VoxelGrid.before(scan, depths)``
+            makes them; size and place of the planes are free, `at_depths` and larger ``size`` and ``extent`` of the
+            same pitch too.
+        time_axis: of the transients.
+        pulse: of the virtual illumination.
+        camera: :class:`DirectLight` (None), or :class:`ConfocalCamera`, :class:`TransientCamera`, whose fields are
+            videos (..., N, Z, Y, X).
+        falloff: with 1 the field is the Rayleigh-Sommerfeld integral; with 0 its phases alone, which is
+            :class:`FilteredBackprojection` with the same filter. Distances below half a bin fall off as half a bin
+            does.
+        dtype: float32 or float64.
 
-    Frequencies within 4 standard deviations of the pulse's spectrum are kept, zero and below for pulses of less than
-    3.9 cycles: all but 2e-8 of its energy. What is left out is 3e-4 of the height of the spectrum at most; a steady
-    background is part of it. Distances below half a bin fall off as half a bin does.
-    Time grows with planes times frequencies (times laser spots) times sensor points; spectra are made a chunk of
-    frequencies and spots at a time. Raises ShapeError for other scans (pairs, lists and curved walls go to
-    :class:`FilteredBackprojection`) and grids, SceneError for a transient camera
-    without one laser spot, UnitError for what is out of range.
+    Raises:
+        ShapeError: for other scans (pairs, lists and curved walls go to :class:`FilteredBackprojection`) and grids.
+        SceneError: for a transient camera without one laser spot.
+        UnitError: for quantities out of range.
+
+    The convolution is linear: nothing wraps around, neither in space nor in time. Frequencies within 4 standard
+    deviations of the pulse's spectrum are kept, zero and below for pulses of less than 3.9 cycles: all but 2e-8 of its
+    energy. The rest is 3e-4 of the height of the spectrum at most; a steady background is part of it. Time grows with
+    planes times frequencies (times laser spots) times sensor points; spectra are made a chunk of frequencies and spots
+    at a time.
     """
 
     def __init__(
@@ -136,7 +278,7 @@ class PhasorField(ScanOperator):
             )
 
     def _leg_lengths(self) -> tuple[Tensor, Tensor]:
-        """Of the spots (L,) and the sensor points (S,), zeros where they do not count."""
+        """Return the legs of the spots (L,) and the sensor points (S,), metres, zeros where they do not count."""
         if not self.scan.first_and_last_leg:
             lengths = torch.zeros(len(self.lasers) + math.prod(self.wall.size), dtype=torch.float64, device="cpu")
             return lengths[: len(self.lasers)], lengths[len(self.lasers) :]
@@ -191,8 +333,8 @@ class PhasorField(ScanOperator):
         return (low, high) if times is None else (low + float(times.min()), high + float(times.max()))
 
     def tables(self) -> dict[str, Tensor]:
-        """Transform to the band (2 F, T), real parts first; phases of the legs (F, L + S, 2); those of the camera's
-        moments (N, F, 2).
+        """Return the transform to the band (2 F, T), real parts first; phases of the legs (F, L + S, 2); phases of the
+        camera's moments (N, F, 2).
         """
         turns = self.frequencies[:, None] * self.axis.centers_opl
         phase = -2 * math.pi * (turns - turns.round())
@@ -206,7 +348,17 @@ class PhasorField(ScanOperator):
         }
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The intensity |field|^2 (..., *volume) of a transient (..., T, *scan.shape) or capture. Raises ShapeError."""
+        """Return the intensity |field|^2 of a transient.
+
+        Args:
+            transient: (..., T, *scan.shape), or a capture of the operator's scan and axis.
+
+        Returns:
+            (..., *volume).
+
+        Raises:
+            ShapeError: for other transients and captures.
+        """
         return self.pulse.image(self.adjoint(self.transients(transient)))
 
     # ------------------------------------------------------------------------------------------------- the two maps
@@ -301,7 +453,7 @@ class PhasorField(ScanOperator):
         return legs[:, :spots][:, some, None] * legs[:, None, spots:]
 
     def _kernels(self, band: slice, device: torch.device) -> Iterator[Tensor]:
-        """Of each plane the transform (F, Y, X) of waves from a sensor point to voxels at every displacement."""
+        """Yield for each plane the transform (F, Y, X) of waves from a sensor point to voxels at every displacement."""
         confocal = self.scan.kind == "confocal"
         along = []
         for axis, (voxels, pitch) in enumerate(zip(self.grid.size, self.wall.pitch, strict=True)):

@@ -1,8 +1,8 @@
-"""Surfaces in a reconstructed volume: depth, how sure of it one can be, and normals.
+"""Surfaces in a reconstructed volume: depth, confidence and normals.
 
-Volumes are (..., Z, Y, X) of real values, higher where something is, on a :class:`VoxelGrid` or on planes at given
-depths. Everything is differentiable by the volume. Volumes in half precision are taken, and depths and normals of them
-returned, in float32.
+Volumes are (..., Z, Y, X) of real values, higher at surfaces, on a :class:`VoxelGrid` or on planes at given depths.
+Everything is differentiable by the volume. Volumes in half precision are taken, and their depths and normals returned,
+in float32.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from torchtransient.reconstruction.voxels import VoxelGrid, checked_depths
 
 @dataclass(frozen=True)
 class DepthMap:
-    """``depth`` (..., Y, X) in metres, ``confidence`` (..., Y, X) in [0, 1], and ``mask``, where it suffices.
+    """``depth`` (..., Y, X) in metres, ``confidence`` (..., Y, X) in [0, 1], and ``mask``, True where it suffices.
 
-    The depth is a number everywhere; what is outside of the mask means nothing.
+    The depth is a number everywhere; outside of the mask it means nothing.
     """
 
     depth: Tensor
@@ -32,14 +32,23 @@ class DepthMap:
 
 
 def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1) -> DepthMap:
-    """The depth of the highest value behind each pixel, between planes where its neighbours say so.
+    """Find the depth of the highest value behind each pixel, between planes by a parabola through its neighbours.
 
-    ``volume`` (..., Z, Y, X), ``depths``: a grid, or (Z,) in metres. A pixel with a value that is not finite is taken
-    for an empty one. A parabola through the maximum and the planes next
-    to it has its top within half a step of it, evenly spaced planes or not; on the first and the last plane the depth
-    is the plane's. ``confidence``: the maximum over that of the whole volume, zero where a volume holds nothing above
-    zero; ``mask``: where it reaches ``threshold``. Gradients go through the three values of each parabola. Raises
-    ShapeError, UnitError.
+    The top of the parabola lies within half a step, evenly spaced planes or not; on the first and the last plane the
+    depth is the plane's. Gradients go through the three values of each parabola.
+
+    Args:
+        volume: (..., Z, Y, X), real. A pixel with a value that is not finite counts as empty.
+        depths: grid, or (Z,) in metres.
+        threshold: confidence from which the mask is True, 0 to 1.
+
+    Returns:
+        Depth, confidence (the maximum over that of the whole volume, zero where a volume holds nothing above zero),
+            mask.
+
+    Raises:
+        ShapeError: for a volume that does not fit the planes or is not real.
+        UnitError: for depths that do not increase, and a threshold beyond 0 to 1.
     """
     z, volume = _checked(volume, depths, "depth_map")
     threshold = share("depth_map: threshold", threshold)
@@ -69,11 +78,22 @@ def depth_map(volume: Tensor, depths: VoxelGrid | Any, *, threshold: float = 0.1
 
 
 def soft_depth(volume: Tensor, depths: VoxelGrid | Any, *, sharpness: float = 20.0) -> Tensor:
-    """The mean depth (..., Y, X) behind each pixel under softmax(``sharpness`` times value over the pixel's maximum).
+    """Return the mean depth behind each pixel under softmax(``sharpness`` times value over the pixel's maximum).
 
-    Smooth in every value, unlike :func:`depth_map`, and independent of the scale of the volume; the higher the
-    sharpness the closer to it, and the less planes next to the maximum have gradients. Pixels with nothing above zero
-    have the mean of all planes. Raises ShapeError, UnitError.
+    Smooth in every value, unlike :func:`depth_map`, and independent of the scale of the volume. Pixels with nothing
+    above zero have the mean of all planes.
+
+    Args:
+        volume: (..., Z, Y, X), real.
+        depths: grid, or (Z,) in metres.
+        sharpness: the higher the closer to :func:`depth_map`, and the smaller the gradients of planes next to the
+            maximum.
+
+    Returns:
+        (..., Y, X), metres.
+
+    Raises:
+        ShapeError, UnitError: as :func:`depth_map`.
     """
     z, volume = _checked(volume, depths, "soft_depth")
     sharpness = within("soft_depth: sharpness", sharpness, 1e-30, 1e30)
@@ -88,10 +108,19 @@ def soft_depth(volume: Tensor, depths: VoxelGrid | Any, *, sharpness: float = 20
 
 
 def normals_from_depth(depth: Tensor, grid: VoxelGrid) -> Tensor:
-    """Unit normals (..., 3, Y, X) in world coordinates of a depth map (..., Y, X), towards the wall.
+    """Return unit normals of a depth map, by central differences, one-sided at the borders.
 
-    Central differences, one-sided at the borders. The depth next to the border of a mask is that of nothing: normals
-    there are as little worth. Raises ShapeError.
+    Normals next to the border of a mask are worth as little as the depth beyond it.
+
+    Args:
+        depth: (..., Y, X), metres.
+        grid: of the volume.
+
+    Returns:
+        (..., 3, Y, X) in world coordinates, towards the wall.
+
+    Raises:
+        ShapeError: for depths that do not fit the grid.
     """
     _check_grid(grid, "normals_from_depth")
     if not isinstance(depth, Tensor) or depth.ndim < 2 or tuple(depth.shape[-2:]) != grid.size:
@@ -104,12 +133,21 @@ def normals_from_depth(depth: Tensor, grid: VoxelGrid) -> Tensor:
 
 
 def normals_from_volume(volume: Tensor, grid: VoxelGrid) -> Tensor:
-    """Unit normals (..., 3, Y, X) in world coordinates, towards the wall, from the gradient of a volume (..., Z, Y, X).
+    """Return unit normals from the gradient of a volume, summed from the first plane to the highest value behind each
+    pixel.
 
-    The gradient is summed from the first plane to the highest value behind each pixel: of a brightness f(z - s(x, y))
-    that sum is f(0) times (-ds/dx, -ds/dy, 1), whatever its profile. More robust than :func:`normals_from_depth`,
-    since it uses all planes. Where nothing is above zero it is the wall's own direction. Raises ShapeError; for fewer
-    than two planes, rows or columns as well.
+    Of a brightness f(z - s(x, y)) that sum is f(0) times (-ds/dx, -ds/dy, 1), whatever its profile. More robust than
+    :func:`normals_from_depth`, since it uses all planes. Where nothing is above zero it is the wall's own direction.
+
+    Args:
+        volume: (..., Z, Y, X), real.
+        grid: of the volume.
+
+    Returns:
+        (..., 3, Y, X) in world coordinates, towards the wall.
+
+    Raises:
+        ShapeError: for a volume that does not fit, and fewer than two planes, rows or columns.
     """
     _check_grid(grid, "normals_from_volume")
     z, volume = _checked(volume, grid, "normals_from_volume")

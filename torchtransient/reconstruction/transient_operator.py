@@ -1,7 +1,8 @@
-"""What all operators between hidden volumes and transients share: where voxels stand, captures as data, tables."""
+"""Bases of operators between hidden volumes and transients: any scan, any points, and confocal grids of a flat wall."""
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,33 +16,43 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.checks import arguments_of
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.capture_checks import (
+    check_from_zero,
+    check_proportions,
+    check_reach,
     checked_axis,
     checked_capture,
     checked_intensities,
+    checked_points,
     checked_precision,
     checked_scan,
+    confocal_wall,
     same_light,
     telling,
 )
-from torchtransient.reconstruction.linear import LinearOperator
-from torchtransient.reconstruction.operator_state import check_same, packed, plain, unpacked
-from torchtransient.reconstruction.planar_scan import PlanarScan
-from torchtransient.reconstruction.proportions import check_proportions
-from torchtransient.reconstruction.voxels import VoxelGrid
+from torchtransient.reconstruction.linear import LinearOperator, check_same, packed, plain, unpacked
+from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid
 
 
 class TransientOperator(LinearOperator):
     """A linear operator between a volume and transients (..., T, *scan points).
 
-    ``scan``: a copy of what was given, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes
-    stand on, None for points that stand on none. Tables are built in double precision and kept in ``dtype``;
-    ``operator.double()`` builds them anew. They are made on the CPU, whatever torch's default device is. ``state_dict``
-    holds no tables but what the operator was made from: scan, axis, points and settings, not the precision. Loading
-    the state of another operator raises ShapeError; ``strict=False`` loads what has none.
+    ``scan``: a copy of the argument, detached; ``axis``: as given. ``grid``: the :class:`VoxelGrid` that volumes stand
+    on, None for points that stand on none. Tables are built in double precision on the CPU, whatever torch's default
+    device is, and kept in ``dtype``; ``operator.double()`` builds them anew. ``state_dict`` holds no tables but the
+    scan, axis, points and settings of the operator, not the precision. Loading the state of another operator raises
+    ShapeError; ``strict=False`` loads models without such a state.
 
-    Classes say :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape`` and
-    ``grid`` (without one, they say :attr:`points`), and call ``_set_tables()`` last. Raises ShapeError for what is
-    no axis, UnitError for a dtype other than float32 and float64.
+    Classes define :meth:`tables`, ``map_``, ``adjoint_`` and :meth:`reconstruct`, set ``data_shape``, ``volume_shape``
+    and ``grid`` (without one, they define :attr:`points`), and call ``_set_tables()`` last.
+
+    Args:
+        scan: of any kind, or the grid of a flat wall.
+        time_axis: of the transients.
+        dtype: float32 or float64.
+
+    Raises:
+        ArgumentError: for other objects than a time axis.
+        UnitError: for another dtype, and a wall and a record that are not of one size.
     """
 
     scan: Scan | PlanarScan
@@ -57,7 +68,7 @@ class TransientOperator(LinearOperator):
 
     @property
     def points(self) -> Tensor:
-        """(..., 3) float64 on the CPU: where the values of a volume stand in world coordinates, metres."""
+        """Places of the values of a volume in world coordinates, (..., 3) float64 on the CPU, metres."""
         if self.grid is None:
             who = type(self).__name__
             raise ShapeError(f"{who}: expected a grid, or points of the class itself, got neither. Set its grid.")
@@ -69,11 +80,15 @@ class TransientOperator(LinearOperator):
         return None if self.grid is None else self.grid.depths
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """The picture of a transient (..., *data_shape) or of a capture's: real, differentiable."""
+        """Return the picture of a transient, real and differentiable.
+
+        Args:
+            transient: (..., *data_shape), or a capture.
+        """
         raise NotImplementedError
 
     def tables(self) -> dict[str, Tensor]:
-        """The tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""
+        """Return the tables of the operator on the CPU, float64 or whole numbers; complex ones as pairs of reals."""
         return {}
 
     def _set_tables(self, device: torch.device | str = "cpu") -> None:
@@ -87,13 +102,23 @@ class TransientOperator(LinearOperator):
         self._set_tables(self.device or "cpu")
 
     def get_extra_state(self) -> Tensor:
-        """What the operator was made from, as bytes: its settings are those arguments of the class that it keeps under
-        their own names, records and tensors among them; of other objects it is their class alone.
+        """Return the settings of the operator as bytes.
+
+        They are the arguments of the class that it keeps under their own names, records and tensors among them; other
+        objects are known by their class alone.
         """
         return packed(self._described())
 
     def set_extra_state(self, state: Any) -> None:
-        """Raises ShapeError for the state of another operator, StorageError for what is none."""
+        """Compare a state with the settings of the operator.
+
+        Args:
+            state: of :meth:`get_extra_state`.
+
+        Raises:
+            ShapeError: for the state of another operator.
+            StorageError: for other objects.
+        """
         who = type(self).__name__
         check_same(self._described(), unpacked(state, who), who)
 
@@ -109,13 +134,17 @@ class TransientOperator(LinearOperator):
         }
 
     def _measured(self) -> Any:
-        """What of the scan the operator depends on."""
+        """Return the part of the scan that the operator depends on."""
         return telling(self.scan) if isinstance(self.scan, Scan) else self.scan
 
     def transients(self, data: Tensor | Capture) -> Tensor:
-        """The transient (..., *data_shape) of a tensor or a capture, in the operator's precision.
+        """Return a transient in the operator's precision.
 
-        Raises ShapeError for a capture of another scan or axis, of polarized light, or without a transient.
+        Args:
+            data: (..., *data_shape), or a capture.
+
+        Raises:
+            ShapeError: for a capture of another scan or axis, of polarized light, or without a transient.
         """
         if not isinstance(data, Capture):
             return self._taken("transient", data, self.data_shape, real=True)
@@ -128,7 +157,7 @@ class TransientOperator(LinearOperator):
         return self._taken("transient", transient, self.data_shape, real=True)
 
     def _takes(self, scan: Scan) -> bool:
-        """Whether captures of a scan are the operator's data."""
+        """Return True where captures of a scan are the operator's data."""
         return isinstance(self.scan, Scan) and same_light(scan, self.scan)
 
     def extra_repr(self) -> str:
@@ -144,10 +173,20 @@ def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:
 
 
 def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:
-    """``reconstruct`` of a capture by an operator of class ``kind`` for its own scan and axis, where its transient is,
-    in double precision for captures of that, else in single, unless ``options`` say ``dtype``.
+    """Reconstruct a capture by an operator for its own scan and axis, on the device of its transient.
 
-    Raises ShapeError for what is no capture, or has no transient, and what the class raises.
+    Args:
+        capture: with a transient.
+        kind: class of the operator.
+        points: of classes that take some.
+        who: begins the message.
+        options: of the class; ``dtype`` is double for captures in double precision, else single, unless given.
+
+    Returns:
+        ``reconstruct`` of the capture.
+
+    Raises:
+        ShapeError: for other objects than captures, for phasors alone, and as the class.
     """
     transient, axis = checked_capture(capture, who)
     options.setdefault("dtype", torch.float64 if transient.dtype == torch.float64 else torch.float32)
@@ -156,3 +195,143 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
     operator = operator.to(transient.device)
     volume: Tensor = operator.reconstruct(capture)
     return volume
+
+
+class ScanOperator(TransientOperator):
+    """A linear operator between values at hidden points and transients (..., T, *scan.shape) of a scan of any kind.
+
+    Args:
+        scan: of any kind.
+        points: grid, or points (..., 3) in world coordinates, metres; volumes have their leading dimensions. Points
+            that carry gradients are taken as they are, detached: operators are differentiable by volumes and transients
+            alone.
+        time_axis: of the transients, counted as the scan's ``first_and_last_leg`` says.
+        dtype: float32 or float64.
+
+    Raises:
+        ShapeError: for other objects than scans and points.
+        UnitError: for points that are not finite or far beyond the record, and for another dtype.
+    """
+
+    scan: Scan
+
+    def __init__(self, scan: Scan, points: VoxelGrid | Tensor, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
+        who = type(self).__name__
+        super().__init__(checked_scan(scan, who), time_axis=time_axis, dtype=dtype)
+        self.grid = points if isinstance(points, VoxelGrid) else None
+        self._points = None if isinstance(points, VoxelGrid) else checked_points(points, who)
+        check_reach(scan, points if self._points is None else self._points, time_axis, who)
+        self.volume_shape = tuple(self.points.shape[:-1])
+        self.data_shape = (time_axis.num_bins, *scan.shape)
+
+    @property
+    def points(self) -> Tensor:
+        """(..., 3) float64 on the CPU: the hidden points in world coordinates, metres."""
+        return super().points if self._points is None else self._points
+
+
+LEAST_BINS = 4
+# Complex numbers that are worked on at once: a piece that the caches of a CPU hold, and one that fills a GPU.
+CPU_CHUNK, GPU_CHUNK = 1 << 17, 1 << 24
+
+
+def chunk_rows(elements: int, device: torch.device) -> int:
+    """Return the number of rows to work on at once.
+
+    Args:
+        elements: complex numbers of a row.
+        device: of the operands.
+    """
+    return max(1, (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK) // max(1, elements))
+
+
+class ConfocalOperator(TransientOperator):
+    """A linear operator between a volume (..., Z, Y, X) before a flat wall and confocal transients (..., T, Y, X).
+
+    Voxels stand behind the points of the wall (:attr:`wall`) at :attr:`depths`, one for each bin: half its optical path
+    length. Time axes start at zero or later, unless a class sets :attr:`early`.
+
+    Args:
+        scan: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
+            from the spot to the sensor point (``first_and_last_leg=False``).
+        time_axis: of the transients.
+        dtype: float32 or float64.
+
+    Raises:
+        ShapeError: for other scans and axes.
+        UnitError: for time axes that begin before zero, and for another dtype.
+    """
+
+    grid: VoxelGrid
+    # Whether bins before time zero are taken: they are where no voxel is.
+    early = False
+
+    def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
+        who = type(self).__name__
+        confocal_wall(scan, who)
+        bins = checked_axis(time_axis, who).num_bins
+        if bins < LEAST_BINS:
+            raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
+        if not self.early:
+            check_from_zero(time_axis, who)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        self.wall = confocal_wall(self.scan, who)
+        self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
+        self.data_shape = (bins, *self.wall.size)
+        self.volume_shape = self.data_shape
+
+    @property
+    def depths(self) -> Tensor:
+        """(Z,) float64: distances of the planes from the wall, metres. Half bins count: half the middle of each bin."""
+        return self.grid.depths
+
+    def _measured(self) -> PlanarScan:
+        return self.wall
+
+    def _takes(self, scan: Scan) -> bool:
+        return scan is self.scan or self.wall.matches(confocal_wall(scan, type(self).__name__))
+
+
+class InverseOperator(LinearOperator):
+    """A regularised inverse of an operator, itself a linear operator from its data to its volume.
+
+    It has the ``points``, ``depths`` and ``grid`` of the operator, and shares its tables until one of them is moved or
+    converted, which leaves the other as it was.
+
+    Args:
+        operator: to be inverted.
+    """
+
+    def __init__(self, operator: ConfocalOperator) -> None:
+        super().__init__()
+        # Modules that share tables but not the lists of them.
+        self.operator = copy.copy(operator)
+        for name in ("_buffers", "_parameters", "_modules"):
+            setattr(self.operator, name, dict(getattr(operator, name)))
+        self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
+        self.dtype = operator.dtype
+        self.volume_name, self.data_name = "transient", operator.volume_name
+
+    @property
+    def axis(self) -> TimeAxis:
+        """Time axis of the transients."""
+        return self.operator.axis
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """Voxels of the result."""
+        return self.operator.grid
+
+    @property
+    def points(self) -> Tensor:
+        """(Z, Y, X, 3) float64 on the CPU: these voxels in world coordinates, metres."""
+        return self.operator.points
+
+    @property
+    def depths(self) -> Tensor:
+        """(Z,) float64: distances of their planes from the wall, metres."""
+        return self.operator.depths
+
+    def extra_repr(self) -> str:
+        taken, found = (" x ".join(map(str, shape)) for shape in (self.volume_shape, self.data_shape))
+        return f"{self.volume_name} of {taken} to {self.data_name} of {found}"

@@ -1,20 +1,174 @@
-"""Regular grids of hidden points: where the voxels of a reconstructed volume stand."""
+"""Grids and what stands on them: points of a flat wall, voxels before it, hidden volumes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.capture import Scan, Wall
+from torchtransient.capture.capture import metadata_text, summed
 from torchtransient.capture.scan import bounds_of
 from torchtransient.checks import Numbers, count, of_class, positive, real_array, shown
-from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.reconstruction.planar_scan import PlanarScan, hidden_side
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.tensor_record import TensorRecord
+
+# Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
+OFF_GRID = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlanarScan:
+    """A regular grid of points on a flat wall.
+
+    ``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
+    ``first``; ``normal`` points to the hidden side. Vectors are (3,) float64 on the CPU.
+    """
+
+    size: tuple[int, int]
+    pitch: tuple[float, float]
+    first: Tensor
+    _: KW_ONLY
+    along_x: Tensor
+    along_y: Tensor
+    normal: Tensor
+
+    @staticmethod
+    def of(points: Tensor, normals: Tensor | None = None, *, who: str, what: str = "sensor points") -> PlanarScan:
+        """Return the grid of points.
+
+        Args:
+            points: (Y, X, 3), two along each side at least, metres.
+            normals: (Y, X, 3) of the wall, towards the hidden side; without them it is that of ``along_x`` times
+                ``along_y``.
+            who: begins the message.
+            what: name of the points in the message.
+
+        Raises:
+            ShapeError: for a list of points, and for grids that are not regular, not at right angles, or not flat.
+        """
+        check_real(points, f"{who}: {what}")
+        p = points.detach().to("cpu", torch.float64, copy=True)
+        if p.ndim != 3 or p.shape[-1] != 3 or min(p.shape[:2]) < 2:
+            raise ShapeError(f"{who}: expected {what} as a grid (Y, X, 3) of 2 x 2 at least, got {tuple(p.shape)}.")
+        rows, columns = p.shape[:2]
+        x, y = (p[0, -1] - p[0, 0]) / (columns - 1), (p[-1, 0] - p[0, 0]) / (rows - 1)
+        dx, dy = float(x.norm()), float(y.norm())
+        i, k = (torch.arange(n, dtype=torch.float64, device="cpu")[:, None] for n in (columns, rows))
+        expected = p[0, 0] + (k * y)[:, None] + (i * x)[None]
+        slack = OFF_GRID * min(dx, dy)
+        off = float((p - expected).norm(dim=-1).max())
+        if not (slack > 0 and off <= slack and abs(float(x @ y)) <= OFF_GRID * dx * dy):
+            raise ShapeError(
+                f"{who}: expected {what} on a regular, rectangular grid of a flat wall, got some {off:.3g} m off it "
+                f"(pitch {dy:.3g} x {dx:.3g} m, angle {_angle(x, y)}). Use Backprojection, which takes any points."
+            )
+        along_x = x / dx
+        # At right angles to rounding, where the points are to a share of their pitch.
+        along_y = y - (y @ along_x) * along_x
+        along_y = along_y / along_y.norm()
+        normal = torch.linalg.cross(along_x, along_y)
+        if normals is not None:
+            normal = _with_normals(normal, normals)
+        return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x=along_x, along_y=along_y, normal=normal)
+
+    @staticmethod
+    def of_scan(scan: Scan, who: str) -> PlanarScan:
+        """Return the grid of a scan's sensor points, with its :func:`hidden_side`.
+
+        Args:
+            scan: on a regular grid of a flat wall.
+            who: begins the message.
+
+        Raises:
+            ShapeError: for other scans.
+        """
+        of_class(f"{who}: scan", scan, Scan, error=ShapeError)
+        wall = PlanarScan.of(scan.sensor_points, who=who)
+        return replace(wall, normal=hidden_side(scan, wall.normal))
+
+    @property
+    def points(self) -> Tensor:
+        """Points of the grid in world coordinates, (Y, X, 3) float64 on the CPU, metres."""
+        rows, columns = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
+        wall = self.first + (rows[:, None, None] * self.pitch[0]) * self.along_y
+        return wall + (columns[None, :, None] * self.pitch[1]) * self.along_x
+
+    def matches(self, other: PlanarScan) -> bool:
+        """Return True for the same grid with the same hidden side, to a thousandth of the smallest pitch.
+
+        Args:
+            other: the grid to compare with.
+        """
+        if self.size != other.size or float(self.normal @ other.normal) <= 0:
+            return False
+        off = float((self.points - other.points).norm(dim=-1).max())
+        return off <= OFF_GRID * min(*self.pitch, *other.pitch)
+
+    def __repr__(self) -> str:
+        (rows, columns), (dy, dx) = self.size, self.pitch
+        return f"PlanarScan({columns} x {rows} points, {dx:.4g} x {dy:.4g} m apart)"
+
+    def local(self, points: Tensor) -> Tensor:
+        """Return coordinates along x, y and the normal, from the first point.
+
+        Args:
+            points: (..., 3) in world coordinates, metres.
+
+        Returns:
+            (..., 3) float64 on the CPU, metres.
+        """
+        off = points.detach().to("cpu", torch.float64) - self.first
+        return torch.stack([off @ self.along_x, off @ self.along_y, off @ self.normal], -1)
+
+
+def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
+    """Return the normal of a scan's wall or its opposite, whichever points to the hidden side.
+
+    That is the side of the scan's normals; without them, the side on which its sensor and its laser stand. Where they
+    stand in the wall or on both sides of it, ``normal`` as given.
+
+    Args:
+        scan: of any kind.
+        normal: (3,).
+    """
+    if scan.sensor_normals is not None:
+        return _with_normals(normal, scan.sensor_normals)
+    points = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
+    middle, extent = points.mean(0), float((points.amax(0) - points.amin(0)).norm())
+    origins = (origin.detach().to("cpu", torch.float64) for origin in (scan.sensor_origin, scan.laser_origin))
+    heights = [float((origin - middle) @ normal) for origin in origins]
+    return -normal if max(heights) < -1e-6 * extent else normal
+
+
+def check_real(points: Tensor, what: str) -> None:
+    """Refuse complex tensors and truth values, which a conversion would make real numbers of.
+
+    Args:
+        points: any tensor.
+        what: begins the message.
+
+    Raises:
+        ShapeError: for such tensors.
+    """
+    if points.is_complex() or points.dtype == torch.bool:
+        raise ShapeError(f"{what}: expected real numbers, got {points.dtype}.")
+
+
+def _with_normals(normal: Tensor, normals: Tensor) -> Tensor:
+    mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+    return normal if float(mean @ normal) >= 0 else -normal
+
+
+def _angle(x: Tensor, y: Tensor) -> str:
+    cos = float(x @ y) / max(float(x.norm() * y.norm()), 1e-300)
+    return f"{math.degrees(math.acos(max(-1.0, min(1.0, cos)))):.2f} degrees"
+
 
 # How far points are off one line at most, as a share of its length.
 ON_ONE_LINE = 1e-6
@@ -66,23 +220,30 @@ class VoxelGrid:
         size: int | Sequence[int] | None = None,
         extent: float | Numbers | None = None,
     ) -> VoxelGrid:
-        """Planes at ``depths`` (Z,) metres before the wall of a scan, parallel to it, along its rows and columns.
+        """Make planes before the wall of a scan, parallel to it, along its rows and columns.
 
         Without ``size`` and ``extent`` a voxel stands before each sensor point of a flat, regular grid, which is what
-        :class:`PhasorField` takes at its fastest. ``size``: (X, Y) voxels or one number for both, None for as many as
-        sensor points; ``extent``: (width, height) of the planes in metres from the outer edges of the voxels, or one
-        number for both, around the middle of the sensor points; None for what the sensor points fill, each with a cell
-        of its own around it. The planes of a curved wall are parallel to its mean plane, depths count from the mean of
-        its points. Of a list of points that knows no wall, planes lie across its mean normal, without normals along the
-        plane that fits the points best (of points on one line: across the way to the sensor); columns run upwards,
-        along the world's y as far as it lies in them (z where the wall lies flat).
-
-        Raises ShapeError where size and extent are missing and the wall is not flat or the points are a list, where
-        the sensor of a list without normals stands on its one line, and for sizes that are none; UnitError for depths
-        that do not increase; SceneError where points on one line, or one point, do not say an extent.
+        :class:`PhasorField` takes at its fastest. The planes of a curved wall are parallel to its mean plane, depths
+        count from the mean of its points. Planes of a list of points that knows no wall lie across its mean normal,
+        without normals along the plane that fits the points best (of points on one line: across the way to the sensor);
+        columns run upwards, along the world's y as far as it lies in them (z where the wall lies flat).
 
         Before the wall is where its normals point. A scan that knows none has its voxels where its sensor and its laser
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
+
+        Args:
+            scan: of any kind.
+            depths: (Z,) metres before the wall, increasing.
+            size: (X, Y) voxels or one number for both, None for as many as sensor points.
+            extent: (width, height) of the planes in metres from the outer edges of the voxels, or one number for both,
+                around the middle of the sensor points; None for the area of the sensor points, each with a cell of its
+                own around it.
+
+        Raises:
+            ShapeError: where size and extent are missing and the wall is not flat or the points are a list, where the
+                sensor of a list without normals stands on its one line, and for other sizes.
+            UnitError: for depths that do not increase.
+            SceneError: where points on one line, or one point, do not say an extent.
         """
         of_class("VoxelGrid.before: scan", scan, Scan, error=ShapeError)
         depths = checked_depths(depths, "VoxelGrid.before")
@@ -120,7 +281,15 @@ class VoxelGrid:
 
     @classmethod
     def of_wall(cls, wall: PlanarScan, depths: Any) -> VoxelGrid:
-        """A voxel before each point of a regular grid, at each of ``depths`` (Z,) metres. Raises as the class."""
+        """Make a voxel before each point of a regular grid, at each depth.
+
+        Args:
+            wall: the grid.
+            depths: (Z,) metres, increasing.
+
+        Raises:
+            ShapeError, UnitError: as the class.
+        """
         return cls(
             depths,
             wall.size,
@@ -133,10 +302,14 @@ class VoxelGrid:
 
     @classmethod
     def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
-        """Voxels that fill the box ``bounds`` (2, 3), its lowest and highest corner in world coordinates, metres.
+        """Make voxels that fill a box: the middles of equal cells, rows along y, columns along x, planes along z.
 
-        ``size``: (X, Y, Z) voxels, or one number for the three. Rows run along y, columns along x, planes along z;
-        voxels are the middles of equal cells. Raises ShapeError and UnitError.
+        Args:
+            bounds: (2, 3), the lowest and highest corner in world coordinates, metres.
+            size: (X, Y, Z) voxels, or one number for the three.
+
+        Raises:
+            ShapeError, UnitError: for other bounds and sizes.
         """
         low, high = bounds_of(bounds, "VoxelGrid.bounds")
         sizes = [count("VoxelGrid.bounds: size", n) for n in _numbers("VoxelGrid.bounds: size (X, Y, Z)", size, 3)]
@@ -150,12 +323,12 @@ class VoxelGrid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(Z, Y, X)."""
+        """Number of voxels (Z, Y, X)."""
         return (len(self.depths), *self.size)
 
     @property
     def points(self) -> Tensor:
-        """(Z, Y, X, 3) float64 on the CPU: the voxels in world coordinates, metres."""
+        """Voxels in world coordinates, (Z, Y, X, 3) float64 on the CPU, metres."""
         j, i = (torch.arange(n, dtype=torch.float64, device="cpu") for n in self.size)
         plane = self.first + (j[:, None, None] * self.pitch[0]) * self.along_y
         plane = plane + (i[None, :, None] * self.pitch[1]) * self.along_x
@@ -163,11 +336,18 @@ class VoxelGrid:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """(width, height) of a plane from the outer edges of its voxels, metres."""
+        """Size (width, height) of a plane from the outer edges of its voxels, metres."""
         return self.size[1] * self.pitch[1], self.size[0] * self.pitch[0]
 
     def at_depths(self, depths: Any) -> VoxelGrid:
-        """The grid with other planes. Raises ShapeError and UnitError."""
+        """Return the grid with other planes.
+
+        Args:
+            depths: (Z,) metres, increasing.
+
+        Raises:
+            ShapeError, UnitError: for other depths.
+        """
         return replace(self, depths=depths)
 
     def __eq__(self, other: object) -> bool:
@@ -187,7 +367,16 @@ class VoxelGrid:
 
 
 def checked_depths(values: Any, who: str) -> Tensor:
-    """Depths (Z,) of planes, float64 on the CPU. Raises ShapeError and UnitError."""
+    """Return depths of planes, float64 on the CPU.
+
+    Args:
+        values: (Z,) metres, a tensor, an array or a list.
+        who: begins the message.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for depths that are not finite or do not increase.
+    """
     plain = real_array(values)
     if plain is None or plain.ndim != 1 or len(plain) == 0:
         raise ShapeError(f"{who}: expected depths (Z,) in metres, got {shown(values)}.")
@@ -248,3 +437,98 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     along_y = y / y.norm()
     normal = torch.linalg.cross(along_x, along_y)
     return along_x, along_y, hidden_side(scan, normal)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HiddenVolume(TensorRecord):
+    """A hidden volume as a record of tensors: the result of a method, its voxels, and its settings.
+
+    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
+    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
+    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and the reason for it, plain
+    data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
+
+    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
+    values and directions; grid and times stay on the CPU, and are the same in a batch.
+
+    Raises:
+        ShapeError: where tensors and grid do not fit.
+        UnitError: for times that are not finite.
+        StorageError: for metadata that is not plain.
+    """
+
+    notes: ClassVar[tuple[str, ...]] = ("metadata",)
+
+    values: Tensor
+    grid: VoxelGrid
+    method: str
+    _: KW_ONLY
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    times: Tensor | None = None
+    directions: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        _check_volume(self)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Values and directions."""
+        return {name: tensor for name, tensor in super().tensors().items() if name != "times"}
+
+    def _settings(self) -> dict[str, Any]:
+        # One by one: torch 2.6 makes no list inside of `torch.func.grad`.
+        times = None if self.times is None else tuple(time.item() for time in self.times.unbind())
+        return {**super()._settings(), "times": times}
+
+    @classmethod
+    def merged_notes(cls, records: Sequence[HiddenVolume]) -> dict[str, Any]:
+        return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
+
+    def _shown(self) -> dict[str, str]:
+        frames = {} if self.times is None else {"times": f"{len(self.times)} of them"}
+        return {**{name: text for name, text in super()._shown().items() if name != "times"}, **frames}
+
+    def picture(self) -> Tensor:
+        """(Z, Y, X): the first item of a batch, summed over its channels; of a film the highest value of all times."""
+        per_item = 4 if self.times is None else 5
+        values = self.values.detach()
+        while values.ndim > per_item:
+            values = values[0]
+        together = summed(values, 0)
+        return together if self.times is None else together.amax(0)
+
+
+def _check_volume(volume: HiddenVolume) -> None:
+    """Raise ShapeError unless values, times and directions are real and fit the grid and each other."""
+    if not isinstance(volume.grid, VoxelGrid):
+        raise ArgumentError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(volume.grid)}.")
+    frames = () if volume.times is None else _frames(volume.times)
+    _check_values("values", volume.values, (*frames, *volume.grid.shape))
+    if volume.directions is not None:
+        _check_values("directions", volume.directions, (3, *volume.grid.shape))
+        items = tuple(volume.values.shape[: -3 - len(frames)])
+        if tuple(volume.directions.shape[:-4]) != items:
+            sizes = ", ".join(map(str, (*items, 3, *volume.grid.shape)))
+            raise ShapeError(
+                f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
+                f"{tuple(volume.directions.shape)}."
+            )
+    if not isinstance(volume.method, str) or "\0" in volume.method:
+        raise ArgumentError(f"HiddenVolume: expected method as a name, got {shown(volume.method)}.")
+    metadata_text(volume.metadata, "HiddenVolume")
+
+
+def _frames(times: Any) -> tuple[int]:
+    if not isinstance(times, Tensor) or times.ndim != 1 or times.is_complex():
+        got = f"{tuple(times.shape)} {times.dtype}" if isinstance(times, Tensor) else shown(times)
+        raise ShapeError(f"HiddenVolume: expected times as a tensor (N,) of real numbers, got {got}.")
+    if not bool(torch.isfinite(times).all()):
+        raise UnitError("HiddenVolume: expected finite times in metres of optical path, got some that are not.")
+    return (len(times),)
+
+
+def _check_values(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
+    fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
+    if not fits or tensor.is_complex() or tensor.dtype == torch.bool or tensor.numel() == 0:
+        got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
+        sizes = ", ".join(map(str, shape))
+        raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")

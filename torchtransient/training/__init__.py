@@ -2,10 +2,10 @@
 
 from torchtransient.training.accumulation import accumulate as accumulate
 from torchtransient.training.batches import Batches as Batches
+from torchtransient.training.batches import Ranks as Ranks
+from torchtransient.training.batches import ranks as ranks
+from torchtransient.training.batches import worker_init as worker_init
 from torchtransient.training.checkpoint import Checkpoint as Checkpoint
 from torchtransient.training.checkpoint import load_checkpoint as load_checkpoint
 from torchtransient.training.checkpoint import save_checkpoint as save_checkpoint
-from torchtransient.training.processes import Ranks as Ranks
-from torchtransient.training.processes import ranks as ranks
-from torchtransient.training.processes import worker_init as worker_init
 from torchtransient.training.seeds import Seeds as Seeds

@@ -35,15 +35,18 @@ def accumulate(
         loss = tt.training.accumulate(lambda view: loss_fn(renderer({POSE: poses[view]}), measured[view]), range(8))
         optimizer.step()
 
-    ``loss_of``: gives a scalar tensor. ``parts``: any iterable that ends. ``weights``: one for each part; None takes
-    1 / number of parts, which gives the gradient of a mean over parts of one size. Parts of other sizes of a mean over
-    samples: ``[len(p) / total ...]``.
-    ``model``: a DistributedDataParallel, whose ranks exchange gradients once, at the last part, instead of at each one.
-    ``scaler``: scales losses before they are differentiated; the sum that is returned is not scaled.
+    Args:
+        loss_of: function of a part that returns a scalar tensor.
+        parts: any iterable that ends.
+        weights: one for each part; None takes 1 / number of parts, which gives the gradient of a mean over parts of one
+            size. Parts of other sizes of a mean over samples: ``[len(p) / total ...]``.
+        model: a DistributedDataParallel, whose ranks exchange gradients once, at the last part, instead of at each one.
+        scaler: scales losses before they are differentiated; the sum that is returned is not scaled.
 
-    Raises ShapeError for no parts, weights that do not match them and losses that are no scalars, UnitError for weights
-    that are not finite, GradientError for a loss without a gradient. Nothing has been differentiated then, except by
-    parts that came before the wrong loss.
+    Raises:
+        ShapeError: for no parts, weights that do not match them and losses that are no scalars.
+        UnitError: for weights that are not finite.
+        GradientError: for a loss without a gradient. Nothing has been differentiated then, except by parts before it.
     """
     try:
         each = iter(parts)

@@ -1,18 +1,192 @@
-"""Which samples are learnt from at which step: a function of the step, the same for any number of ranks."""
+"""Processes of a training, and the share of the batches that each one takes."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import KW_ONLY, dataclass, field
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
-from torchtransient.checks import by_number, count, flag, shown
-from torchtransient.errors import StorageError, UnitError
-from torchtransient.training.processes import worker_init
+from torchtransient.checks import as_number, by_number, count, flag, is_one_of, positive, shown
+from torchtransient.errors import DeviceError, StorageError, UnitError
+
+_TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The rank of this process in a run.
+
+    ``rank``: its number of ``size``; ``local``: its number on this machine of ``local_size``. ``device``: of its
+    tensors. ``variant_prefix``: beginning of the names of Mitsuba variants that compute there.
+    """
+
+    rank: int = 0
+    size: int = 1
+    _: KW_ONLY
+    local: int = 0
+    local_size: int = 1
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @property
+    def is_first(self) -> bool:
+        """True for the rank that prints and writes."""
+        return self.rank == 0
+
+    @property
+    def variant_prefix(self) -> str:
+        """"llvm_ad_" or "cuda_ad_"."""
+        return "cuda_ad_" if self.device.type == "cuda" else "llvm_ad_"
+
+    def mean(self, value: float) -> float:
+        """Return the mean of a number over all ranks, which all have to call this.
+
+        Args:
+            value: of this rank.
+
+        Raises:
+            UnitError: for other values than one number.
+        """
+        number = as_number(value)
+        if number is None:
+            raise UnitError(f"ranks: expected one number to take the mean of, got {shown(value)}.")
+        if self.size == 1:
+            return number
+        total = torch.tensor(number, dtype=torch.float64, device=self.device)
+        dist.all_reduce(total)
+        return float(total) / self.size
+
+    def wait(self) -> None:
+        """Go on when all ranks have come here: after the first one has written what the others read."""
+        if self.size > 1:
+            dist.barrier()
+
+
+@contextmanager
+def ranks(
+    device: str = "cpu", *, threads: int | None = None, backend: str | None = None, timeout_s: float = 1800.0
+) -> Iterator[Ranks]:
+    """Join the process group of `torchrun`, and leave it at the end; without torchrun, one rank and no group. ::
+
+        with tt.training.ranks() as ranks:                    # torchrun --nproc-per-node 2 train.py
+            model = DistributedDataParallel(model) if ranks.size > 1 else model
+
+    Args:
+        device: "cpu" (group "gloo") or "cuda" (group "nccl", one device a rank). Dr.Jit computes on the first device
+            that the process can see and has no choice of others, so that with "cuda" every rank is shown its own alone
+            (CUDA_VISIBLE_DEVICES): call this before anything has used CUDA, in torch or in a variant of Mitsuba.
+        threads: of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares the cores of the
+            machine among its ranks. They come back to their number before.
+        backend: instead of gloo and nccl.
+        timeout_s: seconds that a rank waits for the others.
+
+    Raises:
+        UnitError: for other devices, threads and broken settings of torchrun.
+        DeviceError: for "cuda" where there is none, or where it is in use already.
+    """
+    from torchtransient.rendering.threads import threads as set_threads
+
+    if not is_one_of(device, ("cpu", "cuda")):
+        raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {shown(device)}.")
+    timeout_s = positive("ranks: timeout_s", timeout_s)
+    found = _found(device)
+    if device == "cuda":
+        _take_device(found)
+    several = found.size > 1
+    with set_threads(threads if threads is not None else max(1, _cores() // found.local_size)):
+        if several:
+            kind = backend or ("nccl" if device == "cuda" else "gloo")
+            _join(kind, timeout_s)
+        try:
+            yield found
+        finally:
+            if several and dist.is_initialized():
+                dist.destroy_process_group()
+
+
+def worker_init(worker: int) -> None:
+    """Let a process of a DataLoader compute with one thread, of torch and of Dr.Jit: ``worker_init_fn=worker_init``.
+
+    For data sets that render. Those processes have to be spawned, since Dr.Jit does not survive a fork
+    (``multiprocessing_context="spawn"``), and are worth keeping (``persistent_workers=True``): they compile anew.
+
+    Args:
+        worker: number of the process, unused.
+    """
+    from torchtransient.rendering.threads import threads as set_threads
+
+    set_threads(1)
+
+
+def _join(kind: str, timeout_s: float) -> None:
+    if dist.is_initialized():
+        raise DeviceError("ranks: this process is in a group already, which it would leave at the end; open one.")
+    try:
+        dist.init_process_group(kind, timeout=timedelta(seconds=timeout_s))
+    except ValueError as error:
+        raise UnitError(f"ranks: the group cannot be joined: {error}. Start the script with torchrun.") from error
+
+
+def _found(device: str) -> Ranks:
+    given = {name: os.environ[name] for name in _TORCHRUN if name in os.environ}
+    if not given:
+        return Ranks(device=torch.device(device))
+    if len(given) < len(_TORCHRUN):
+        missing = ", ".join(name for name in _TORCHRUN if name not in given)
+        raise UnitError(f"ranks: {', '.join(given)} are set and {missing} not; start the script with torchrun.")
+    least = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
+    rank, size, local, local_size = (
+        count(f"ranks: {name}", _whole(given[name]), least[name], UnitError) for name in _TORCHRUN
+    )
+    if rank >= size or local >= local_size:
+        raise UnitError(
+            f"ranks: expected RANK below WORLD_SIZE and LOCAL_RANK below LOCAL_WORLD_SIZE, got {rank} of {size} and "
+            f"{local} of {local_size}; start the script with torchrun."
+        )
+    return Ranks(rank, size, local=local, local_size=local_size, device=torch.device(device))
+
+
+def _whole(text: str) -> int | str:
+    return int(text) if text.isdecimal() else text
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _take_device(found: Ranks) -> None:
+    """Show this process one device."""
+    mitsuba = sys.modules.get("mitsuba")
+    variant = None if mitsuba is None else mitsuba.variant()
+    in_use = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    if in_use or (variant or "").startswith("cuda"):
+        if found.local_size == 1:
+            return
+        raise DeviceError(
+            "ranks: expected to choose the device of this rank before anything uses CUDA, but torch or Mitsuba does "
+            "already. Open `with tt.training.ranks('cuda')` first."
+        )
+    if found.local_size > 1:
+        seen = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        names = seen.split(",") if seen else [str(n) for n in range(found.local_size)]
+        if found.local >= len(names):
+            raise DeviceError(
+                f"ranks: {found.local_size} ranks on this machine and {len(names)} devices in "
+                f"CUDA_VISIBLE_DEVICES={seen!r}; start as many ranks as devices."
+            )
+        os.environ["CUDA_VISIBLE_DEVICES"] = names[found.local]
+    if not torch.cuda.is_available():
+        raise DeviceError("ranks: expected a CUDA device, torch finds none. Use device='cpu'.")
+
 
 _WHAT = "Batches"
 # What these batches say themselves to a DataLoader.
@@ -23,23 +197,28 @@ class Batches(Sampler[list[int]]):
     """Numbers of the samples of every step, without an end; :meth:`loader` reads them.
 
     Samples come in an order that is shuffled anew in every epoch; a batch may begin in one epoch and end in the next,
-    so that all batches have one size and no sample is left out. ``batch_size`` is that of all ranks together: at each
-    step rank r of n reads the r-th n-th of it. Runs of 1 and of 2 ranks learn from the same samples at the same step.
+    so that all batches have one size and no sample is left out. At each step rank r of n reads the r-th n-th of the
+    batch. Runs of 1 and of 2 ranks learn from the same samples at the same step.
 
-    The order depends on ``seed``, ``size`` and the number of samples before it alone. :attr:`step` is the position:
-    what the next iterator begins with. A loop that counts its steps sets it when it goes on; iterators, which prefetch,
-    do not change it. A second iterator, or a state, that would repeat what an iterator has given since the position was
-    set is a StorageError: set it, to the same number where that is meant. ::
+    The order depends on ``seed``, ``size`` and the number of samples before it alone. :attr:`step` is the position of
+    the next iterator. A loop that counts its steps sets it when it goes on; iterators, which prefetch, do not change
+    it. A second iterator, or a state, that would repeat batches which an iterator has given since the position was set
+    is a StorageError: set it, to the same number where that is meant. ::
 
         batches = tt.training.Batches(len(data), 32, seed=0, rank=ranks.rank, world_size=ranks.size)
         batches.step = first
         for step, batch in zip(range(first, last), batches.loader(data)):
             ...
 
-    ``size``: samples of the data set, which is map-style. ``shuffle=False``: in their order. ``step`` may be set at any
-    time before an iterator is made. Raises UnitError for numbers that cannot be used, ArgumentError for what is no data
-    set, StorageError for a state of
-    another order and a position that was left behind.
+    Args:
+        size: samples of the data set, which is map-style.
+        batch_size: of all ranks together.
+        seed: of the order.
+        shuffle: False keeps the order of the data set.
+        rank, world_size: of this process.
+
+    Raises:
+        UnitError: for numbers that cannot be used.
     """
 
     def __init__(
@@ -64,7 +243,7 @@ class Batches(Sampler[list[int]]):
 
     @property
     def step(self) -> int:
-        """The step that the next iterator begins with."""
+        """Step of the next iterator; may be set at any time before one is made."""
         return self._step
 
     @step.setter
@@ -73,27 +252,46 @@ class Batches(Sampler[list[int]]):
         self._is_left = False
 
     def places(self, step: int) -> list[int]:
-        """Where this rank's samples stand in the batch of all ranks, from 0 on: for ``Seeds`` where the same number may
-        come twice in a step (a batch over the end of an epoch, data sets of several folders).
+        """Return the places of this rank's samples in the batch of all ranks, from 0 on.
+
+        For ``Seeds`` where the same number may come twice in a step (a batch over the end of an epoch, data sets of
+        several folders).
+
+        Args:
+            step: number of the step.
         """
         count(f"{_WHAT}: step", step, 0, UnitError)
         part = self.batch_size // self.world_size
         return list(range(self.rank * part, (self.rank + 1) * part))
 
     def samples(self, step: int) -> list[int]:
-        """What this rank reads at a step."""
+        """Return the numbers of this rank's samples at a step.
+
+        Args:
+            step: number of the step.
+        """
         number, part = count(f"{_WHAT}: step", step, 0, UnitError), self.batch_size // self.world_size
         first = number * self.batch_size + self.rank * part
         return [self._sample(n) for n in range(first, first + part)]
 
     def loader(self, data: Dataset[Any], *, workers: int = 0, renders: bool = False, **options: Any) -> DataLoader[Any]:
-        """A DataLoader of these batches, which takes nothing from torch's own generator: an iterator of others draws
-        from it, so that a run that is resumed would have other random numbers than one that was not.
+        """Make a DataLoader of these batches, which takes nothing from torch's own generator.
 
-        ``workers``: processes that read. ``renders``: whether the data set renders; they are spawned then, and have one
-        thread each (:func:`worker_init`). What they draw from their own generators depends on the seed of these
-        batches, the rank, and the position at which the loader was made, and begins anew with each iterator: give noise
-        a seed of its own, as ``TransientDataset(seed=)`` does. ``options``: others of the DataLoader. Raises UnitError.
+        An iterator of other loaders draws from it, so that a run that is resumed would have other random numbers than
+        one that was not.
+
+        Args:
+            data: map-style data set of ``size`` samples.
+            workers: processes that read. Their own generators depend on the seed of these batches, the rank, and the
+                position at which the loader was made, and begin anew with each iterator: give noise a seed of its own,
+                as ``TransientDataset(seed=)`` does.
+            renders: True for a data set that renders; processes are spawned then, and have one thread each
+                (:func:`worker_init`).
+            options: others of the DataLoader.
+
+        Raises:
+            UnitError: for streams, data sets of another size, and options that the batches set.
+            ArgumentError: for other objects than data sets.
         """
         processes = count(f"{_WHAT}: workers", workers, 0, UnitError)
         if isinstance(data, IterableDataset):
@@ -115,7 +313,11 @@ class Batches(Sampler[list[int]]):
         return DataLoader(data, batch_sampler=self, num_workers=processes, **{**own, **options})
 
     def epoch(self, step: int) -> float:
-        """How many times the data set has been gone through when a step begins."""
+        """Return the number of passes over the data set before a step.
+
+        Args:
+            step: number of the step.
+        """
         return count(f"{_WHAT}: step", step, 0, UnitError) * self.batch_size / self.size
 
     def __iter__(self) -> Iterator[list[int]]:
@@ -127,17 +329,28 @@ class Batches(Sampler[list[int]]):
             step += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Position and order; the number of ranks is no part of it."""
+        """Return position and order; the number of ranks is no part of it."""
         self._check_position("a state")
         return {"step": self._step, **self._order()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Raises StorageError where samples would come in another order than that of the state."""
+        """Put the position of a state back.
+
+        Args:
+            state: of :meth:`state_dict`.
+
+        Raises:
+            StorageError: where samples would come in another order than that of the state.
+        """
         self.check_state_dict(state)
         self.step = state["step"]
 
     def check_state_dict(self, state: dict[str, Any]) -> None:
-        """Raise what :meth:`load_state_dict` would, and change nothing."""
+        """Raise the errors of :meth:`load_state_dict`, and change nothing.
+
+        Args:
+            state: of :meth:`state_dict`.
+        """
         if not isinstance(state, dict):
             raise StorageError(f"{_WHAT}: expected a state as of state_dict(), got {shown(state)}.")
         order = {name: value for name, value in state.items() if name != "step"}
@@ -155,7 +368,7 @@ class Batches(Sampler[list[int]]):
             )
 
     def _of_workers(self) -> torch.Generator:
-        """Of the seeds of a loader's processes: others in each rank, and after a run has gone on."""
+        """Generator of the seeds of a loader's processes: another in each rank, and after a run has gone on."""
         key = np.random.SeedSequence([self.seed, self.rank, self._step]).generate_state(1, np.uint64)[0]
         return torch.Generator().manual_seed(int(key >> np.uint64(1)))
 

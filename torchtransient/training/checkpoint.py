@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import pickle
+import random
 import warnings
 import zipfile
+from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
@@ -13,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import nn
@@ -28,9 +31,229 @@ from torchtransient.errors import (
     TorchTransientWarning,
     UnitError,
 )
-from torchtransient.training.optimizer_states import check_optimizer, kind_of, put_back_optimizer
-from torchtransient.training.plain_state import plain
-from torchtransient.training.random_states import check_random_state, random_state, set_random_state
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, torch.Size, torch.dtype, torch.device)
+
+# Kinds of numbers that torch has, in any order of their bytes.
+_ARRAYS = [np.dtype(kind) for kind in ("?", "i1", "u1")]
+_ARRAYS += [np.dtype(order + kind + size) for order in "<>" for kind in "iu" for size in "248"]
+_ARRAYS += [np.dtype(order + kind) for order in "<>" for kind in ("f2", "f4", "f8", "c8", "c16")]
+
+
+def plain(value: Any, where: str) -> Any:
+    """Return a state as plain data: mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch.
+
+    Args:
+        value: of any kind; tensors are detached.
+        where: its place, for the message.
+
+    Raises:
+        StorageError: for objects that are no data, with their place.
+    """
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, torch.Tensor) and is_lazy(value):
+        raise StorageError(f"save_checkpoint: {where} has no shape yet: run the lazy module once before.")
+    if isinstance(value, torch.Tensor):
+        return value.detach()
+    if isinstance(value, np.generic) and type(value.item()) in _PLAIN:
+        return value.item()
+    if isinstance(value, np.ndarray) and value.dtype in _ARRAYS:
+        return torch.from_numpy(value.astype(value.dtype.newbyteorder("="), copy=True))
+    if isinstance(value, Mapping):
+        items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
+        return _ordered(value, items, where) if isinstance(value, OrderedDict) else items
+    if type(value) in (list, tuple, set, frozenset):
+        entries = [plain(entry, f"{where}[{n}]") for n, entry in enumerate(value)]
+        return entries if type(value) is list else set(entries) if type(value) in (set, frozenset) else tuple(entries)
+    raise StorageError(
+        f"save_checkpoint: {where} is a {type(value).__name__}, expected data: numbers, texts, tensors, lists, "
+        "dictionaries. Anything else would have to be executed when it is read."
+    )
+
+
+def _ordered(value: OrderedDict[Any, Any], items: dict[Any, Any], where: str) -> OrderedDict[Any, Any]:
+    """With the versions of modules, by which they convert what older ones have written."""
+    made = OrderedDict(items)
+    if hasattr(value, "_metadata"):
+        made._metadata = plain(value._metadata, f"{where}._metadata")  # type: ignore[attr-defined]
+    return made
+
+
+def _key(key: Any, where: str) -> Any:
+    if type(key) in (str, int, bool, float, bytes, type(None)):
+        return key
+    if isinstance(key, tuple):
+        return tuple(_key(entry, where) for entry in key)
+    raise StorageError(f"save_checkpoint: a key of {where} is a {type(key).__name__}, expected a text or a number.")
+
+
+def random_state() -> dict[str, Any]:
+    """Return the states of the generators of Python, NumPy (the legacy one of the process), torch and its CUDA devices.
+    """
+    numpy = np.random.get_state(legacy=False)  # noqa: NPY002 (others draw from it)
+    assert isinstance(numpy, dict)
+    version, words, gauss = random.getstate()
+    found = {
+        "python": {"version": version, "words": list(words), "gauss": gauss},
+        "numpy": {
+            "bit_generator": numpy["bit_generator"],
+            "key": torch.from_numpy(numpy["state"]["key"].astype(np.int64)),
+            "pos": int(numpy["state"]["pos"]),
+            "has_gauss": int(numpy["has_gauss"]),
+            "gauss": float(numpy["gauss"]),
+        },
+        "torch": torch.get_rng_state(),
+    }
+    if torch.cuda.is_available():
+        found["cuda"] = torch.cuda.get_rng_state_all()
+    return found
+
+
+def check_random_state(state: Any) -> None:
+    """Check a state of generators, and change nothing.
+
+    Args:
+        state: of :func:`random_state`.
+
+    Raises:
+        StorageError: for a state of another number of CUDA devices, and other objects.
+    """
+    lacking = [name for name in ("python", "numpy", "torch") if not isinstance(state, dict) or name not in state]
+    if lacking:
+        raise StorageError(f"load_checkpoint: its random numbers lack those of {', '.join(lacking)}.")
+    devices = len(state.get("cuda", ()))
+    here = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if devices != here:
+        raise StorageError(
+            f"load_checkpoint: its random numbers are of {devices} CUDA devices, here are {here}. Use as many, or "
+            "leave them alone with random=False."
+        )
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Put the states of all generators back.
+
+    Args:
+        state: of :func:`random_state`.
+
+    Raises:
+        StorageError: as `check_random_state`, and for broken states.
+    """
+    check_random_state(state)
+    devices = len(state.get("cuda", ()))
+    try:
+        python, numpy = state["python"], state["numpy"]
+        words = tuple(python["words"])
+        key = numpy["key"].numpy().astype(np.uint32)
+        random.setstate((python["version"], words, python["gauss"]))
+        legacy = (numpy["bit_generator"], key, numpy["pos"], numpy["has_gauss"], numpy["gauss"])
+        np.random.set_state(legacy)  # noqa: NPY002
+        torch.set_rng_state(state["torch"])
+        if devices:
+            torch.cuda.set_rng_state_all(state["cuda"])
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise StorageError(f"load_checkpoint: its random numbers cannot be used: {error}") from error
+
+
+# Entries of torch's optimisers that have the shape of their parameter.
+_OF_SHAPE = (
+    "exp_avg", "exp_avg_sq", "max_exp_avg_sq", "exp_inf", "momentum_buffer", "square_avg", "grad_avg", "sum",
+    "acc_delta", "ax", "prev",
+)  # fmt: skip
+
+
+def kind_of(optimizer: torch.optim.Optimizer) -> str:
+    """Return the name of an optimiser's class, with the module.
+
+    Args:
+        optimizer: of torch.
+    """
+    return f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
+
+
+def put_back_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Load a state that was checked.
+
+    Entries that schedules and callers keep in groups, and the state lacks, stay as they are here: torch would delete
+    them, and some schedules fail without them at their next step.
+
+    Args:
+        optimizer: of torch.
+        state: of its ``state_dict``.
+    """
+    groups = [
+        {**{key: value for key, value in own.items() if key not in group and _is_added(optimizer, key)}, **group}
+        for own, group in zip(optimizer.param_groups, state["param_groups"], strict=True)
+    ]
+    optimizer.load_state_dict({**state, "param_groups": groups})
+
+
+def check_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, state: Any, kind: Any, is_same_torch: bool
+) -> None:  # fmt: skip
+    """Check a state of an optimiser, and change nothing.
+
+    Args:
+        name: of the part.
+        optimizer: of torch.
+        state: to be loaded.
+        kind: :func:`kind_of` the optimiser that has written it, None if unknown.
+        is_same_torch: True for a state of the same torch; others may have other settings.
+
+    Raises:
+        StorageError, ShapeError: for a state of another kind, or of other groups, settings or shapes.
+    """
+    groups = state.get("param_groups") if isinstance(state, dict) else None
+    entries = state.get("state") if isinstance(state, dict) else None
+    if not isinstance(groups, list) or not isinstance(entries, dict):
+        raise StorageError(f"load_checkpoint: the part {name!r} is no state of an optimiser.")
+    if kind is not None and not _is_same_kind(kind, kind_of(optimizer)):
+        raise StorageError(
+            f"load_checkpoint: the state of {name!r} is of another kind of optimiser, {shown(kind)}; here is "
+            f"{kind_of(optimizer)!r}."
+        )
+    here = [len(group["params"]) for group in optimizer.param_groups]
+    there = [len(group["params"]) for group in groups]
+    if here != there:
+        raise StorageError(
+            f"load_checkpoint: {name!r} has groups of {there} parameters in the file, here of {here}: make the "
+            "optimiser of the same parameters, in the same order."
+        )
+    for own, group in zip(optimizer.param_groups, groups, strict=True):
+        lacks = sorted(key for key in own.keys() - group.keys() if not _is_added(optimizer, key))
+        if is_same_torch and lacks:
+            raise StorageError(
+                f"load_checkpoint: the state of {name!r} is of another kind of optimiser, it lacks {', '.join(lacks)}; "
+                f"here is {type(optimizer).__name__}."
+            )
+        for parameter, number in zip(own["params"], group["params"], strict=True):
+            for entry, value in entries.get(number, {}).items():
+                wrong = isinstance(value, torch.Tensor) and entry in _OF_SHAPE and value.shape != parameter.shape
+                # Of what torch keeps of complex numbers as pairs, and of lazy parameters, nothing is known yet.
+                if wrong and not parameter.is_complex() and not torch.nn.parameter.is_lazy(parameter):
+                    raise ShapeError(
+                        f"load_checkpoint: {entry!r} of parameter {number} of {name!r}: expected shape "
+                        f"{tuple(parameter.shape)}, the file has {tuple(value.shape)}."
+                    )
+
+
+def _is_same_kind(there: Any, here: str) -> bool:
+    """Modules count by their package: within it they move from version to version. A script's own class is of the
+    module `__main__` when it is run, and of another one when it is imported.
+    """
+    if not isinstance(there, str):
+        return False
+    packages = {kind.partition(".")[0] for kind in (there, here)}
+    return there.rpartition(".")[2] == here.rpartition(".")[2] and (len(packages) == 1 or "__main__" in packages)
+
+
+def _is_added(optimizer: torch.optim.Optimizer, key: str) -> bool:
+    """Return True for an entry of groups that is none of the optimiser's own settings, such as a schedule's
+    ``initial_lr``.
+    """
+    return key != "params" and key not in optimizer.defaults
+
 
 _FORMAT, _VERSION = "torchtransient checkpoint", 1
 _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries")
@@ -38,10 +261,10 @@ _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint says beside the states of its parts.
+    """Contents of a checkpoint beside the states of its parts.
 
     ``step``: the number of steps that are done, which is the step to go on with. ``values``: as they were given.
-    ``libraries``: versions that wrote it, by name. ``ranks``: how many processes.
+    ``libraries``: versions that wrote it, by name. ``ranks``: number of processes.
     """
 
     step: int
@@ -59,19 +282,25 @@ def save_checkpoint(
         parts = {"model": model, "optimizer": optimizer, "schedule": schedule, "batches": batches, "noise": generator}
         tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
 
-    ``parts``: by name, whatever has ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
-    GradScaler, :class:`Batches`), and generators of torch. What DistributedDataParallel or ``torch.compile`` has
-    wrapped is stored as what it was, so that the checkpoint can be read with and without. ``step``: steps that are
-    done. ``values``: plain data (numbers, texts, tensors, lists, dictionaries) that come back. Beside them: the random
-    numbers of Python, NumPy, torch and CUDA of this process, and versions of libraries.
+    Beside parts and values it holds the random numbers of Python, NumPy, torch and CUDA of this process, and versions
+    of libraries. Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a
+    run is killed, ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and
+    the first one writes; parts are its own, random numbers and generators those of every rank.
 
-    Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a run is killed,
-    ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and the first one
-    writes; parts are its own, random numbers and generators those of every rank.
+    Args:
+        path: of the file.
+        parts: by name, objects with ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
+            GradScaler, :class:`Batches`), and generators of torch. Modules inside of DistributedDataParallel or
+            ``torch.compile`` are stored without them, so that the checkpoint can be read with and without.
+        step: number of steps that are done.
+        values: plain data (numbers, texts, tensors, lists, dictionaries) that come back.
 
-    Not in it: what the network's data come from beyond their position, buffers that modules do not put into their
-    state, and attributes. Raises StorageError for parts without a state, for states that could not be read without
-    executing something, and where nothing can be written.
+    Raises:
+        StorageError: for states that could not be read without executing something, and where nothing can be written.
+        ArgumentError: for parts without a state.
+
+    Not in it: the source of the network's data beyond their position, buffers that modules do not put into their state,
+    and attributes.
     """
     place = path_of(path, "save_checkpoint")
     failure: str | None = "its parts or values are no state; see its own error."
@@ -99,19 +328,24 @@ def save_checkpoint(
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
     """Put the state of a run back into its parts, and return the step to go on with.
 
-    ``parts``: those of :func:`save_checkpoint`, made anew, under the same names. ``random``: whether the random numbers
-    of this process are put back, which takes as many ranks as have written it; with False, and all draws made by
-    :class:`Seeds`, the number of ranks may change.
-
     A run that was stopped and goes on ends with the same weights as one that was not, to the bit, where a step depends
     on parts, random numbers and step alone, and sums are added in the same order: same libraries and machine,
     ``tt.threads(1)``. Other libraries are warned of (TorchTransientWarning).
 
     Nothing in the file is executed (``weights_only``), and nothing is changed before the whole file has been checked:
-    its sums, format, names of parts, names and shapes of the tensors of modules, kind, groups, settings and moments
-    of optimisers, order of :class:`Batches` (of other parts: what their ``check_state_dict(state)`` raises, if they
-    have one). What a part still refuses afterwards is an error that says so. Every rank reads it. Raises StorageError
-    for a file that is not there, torn, or something else; ShapeError for tensors of other shapes.
+    its sums, format, names of parts, names and shapes of the tensors of modules, kind, groups, settings and moments of
+    optimisers, order of :class:`Batches` (of other parts: the errors of their ``check_state_dict(state)``, if they have
+    one). A part that still refuses its state afterwards raises an error that says so. Every rank reads the file.
+
+    Args:
+        path: of the file.
+        parts: of :func:`save_checkpoint`, made anew, under the same names.
+        random: put the random numbers of this process back, which takes as many ranks as have written it; with False,
+            and all draws made by :class:`Seeds`, the number of ranks may change.
+
+    Raises:
+        StorageError: for a file that is not there, torn, or another kind.
+        ShapeError: for tensors of other shapes.
     """
     source = path_of(path, "load_checkpoint")
     given, where = _named(parts, "load_checkpoint"), str(source)
@@ -177,7 +411,7 @@ def _named(parts: Any, who: str) -> dict[str, Any]:
 
 
 def _inner(part: Any) -> Any:
-    """What DistributedDataParallel or torch.compile has wrapped; they share its state, under other names."""
+    """Return the module inside of DistributedDataParallel or torch.compile; they share its state, under other names."""
     while True:
         if isinstance(part, DistributedDataParallel):
             part = part.module
@@ -205,7 +439,7 @@ def _state_of(name: str, part: Any) -> Any:
 
 
 def _check(name: str, part: Any, state: Any) -> None:
-    """What can be told before anything is changed."""
+    """Check a state, and change nothing."""
     part = _inner(part)
     if isinstance(part, torch.Generator):
         if not isinstance(state, dict) or state.get("device") != part.device.type or "generators" not in state:
@@ -263,7 +497,9 @@ def _put_back(name: str, part: Any, state: Any) -> None:
 
 
 def _written(path: Path, content: dict[str, Any]) -> Exception | None:
-    """What went wrong, None for nothing. A full disk is an OSError of ours, or a RuntimeError of torch's."""
+    """Write a checkpoint and return the error, None without one. A full disk is an OSError, or a RuntimeError of
+    torch's.
+    """
     if not path.name:
         return OSError(f"{os.fspath(path)!r} is no name of a file")
     try:
@@ -368,7 +604,7 @@ def _of_all_ranks(state: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _told_by_first(failure: str | None) -> str | None:
-    """What went wrong in the first rank; all wait for it, so that the file is there when they go on."""
+    """Return the failure of the first rank; all wait for it, so that the file is there when they go on."""
     if not _in_group():
         return failure
     said = [failure]

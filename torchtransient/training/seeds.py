@@ -19,8 +19,8 @@ class Seeds:
     """Seeds of the renders of a run, and generators of its noise.
 
     They depend on the run's ``seed``, the step and the number of the sample, not on the rank, the number of ranks, the
-    place in a batch or what was drawn before: 1 and 2 ranks render the same sample with the same random numbers, and a
-    run that is resumed at a step goes on as one that was not stopped. ::
+    place in a batch or earlier draws: 1 and 2 ranks render the same sample with the same random numbers, and a run that
+    is resumed at a step goes on as one that was not stopped. ::
 
         seeds = tt.training.Seeds(0)
         out = renderer(values, seed=seeds(step, batch["index"]))
@@ -31,8 +31,13 @@ class Seeds:
     32-bit numbers (Even and Mansour 1997, with the integer hash of C. Wellons), whose keys are a hash of seed and step
     (BLAKE2b). Between steps equal seeds are as rare as of random numbers, 2^-32 a pair.
 
-    ``seed``: a whole number from 0 on. ``purpose``: tells apart what a run draws several of, the two renders of an
-    unbiased loss for instance: ``Seeds(0, "second render")``. Raises UnitError.
+    Args:
+        seed: whole number from 0 on.
+        purpose: tells apart several draws of a run, the two renders of an unbiased loss for instance:
+            ``Seeds(0, "second render")``.
+
+    Raises:
+        UnitError: for other seeds.
     """
 
     seed: int
@@ -44,19 +49,31 @@ class Seeds:
             raise ArgumentError(f"Seeds: expected purpose as a text, got {self.purpose!r}.")
 
     def __call__(self, step: int, samples: Iterable[int] | torch.Tensor) -> list[int]:
-        """One seed for each of the ``samples``, their numbers in the data set: what ``renderer(..., seed=)`` takes.
+        """Return one seed for each sample, as ``renderer(..., seed=)`` takes them.
 
-        ``samples``: whole numbers from 0 to 2^32 - 1, or a tensor (B,) of them.
+        Args:
+            step: number of the step.
+            samples: numbers in the data set from 0 to 2^32 - 1, or a tensor (B,) of them.
+
+        Raises:
+            UnitError: for other numbers.
         """
         first, second, third = self._keys(step)
         return [_permuted(_permuted(n ^ first) ^ second) ^ third for n in _numbers(samples)]
 
     def generator(self, step: int, sample: int = 0, device: torch.device | str = "cpu") -> torch.Generator:
-        """A generator of torch for what else a step draws, sensor noise for instance.
+        """Return a generator of torch for the other draws of a step, sensor noise for instance.
 
-        One generator for a whole batch makes noise that depends on who has which part of it. ``sample``: the number of
-        the one sample that it is for, where it shall not; or the rank, so that ranks draw different numbers. Raises
-        UnitError, DeviceError.
+        One generator for a whole batch makes noise that depends on the parts that ranks have of it.
+
+        Args:
+            step: number of the step.
+            sample: number of the one sample that it is for; or the rank, so that ranks draw different numbers.
+            device: of the generator.
+
+        Raises:
+            UnitError: for other numbers.
+            DeviceError: for a device that torch does not have.
         """
         number = count("Seeds: sample", sample, 0, UnitError)
         digest = self._digest(step, f"generator/{number}")

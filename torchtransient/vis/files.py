@@ -50,6 +50,19 @@ def save_figure(figure: Figure, path: str | Path | None, who: str, dpi: int = 12
     return figure
 
 
+def check_picture(path: str | Path, who: str = "picture") -> None:
+    """Raise StorageError when matplotlib could not write to `path`, MissingPackageError without it. For before a long
+    render."""
+    check_folder(path, who)
+    figure_type()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    endings = FigureCanvasAgg.get_supported_filetypes()
+    if Path(path).suffix.lstrip(".").lower() not in endings:
+        known = ", ".join(f".{ending}" for ending in sorted(endings))
+        raise StorageError(f"{who}: expected a name that ends in .png, or another of {known}, got '{path}'.")
+
+
 @contextmanager
 def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
     """A name to write a picture to that takes the place of `path` once it is whole, and the ending of `path`."""

@@ -19,9 +19,7 @@ from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import enlarge, figure_type, picture_figure, save_figure, to_bytes
 from torchtransient.vis.sources import Source, frequencies_of, phasor_of
-from torchtransient.vis.stamps import with_strip
-from torchtransient.vis.video import Frames
-from torchtransient.vis.video_file import check_video, write_video
+from torchtransient.vis.videos import Frames, check_video, with_strip, write_video
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

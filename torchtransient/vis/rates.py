@@ -1,4 +1,4 @@
-"""Light over the rates of its paths: range-Doppler maps, and speeds as a picture."""
+"""Light over the rates of its paths: range-Doppler maps."""
 
 from __future__ import annotations
 
@@ -6,22 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import RateAxis, TimeAxis
-from torchtransient.checks import is_one_of, of_class, shown
-from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.vis import colour_maps
-from torchtransient.vis.files import figure_type, picture_figure, save_figure
+from torchtransient.checks import of_class
+from torchtransient.errors import ShapeError
+from torchtransient.vis.files import figure_type, save_figure
 from torchtransient.vis.sources import Source, as_tensor, pixel_of, read_rates
 from torchtransient.vis.tone_mapping import checked_positive
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-READINGS = ("mean", "peak")
 
 
 def range_doppler(
@@ -81,67 +76,6 @@ def range_doppler(
     if title:
         figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, me)
-
-
-def speed_picture(
-    source: Source,
-    path: str | Path | None = None,
-    *,
-    rate_axis: RateAxis | None = None,
-    reading: str = "mean",
-    limit: float | None = None,
-    title: str = "",
-) -> Figure:
-    """A matplotlib figure of the speed of approach of every pixel: blue comes nearer, red goes away, white stands.
-
-    Args:
-        source: light (C, R, T, H, W), or a result or its file that has it as ``rates``: the speed is
-            minus half the rate; or speeds (H, W) or (1, H, W) in m/s, as `sensing.range_and_speed` finds them.
-        path: file to write the figure to.
-        rate_axis: axis of R; None takes that of the result, ``rate_axis``.
-        reading: "mean", the mean rate of a pixel's light, or "peak", the rate of its brightest bin, all lengths added
-            up.
-        limit: end of the symmetric scale, m/s; None for where 99 % of the pixels are.
-        title: text above the picture.
-
-    Pixels without light or speed are grey.
-
-    Raises:
-        ShapeError: for other shapes, and a rate axis that does not fit or is not known.
-        ArgumentError: for another reading.
-        UnitError: unless the limit is positive.
-        StorageError: when the figure cannot be written.
-    """
-    me = "speed_picture"
-    if not is_one_of(reading, READINGS):
-        raise ArgumentError(f"{me}: expected a reading out of {', '.join(READINGS)}, got {shown(reading)}.")
-    speeds = _speeds(source, rate_axis, reading, me)
-    end = colour_maps.symmetric_limit(speeds) if limit is None else checked_positive("limit", limit, me)
-    figure, (panel,) = picture_figure(speeds.shape[0], speeds.shape[1], side=4.6)
-    image = panel.imshow(speeds, cmap=_colours("RdBu"), vmin=-end, vmax=end, interpolation="nearest")
-    outside = np.abs(speeds[np.isfinite(speeds)]) > end
-    extend = "both" if outside.any() else "neither"
-    figure.colorbar(image, ax=panel, shrink=0.85, label="speed of approach (m/s)", extend=extend)
-    panel.set_title(title, fontsize=10)
-    return save_figure(figure, path, me)
-
-
-def _speeds(source: Source, rate_axis: RateAxis | None, reading: str, who: str) -> NDArray[np.float64]:
-    """Speeds of approach (H, W), NaN without light."""
-    if getattr(source, "rates", None) is None:
-        given = as_tensor(source, who)
-        if given.ndim == 2 or (given.ndim == 3 and given.shape[0] == 1):
-            if given.is_complex() or not given.numel():
-                raise ShapeError(f"{who}: expected speeds (H, W) in m/s, got {given.dtype} {tuple(given.shape)}.")
-            return given.double().reshape(given.shape[-2:]).numpy()
-    light, _, axis = _rates_of(source, None, rate_axis, who)
-    spectrum = light.sum(1)
-    total = spectrum.sum(0)
-    if reading == "peak":
-        rate = axis.centers[spectrum.argmax(0)]
-    else:
-        rate = torch.einsum("rhw,r->hw", spectrum, axis.centers) / torch.where(total > 0, total, 1.0)
-    return torch.where(total > 0, -rate / 2, torch.nan).numpy()
 
 
 def _rates_of(

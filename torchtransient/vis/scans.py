@@ -1,11 +1,11 @@
-"""Pictures of captures around a corner. The wall stands as the sensor points lie: columns along u to the right, rows
-along v upwards.
-"""
+"""Pictures of scans and captures: their layout in space with hidden shapes, and transients over the wall."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,20 +15,26 @@ from torch import Tensor
 from torchtransient import checks
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.capture.capture import computed
-from torchtransient.checks import is_one_of, shown
+from torchtransient.capture.wall import triple
+from torchtransient.checks import checked_mesh, is_one_of, positive, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
-from torchtransient.vis.arrival import checked_limits, peak_time_picture
 from torchtransient.vis.files import figure_type, save_figure
-from torchtransient.vis.hidden_shapes import SQUARE, hidden_polygons
-from torchtransient.vis.video import Frames, FrameSettings, frames
-from torchtransient.vis.video_file import check_video, write_video
+from torchtransient.vis.pictures import checked_limits
+from torchtransient.vis.sources import middle_spot, of_one_spot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Array = NDArray[np.float64]
+
 STYLES = ("curves", "image")
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
+# Mitsuba's square and cube.
+SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+_CUBE = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+_CUBE_FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+# Sides of a circle, and rows of a sphere.
+_SIDES, _ROWS = 32, 16
 
 
 def transients_grid(
@@ -51,10 +57,10 @@ def transients_grid(
     figure when `path` is given. Raises ShapeError for a batch, more than 3 channels or no transient, UnitError for
     limits without a bin, ArgumentError for an unknown style, StorageError.
     """
-    cube, axis, scan = _one_spot(capture, laser, "transients_grid")
+    cube, axis, scan = of_one_spot(capture, laser, "transients_grid")
     if limits is not None:
         part = Capture(cube, axis, scan).crop(*checked_limits(limits))
-        cube, axis = _transient(part, "transients_grid")
+        cube, axis, _ = of_one_spot(part, None, "transients_grid")
     style = ("curves" if cube.ndim == 4 else "image") if style is None else style
     if not is_one_of(style, STYLES):
         raise ArgumentError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
@@ -77,44 +83,53 @@ def transients_grid(
     return save_figure(figure, path, "transients_grid")
 
 
-def wall_frames(
-    capture: Capture, *, laser: int | tuple[int, ...] | None = None, **settings: Unpack[FrameSettings]
-) -> Frames:
-    """The wall as the light arrives on it, a bin a frame: `frames` of the sensor grid, y up.
-
-    `laser` as in `transients_grid`; `settings` (exposure, curve, accumulate, stamp, scale, every) are those of
-    `frames`. Raises ShapeError for captures without a grid of sensor points.
-    """
-    cube, axis = _grid(capture, laser, "wall_frames")
-    return frames(cube, axis=axis, **settings)
+def _title(capture: Capture, laser: Any) -> str:
+    spot = ""
+    if capture.scan.kind == "exhaustive":
+        spot = f", spot {middle_spot(capture.scan) if laser is None else laser}"
+    return f"{capture.scan.kind} scan{spot}"
 
 
-def wall_video(
-    capture: Capture, path: str | Path, *, fps: float = 25.0, progress: bool = False, **settings: Any
-) -> Path:
-    """Write `wall_frames` as `.mp4` or `.gif`; returns the path. `settings` are those of `wall_frames`.
-
-    Raises StorageError for another ending or folder before any frame is made, and as `wall_frames`.
-    """
-    check_video(path)
-    shown = wall_frames(capture, **settings)
-    return write_video(path, shown, len(shown), fps=fps, progress=progress)
+def _chosen(available: int, wanted: int) -> list[int]:
+    """Indices of `wanted` places in the middles of equal parts, all of them where there are no more."""
+    count = min(available, wanted)
+    return [int((k + 0.5) * available / count) for k in range(count)]
 
 
-def peak_time_map(
-    capture: Capture,
-    path: str | Path | None = None,
-    *,
-    laser: int | tuple[int, ...] | None = None,
-    limits: tuple[float, float] | None = None,
-    title: str = "",
-) -> Figure:
-    """A matplotlib figure of the wall with the time of the most light at each sensor point, y up.
+def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -> Figure:
+    figure = figure_type()(figsize=(1.0 + 1.9 * len(columns), 0.8 + 1.3 * len(rows)), layout="constrained")
+    panels = figure.subplots(len(rows), len(columns), sharex=True, sharey=True, squeeze=False)
+    edges = axis.edges_opl.numpy()
+    for line, row in zip(panels, reversed(rows), strict=True):
+        for panel, column in zip(line, columns, strict=True):
+            for values, colour in zip(cube[:, :, row, column].numpy(), _COLOURS[cube.shape[0]], strict=True):
+                panel.stairs(values, edges, color=colour, linewidth=0.9)
+            panel.set_title(f"({row}, {column})", fontsize=7, pad=2)
+            panel.margins(x=0)
+            panel.tick_params(labelsize=7)
+    figure.supxlabel("optical path length (m)", fontsize=9)
+    figure.supylabel("radiance in a bin", fontsize=9)
+    return figure
 
-    `laser` as in `transients_grid`; `limits` in metres as in `peak_time_picture`. Errors as both.
-    """
-    cube, axis = _grid(capture, laser, "peak_time_map")
-    return peak_time_picture(cube, path, axis=axis, limits=limits, title=title or _title(capture, laser))
+
+def _image(cube: Tensor, axis: TimeAxis) -> Figure:
+    """All points against time, the brightest bin white."""
+    lines = cube.sum(0).flatten(1).T
+    figure = figure_type()(figsize=(8.0, 4.5), layout="constrained")
+    panel = figure.subplots()
+    extent = (axis.start_opl, axis.end_opl, len(lines) - 0.5, -0.5)
+    finite = torch.nan_to_num(lines, nan=0.0, posinf=0.0, neginf=0.0)
+    image = panel.imshow(
+        lines.numpy(), aspect="auto", extent=extent, cmap="inferno", vmin=0.0, vmax=float(finite.max()) or 1.0,
+        interpolation="nearest",
+    )  # fmt: skip
+    figure.colorbar(image, ax=panel, label="radiance in a bin")
+    panel.set_xlabel("optical path length (m)")
+    panel.set_ylabel("sensor point, row by row" if cube.ndim == 4 else "sensor point")
+    return figure
+
+
+# ---------------------------------------------------------------------------------------------- layout in space
 
 
 def scan_layout(
@@ -169,98 +184,6 @@ def scan_layout(
     return save_figure(figure, path, "scan_layout")
 
 
-# ------------------------------------------------------------------------------------------------------------- parts
-
-
-def _transient(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
-    """(C, T, ...) on the CPU without gradients, S0 of polarized captures."""
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
-    if capture.transient is None or capture.axis is None:
-        raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
-    cube = computed(capture.transient.detach().cpu())
-    rank = len(capture.scan.shape) + 2
-    if capture.polarized:
-        cube = cube.select(cube.ndim - rank - 1, 0)
-    if cube.ndim != rank:
-        raise ShapeError(f"{who}: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
-    return cube, capture.axis
-
-
-def _one_spot(capture: Capture, laser: Any, who: str) -> tuple[Tensor, TimeAxis, Scan]:
-    """Of one laser spot: (C, T, Sy, Sx) or (C, T, N)."""
-    _transient(capture, who)  # says what is wrong before a part is taken
-    if capture.scan.kind == "exhaustive":
-        capture = capture.single(_middle(capture.scan) if laser is None else laser)
-    elif laser is not None:
-        raise ShapeError(f"{who}: laser= chooses a spot of an exhaustive capture, got a {capture.scan.kind} one.")
-    cube, axis = _transient(capture, who)
-    if cube.shape[0] not in _COLOURS:
-        raise ShapeError(f"{who}: expected one channel or three, got {cube.shape[0]}; choose some.")
-    return cube, axis, capture.scan
-
-
-def _grid(capture: Capture, laser: Any, who: str) -> tuple[Tensor, TimeAxis]:
-    """(C, T, Sy, Sx) with the highest row first, as pictures have it."""
-    cube, axis, scan = _one_spot(capture, laser, who)
-    if cube.ndim != 4:
-        raise ShapeError(
-            f"{who}: expected a grid of sensor points, got a list of {scan.pairs}; transients_grid(style='image') "
-            "draws lists."
-        )
-    return cube.flip(2), axis
-
-
-def _middle(scan: Scan) -> tuple[int, ...]:
-    return tuple(n // 2 for n in scan.laser_shape)
-
-
-def _title(capture: Capture, laser: Any) -> str:
-    spot = ""
-    if capture.scan.kind == "exhaustive":
-        spot = f", spot {_middle(capture.scan) if laser is None else laser}"
-    return f"{capture.scan.kind} scan{spot}"
-
-
-def _chosen(available: int, wanted: int) -> list[int]:
-    """Indices of `wanted` places in the middles of equal parts, all of them where there are no more."""
-    count = min(available, wanted)
-    return [int((k + 0.5) * available / count) for k in range(count)]
-
-
-def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -> Figure:
-    figure = figure_type()(figsize=(1.0 + 1.9 * len(columns), 0.8 + 1.3 * len(rows)), layout="constrained")
-    panels = figure.subplots(len(rows), len(columns), sharex=True, sharey=True, squeeze=False)
-    edges = axis.edges_opl.numpy()
-    for line, row in zip(panels, reversed(rows), strict=True):
-        for panel, column in zip(line, columns, strict=True):
-            for values, colour in zip(cube[:, :, row, column].numpy(), _COLOURS[cube.shape[0]], strict=True):
-                panel.stairs(values, edges, color=colour, linewidth=0.9)
-            panel.set_title(f"({row}, {column})", fontsize=7, pad=2)
-            panel.margins(x=0)
-            panel.tick_params(labelsize=7)
-    figure.supxlabel("optical path length (m)", fontsize=9)
-    figure.supylabel("radiance in a bin", fontsize=9)
-    return figure
-
-
-def _image(cube: Tensor, axis: TimeAxis) -> Figure:
-    """All points against time, the brightest bin white."""
-    lines = cube.sum(0).flatten(1).T
-    figure = figure_type()(figsize=(8.0, 4.5), layout="constrained")
-    panel = figure.subplots()
-    extent = (axis.start_opl, axis.end_opl, len(lines) - 0.5, -0.5)
-    finite = torch.nan_to_num(lines, nan=0.0, posinf=0.0, neginf=0.0)
-    image = panel.imshow(
-        lines.numpy(), aspect="auto", extent=extent, cmap="inferno", vmin=0.0, vmax=float(finite.max()) or 1.0,
-        interpolation="nearest",
-    )  # fmt: skip
-    figure.colorbar(image, ax=panel, label="radiance in a bin")
-    panel.set_xlabel("optical path length (m)")
-    panel.set_ylabel("sensor point, row by row" if cube.ndim == 4 else "sensor point")
-    return figure
-
-
 def _draw_faces(panel: Any, polygons: list[NDArray[np.float64]], colour: str, alpha: float) -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -279,3 +202,113 @@ def _equal_box(panel: Any, points: NDArray[np.float64]) -> None:
     for set_limits, center, length in zip((panel.set_xlim, panel.set_ylim, panel.set_zlim), middle, size, strict=True):
         set_limits(center - 0.55 * length, center + 0.55 * length)
     panel.set_box_aspect(size)
+
+
+# ---------------------------------------------------------------------------------------- hidden shapes as polygons
+
+
+def hidden_polygons(hidden: Any, who: str) -> list[list[Array]]:
+    """Of each hidden thing the corners (N, 3) of its faces, metres.
+
+    ``hidden``: shapes of Mitsuba by name, a single one, (vertices (V, 3), faces (F, 3)), an object with both, or None.
+    Nodes that a shape refers to are left out. Raises SceneError for other shapes than :data:`DRAWN`
+    (mesh files among them) and for what is no shape; ShapeError and UnitError for meshes and transforms that are none.
+    """
+    if hidden is None:
+        return []
+    if isinstance(hidden, Mapping):
+        if "type" in hidden and hidden["type"] != "scene":
+            return [_of_shape("hidden", hidden, who)]
+        shapes = {name: node for name, node in hidden.items() if name != "type"}
+        used = set(_references(shapes))
+        return [_of_shape(name, node, who) for name, node in shapes.items() if name not in used]
+    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
+        vertices, faces = hidden
+        return [_of_mesh(vertices, faces, f"{who}: hidden")]
+    if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
+        return [_of_mesh(hidden.vertices, hidden.faces, f"{who}: hidden")]
+    if isinstance(hidden, (str, PathLike)):
+        raise SceneError(f"{who}: mesh files are not drawn, got {str(hidden)!r}. Give its (vertices, faces).")
+    raise SceneError(
+        f"{who}: expected hidden as shapes by name, a shape, (vertices, faces) or an object with both, got "
+        f"{shown(hidden)}."
+    )
+
+
+def _of_shape(name: str, shape: Any, who: str) -> list[Array]:
+    where = f"{who}: hidden {name!r}"
+    if not isinstance(shape, Mapping) or "type" not in shape:
+        raise SceneError(f"{where}: expected a dictionary with a type, got {shown(shape)}.")
+    kind = shape["type"]
+    if kind not in DRAWN:
+        raise SceneError(f"{where}: shapes that are drawn are {', '.join(DRAWN)}, got {kind!r}. Leave it out.")
+    matrix = transform(f"{where}: to_world", shape.get("to_world", np.eye(4)))
+    return [points @ matrix[:3, :3].T + matrix[:3, 3] for points in DRAWN[kind](shape, where)]
+
+
+def _references(nodes: Any) -> Iterator[str]:
+    """Names that nodes refer to."""
+    for node in nodes.values():
+        if isinstance(node, Mapping):
+            if node.get("type") == "ref":
+                yield str(node.get("id"))
+            yield from _references(node)
+
+
+# -------------------------------------------------------------------------------------- faces of each shape, unplaced
+
+
+def _of_mesh(vertices: Any, faces: Any, where: str) -> list[Array]:
+    points, triangles = checked_mesh(where, vertices, faces)
+    return list(points[triangles])
+
+
+def _mesh(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    return _of_mesh(shape.get("vertices"), shape.get("faces"), where)
+
+
+def _square(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    return [SQUARE]
+
+
+def _cube(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    return list(_CUBE[np.array(_CUBE_FACES)])
+
+
+def _circle(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    angle = np.arange(_SIDES) * 2 * np.pi / _SIDES
+    return [np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)]
+
+
+def _sphere(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    center = triple(f"{where}: center", shape.get("center", (0.0, 0.0, 0.0)))
+    radius = positive(f"{where}: radius", shape.get("radius", 1.0))
+    up, around = np.linspace(0, np.pi, _ROWS + 1)[:, None], np.linspace(0, 2 * np.pi, _SIDES + 1)[None]
+    x, y, z = np.sin(up) * np.cos(around), np.sin(up) * np.sin(around), np.cos(up) + 0 * around
+    return _cells(center + radius * np.stack([x, y, z], -1))
+
+
+def _cylinder(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
+    begin = triple(f"{where}: p0", shape.get("p0", (0.0, 0.0, 0.0)))
+    end = triple(f"{where}: p1", shape.get("p1", (0.0, 0.0, 1.0)))
+    radius = positive(f"{where}: radius", shape.get("radius", 1.0))
+    axis = end - begin
+    aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    aside /= np.linalg.norm(aside) or 1.0
+    other = np.cross(axis, aside) / (np.linalg.norm(axis) or 1.0)
+    angle = np.linspace(0, 2 * np.pi, _SIDES + 1)[:, None]
+    circle = radius * (np.cos(angle) * aside + np.sin(angle) * other)
+    return _cells(np.stack([begin + circle, end + circle]))
+
+
+def _cells(grid: Array) -> list[Array]:
+    """The quadrilaterals (4, 3) of a grid of points (M, N, 3)."""
+    corners = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], 2)
+    return list(corners.reshape(-1, 4, 3))
+
+
+# Shapes that are drawn, by Mitsuba's name.
+DRAWN: dict[str, Callable[[Mapping[str, Any], str], Sequence[Array]]] = {
+    "mesh_arrays": _mesh, "rectangle": _square, "cube": _cube, "disk": _circle, "sphere": _sphere,
+    "cylinder": _cylinder,
+}  # fmt: skip

@@ -16,6 +16,8 @@ from torch import Tensor
 from torchtransient.array_files.array_file import damage_said, read_npy, read_some
 from torchtransient.array_files.plain_texts import json_data
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.capture import Capture, Scan
+from torchtransient.capture.capture import computed
 from torchtransient.checks import as_whole, of_class, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 
@@ -252,6 +254,15 @@ def _load(source: Source, name: str) -> Loaded:
         source = read_file(Path(source))
     if isinstance(source, Loaded):
         return source
+    if isinstance(source, Capture) and source.transient is not None and name != "phasor":
+        cube, axis, scan = of_one_spot(source, None, "picture")
+        if cube.ndim != 4:
+            raise ShapeError(
+                f"picture: expected a capture of a grid of sensor points, got a list of {scan.pairs}; "
+                "transients_grid(style='image') draws lists, and tt.vis.view shows them."
+            )
+        # The wall's rows run upwards, those of pictures downwards.
+        return Loaded(transient=cube.flip(2), axis=axis)
     if any(hasattr(source, name) for name in _TENSORS if name != "steady"):
         _refuse_batch(source)
         given = {key: getattr(source, key, None) for key in _TENSORS}
@@ -264,6 +275,53 @@ def _load(source: Source, name: str) -> Loaded:
     if name == "transient" or tensor.ndim == 5 or (tensor.ndim == 4 and tensor.shape[0] != 4):
         return Loaded(transient=tensor)
     return Loaded(steady=tensor)
+
+
+def of_one_spot(
+    capture: Capture, laser: int | tuple[int, ...] | None, who: str
+) -> tuple[Tensor, TimeAxis, Scan]:
+    """Return the light of a capture under one laser spot.
+
+    Args:
+        capture: one with a transient; of polarized ones S0 is taken.
+        laser: spot of an exhaustive capture; None for the middle one.
+        who: beginning of messages.
+
+    Returns:
+        Light (C, T, rows, columns) of a grid or (C, T, N) of a list on the CPU, C = 1 or 3, its axis and its scan.
+
+    Raises:
+        ArgumentError: for another object.
+        ShapeError: for phasors alone, a batch, other numbers of channels, and a spot that there is none of.
+    """
+    _light_of(capture, who)  # before a part is taken
+    if capture.scan.kind == "exhaustive":
+        capture = capture.single(middle_spot(capture.scan) if laser is None else laser)
+    elif laser is not None:
+        raise ShapeError(f"{who}: laser= chooses a spot of an exhaustive capture, got a {capture.scan.kind} one.")
+    cube, axis = _light_of(capture, who)
+    if cube.shape[0] not in (1, 3):
+        raise ShapeError(f"{who}: expected one channel or three, got {cube.shape[0]}; choose some.")
+    return cube, axis, capture.scan
+
+
+def _light_of(capture: Any, who: str) -> tuple[Tensor, TimeAxis]:
+    if not isinstance(capture, Capture):
+        raise ArgumentError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
+    if capture.transient is None or capture.axis is None:
+        raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
+    cube = computed(capture.transient.detach().cpu())
+    rank = len(capture.scan.shape) + 2
+    if capture.polarized:
+        cube = cube.select(cube.ndim - rank - 1, 0)
+    if cube.ndim != rank:
+        raise ShapeError(f"{who}: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
+    return cube, capture.axis
+
+
+def middle_spot(scan: Scan) -> tuple[int, ...]:
+    """Return the index of the laser spot in the middle of an exhaustive scan."""
+    return tuple(n // 2 for n in scan.laser_shape)
 
 
 def read_any(path: Path) -> Any:

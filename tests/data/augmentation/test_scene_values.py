@@ -13,13 +13,12 @@ from kornia.augmentation import RandomAffine, RandomRotation
 from support.sweeps import together
 from tools.every_plugin import every_plugin
 from torchtransient import plugins
-from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
-from torchtransient.data.augmentation.pixel_map import PixelMap
-from torchtransient.data.augmentation.scene_values import OF_DEVICES, UNAFFECTED, check_values, stays_true
+from torchtransient.data import Affine, Augment, Crop, Flip, PixelMap, QuarterTurn
+from torchtransient.data.scene_values import OF_DEVICES, UNAFFECTED, check_values, stays_true
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
-from torchtransient.sensing.devices.devices import KINDS
+from torchtransient.sensing.devices import KINDS
 
 N = 6
 OPERATIONS = {

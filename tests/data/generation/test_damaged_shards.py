@@ -8,31 +8,21 @@ import shutil
 
 import pytest
 
-from support.crew_here import workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files
 from support.stored_samples import sample
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.storage.manifest import build_manifest, verify
-from torchtransient.data.storage.shard_file import Shard, ShardWriter
+from torchtransient.data import Shard, ShardWriter, build_manifest, generate, verify
 from torchtransient.errors import StorageError
 
-SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 1}
+SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 0}
 RECIPE = FakeRecipe(shape=(1, 4, 2, 3))
 NAMES = [f"shard-{number:06d}.h5" for number in range(4)]
-
-
-@pytest.fixture(autouse=True)
-def here():
-    with workers_here():
-        yield
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("damaged") / "set"
-    with workers_here():
-        generate(RECIPE, folder, **SMALL)
+    generate(RECIPE, folder, **SMALL)
     return folder
 
 

@@ -14,15 +14,17 @@ import pytest
 
 import torchtransient as tt
 from support.fake_recipe import FakeRecipe
-from support.generation_runs import damage, data_files, environment, finish, leftovers, start
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.generation.latest_picture import LatestPicture
-from torchtransient.data.generation.ledger import DIED
-from torchtransient.data.generation.settings import Settings
-from torchtransient.data.generation.shard_making import ShardMaker
-from torchtransient.data.storage.manifest import verify
-from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import ArgumentError, SceneError, StorageError, UnitError
+from support.generation_runs import data_files, environment, finish, leftovers, start
+from torchtransient.data import Shard, generate, verify
+from torchtransient.data.crew import DIED
+from torchtransient.data.overview import LatestPicture
+from torchtransient.errors import ArgumentError, MissingPackageError, SceneError, StorageError, UnitError
+
+
+@dataclass(frozen=True)
+class Deviceless(FakeRecipe):
+    device: None = None
+
 
 RECIPE = FakeRecipe()
 QUICK = {"n": 23, "per_shard": 4, "progress": False}
@@ -51,8 +53,12 @@ def failures(folder):
     return found
 
 
-@pytest.mark.slow
-def test_what_is_there(calm):
+def test_what_is_there(calm, tmp_path):
+    """A worker's bytes are those of this process."""
+    with tt.threads(2) as before:
+        generate(RECIPE, tmp_path, workers=0, **QUICK)
+        assert tt.threads() == before
+    assert data_files(tmp_path) == data_files(calm)
     assert leftovers(calm) == []
     assert verify(calm).complete and verify(calm).samples == 23
     maker = RECIPE.maker()
@@ -74,58 +80,6 @@ def test_equal_bytes_of_many_workers(calm, tmp_path):
     numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
     generate(RECIPE, tmp_path, workers=np.int64(2), progress=False, **numbers)
     assert data_files(tmp_path) == data_files(calm)
-
-
-@pytest.mark.slow
-def test_equal_bytes_of_shares(calm, tmp_path):
-    first = generate(RECIPE, tmp_path, workers=3, shard=(1, 2), **QUICK)
-    assert (first.samples, first.shards) == (11, 3)
-    second = generate(RECIPE, tmp_path, shard=(0, 2), **QUICK)
-    assert second.samples == 12 and data_files(tmp_path) == data_files(calm)
-
-
-@pytest.mark.slow
-def test_going_on(calm, tmp_path):
-    folder = tmp_path / "set"
-    generate(RECIPE, folder, workers=1, **QUICK)
-    before = data_files(folder)
-    stamp = (folder / "shard-000003.h5").stat().st_mtime_ns
-    damage(folder)
-    done = generate(RECIPE, folder, workers=1, n=23, progress=False)
-    assert (done.samples, done.kept) == (8, 15)
-    assert data_files(folder) == before == data_files(calm)
-    assert (folder / "shard-000003.h5").stat().st_mtime_ns == stamp and leftovers(folder) == []
-    lines = (folder / "log.jsonl").read_text().splitlines()
-    assert [line for line in lines if not line.endswith("}")] == ['{"half']
-    assert "damaged" in [json.loads(line)["event"] for line in lines if line.endswith("}")]
-    again = generate(RECIPE, folder, workers=1, n=23, progress=False)
-    assert (again.samples, again.kept) == (0, 23)
-
-
-@pytest.mark.slow
-def test_shards_without_their_recipe(calm, tmp_path):
-    """What the shards say counts where recipe.json was lost."""
-    folder = tmp_path / "set"
-    folder.mkdir()
-    name = "shard-000001.h5"
-    (folder / name).write_bytes((calm / name).read_bytes())
-    with pytest.raises(StorageError, match=r"shard-000001\.h5' belongs to another data set: its recipe"):
-        generate(FakeRecipe(seed=1), folder, **QUICK)
-    done = generate(RECIPE, folder, workers=1, **QUICK)
-    assert done.kept == 4 and data_files(folder) == data_files(calm)
-    # One that lies under the name of another.
-    (folder / name).write_bytes((calm / "shard-000002.h5").read_bytes())
-    assert generate(RECIPE, folder, **QUICK).samples == 4 and data_files(folder) == data_files(calm)
-
-
-@pytest.mark.slow
-def test_other_versions_of_packages(calm, tmp_path):
-    folder = tmp_path / "set"
-    generate(RECIPE, folder, workers=1, **QUICK)
-    (folder / "shard-000001.h5").unlink()
-    with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
-        generate(replace(RECIPE, versions={"fake": "2"}), folder, workers=1, **QUICK)
-    assert not (folder / "shard-000001.h5").exists()
 
 
 # ------------------------------------------------------------------------------------------------- samples that fail
@@ -186,35 +140,6 @@ def test_no_sample_can_be_made(tmp_path):
     assert 'fake_recipe.py", line' in said and said in str(caught.value.__cause__)
 
 
-class Told:
-    """Hears of samples."""
-
-    def __init__(self):
-        self.heard = []
-
-    def begin(self, shard, index):
-        return None
-
-    def __getattr__(self, name):
-        return lambda *facts: self.heard.append((name, *facts))
-
-
-@dataclass(frozen=True)
-class Checked(FakeRecipe):
-    def check(self, maker=None):
-        assert maker is not None and maker.recipe is self
-
-
-def test_measuring_checks_with_its_own_scenes_and_says_where_samples_fail(tmp_path):
-    told = Told()
-    recipe = Checked(raising=(0,))
-    with tt.threads(1):
-        found = ShardMaker(Settings(recipe, str(tmp_path), 4, "exact", "blosc2", 2)).measure(range(4), told)
-    assert found.standard_error == 0.25
-    traces = [facts for name, *facts in told.heard if name == "traced"]
-    assert [facts[:2] for facts in traces] == [[-1, 0]] and 'fake_recipe.py", line' in traces[0][2]
-
-
 # --------------------------------------------------------------------------------------------------------- arguments
 
 
@@ -229,7 +154,8 @@ class Unpicklable(FakeRecipe):
     [
         ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"),
         ({"n": None}, ArgumentError, "how many"),
-        ({"workers": 0}, UnitError, "workers"), ({"retries": -1}, UnitError, "retries"),
+        ({"workers": -1}, UnitError, "workers"), ({"workers": 0, "engine": "ray"}, UnitError, "workers"),
+        ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
         ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
         ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
@@ -238,6 +164,7 @@ class Unpicklable(FakeRecipe):
         ({"store": "half"}, ArgumentError, "store"), ({"compression": "lzma"}, ArgumentError, "compression"),
         ({"recipe": {}}, ArgumentError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
         ({"folder": 3}, StorageError, "folder|name of a file"),
+        ({"recipe": Deviceless(), "store": "counts"}, SceneError, "with a device"),
     ],
 )  # fmt: skip
 def test_arguments(tmp_path, changes, error, words):
@@ -265,6 +192,12 @@ def test_what_is_no_recipe_is_said_before_a_number_is_asked_for(given, words, tm
     assert not list(tmp_path.iterdir())
 
 
+def test_without_ray(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingPackageError, match="needs the package ray"):
+        generate(RECIPE, tmp_path, engine="ray", **QUICK)
+
+
 def test_a_folder_that_is_a_file(tmp_path):
     (tmp_path / "a").write_text("")
     with pytest.raises(StorageError, match="cannot be made"):
@@ -277,7 +210,7 @@ def test_a_script_without_a_guard(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
-        "from torchtransient.data.generation.generate import generate\n"
+        "from torchtransient.data.generation import generate\n"
         f"generate(FakeRecipe(), {str(tmp_path / 'set')!r}, 4, progress=False)\n"
     )
     found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchtransient.data.generation.plan import Plan, samples_per_shard
-from torchtransient.data.storage.file_names import shard_file_name
+from torchtransient.data.run_settings import Plan, samples_per_shard, shard_file_name
 
 MB = 2**20
 

@@ -10,12 +10,10 @@ import pytest
 import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from torchtransient import plugins
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.generation.settings import Settings
-from torchtransient.data.generation.shard_making import ShardMaker
-from torchtransient.data.reading.online import OnlineDataset
-from torchtransient.data.recipes.plugin_modules import plugins_here
-from torchtransient.data.storage.manifest import verify
+from torchtransient.data import OnlineDataset, generate, verify
+from torchtransient.data.processes import registered_plugins
+from torchtransient.data.run_settings import RunSettings
+from torchtransient.data.shard_making import ShardMaker
 from torchtransient.errors import PluginRegistrationError, SceneError, StorageError
 from torchtransient.plugins import _registry
 
@@ -85,18 +83,18 @@ def painted(**more):
 
 
 def settings_of(recipe, folder, added):
-    return Settings(recipe, str(folder), 4, "exact", "blosc2", 0, added)
+    return RunSettings(recipe, str(folder), 4, "exact", "blosc2", 0, added)
 
 
 def test_what_is_registered_is_handed_on(theirs, tmp_path):
-    assert plugins_here() == ()
+    assert registered_plugins() == ()
     plugins.register_module(theirs.stem, (("bsdf", "their_paint"),))
-    added = plugins_here()
+    added = registered_plugins()
     assert added == (("their_paint_module", (("bsdf", "their_paint"),)),)
     _registry._state.third_party = []
     with tt.threads(1):
         ShardMaker(settings_of(FakeRecipe(), tmp_path, added)).close()
-    assert plugins_here() == added
+    assert registered_plugins() == added
 
 
 def test_what_cannot_be_imported_there_is_said(tmp_path):
@@ -110,7 +108,7 @@ def test_recipes_name_their_modules(theirs):
     assert recipe.to_dict()["plugins"] == ["their_paint_module"]
     _registry._state.third_party = []
     again = tt.data.Recipe.from_dict(recipe.to_dict())
-    assert again == recipe and plugins_here() == (("their_paint_module", ()),)
+    assert again == recipe and registered_plugins() == (("their_paint_module", ()),)
     before = recipe.maker().about()["versions"]["their_paint_module"]
     assert before.startswith("sha256 ")
     theirs.write_text(PAINT.replace("self.gain)", "self.gain * 2)"))

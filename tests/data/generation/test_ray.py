@@ -11,10 +11,9 @@ import pytest
 
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, kill, leftovers
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.generation.ledger import DIED
-from torchtransient.data.storage.manifest import verify
-from torchtransient.errors import StorageError
+from torchtransient.data import generate, verify
+from torchtransient.data.crew import DIED
+from torchtransient.errors import StorageError, TorchTransientWarning
 
 pytestmark = pytest.mark.slow
 ASKED = {"n": 48, "per_shard": 6, "progress": False, "engine": "ray"}
@@ -86,6 +85,11 @@ def test_what_fails_is_named(cluster, tmp_path):
     found = verify(tmp_path)
     assert found.complete and found.samples == 45
     assert found.failed == {3: "SceneError: sample 3 cannot be made by <object at 0x...>", 7: DIED, 20: DIED}
+
+
+def test_more_workers_than_processors(cluster, tmp_path):
+    with pytest.warns(TorchTransientWarning, match="2 processors, and 5 workers were asked for; 2 are started"):
+        assert generate(FakeRecipe(), tmp_path, workers=5, **ASKED).samples == 48
 
 
 def test_errors_of_workers(cluster, tmp_path):

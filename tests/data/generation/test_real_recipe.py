@@ -6,9 +6,7 @@ import pytest
 
 import torchtransient as tt
 from support.generation_runs import data_files, kill, leftovers, start_command, wait_until, workers_of
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.recipes.recipe import Recipe
-from torchtransient.data.storage.manifest import verify
+from torchtransient.data import Recipe, generate, verify
 
 pytestmark = pytest.mark.slow
 RECIPE = """

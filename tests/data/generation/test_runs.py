@@ -1,4 +1,4 @@
-"""Runs of `generate` whose workers live in this process: what is made, kept and made again, and what is said of it."""
+"""Runs of `generate` in this process: what is made, kept and made again, and what is said of it."""
 
 from __future__ import annotations
 
@@ -10,22 +10,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from support.crew_here import CrewHere, workers_here
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import damage, data_files, leftovers
-from torchtransient.data.generation import generate as runs
-from torchtransient.data.generation import ray_engine, settings
-from torchtransient.data.generation import summary as summaries
-from torchtransient.data.generation.generate import generate
-from torchtransient.data.generation.run_log import RunLog, SampleBar
-from torchtransient.data.generation.settings import check_same, plain, read_description
-from torchtransient.data.generation.summary import drawn_sheet, summary
-from torchtransient.data.storage import manifest
-from torchtransient.data.storage.manifest import verify
-from torchtransient.data.storage.shard_file import Shard
-from torchtransient.errors import SceneError, StorageError, TorchTransientError
+from torchtransient.data import Shard, generate, verify
+from torchtransient.data import overview as summaries
+from torchtransient.data.crew import RunLog
+from torchtransient.data.overview import drawn_sheet, summary
+from torchtransient.errors import SceneError, StorageError
 
-SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 1}
+SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 0}
 RECIPE = FakeRecipe(shape=(1, 4, 2, 3))
 
 
@@ -34,17 +27,10 @@ class Counted(FakeRecipe):
     n: int = 5
 
 
-@pytest.fixture(autouse=True)
-def here():
-    with workers_here():
-        yield
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "set"
-    with workers_here():
-        done = generate(RECIPE, folder, **SMALL)
+    done = generate(RECIPE, folder, **SMALL)
     assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (7, 0, 0, 0, 4)
     assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5")) and done.folder == folder
     return folder
@@ -70,7 +56,7 @@ def test_a_run_and_its_log(whole):
     assert verify(whole).complete and verify(whole).samples == 7 and leftovers(whole) == []
     first, *shards, last = events(whole)
     assert (first["event"], first["n"], first["workers"], first["engine"], first["shard"]) == (
-        "begin", 7, 1, "local", None,
+        "begin", 7, 0, "local", None,
     )  # fmt: skip
     assert [one["shard"] for one in shards] == [0, 1, 2, 3] and {one["event"] for one in shards} == {"shard"}
     assert (last["event"], last["samples"], last["shards"], last["failed"]) == ("end", 7, 4, 0)
@@ -78,7 +64,7 @@ def test_a_run_and_its_log(whole):
 
 
 def test_two_shares_are_the_whole(whole, tmp_path):
-    first = generate(RECIPE, tmp_path, shard=(1, 2), **SMALL | {"workers": 3})
+    first = generate(RECIPE, tmp_path, shard=(1, 2), **SMALL)
     assert (first.samples, first.shards, first.kept) == (3, 2, 0)
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["shard-000001.h5", "shard-000003.h5"]
     second = generate(RECIPE, tmp_path, shard=(0, 2), **SMALL)
@@ -104,17 +90,8 @@ def test_going_on(whole, tmp_path):
 
 
 def test_how_many_samples_a_recipe_says(tmp_path):
-    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, per_shard=4, compression="none", progress=False)
+    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, workers=0, per_shard=4, compression="none", progress=False)
     assert (done.samples, done.shards) == (5, 2)
-
-
-@pytest.mark.parametrize(("n", "per_shard", "shards"), [(130, 2, 65), (64, 1, 64)])
-def test_samples_of_a_file_unless_they_are_told(tmp_path, monkeypatch, n, per_shard, shards):
-    made = []
-    monkeypatch.setattr(CrewHere, "make", lambda self, left, found: made.append((left, found["per_shard"])))
-    monkeypatch.setattr(runs, "_check_made", lambda *given: None)
-    generate(RECIPE, tmp_path, n, compression="none", progress=False)
-    assert made == [(list(range(shards)), per_shard)]
 
 
 def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
@@ -134,23 +111,6 @@ def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
     assert shown == [[7, 3, 4, "closed"]]
     generate(FakeRecipe(raising=(1, 3)), tmp_path / "other", retries=0, **SMALL | {"progress": True})
     assert shown[1] == [7, 0, 7, *({"failed": k, "restarts": 0} for k in (1, 2)), "closed"]
-
-
-def test_what_a_bar_tells():
-    bar = SampleBar(5, 0, shown=False)
-    bar(2, failed=1)
-    bar(-1, failed=-1, restarts=1)
-    assert (bar.failed, bar.restarts) == (0, 1)
-    told = []
-    bar._bar = SimpleNamespace(set_postfix=lambda one, refresh: told.append(one), update=told.append)
-    bar(3)
-    bar(1, restarts=2)
-    bar(1, failed=4)
-    assert told == [3, {"failed": 0, "restarts": 3}, 1, {"failed": 4, "restarts": 3}, 1]
-    # A terminal that is gone.
-    bar._bar = SimpleNamespace(update=lambda more: (_ for _ in ()).throw(OSError))
-    bar(1)
-    assert bar._bar is None
 
 
 def test_a_log_that_cannot_be_written(tmp_path):
@@ -189,50 +149,6 @@ def test_shards_of_other_versions(whole, tmp_path):
     with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
         generate(replace(RECIPE, versions={"fake": "2"}), folder, **SMALL)
     assert not (folder / "shard-000001.h5").exists()
-
-
-def test_two_runs_that_begin_at_once(tmp_path, monkeypatch):
-    """The one that comes second makes what the first one began."""
-
-    def first(folder, described):
-        return described | {"per_shard": 3}
-
-    monkeypatch.setattr(runs, "write_description", first)
-    assert generate(RECIPE, tmp_path / "a", **SMALL | {"per_shard": None}).shards == 3
-    with pytest.raises(StorageError, match="per_shard is 3 there and 2 here"):
-        generate(RECIPE, tmp_path / "b", **SMALL)
-
-
-def test_a_manifest_of_all_that_is_there_at_the_end(whole, tmp_path, monkeypatch):
-    """Also of what another run finishes meanwhile; of nothing there is none."""
-    folder, built, build = copied(whole, tmp_path / "set", 0), [], manifest.build_manifest
-
-    def watched(place):
-        built.append(len(list(place.glob("*.h5"))))
-        if len(built) == 1:
-            (place / "shard-000001.h5").write_bytes((whole / "shard-000001.h5").read_bytes())
-        return build(place)
-
-    monkeypatch.setattr(manifest, "build_manifest", watched)
-    runs._write_manifest(folder)
-    assert built == [1, 2]
-    (tmp_path / "empty").mkdir()
-    runs._write_manifest(tmp_path / "empty")
-    assert built == [1, 2]
-
-
-@pytest.mark.parametrize(("engine", "more"), [("local", ""), ("ray", " All machines of the cluster have to see this")])
-def test_shards_that_are_somewhere_else(tmp_path, monkeypatch, engine, more):
-    """A worker says that it has written one, and this machine does not see it."""
-    monkeypatch.setattr(ray_engine, "RayCrew", lambda settings, workers, ledger, timeout_s, address: (
-        seen.append(address), CrewHere(settings, workers, ledger, timeout_s))[1])  # fmt: skip
-    seen = []
-    monkeypatch.setattr(CrewHere, "make", lambda self, left, found: None)
-    with pytest.raises(StorageError, match=rf"shard 0 was written, and '.*shard-000000\.h5' is not there\.{more}"):
-        generate(RECIPE, tmp_path, engine=engine, address="auto" if engine == "ray" else None, **SMALL)
-    assert seen == (["auto"] if engine == "ray" else [])
-    (stopped,) = events(tmp_path, "stopped")
-    assert stopped["error"].startswith("StorageError: generate: shard 0") and not events(tmp_path, "end")
 
 
 def test_a_run_that_is_stopped(whole, tmp_path, monkeypatch):
@@ -274,15 +190,6 @@ def test_samples_that_fail(whole, tmp_path):
         generate(replace(RECIPE, raising=tuple(range(40))), tmp_path / "none", **SMALL | {"n": 40})
 
 
-def test_calls_out_of_place(tmp_path, monkeypatch):
-    monkeypatch.setattr(runs.os, "access", lambda place, mode: mode != os.W_OK | os.X_OK)
-    with pytest.raises(StorageError, match="no permission to write into"):
-        generate(RECIPE, tmp_path, **SMALL)
-    monkeypatch.setattr(runs.multiprocessing, "current_process", lambda: SimpleNamespace(_inheriting=True))
-    with pytest.raises(TorchTransientError, match="called while a worker imports this script"):
-        generate(RECIPE, tmp_path, **SMALL)
-
-
 # ------------------------------------------------------------------------------------------- recipe.json, and words
 
 
@@ -296,37 +203,19 @@ def test_a_folder_whose_first_samples_were_left_out(whole, tmp_path):
         generate(RECIPE, place, **SMALL)
 
 
-def test_recipe_json_that_is_none(tmp_path):
-    assert read_description(tmp_path) is None
-    place = tmp_path / "recipe.json"
-    some = b'{"format": 0, "key": 1, "n": 2}'
-    for content, words in ((b"[1]", "lacks 'format'"), (some, "lacks 'per_shard'"), (b"\xff", "damaged")):
-        place.write_bytes(content)
-        with pytest.raises(StorageError, match=words):
-            read_description(tmp_path)
-    names = (*settings.DECIDING, "about")
-    place.write_text(json.dumps(dict.fromkeys(names, 1)))
-    assert read_description(tmp_path) == dict.fromkeys(names, 1)
-    for wrong in ({"a": object()}, {"a": {1: {2}}}):
-        with pytest.raises(StorageError, match="recipe of plain data, which JSON can hold"):
-            plain(wrong)
-    assert plain({"b": (1, 2), "a": None}) == {"a": None, "b": [1, 2]}
+@pytest.mark.parametrize("content", [b"[1]", b'{"format": 0, "key": 1, "n": 2}', b"\xff"])
+def test_recipe_json_that_is_none(tmp_path, content):
+    (tmp_path / "recipe.json").write_bytes(content)
+    with pytest.raises(StorageError, match=r"recipe\.json"):
+        generate(RECIPE, tmp_path, **SMALL)
 
 
-@pytest.mark.parametrize(
-    ("there", "here", "words"),
-    [
-        ({"seed": 1}, {"seed": 2}, r"another one \(seed is 1 there and 2 here\)"),
-        ({"a": {"b": [1], "c": 2}}, {"a": {"b": [1], "c": 3}}, r"\(a\.c is 2 there and 3 here\)"),
-        ({"n": 3, "a": 1}, {"n": 4, "a": 1}, "a file that it names has changed"),
-        ([1], [2], r"\(it is \[1\] there and \[2\] here\)"),
-        ({"a": "x" * 58}, {"a": "x" * 59}, f"a is '{'x' * 58}' there and '{'x' * 56}... here"),
-    ],
-)
-def test_where_recipes_differ(tmp_path, there, here, words):
-    with pytest.raises(StorageError, match=words):
-        check_same({"key": 1, "recipe": there}, {"key": 2, "recipe": here}, tmp_path)
-    check_same({"key": 1, "n": 2}, {"key": 1, "store": "exact"}, tmp_path)
+def test_shards_that_are_somewhere_else(tmp_path, monkeypatch):
+    """A worker has written one that this machine does not see."""
+    monkeypatch.setattr("torchtransient.data.local_engine.InProcessCrew.make", lambda self, left, found: None)
+    with pytest.raises(StorageError, match=r"shard 0 was written, and '.*shard-000000\.h5' is not there"):
+        generate(RECIPE, tmp_path, **SMALL)
+    assert events(tmp_path, "stopped") and not events(tmp_path, "end")
 
 
 def test_what_a_summary_says(whole, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import os
 import pickle
 import signal
@@ -12,9 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-import warnings
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,10 +21,9 @@ from torch.utils.data import DataLoader
 
 from support.marks import long_rows
 from support.online_recipe import SHAPE, OnlineRecipe
-from torchtransient.data.reading.online import OnlineDataset
-from torchtransient.data.reading.online_producers import Producers
-from torchtransient.data.reading.online_schedule import Schedule
-from torchtransient.errors import SceneError, ShapeError, StorageError, TorchTransientError, UnitError
+from torchtransient.data import OnlineDataset
+from torchtransient.data.online import Schedule
+from torchtransient.errors import PhysicsWarning, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
 
 TESTS = Path(__file__).parents[2]
 
@@ -118,26 +116,6 @@ def test_uses_of_a_full_ring_are_what_was_asked_for():
     assert schedule.drawn / schedule.made > 4.7
 
 
-def test_without_a_bound_nobody_waits():
-    schedule = Schedule(8, 1, math.inf, 1, first=0, seed=0)
-    for _ in range(100):
-        order = schedule.order(0)
-        schedule.finished(order.index)
-    assert schedule.made == 100 and schedule.drawn == 0
-    for _ in range(1000):
-        assert schedule.can_draw()
-        schedule.draw()
-
-
-def test_orders_of_a_lost_producer_come_again():
-    schedule = Schedule(16, 2, 5.0, 1, first=7, seed=0)
-    first = [schedule.order(0) for _ in range(2)]
-    schedule.order(1)
-    assert schedule.lost(0) == [7, 8]
-    again = [schedule.order(0) for _ in range(2)]
-    assert [order.index for order in again] == [order.index for order in first] == [7, 8]
-
-
 # -------------------------------------------------------------------------------------------------- whole data sets
 
 
@@ -163,33 +141,6 @@ def test_samples_are_whole_and_come_from_the_recipe(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_sample_is_made_once():
-    with OnlineDataset(OnlineRecipe(), capacity=8, workers=3, uses=1.0, warm=1) as data:
-        seen = Counter(index_of(data.draw()) for _ in range(300))
-    assert max(seen.values()) < 20
-    assert max(seen) < 300 + 8 + 3
-
-
-@pytest.mark.slow
-def test_a_place_is_ordered_anew_only_when_what_was_drawn_there_is_copied(monkeypatch):
-    """A producer may write as soon as it is told: here it has written before it is."""
-    say = Producers._say
-
-    def written_at_once(self, worker, *message):
-        if message[0] == "make" and self._ring:
-            for array in self._ring.values():
-                array[message[2]] = -1
-        say(self, worker, *message)
-
-    monkeypatch.setattr(Producers, "_say", written_at_once)
-    with OnlineDataset(OnlineRecipe(), capacity=2, uses=1.0, warm=2) as data:
-        for _ in range(40):
-            index_of(data.draw())
-            # Then the ring is full, and only a draw makes room.
-            time.sleep(0.01)
-
-
-@pytest.mark.slow
 def test_tensors_are_the_callers_own():
     with OnlineDataset(OnlineRecipe(), capacity=4, uses=1.0, warm=1) as data:
         kept = [data.draw() for _ in range(60)]
@@ -200,14 +151,17 @@ def test_tensors_are_the_callers_own():
     assert not kept[0]["transient"].is_shared()
 
 
-@pytest.mark.slow
 def test_loader_makes_batches():
-    recipe = OnlineRecipe()
+    """After a warning of the light that the window misses."""
+    recipe = OnlineRecipe(late=(3,))
     with OnlineDataset(recipe, capacity=16, warm=4, transform=lambda x: x.sum(1)) as data:
         loader = DataLoader(data, batch_size=8, num_workers=0)
+        with pytest.warns(PhysicsWarning, match="more than 1% in 1 of"):
+            next(iter(loader))
         for _, batch in zip(range(5), loader, strict=False):
             assert batch["transient"].shape == (8, *SHAPE) and batch["index"].shape == (8,)
             assert (batch["depth"][:, 0, 0] == batch["index"]).all()
+            assert (batch["outside"].sum(1) == 0.75 * (batch["index"] == 3)).all()
             assert len(batch["values"]["box.filename"]) == 8
             assert (batch["measurement"][:, 0, 0, 0] == 16 * batch["index"]).all()
         with pytest.raises(TorchTransientError, match="num_workers=0"):
@@ -260,12 +214,24 @@ def test_threads_draw_together():
 
 
 @pytest.mark.slow
-def test_error_of_a_producer_is_raised_with_its_message(tmp_path):
-    data = OnlineDataset(OnlineRecipe(bug=(5,), pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
+@pytest.mark.parametrize(
+    ("recipe", "error", "words"),
+    [
+        ({"bug": (5,)}, ValueError, "sample 5 met a mistake"),
+        ({"unpicklable": (0,)}, TorchTransientError, "UnpicklableError: cannot be sent"),
+        ({"broken": "no such mesh"}, SceneError, "no such mesh"),
+        ({"odd": (3,)}, ShapeError, "same names, shapes and types"),
+        ({"fail": tuple(range(100))}, TorchTransientError, "16 samples failed one after another, .*has no light"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:OnlineDataset. sample")
+def test_errors_of_producers_are_raised(tmp_path, recipe, error, words):
+    """Again and again, with the traceback of the producer; no process is left."""
+    data = OnlineDataset(OnlineRecipe(**recipe, pids=str(tmp_path)), capacity=8, uses=1.0, warm=1)
     for _ in range(2):
-        with pytest.raises(ValueError, match="sample 5 met a mistake") as caught:
+        with pytest.raises(error, match=words) as caught:
             draws(data, 100)
-        assert "met a mistake" in str(caught.value.__cause__) and "online_recipe.py" in str(caught.value.__cause__)
+        assert "fail" in recipe or "online_recipe.py" in str(caught.value.__cause__) or "odd" in recipe
     assert gone(tmp_path)
 
 
@@ -276,45 +242,6 @@ def test_samples_that_fail_are_left_out():
         with pytest.warns(UserWarning, match="sample 2 is left out: SceneError: sample 2 has no light"):
             seen = set(draws(data, 60))
         assert data.failed == 3 and not seen & {2, 3, 7} and len(seen) > 20
-
-
-@pytest.mark.slow
-def test_nothing_but_failures_is_an_error():
-    data = OnlineDataset(OnlineRecipe(fail=tuple(range(100))), capacity=8, warm=1)
-    with data, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with pytest.raises(TorchTransientError, match=r"16 samples failed one after another, .*has no light"):
-            data.draw()
-
-
-@pytest.mark.slow
-def test_error_that_cannot_be_sent_is_told():
-    data = OnlineDataset(OnlineRecipe(unpicklable=(0,)), capacity=4)
-    with data, pytest.raises(TorchTransientError, match="UnpicklableError: cannot be sent"):
-        data.draw()
-
-
-@pytest.mark.slow
-def test_error_of_the_recipe_is_raised():
-    data = OnlineDataset(OnlineRecipe(broken="no such mesh"), capacity=4)
-    with data, pytest.raises(SceneError, match="no such mesh"):
-        data.draw()
-
-
-@pytest.mark.slow
-def test_samples_of_another_kind_are_an_error():
-    data = OnlineDataset(OnlineRecipe(odd=(3,)), capacity=8, uses=1.0, warm=1)
-    with data, pytest.raises(ShapeError, match="same names, shapes and types"):
-        draws(data, 100)
-
-
-@pytest.mark.slow
-def test_a_killed_producer_is_started_again(tmp_path):
-    recipe = OnlineRecipe(die=(6,), once=str(tmp_path))
-    data = OnlineDataset(recipe, capacity=8, workers=2, uses=1.0, warm=1)
-    with data, pytest.warns(UserWarning, match="by signal 9 while it rendered sample 6"):
-        seen = draws(data, 300)
-    assert len(set(seen)) > 150 and max(seen) < 320
 
 
 @pytest.mark.slow
@@ -355,12 +282,7 @@ def test_a_producer_that_hangs_is_an_error(tmp_path):
 
 @pytest.mark.slow
 def test_more_than_the_shared_memory_is_an_error(monkeypatch):
-    from torchtransient.data.reading import online_producers
-
-    class Small:
-        free = 2**16
-
-    monkeypatch.setattr(online_producers.shutil, "disk_usage", lambda path: Small)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2**16))
     with OnlineDataset(OnlineRecipe(), capacity=1024) as data, pytest.raises(StorageError, match="shared memory"):
         data.draw()
 
@@ -396,7 +318,7 @@ SCRIPT = """
 import os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from support.online_recipe import OnlineRecipe
-from torchtransient.data.reading.online import OnlineDataset
+from torchtransient.data import OnlineDataset
 
 if __name__ == "__main__":
     # A shell starts what it puts behind with interrupts ignored, which children inherit.
@@ -446,7 +368,7 @@ def test_a_script_without_a_guard_is_told(tmp_path):
     script = tmp_path / "train.py"
     script.write_text(
         f"import sys\nsys.path.insert(0, {str(TESTS)!r})\nfrom support.online_recipe import OnlineRecipe\n"
-        "from torchtransient.data.reading.online import OnlineDataset\n"
+        "from torchtransient.data.online import OnlineDataset\n"
         "OnlineDataset(OnlineRecipe(), capacity=4).draw()\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 import torchtransient as tt
 from support.marks import long_rows
 from support.stored_samples import cube, folder
-from torchtransient.data.reading.stream import TransientStream
+from torchtransient.data import TransientStream
 from torchtransient.errors import StorageError, TorchTransientError
 
 N = 23
@@ -50,16 +50,7 @@ def test_whole_shards_follow_each_other(data):
     # With a buffer of five, nobody comes more than four places early.
     order, base = (TransientStream(data, buffer=size).order(0).tolist() for size in (5, 1))
     assert order != base and sorted(order) == sorted(base)
-    plain = TransientStream(data, buffer=1)._everything(0).tolist()
-    assert all(plain.index(number) - place <= 4 for place, number in enumerate(order))
-
-
-def test_shuffling_is_even():
-    from torchtransient.data.reading.stream import _buffered
-
-    numbers = np.arange(6)
-    first = [_buffered(numbers, 6, np.random.default_rng(k))[0] for k in range(1200)]
-    assert np.all(np.abs(np.bincount(first, minlength=6) - 200) < 60)
+    assert all(base.index(number) - place <= 4 for place, number in enumerate(order))
 
 
 @pytest.mark.slow
@@ -157,8 +148,7 @@ def test_parts_and_axis(data):
 STOPPED = [(0, 4, None), (2, 4, None), (3, 2, (1, 2))]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("workers", "size", "rank"), long_rows(STOPPED, [STOPPED[0], STOPPED[2]]))
+@pytest.mark.parametrize(("workers", "size", "rank"), long_rows(STOPPED, [STOPPED[0]]))
 def test_an_epoch_goes_on_where_it_was_stopped(data, workers, size, rank):
     share = {} if rank is None else {"rank": rank[0], "world_size": rank[1]}
 

@@ -11,10 +11,9 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.data.recipes.distribution import ANYTHING, NUMBERS, POSE, Place
-from torchtransient.data.recipes.streams import Extreme, Fixed, Stream
-from torchtransient.data.recipes.written import read_distribution, written
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.data.distributions import ANYTHING, NUMBERS, POSE, Extreme, Fixed, Place, Stream
+from torchtransient.data.serialization import read_distribution, written
+from torchtransient.errors import SceneError, ShapeError, UnitError
 
 D = tt.data
 DRAWS = 400
@@ -107,25 +106,16 @@ def test_numbers_of_one_draw(u):
     assert turned == pytest.approx(D.Turn([0, 0, 1], 20 + 80 * u, 20 + 80 * u).draw(Fixed(0.0), AT))
 
 
-def test_normal_distributions_end_where_floats_do():
-    """2^-53 of the light of a draw is left out at both sides; an end at infinity is none."""
-    most = NormalDist().inv_cdf(1 - 2.0**-53)
-    ends = [float(D.Normal(1, 2).draw(Extreme(upper), NUMBER)) for upper in (False, True)]
-    assert ends == pytest.approx([1 - 2 * most, 1 + 2 * most], rel=1e-6)
-    # Where 2^-54 of it lies below the lower end, the last of its draws is rounded up to all of it.
-    assert float(D.Normal(1, 2, low=1 - 2 * 8.37).draw(Extreme(True), NUMBER)) == pytest.approx(ends[1])
+def test_ends_of_normal_distributions():
+    """An end at infinity is none; a deviation of zero is the mean; a billionth of the distribution has to be left."""
     assert D.Normal(0, 1, low=-np.inf, high=np.inf) == D.Normal(0, 1)
-    # Nor does a logarithm bring numbers beyond their ends: that of 10 gives 10.000000000000002 back.
-    assert all(float(D.LogUniform(10, 10).draw(Fixed(u), NUMBER)) == 10 for u in (0.0, 0.25, 0.5, 0.75))
-    # A deviation of zero is its mean, at an end too.
+    ends = [float(D.Normal(1, 2).draw(Extreme(upper), NUMBER)) for upper in (False, True)]
+    assert np.isfinite(ends).all() and ends[0] + ends[1] == pytest.approx(2)
     for mean in (0.0, 1.0):
         assert float(D.Normal(mean, 0, low=0, high=1).draw(Fixed(0.25), NUMBER)) == mean
-    assert float(D.Normal(1, 0, low=1, high=1).draw(Fixed(0.25), NUMBER)) == 1
-    # A billionth of the distribution has to be left.
-    for mean in (5.99, -5.99):
-        D.Normal(0, 1, low=mean if mean > 0 else None, high=mean if mean < 0 else None)
-        with pytest.raises(UnitError, match="next to nothing"):
-            D.Normal([0, 0], 1, low=mean + 0.02 if mean > 0 else None, high=mean - 0.02 if mean < 0 else None)
+    D.Normal(0, 1, low=5.99)
+    with pytest.raises(UnitError, match="next to nothing"):
+        D.Normal([0, 0], 1, low=6.01)
 
 
 def test_a_number_that_draws_each_choice():
@@ -178,13 +168,6 @@ def test_offsets_are_in_the_world():
     assert brighter == pytest.approx(COLOUR.described + 0.5)
 
 
-def test_scales():
-    assert D.Scale(2, 2).draw(Stream(0, 0, "x"), AT) == pytest.approx(T0 @ np.diag([2, 2, 2, 1]))
-    along = D.Scale([1, 2, 3], [1, 2, 3], same=False)
-    assert along.draw(Stream(0, 0, "x"), AT) == pytest.approx(T0 @ np.diag([1, 2, 3, 1]))
-    assert D.Scale(3, 3).draw(Stream(0, 0, "x"), COLOUR) == pytest.approx(3 * COLOUR.described)
-
-
 def test_compose_goes_on_from_where_the_last_one_was():
     steps = [D.Offset([1, 0, 0], [1, 0, 0]), D.Turn([0, 1, 0], 90, 90, about="world")]
     place = Place("x", POSE, (4, 4), np.eye(4))
@@ -206,7 +189,6 @@ def test_look_at():
 WRONG = {
     "low over high": (lambda: D.Uniform(2, 1), UnitError, "low <= high"),
     "not finite": (lambda: D.Uniform(0, np.inf), UnitError, "finite"),
-    "text": (lambda: D.Uniform("a", 1), UnitError, "finite number"),
     "shapes": (lambda: D.Uniform([0, 0], [1, 1, 1]), ShapeError, "one shape"),
     "log of zero": (lambda: D.LogUniform(0, 1), UnitError, "greater than zero"),
     "negative deviation": (lambda: D.Normal(0, -1), UnitError, "std"),
@@ -214,27 +196,16 @@ WRONG = {
     "too far apart": (lambda: D.Uniform(-1.7e308, 1.7e308), UnitError, "more than floats hold"),
     "nothing left": (lambda: D.Normal(0, 1, low=40), UnitError, "next to nothing"),
     "empty choice": (lambda: D.Choice([]), SceneError, "at least one"),
-    "choice of a text": (lambda: D.Choice("abc"), SceneError, "list of values"),
     "weights": (lambda: D.Choice([1, 2], weights=[1]), UnitError, "2 weights"),
     "negative weight": (lambda: D.Choice([1, 2], weights=[2, -1]), UnitError, "weights of at least 0"),
-    "weight without end": (lambda: D.Choice([1, 2], weights=[1, np.inf]), UnitError, "2 weights"),
     "mean that is none": (lambda: D.Normal(np.nan, 1), UnitError, "mean as finite numbers, got"),
-    "mean without end": (lambda: D.Normal(np.inf, 1), UnitError, "mean as finite numbers, got"),
     "end that is none": (lambda: D.Normal(0, 1, low=np.nan), UnitError, "low as a number or None"),
-    "end in words": (lambda: D.Normal(0, 1, high="much"), UnitError, "high as a number or None"),
     "ends in turns": (lambda: D.Normal(0, 1, low=2, high=1), UnitError, "low <= high, got 2 and 1"),
     "mean over the end": (lambda: D.Normal([0, 5], [1, 0], high=1), UnitError, "outside of"),
-    "mean under the end": (lambda: D.Normal(-1, 0, low=0), UnitError, "outside of"),
     "log of a colour": (lambda: D.LogUniform([1, 0], [2, 2]), UnitError, "greater than zero"),
-    "three angles": (lambda: D.Turn(low=[0, 1, 2], high=[3, 3, 3]), ShapeError, "single angles"),
     "two numbers for a point": (lambda: D.LookAt([1, 2], [0, 0, 0]), ShapeError, "three finite numbers"),
-    "nothing to compose": (lambda: D.Compose([]), SceneError, "list of distributions"),
-    "no weight": (lambda: D.Choice([1, 2], weights=[0, 0]), UnitError, "greater than zero"),
     "axis": (lambda: D.Turn([0, 0, 0]), UnitError, "length"),
-    "about": (lambda: D.Turn(about="me"), ArgumentError, "self"),
-    "compose": (lambda: D.Compose([1]), SceneError, "distributions"),
     "scale": (lambda: D.Scale(-1, 1), UnitError, "at least 0"),
-    "same": (lambda: D.Uniform(0, 1, same="no"), ArgumentError, "True or False"),
 }
 
 
@@ -280,13 +251,3 @@ def test_written_read_pickled_and_compared(one):
     assert read_distribution("x", plain) == one and written(read_distribution("x", plain)) == plain
     assert pickle.loads(pickle.dumps(one)) == one
     assert sum(one == other for other in EVERY) == 1
-
-
-def test_short_forms():
-    assert read_distribution("x", {"uniform": [0, 1]}) == D.Uniform(0, 1)
-    assert read_distribution("x", {"choice": ["a", "b"]}) == D.Choice(["a", "b"])
-    steps = {"compose": [{"turn": {}}, {"offset": [0, 1]}]}
-    assert read_distribution("x", steps) == D.Compose([D.Turn(), D.Offset(0, 1)])
-    for wrong in ({"uniform": [0]}, {"unifrm": [0, 1]}, {"uniform": {"lo": 1}}, 3, {"uniform": {"low": 1}}, {}):
-        with pytest.raises(SceneError, match="uniform"):
-            read_distribution("x", wrong)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ import torch
 
 import torchtransient as tt
 from support.text_files import RECIPES
-from torchtransient.data.generation.settings import check_same
-from torchtransient.data.recipes.places import without_places
-from torchtransient.errors import SceneError, StorageError, UnitError
+from torchtransient.data.run_settings import check_same
+from torchtransient.data.serialization import without_places
+from torchtransient.errors import MissingPackageError, SceneError, StorageError, UnitError
 
 D = tt.data
 
@@ -109,6 +110,33 @@ def changed(**entries):
 
     data = yaml.safe_load(TEXT)
     return D.Recipe.from_dict({name: entry for name, entry in (data | entries).items() if entry is not None})
+
+
+def test_devices_in_files(tmp_path):
+    """YAML and JSON, beside the recipe."""
+    device = tt.sensing.device("vl53l8_like")
+    device.to_yaml(tmp_path / "mine.yaml")
+    (tmp_path / "mine.json").write_text(json.dumps(device.to_dict()))
+    for name in ("mine.yaml", "mine.json"):
+        plain = {"scene": {"builtin": "cornell_box"}, "variant": "llvm_ad_mono", "device": name}
+        assert D.Recipe.from_dict(plain, tmp_path).device == device
+    assert changed(device=device.to_dict()).device == device
+
+
+def test_scenes_weights_pictures_and_gates_are_written(monkeypatch):
+    scene = tt.scenes.cornell_box(resolution=4)
+    pixels = np.arange(4 * 5 * 3, dtype=np.float32).reshape(4, 5, 3) / 60
+    textured = scene | {"red": {"type": "diffuse", "reflectance": {"type": "bitmap", "data": pixels, "raw": True}}}
+    gates = [tt.Gate.gaussian(8.0, 2.0)]
+    recipe = D.Recipe(D.OneOf({"a": scene, "b": textured}, [1, 3]), variant="llvm_ad_rgb", spp=2, gates=gates)
+    again = D.Recipe.from_dict(json.loads(json.dumps(recipe.to_dict())))
+    assert again == recipe and again.key() == recipe.key()
+    assert again.scenes.weights == [1, 3] and list(again.settings.gates) == gates
+    with pytest.raises(SceneError, match="finite numbers and plain data"):
+        D.Recipe(scene, {"red.reflectance": D.Choice([float("nan")])}).to_dict()
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(MissingPackageError, match="YAML needs PyYAML"):
+        recipe.to_yaml()
 
 
 def test_keys_tell_recipes_apart():

@@ -8,7 +8,7 @@ from PIL import Image
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.data.recipes.maker import Maker
+from torchtransient.data.maker import Maker
 from torchtransient.errors import SceneError
 
 D = tt.data

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.data.recipes.sample import in_order
+from torchtransient.data.sample import in_order
 
 # Of films, from pixels first to pixels last: histograms in one and three channels, phasors, of several cameras, Stokes
 # components, an exhaustive scan, a steady image.

@@ -7,7 +7,6 @@ import pytest
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.data.generation.shard_making import reason_of
 from torchtransient.errors import SceneError
 
 D = tt.data
@@ -63,10 +62,3 @@ def test_windows(kind, tmp_path):
 def test_counts_need_a_device(tmp_path):
     with pytest.raises(SceneError, match="recipes with a device"):
         D.generate(RECIPES["one sensor"](), tmp_path, 2, store="counts", progress=False)
-
-
-def test_reasons_do_not_tell_folders():
-    """The same recipe elsewhere makes the same bytes, also of samples that fail."""
-    for folder in ("/home/a", "/srv/of b/c"):
-        error = SceneError(f'At dictionary node: "{folder}/mesh.ply": I/O error, of 3/4 in a/b.ply')
-        assert reason_of(error).endswith('mesh.ply": I/O error, of 3/4 in a/b.ply') and folder not in reason_of(error)

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from support.stored_samples import AXIS, sample, write
-from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.storage.encodings import counts_of, rounded_mantissa
-from torchtransient.data.storage.shard_file import Shard
-from torchtransient.data.storage.web_dataset import export_web_dataset
+from torchtransient.data import Shard, TransientDataset, export_web_dataset
+from torchtransient.data.shard_format import counts_of, rounded_mantissa
 from torchtransient.errors import StorageError
 
 

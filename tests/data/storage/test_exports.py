@@ -18,12 +18,15 @@ import zstandard
 import torchtransient as tt
 from support.capture_files import grids, made
 from support.stored_samples import AXIS, cube, folder, header, sample, write
-from torchtransient.data.generation.summary import drawn_sheet, summary
-from torchtransient.data.reading.transient_dataset import TransientDataset
-from torchtransient.data.recipes.written import written_frequencies
-from torchtransient.data.storage.shard_writing import ShardWriter
-from torchtransient.data.storage.tal_export import export_tal
-from torchtransient.data.storage.web_dataset import decode_web_sample, export_web_dataset, read_web_dataset
+from torchtransient.data import (
+    ShardWriter,
+    TransientDataset,
+    export_tal,
+    export_web_dataset,
+    read_web_dataset,
+)
+from torchtransient.data.exports import decode_web_sample
+from torchtransient.data.serialization import written_frequencies
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
 from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.tensor_record import same
@@ -49,18 +52,6 @@ def test_our_decoder(data, tmp_path):
         assert same(dict(sorted(item.items())), dict(sorted(source[i].items())))
     about = json.loads((tmp_path / "about.json").read_text())
     assert about["axis"] == AXIS and about["about"]["spp"] == 16
-
-
-@pytest.mark.parametrize("megabytes", [0.2, 0.5])
-def test_a_tar_ends_with_the_sample_that_fills_it(data, tmp_path, megabytes):
-    """Members lie in blocks of 512 bytes, behind one each; two empty ones and what fills 10 KiB end a tar."""
-    paths = export(data, tmp_path, megabytes=megabytes)
-    assert len(paths) > 1
-    for path in paths[:-1]:
-        with tarfile.open(path) as tar:
-            ends = {member.name.split(".")[0]: member.offset_data + -(-member.size // 512) * 512 for member in tar}
-        *before, last = ends.values()
-        assert max(before, default=0) < megabytes * 1e6 <= last
 
 
 def test_the_package_webdataset(data, tmp_path):
@@ -100,11 +91,6 @@ def test_names_with_points(tmp_path):
     write(tmp_path / "shard-000000.h5", [replace(sample(0), arrays={"a.b": np.ones((2, 3))})])
     with pytest.raises(StorageError, match=r"expected 'a\.b' as a tensor, under a name without points"):
         export(tmp_path, tmp_path / "out")
-
-
-def test_bars(data, tmp_path, capsys):
-    export_web_dataset(data, tmp_path)
-    assert "export: 100%" in capsys.readouterr().err
 
 
 def tar_of(path, members):
@@ -230,13 +216,6 @@ def rendered(place, samples=3, **settings):
     about = json.loads(json.dumps(maker.about()))
     write(place / "shard-000000.h5", [maker.sample(i) for i in range(samples)], about=about)
     (place / "out").mkdir()
-
-
-@pytest.mark.slow
-def test_what_a_summary_says_of_phasors(tmp_path):
-    rendered(tmp_path, samples=1, frequencies=[1.0, 2.0, 3.0])
-    assert "3 frequencies, 1 to 3 cycles per metre" in summary(tmp_path)
-    assert drawn_sheet(tmp_path, tmp_path / "sheet.png", 1, 0) == [0]
 
 
 @pytest.mark.slow

@@ -20,9 +20,8 @@ import pytest
 
 from support.hostile_captures import bytes_changed, structure_changed
 from support.stored_samples import header, sample, write
-from torchtransient.data.storage.chunks import COMPRESSIONS
-from torchtransient.data.storage.manifest import verify
-from torchtransient.data.storage.shard_file import Shard, ShardWriter
+from torchtransient.data import Shard, ShardWriter, verify
+from torchtransient.data.shard_format import COMPRESSIONS
 from torchtransient.errors import MissingPackageError, StorageError
 
 
@@ -134,18 +133,18 @@ CHUNKS = {"chunks": (1, 1, 256, 16, 16), "fletcher32": True}
         (about_changed(arrays=[]), "damaged"),
         (about_changed(failed=[[0, 5, "x"]]), "doubled or missing"),
         (about_changed(failed=3), "not iterable"),
-        (about_changed(texts={"a": ["x"]}), "does not tell"),
-        (about_changed(texts={"a": "xy"}), "does not tell"),
-        (about_changed(texts={"a": ["x", 3]}), "does not tell"),
-        (about_changed(structure="xy"), "does not tell"),
-        (about_changed(structure=["x"] * 3), "does not tell"),
-        (about_changed(store=3), "does not tell"),
-        (about_changed(compression=None), "does not tell"),
-        (about_changed(arrays={"transient": {"encoding": "half"}}), "does not tell"),
-        (about_changed(values="ab"), "does not tell"),
-        (about_changed(values=["count", 3]), "does not tell"),
+        (about_changed(texts={"a": ["x"]}), "does not describe"),
+        (about_changed(texts={"a": "xy"}), "does not describe"),
+        (about_changed(texts={"a": ["x", 3]}), "does not describe"),
+        (about_changed(structure="xy"), "does not describe"),
+        (about_changed(structure=["x"] * 3), "does not describe"),
+        (about_changed(store=3), "does not describe"),
+        (about_changed(compression=None), "does not describe"),
+        (about_changed(arrays={"transient": {"encoding": "half"}}), "does not describe"),
+        (about_changed(values="ab"), "does not describe"),
+        (about_changed(values=["count", 3]), "does not describe"),
         (about_changed(values=["../../about"]), "expected a row of"),
-        (about_changed(header="x"), "does not tell"),
+        (about_changed(header="x"), "does not describe"),
     ],
 )
 def test_what_is_not_believed(tmp_path, change, message):

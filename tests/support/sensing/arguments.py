@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from support.sensing.all_entries import ENTRIES
 from torchtransient import sensing
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.chirps import Chirps
@@ -201,6 +202,8 @@ CALLS = {
          "max_depth_m": number(7.0), "min_depth_m": number(0.0)}, {}),
     "wrapped_difference": ({"a": 6 * rand(3), "b": 6 * rand(3, seed=1)}, {}),
 }  # fmt: skip
+
+CALLS |= {type(entry.make()).__name__: entry.call for entry in ENTRIES if entry.call is not None}
 
 # What takes no real numbers of its own, or takes modules, records and names.
 OTHERS = {

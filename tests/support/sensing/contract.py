@@ -35,7 +35,7 @@ class Entry:
     makes inputs.
     `conserves`: `f(output) - f(input)` has to vanish (sum of energy or counts). `errors`: (callable, exception type).
     `dtypes`: those the expectation keeps. `random`: forward draws, with every policy in `policies`.
-    `differentiable_parameters`: gradcheck in the module's parameters too.
+    `call`: (arguments that hold real numbers, the others) of a good call of the class, for the sweep of gradients.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Entry:
     errors: tuple[tuple[Callable[[], Any], type[Exception]], ...] = ()
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     random: bool = False
+    call: tuple[dict[str, Tensor], dict[str, Any]] | None = None
     policies: tuple[str, ...] = field(default=("expected", "gaussian", "straight_through", "score"))
 
     def module(self, dtype: torch.dtype = torch.float64, **keywords: Any) -> nn.Module:

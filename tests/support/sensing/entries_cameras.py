@@ -8,15 +8,13 @@ from support.sensing.contract import Entry
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.cameras import electronics
-from torchtransient.sensing.itof import itof, itof_codes
 
 AXIS = TimeAxis(0.5, 0.2, 12)
 MAP_M = 0.2 * torch.arange(6.0).reshape(2, 3)
 
 
 def itof_correlation():
-    return itof.ItofCorrelation(itof_codes.square_code(4), (20e6, 60e6), AXIS, contrast=0.8)
+    return sensing.ItofCorrelation(sensing.square_code(4), (20e6, 60e6), AXIS, contrast=0.8)
 
 
 def two_tap_camera():
@@ -24,11 +22,11 @@ def two_tap_camera():
     known = sensing.ItofCalibration(
         phase_offset_rad=0.3, direction=-1, phase_map_rad=0.1 * torch.arange(6.0).reshape(2, 3)
     )
-    return itof.ItofCorrelation(sensing.TwoTapCode(itof_codes.square_code(2)), (20e6, 60e6), AXIS, calibration=known)
+    return sensing.ItofCorrelation(sensing.TwoTapCode(sensing.square_code(2)), (20e6, 60e6), AXIS, calibration=known)
 
 
 def pixel_electronics(grad="expected"):
-    return electronics.PixelElectronics(
+    return sensing.PixelElectronics(
         full_well_e=1e4, read_noise_e=3.0, ktc_noise_e=2.0, excess_noise=1.2, gain_e_per_dn=0.5, bits=14,
         black_level_dn=100.0, offset_map_e=torch.tensor(0.25), gain_map=torch.tensor(1.1), grad=grad,
     )  # fmt: skip
@@ -39,7 +37,7 @@ def chain(grad=None):
         [
             sensing.ImpulseResponse(sensing.GaussianResponse(900e-12), AXIS, boundary="periodic"),
             itof_correlation(),
-            electronics.PixelElectronics(read_noise_e=0.5),
+            sensing.PixelElectronics(read_noise_e=0.5),
         ],
         grad=grad,
     )
@@ -47,11 +45,11 @@ def chain(grad=None):
 
 def differences(grad=None):
     """Two taps with the noise of both, and their difference."""
-    code = sensing.TwoTapCode(itof_codes.sine_code(2))
+    code = sensing.TwoTapCode(sensing.sine_code(2))
     return sensing.Compose(
         [
-            itof.ItofCorrelation(code, 20e6, AXIS, background_e=2.0),
-            electronics.PixelElectronics(read_noise_e=0.5),
+            sensing.ItofCorrelation(code, 20e6, AXIS, background_e=2.0),
+            sensing.PixelElectronics(read_noise_e=0.5),
             sensing.TapDifference(),
         ],
         grad=grad,
@@ -80,21 +78,21 @@ ENTRIES: list[Entry] = [
         errors=(
             (lambda: itof_correlation()(torch.ones(1, 7, 1, 1)), ShapeError),
             (lambda: itof_correlation()(torch.ones(3)), ShapeError),
-            (lambda: itof.ItofCorrelation(itof_codes.sine_code(4), 20.0, AXIS), UnitError),
+            (lambda: sensing.ItofCorrelation(sensing.sine_code(4), 20.0, AXIS), UnitError),
         ),
     ),
     Entry("ItofCorrelation-two-tap", two_tap_camera, conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1)),
     Entry(
         "ItofCorrelation-map",
-        lambda: itof.ItofCorrelation(
-            itof_codes.sine_code(3), (20e6, 60e6), AXIS, calibration=sensing.ItofCalibration(depth_map_m=MAP_M)
+        lambda: sensing.ItofCorrelation(
+            sensing.sine_code(3), (20e6, 60e6), AXIS, calibration=sensing.ItofCalibration(depth_map_m=MAP_M)
         ),
         conserves=lambda y: y.sum() / (2 if y.shape[-3] == 6 else 1),
     ),
     Entry(
         "ItofCorrelation-learnt",
-        lambda: itof.ItofCorrelation(
-            sensing.TwoTapCode(itof_codes.sine_code(2)),
+        lambda: sensing.ItofCorrelation(
+            sensing.TwoTapCode(sensing.sine_code(2)),
             (20e6, 60e6),
             AXIS,
             calibration=sensing.ItofCalibration(
@@ -113,7 +111,7 @@ ENTRIES: list[Entry] = [
         "PixelElectronics",
         pixel_electronics,
         random=True,
-        errors=((lambda: electronics.PixelElectronics(read_noise_e=-1.0), UnitError),),
+        errors=((lambda: sensing.PixelElectronics(read_noise_e=-1.0), UnitError),),
     ),
     Entry("Compose", chain, random=True),
     Entry("Compose-differences", differences, random=True),

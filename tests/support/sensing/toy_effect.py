@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import check_transient
-from torchtransient.sensing.base.sensor import Sensor
+from torchtransient.sensing import Sensor
+from torchtransient.sensing.checks import check_transient
 
 
 class StrayLight(Sensor):

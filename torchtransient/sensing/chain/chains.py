@@ -1,4 +1,17 @@
-"""Chains of single-photon detectors from their parts, in the order in which light meets them."""
+"""Chains of detectors from their parts, in the order in which light meets them: photon counters and streak cameras.
+
+A streak camera has a photocathode, a sweep that turns time into place, an intensifier and a camera behind it. The slit
+is H or W; both stay. Photoelectrons scatter one by one in the tube, so that they are as Poisson after its spread as
+before it, and the stages stand in this order:
+
+    optics and tube spread   `LensBlur` across the slit, `ImpulseResponse` along time: linear, in the mean
+    sweep jitter             `SweepJitter`: every sweep starts a little early or late, all pixels alike
+    photocathode, channel plate   `PixelElectronics(excess_noise=...)`: shot noise and the spread of the gain
+    phosphor                 `LensBlur`: a spot covers several pixels, whose noise is then correlated
+    camera                   `PixelElectronics(shot_noise=False, ...)`: read noise, full well, converter
+
+Source: Velten et al., "Femto-photography" (ACM TOG 2013): 2 ps resolution, additive read noise, Poisson photocathode.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +19,22 @@ from collections.abc import Sequence
 
 from torch import nn
 
-from torchtransient.checks import shown
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.sensing.base.policies import GradPolicy
-from torchtransient.sensing.base.sensor import Sensor
+from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.chain.compose import Compose
-from torchtransient.sensing.correlated_noise.afterpulsing import Afterpulsing
-from torchtransient.sensing.correlated_noise.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.correlated_noise.crosstalk import Crosstalk
-from torchtransient.sensing.optics.photon_budget import PhotonBudget
-from torchtransient.sensing.response.impulse_response import ImpulseResponse
-from torchtransient.sensing.response.responses import Response
-from torchtransient.sensing.timing.detection_jitter import DetectionJitter
-from torchtransient.sensing.timing.pixel_skew import DetectionSkew
-from torchtransient.sensing.timing.tdc import TDC
+from torchtransient.sensing.checks import check_number
+from torchtransient.sensing.crosstalk import Crosstalk
+from torchtransient.sensing.electronics import PixelElectronics
+from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.photon_budget import PhotonBudget
+from torchtransient.sensing.responses import GaussianResponse, Response
+from torchtransient.sensing.sensor import GradPolicy, Sensor
+from torchtransient.sensing.spatial_psf import LensBlur
+from torchtransient.sensing.time_convolution import Boundary
+from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, SweepJitter
 
 
 def counting_chain(
@@ -36,16 +51,29 @@ def counting_chain(
     readout: Sequence[Sensor] | None = (),
     grad: GradPolicy | None = None,
 ) -> Compose:
-    """Radiance (..., C, T, H, W) to counts: the parts of a single-photon detector as one chain, whatever their order.
+    """Make a chain of the parts of a single-photon detector, radiance (..., C, T, H, W) to counts, in their order.
 
     Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds what is constant;
-    `detector` counts them (`SynchronousSPAD`, `FreeRunningSPAD`, a `MacroPixel` of them, ...); `jitter` and `skew` move
-    every detection; `afterpulsing` and `crosstalk` add others; `converter` gives each of them its code; `readout` is
-    what the pixel keeps (`ZoneSum`, `CodedHistogram`). A `Response` is taken for the bins of the budget. Why so:
-    docs/photon_counting.md. `grad` as of `Compose`.
+    `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add others;
+    `converter` gives each of them its code; `readout` is what the pixel keeps. The reasons: docs/photon_counting.md.
 
-    Raises ArgumentError for a part that is none of its kind, UnitError for parts that do not go together: another
-    number of cycles, another laser period, other bins, afterpulses of a detector that has its own (`AfterpulsingSPAD`).
+    Args:
+        budget: rates of detections.
+        detector: `SynchronousSPAD`, `FreeRunningSPAD`, a `MacroPixel` of them, ...
+        optics: sensors that spread light over pixels.
+        pulse: pulse of the laser; a `Response` is taken for the bins of the budget.
+        jitter: jitter of detections; a `Response` is taken for the bins of the budget.
+        skew: delays of pixels.
+        afterpulsing: afterpulses.
+        crosstalk: crosstalk.
+        converter: time-to-digital converter.
+        readout: `ZoneSum`, `CodedHistogram`, ...
+        grad: gradient policy, as of `Compose`.
+
+    Raises:
+        ShapeError: for a part that is none of its kind.
+        ArgumentError: for afterpulses of a detector that has its own (`AfterpulsingSPAD`).
+        UnitError: for parts that do not go together: another number of cycles, another laser period, other bins.
     """
     where = "counting_chain"
     _check(budget, (PhotonBudget,), "budget", where)
@@ -73,7 +101,7 @@ def counting_chain(
 
 
 def _parts(parts: Sequence[nn.Module] | None, name: str, where: str) -> list[nn.Module]:
-    """A list of sensors, or None for none of them."""
+    """Return a list of sensors, empty for None."""
     if parts is None:
         return []
     if not isinstance(parts, (list, tuple, nn.ModuleList, nn.Sequential)):
@@ -99,3 +127,72 @@ def _check(part: nn.Module | None, kinds: tuple[type, ...], name: str, where: st
         names = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
         raise ShapeError(f"{where}: expected {name} to be {names}, got {shown(part)}.")
     return part
+
+
+# ------------------------------------------------------------------------------------------------------- streak cameras
+
+
+class StreakCamera(Compose):
+    """Streak camera on photoelectrons per bin and exposure (..., C, T, H, W), output in electrons, the same shape.
+
+    The mean is exact; gradient policies as those of the stages. Not modelled: curvature of the sweep, space charge.
+
+    Args:
+        axis: axis of the light.
+        time_fwhm_s: resolution along time in seconds; 0 leaves the stage out.
+        spatial_fwhm_px: blur of optics and tube in pixels; 0 leaves the stage out.
+        phosphor_fwhm_px: blur behind the gain in pixels; 0 leaves the stage out.
+        jitter_fwhm_s: jitter of a sweep in seconds.
+        sweeps: sweeps of an exposure.
+        excess_noise: of the channel plate, F^2.
+        read_noise_e: of the camera, referred to photoelectrons, as the following.
+        full_well_e: as of `PixelElectronics`.
+        gain_e_per_dn: as of `PixelElectronics`.
+        bits: as of `PixelElectronics`.
+        black_level_dn: as of `PixelElectronics`.
+        boundary: of the window in time, for spread and jitter; "periodic" keeps a constant background constant, while
+            light close to one end shows a trace at the other; "zero" loses what leaves.
+        grad: gradient policy.
+    """
+
+    def __init__(
+        self,
+        axis: TimeAxis,
+        *,
+        time_fwhm_s: float = 2e-12,
+        spatial_fwhm_px: float = 1.5,
+        phosphor_fwhm_px: float = 0.0,
+        jitter_fwhm_s: float = 1e-12,
+        sweeps: int = 1,
+        excess_noise: float = 1.5,
+        read_noise_e: float = 0.5,
+        full_well_e: float | None = None,
+        gain_e_per_dn: float | None = None,
+        bits: int | None = None,
+        black_level_dn: float = 0.0,
+        boundary: Boundary = "periodic",
+        grad: GradPolicy = "expected",
+    ) -> None:
+        of_class("StreakCamera: axis", axis, TimeAxis)
+        time_fwhm_s = check_number(time_fwhm_s, "time_fwhm_s", "StreakCamera")
+        spatial_fwhm_px = check_number(spatial_fwhm_px, "spatial_fwhm_px", "StreakCamera")
+        phosphor_fwhm_px = check_number(phosphor_fwhm_px, "phosphor_fwhm_px", "StreakCamera")
+        camera = PixelElectronics(
+            shot_noise=False,
+            read_noise_e=read_noise_e,
+            full_well_e=full_well_e,
+            gain_e_per_dn=gain_e_per_dn,
+            bits=bits,
+            black_level_dn=black_level_dn,
+        )
+        stages = [
+            LensBlur(spatial_fwhm_px, "replicate") if spatial_fwhm_px > 0 else None,
+            ImpulseResponse(GaussianResponse(time_fwhm_s), axis, boundary=boundary) if time_fwhm_s > 0 else None,
+            SweepJitter(jitter_fwhm_s, axis, sweeps=sweeps, boundary=boundary),
+            PixelElectronics(excess_noise=excess_noise),
+            LensBlur(phosphor_fwhm_px, "replicate") if phosphor_fwhm_px > 0 else None,
+            camera,
+        ]
+        super().__init__([s for s in stages if s is not None], grad=grad)
+        self.boundary: Boundary = boundary
+        self.axis, self.num_bins = axis, axis.num_bins

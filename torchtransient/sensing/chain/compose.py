@@ -1,4 +1,9 @@
-"""Sensors in a row, after a renderer or inside a data set."""
+"""Sensors in a row, after a renderer or inside a data set, and images whose pixels go to different sensors.
+
+First photons of a cycle and what moves their time stamps are drawn at once: a cycle has one detection at most, so that
+counts whose detections move by themselves are multinomial again, with the moved probabilities: one draw of
+`sample_multinomial` instead of one for every place that a detection may go to.
+"""
 
 from __future__ import annotations
 
@@ -11,50 +16,162 @@ from torch import Tensor, nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.checks import several
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
-from torchtransient.sensing.base.layout import TIME, not_a_transient
-from torchtransient.sensing.base.policies import GradPolicy, check_policy
-from torchtransient.sensing.base.sensor import RandomSensor, Sensor
-from torchtransient.sensing.chain.agreement import check_axis as check_axis
-from torchtransient.sensing.chain.agreement import check_stages, check_window
-from torchtransient.sensing.chain.chain_order import check_order
-from torchtransient.sensing.chain.chain_walk import (
+from torchtransient.sensing.chain.stages import (
+    check_axis,
     check_draws,
+    check_order,
+    check_stages,
+    check_window,
     draw_of,
     draws,
     ends_of,
     mean_of,
     measurement_of,
     normal_of,
+    policies_of,
     unrolled,
 )
-from torchtransient.sensing.chain.first_photon_moves import (
-    moved_first_photons,
-    moved_probabilities,
-    moving_together,
-    multinomial_log_prob,
-)
+from torchtransient.sensing.checks import TIME, check_generator, check_transient, not_a_transient
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
-from torchtransient.sensing.itof.itof import ItofCorrelation
+from torchtransient.sensing.counts import MovedCounts
+from torchtransient.sensing.draws import sample_multinomial
+from torchtransient.sensing.itof.correlation import ItofCorrelation
+from torchtransient.sensing.sensor import (
+    GradPolicy,
+    RandomSensor,
+    ScoreFunction,
+    Sensor,
+    added,
+    check_policy,
+    common_bins,
+    record_score,
+    straight_through,
+)
+from torchtransient.sensing.spad import SynchronousSPAD, multinomial_noise
+from torchtransient.sensing.timing import TDC
+
+
+def moving_together(
+    stages: Sequence[nn.Module], *, policy: bool
+) -> tuple[SynchronousSPAD, list[MovedCounts]] | None:
+    """Find the SPAD that a chain begins with and the moves behind it, where they can be drawn at once.
+
+    Args:
+        stages: stages to call one after another.
+        policy: only if all have the same gradient policy, and one that draws.
+
+    Returns:
+        The SPAD and the moves, or None.
+    """
+    spad = stages[0]
+    if not isinstance(spad, SynchronousSPAD) or type(spad) is not SynchronousSPAD or spad.dead_bins is not None:
+        return None
+    moves: list[MovedCounts] = []
+    for stage in stages[1:]:
+        if not isinstance(stage, MovedCounts) or (isinstance(stage, TDC) and stage.acts_on == "rates"):
+            break
+        moves.append(stage)
+    same = not policy or (spad.grad != "expected" and all(m.grad == spad.grad for m in moves))
+    return (spad, moves) if moves and same and not any(_watched(s) for s in (spad, *moves)) else None
+
+
+def _watched(stage: nn.Module) -> bool:
+    """Return True if a stage has hooks on its inputs or outputs."""
+    return bool(stage._forward_hooks or stage._forward_pre_hooks or stage._backward_hooks)
+
+
+def moved_probabilities(spad: SynchronousSPAD, moves: Sequence[MovedCounts], x: Tensor) -> Tensor:
+    """Probability of each time stamp in a cycle, in single precision at least.
+
+    Args:
+        spad: detector of one detection per cycle.
+        moves: stages behind it.
+        x: rate per cycle and bin, (..., C, T, H, W).
+    """
+    p = spad.probabilities(x)
+    for stage in moves:
+        p = stage.expected(p)
+    return p
+
+
+def moved_first_photons(
+    spad: SynchronousSPAD,
+    moves: Sequence[MovedCounts],
+    x: Tensor,
+    generator: torch.Generator | None,
+    policy: GradPolicy | None = None,
+) -> Tensor:
+    """Measure light with a SPAD and its moves under a policy.
+
+    Args:
+        spad: detector of one detection per cycle.
+        moves: stages behind it.
+        x: rate per cycle and bin, (..., C, T, H, W).
+        generator: source of randomness.
+        policy: gradient policy; None for a draw without gradient.
+    """
+    check_generator(generator, type(spad).__name__)
+    p = moved_probabilities(spad, moves, x)
+    if policy == "gaussian":
+        return p * spad.cycles + multinomial_noise(p, spad.cycles, generator)
+    with torch.no_grad():
+        counts = sample_multinomial(spad.cycles, p, generator)
+    if policy == "straight_through" and torch.is_grad_enabled():
+        counts = straight_through(counts, p * spad.cycles)
+    elif policy == "score":
+        record_score(lambda: multinomial_log_prob(counts, p, spad.cycles), type(spad).__name__)
+    return counts
+
+
+def multinomial_log_prob(counts: Tensor, probabilities: Tensor, trials: int) -> Tensor:
+    """Log-probability of multinomial counts and the trials without one.
+
+    Gradients are finite at probability 0 with count 0; a count there has log-probability -inf.
+
+    Args:
+        counts: (..., T, H, W).
+        probabilities: (..., T, H, W).
+        trials: number of trials.
+
+    Returns:
+        (..., H, W), float64.
+    """
+    n, p = counts.detach().double(), probabilities.double()
+    none, rest = trials - n.sum(TIME), 1 - p.sum(TIME)
+    value = (n * torch.where(n > 0, p, 1.0).log()).sum(TIME)
+    # probabilities that add up to one leave rounding of either sign
+    rest = rest.clamp_min(1e-18)
+    counted = torch.lgamma(none + 1) + torch.lgamma(n + 1).sum(TIME)
+    return value + none * rest.log() - counted + torch.lgamma(n.new_tensor(trials + 1.0))
+
+
+# --------------------------------------------------------------------------------------------------------------- chains
 
 
 class Compose(Sensor):
-    """Stages in the order in which light meets them: ``Compose([budget, response, detector])``.
+    """Chain of stages in the order in which light meets them: ``Compose([budget, response, detector])``.
 
-    Stages are sensors, or other modules of one tensor; stages in an ``nn.Sequential`` or an ``nn.ModuleList`` are taken
-    as if they were given one by one. The input is a transient (..., C, T, H, W), or what a renderer returns (an object
-    with ``transient``, ``phasor``, ``beats`` and ``axis``): its axis is compared with those of the stages, a phasor
-    image goes to an `ItofCorrelation` in front, spectra of beats to `Speckle`, `BeatNoise` or `CoherentReceiver`.
-    ``grad``: set this policy in every random stage; None leaves them as they are.
+    The input is a transient (..., C, T, H, W), or a renderer's output: its axis is compared with those of the stages, a
+    phasor image goes to an `ItofCorrelation` in front, spectra of beats to `Speckle`, `BeatNoise` or
+    `CoherentReceiver`.
 
     ``expected`` hands the mean of each stage to the next: the exact mean where the later stages are linear, else first
     order in the noise. Works as ``transform`` of a data set, in worker processes too; equal generators give equal
     results. A first-photon detector and the `DetectionJitter`, `DetectionSkew` and `TDC` behind it are drawn at once,
-    under one policy: the same distribution, in less time. Raises ShapeError for no stage, something that is no module,
-    or a module of another kind with random sensors inside, which nobody could draw; UnitError where
-    one stage is not made for what those before it give: other bins, another number of cycles, another laser period,
-    or another quantity, as the rates of one cycle where the counts of all are meant (see `agreement`); and for an
-    order in which constant light starves at the ends of the window, or counts are averaged: light's own shape, then
-    `PhotonBudget`, the detector, and what acts on detections. Orders are looked at again when a state is loaded.
+    under one policy: the same distribution, in less time. Orders are checked again when a state is loaded.
+
+    Args:
+        stages: sensors, or other modules of one tensor; stages in an ``nn.Sequential`` or an ``nn.ModuleList`` are
+            taken as if they were given one by one.
+        grad: gradient policy of every random stage; None leaves them as they are.
+
+    Raises:
+        ArgumentError: for no stage, something that is no module, or a module of another kind with random sensors
+            inside, which cannot be drawn.
+        UnitError: where one stage is not made for what those before it give: other bins, another number of cycles,
+            another laser period, or another quantity, as the rates of one cycle where the counts of all are meant; and
+            for an order in which constant light starves at the ends of the window, or counts are averaged: light's own
+            shape, then `PhotonBudget`, the detector, and what acts on detections.
     """
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
@@ -77,7 +194,14 @@ class Compose(Sensor):
             self.set_grad(grad)
 
     def set_grad(self, grad: GradPolicy) -> Compose:
-        """Use this gradient policy in every random stage, nested ones too; returns the chain."""
+        """Use a gradient policy in every random stage, nested ones too.
+
+        Args:
+            grad: gradient policy.
+
+        Returns:
+            The chain.
+        """
         policy = check_policy(grad, "Compose")
         for module in self.modules():
             if isinstance(module, RandomSensor):
@@ -85,11 +209,20 @@ class Compose(Sensor):
         return self
 
     def expected(self, x: Any) -> Tensor:
-        """The chain of the stages' means; see the class."""
+        """Mean of the chain, from the means of its stages.
+
+        Args:
+            x: light, or a renderer's output.
+        """
         return self._run(x, mean_of)
 
     def forward(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
-        """The measurement, every random stage under its own policy and with the same generator in turn."""
+        """Measure light, every random stage under its own policy and with the same generator in turn.
+
+        Args:
+            x: light, or a renderer's output.
+            generator: source of randomness.
+        """
 
         def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
             found = moving_together(stages, policy=True)
@@ -101,7 +234,12 @@ class Compose(Sensor):
         return self._run(x, lambda stage, y: measurement_of(stage, y, generator), at_once)
 
     def gaussian(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
-        """The normal surrogates of all random stages in turn, whatever their policies; differentiable."""
+        """Draw the normal surrogates of all random stages in turn, whatever their policies; differentiable.
+
+        Args:
+            x: light, or a renderer's output.
+            generator: source of randomness.
+        """
 
         def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
             found = moving_together(stages, policy=False)
@@ -113,7 +251,12 @@ class Compose(Sensor):
         return self._run(x, lambda stage, y: normal_of(stage, y, generator), at_once)
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
-        """One draw of every random stage, whatever its policy, without gradient."""
+        """Draw every random stage, whatever its policy, without gradient.
+
+        Args:
+            x: light, or a renderer's output.
+            generator: source of randomness.
+        """
 
         def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
             found = moving_together(stages, policy=False)
@@ -126,9 +269,14 @@ class Compose(Sensor):
             return self._run(x, lambda stage, y: draw_of(stage, y, generator), at_once)
 
     def variance(self, x: Any) -> Tensor:
-        """Variance of every entry. For chains that draw nothing, or whose last stage alone does; else GradientError.
+        """Variance of every entry, for chains whose last stage alone draws.
 
-        Draws of several stages have no closed form: `sample` tells, and `gaussian` has their covariance.
+        Args:
+            x: light, or a renderer's output.
+
+        Raises:
+            GradientError: for other chains: draws of several stages have no closed form; `gaussian` has their
+                covariance.
         """
         y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
         stages = unrolled(self.stages)[used:]
@@ -148,11 +296,20 @@ class Compose(Sensor):
         return result
 
     def log_prob(self, measurement: Tensor, x: Any) -> Tensor:
-        """Log-probability of a measurement, time summed: (..., C, H, W), differentiable in `x` and the parameters.
+        """Log-probability of a measurement, summed over time, differentiable in the light and the parameters.
 
         For chains in which one detector draws, behind stages that do not: the `log_prob` of the last stage, or the
         multinomial of a `SynchronousSPAD` of one detection per cycle and the `DetectionJitter` and `TDC` behind it.
-        GradientError for other chains: draws of several stages have no closed form.
+
+        Args:
+            measurement: result of `sample`.
+            x: light, or a renderer's output.
+
+        Returns:
+            (..., C, H, W).
+
+        Raises:
+            GradientError: for other chains: draws of several stages have no closed form.
         """
         y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
         stages = unrolled(self.stages)[used:]
@@ -178,7 +335,7 @@ class Compose(Sensor):
         step: Callable[[nn.Module, Tensor], Any],
         at_once: Callable[[list[nn.Module], Tensor], tuple[Tensor, int]] | None = None,
     ) -> Tensor:
-        """`step` for one stage after another; `at_once` takes several where it can, and says how many."""
+        """Call `step` for one stage after another; `at_once` takes several where it can, and returns their number."""
         stages = unrolled(self.stages)
         if isinstance(x, Tensor):
             y = x
@@ -195,7 +352,7 @@ class Compose(Sensor):
         return y
 
     def _opened(self, output: Any) -> tuple[Tensor, int]:
-        """The tensor of a renderer's output, and how many stages it has passed already."""
+        """Return the tensor of a renderer's output, and the number of stages that it has passed already."""
         transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
         beats = getattr(output, "beats", None)
         if getattr(output, "gates", None) is not None:
@@ -237,13 +394,213 @@ class Compose(Sensor):
         )
 
     def check_axis(self, axis: TimeAxis) -> None:
-        """UnitError when a stage was made for other bins than those of ``axis``, or without an axis."""
+        """Check that all stages were made for the bins of an axis.
+
+        Args:
+            axis: axis of the light.
+
+        Raises:
+            UnitError: for other bins, or no axis.
+        """
         if not isinstance(axis, TimeAxis):
             raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
         check_axis(self, axis)
 
 
 def _look_again(chain: nn.Module, incompatible: object) -> None:
-    """UnitError for a state under which the order no longer holds, such as a background that was not there before."""
+    """Raise UnitError for a loaded state under which the order no longer holds, such as one with a new background."""
     if isinstance(chain, Compose):
         check_order(chain.stages, "Compose")
+
+
+# ------------------------------------------------------------------------------------------ pixels of different sensors
+
+
+_MOST_GROUPS = 256
+
+
+class PixelGroups(RandomSensor):
+    """Image (..., C, T, H, W) whose pixels go to different sensors: pixel (i, j) to `sensors[which[i, j]]`.
+
+    For everything that is one number in a sensor and differs from pixel to pixel: dead times (`by_value`), gates,
+    afterpulses. Costs a call for each sensor. Draws, normal surrogates, scores and policies are those of the sensors.
+
+    Args:
+        sensors: sensors, or chains of them (`Compose`), that treat pixels alone (no lenses, no crosstalk) and give
+            equal numbers of bins.
+        which: (H, W) whole numbers.
+        grad: gradient policy of all sensors; None leaves theirs.
+
+    Raises:
+        ShapeError: for other images and for numbers that are no sensor's.
+        UnitError: for sensors of different quantities or bins.
+        GradientError: for a `variance` or `log_prob` that a sensor has not.
+    """
+
+    which: Tensor
+
+    def __init__(self, sensors: Sequence[Sensor], which: Tensor, *, grad: GradPolicy | None = None) -> None:
+        super(RandomSensor, self).__init__()
+        sensors = several("PixelGroups", sensors, "sensors", error=ArgumentError)
+        wrong = [type(s).__name__ for s in sensors if not isinstance(s, Sensor)]
+        if not len(sensors) or wrong:
+            raise ArgumentError(f"PixelGroups: expected a list of sensors, got {wrong or 'an empty one'}.")
+        if not isinstance(which, Tensor) or which.ndim != 2 or which.is_complex():
+            shape = tuple(which.shape) if isinstance(which, Tensor) else type(which).__name__
+            raise ShapeError(f"PixelGroups: expected which as (H, W) numbers of sensors, got {shape}.")
+        numbers = which.long()
+        inside = (numbers == which) & (numbers >= 0) & (numbers < len(sensors))
+        if not bool(inside.all()):
+            raise ShapeError(f"PixelGroups: expected numbers of {len(sensors)} sensors, 0 to {len(sensors) - 1}.")
+        check_draws(sensors, "PixelGroups")
+        self.sensors = nn.ModuleList(sensors)
+        self.register_buffer("which", numbers)
+        self.takes, self.gives = sensors[0].takes, sensors[0].gives
+        if any((s.takes, s.gives) != (self.takes, self.gives) for s in sensors):
+            raise UnitError("PixelGroups: expected sensors that take and give the same, got different kinds of light.")
+        self.bin_width_s, self.num_bins = common_bins(sensors, "PixelGroups")
+        if grad is not None:
+            self.grad = grad
+
+    @classmethod
+    def by_value(
+        cls, values: Tensor, make: Callable[[float], Sensor], *, grad: GradPolicy | None = None
+    ) -> PixelGroups:
+        """Make one sensor for each of the numbers of a map: dead times in seconds, say.
+
+        Args:
+            values: (H, W), at most 256 different ones: round maps that have more, to a tenth of a bin for instance.
+            make: function of a value that makes a sensor.
+            grad: gradient policy of all sensors; None leaves theirs.
+
+        Raises:
+            UnitError: for more values.
+            ShapeError: for other shapes.
+        """
+        if not isinstance(values, Tensor) or values.ndim != 2:
+            raise ShapeError("PixelGroups.by_value: expected a map (H, W), got something else.")
+        different, which = torch.unique(values.double(), return_inverse=True)
+        if different.numel() > _MOST_GROUPS:
+            raise UnitError(
+                f"PixelGroups.by_value: expected at most {_MOST_GROUPS} different values, got {different.numel()}. "
+                "Round the map, to a tenth of a bin for instance."
+            )
+        return cls([make(value) for value in different.tolist()], which, grad=grad)
+
+    @property
+    def grad(self) -> GradPolicy:
+        """The policy of all random sensors. GradientError where they have different ones."""
+        policies = policies_of(self)
+        if len(policies) > 1:
+            raise ArgumentError(f"PixelGroups: expected one policy of all sensors, got {sorted(policies)}. Set grad.")
+        return policies.pop() if policies else "expected"
+
+    @grad.setter
+    def grad(self, value: GradPolicy) -> None:
+        """Policy of all random sensors. ArgumentError where they have different ones."""
+        policy = check_policy(value, "PixelGroups")
+        for part in self.sensors.modules():
+            if isinstance(part, RandomSensor):
+                part.grad = policy
+
+    def check_bins(self, x: object) -> None:
+        super().check_bins(x)
+        for sensor in self.sensors:
+            if isinstance(sensor, Sensor):
+                sensor.check_bins(x)
+
+    def _apart(self, x: Tensor) -> list[tuple[Sensor, Tensor]]:
+        """Return sensors with their pixels' places in a flat image."""
+        check_transient(x, "PixelGroups")
+        if self.which.shape != x.shape[-2:]:
+            raise ShapeError(
+                f"PixelGroups: expected an image {tuple(self.which.shape)} as in which, got {tuple(x.shape[-2:])}. "
+                "Make the map for this sensor."
+            )
+        flat = self.which.flatten()
+        places = [(s, (flat == i).nonzero().squeeze(-1)) for i, s in enumerate(self.sensors)]
+        return [(s, place) for s, place in places if isinstance(s, Sensor) and place.numel()]
+
+    def _measured(self, x: Tensor, measure: Callable[[Sensor, Tensor], Tensor]) -> Tensor:
+        """Measure the pixels of each sensor, and put them together again."""
+        parts, places = [], []
+        for sensor, place in self._apart(x):
+            own = x.flatten(-2).index_select(-1, place).unsqueeze(-2)
+            parts.append(measure(sensor, own).squeeze(-2))
+            places.append(place)
+        if not parts:  # an image without pixels
+            return x
+        return self._together(parts, places)
+
+    def _together(self, parts: list[Tensor], places: list[Tensor]) -> Tensor:
+        """Put flat pixels (..., P) of several groups together as an image (..., H, W)."""
+        lengths = {part.shape[:-1] for part in parts}
+        if len(lengths) > 1:
+            raise ShapeError(f"PixelGroups: expected sensors that give equal bins, got {sorted(map(tuple, lengths))}.")
+        order = torch.cat(places).argsort()
+        flat = torch.cat(parts, -1).index_select(-1, order)
+        return flat.reshape(*flat.shape[:-1], *self.which.shape)
+
+    def probabilities(self, x: Tensor) -> Tensor:
+        """Expected detections per cycle and bin, of detectors.
+
+        Args:
+            x: light (..., C, T, H, W).
+        """
+        return self._measured(x, lambda sensor, own: sensor.probabilities(own))  # type: ignore[operator]
+
+    def expected(self, x: Tensor) -> Tensor:
+        return self._measured(x, mean_of)
+
+    def variance(self, x: Tensor) -> Tensor:
+        def spread(sensor: Sensor, own: Tensor) -> Tensor:
+            result: Tensor = sensor.variance(own) if draws(sensor) else torch.zeros_like(sensor.expected(own))  # type: ignore[operator]
+            return result
+
+        return self._measured(x, spread)
+
+    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Draw the normal surrogates of the sensors, with their covariance between bins.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+        """
+        return self._measured(x, lambda sensor, own: normal_of(sensor, own, generator))
+
+    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        with torch.no_grad():
+            return self._measured(x, lambda sensor, own: draw_of(sensor, own, generator))
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        parts, places = [], []
+        for sensor, place in self._apart(x):
+            if not draws(sensor):
+                raise GradientError(f"PixelGroups.log_prob: expected random sensors, got {type(sensor).__name__}.")
+            seen, own = (v.flatten(-2).index_select(-1, place).unsqueeze(-2) for v in (measurement, x))
+            parts.append(sensor.log_prob(seen, own).squeeze(-2))  # type: ignore[operator]
+            places.append(place)
+        return self._together(parts, places)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Measure light, every sensor under its own policy and with the same generator in turn.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: source of randomness.
+        """
+        scores: list[Tensor] = []
+
+        def measure(sensor: Sensor, own: Tensor) -> Tensor:
+            with ScoreFunction() as score:
+                result = measurement_of(sensor, own, generator)
+            pixels = (*own.shape[:-3], own.shape[-1])
+            found = [value.squeeze(-2) for value in score._log_probs]
+            scores.append(added(found) if found else own.new_zeros(pixels))
+            return result
+
+        y = self._measured(x, measure)
+        if any(s.requires_grad for s in scores):
+            places = [place for _, place in self._apart(x)]
+            record_score(lambda: self._together(scores, places), "PixelGroups")
+        return y

@@ -23,10 +23,9 @@ from torchtransient.checks import of_class
 from torchtransient.chirps import Chirps
 from torchtransient.errors import UnitError
 from torchtransient.floating import product
-from torchtransient.sensing.base.layout import check_count, check_number, check_time_axis, check_transient
-from torchtransient.sensing.base.policies import GradPolicy, standard_normal
-from torchtransient.sensing.base.sensor import RandomSensor
-from torchtransient.sensing.numerics.hypergeometric import log_0f1
+from torchtransient.sensing.checks import check_count, check_number, check_time_axis, check_transient
+from torchtransient.sensing.hypergeometric import log_0f1
+from torchtransient.sensing.sensor import GradPolicy, RandomSensor, standard_normal
 
 # Photons below which a field grows like its power in place of the root, whose slope is infinite at zero.
 _FAINT = 1e-4

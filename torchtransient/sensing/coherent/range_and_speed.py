@@ -14,7 +14,7 @@ from torchtransient.checks import is_one_of, of_class, shown
 from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.base.layout import TIME, check_bins, check_number, check_time_axis
+from torchtransient.sensing.checks import TIME, check_bins, check_number, check_time_axis
 
 Bins = Literal["sums", "samples"]
 KINDS_OF_BINS: tuple[Bins, ...] = get_args(Bins)

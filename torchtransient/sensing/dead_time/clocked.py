@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.base.given import is_dual
+from torchtransient.sensing.checks import is_dual
 from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, check_dead_bins, split_dead_time
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5
@@ -69,10 +69,15 @@ def _level_counts(level: Tensor) -> list[int]:
 
 
 def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tensor, list[int], bool]:
-    """Levels of rows (P, T), whose bins are cut in `least` 2^level pieces of at most `photons` photons.
+    """Find the levels of rows, whose bins are cut in `least` 2^level pieces of at most `photons` photons.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        least: pieces of a bin at level 0.
+        photons: largest number in a piece.
 
     Returns:
-        Level of each row (P,); levels that occur; whether torch.func.vmap hides which rows they belong to.
+        Level of each row (P,); levels that occur; True if torch.func.vmap hides which rows they belong to.
 
     Raises:
         TorchTransientError: if a bin would need more than `MOST_PIECES`.
@@ -90,12 +95,25 @@ def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tu
 
 
 def highest_level(level: Tensor) -> int:
-    """Largest of integers >= 0 (0 of none), of all rows that are mapped over inside of torch.func.vmap."""
+    """Largest of integers >= 0 (0 of none), of all rows that are mapped over inside of torch.func.vmap.
+
+    Args:
+        level: integers.
+    """
     return len(_level_counts(level)) - 2
 
 
 def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
-    """Yield (indices of rows, None for all; pieces of their bins) for every level that occurs."""
+    """Yield the rows of every level of subdivision that occurs.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        dead: dead time in bins.
+        photons: largest number in a piece.
+
+    Yields:
+        Indices of rows, None for all, and pieces of their bins.
+    """
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, _ = subdivision_levels(rate, least, photons)
     for k in present:
@@ -162,7 +180,17 @@ class DeadTimeBlocks:
 def armed_probabilities(
     start: Tensor, rate: Tensor, joined: Tensor | None, stretch: int = _STRETCH
 ) -> tuple[Tensor, Tensor]:
-    """Armed at the start of pieces, and at the end of the last: A[k + 1] = A[k] exp(-rate[k]) + joined[k]."""
+    """Armed at the start of pieces, and at the end of the last: A[k + 1] = A[k] exp(-rate[k]) + joined[k].
+
+    Args:
+        start: armed at the start, (P, 1).
+        rate: (P, N), per piece.
+        joined: rearmed in each piece, (P, N), or None.
+        stretch: pieces summed at a time.
+
+    Returns:
+        (P, N) and (P, 1).
+    """
     found = []
     for begin in range(0, rate.shape[-1], stretch):
         flux = rate[..., begin : begin + stretch].cumsum(-1)
@@ -204,7 +232,15 @@ def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | N
 
 
 def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
-    """Detections (P, T) per cycle and bin by `cycle_means`."""
+    """Detections per cycle and bin by `cycle_means`.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        dead_bins: dead time in bins.
+
+    Returns:
+        (P, T).
+    """
     dead, bins = check_dead_bins(dead_bins), rate.shape[-1]
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, hidden = subdivision_levels(rate, least)
@@ -231,7 +267,15 @@ def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
 
 
 def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
-    """Probability (P, T) of two detections in a bin, for dead times of half a bin to one bin (never three)."""
+    """Probability of two detections in a bin, for dead times of half a bin to one bin (never three).
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        dead_bins: dead time in bins.
+
+    Returns:
+        (P, T).
+    """
     twice = torch.zeros_like(rate)
     for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
         own = rate if rows is None else rate[rows]
@@ -251,7 +295,11 @@ def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
 
 
 def series_degree(largest: float) -> int:
-    """Degree at which terms of exp(largest) fall below rounding."""
+    """Degree at which terms of exp(largest) fall below rounding.
+
+    Args:
+        largest: exponent.
+    """
     degree = 3
     while largest**degree / math.factorial(degree) > _SMALLEST_TERM:
         degree += 1
@@ -452,7 +500,15 @@ class DetectionScan:
 
 
 def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | slice, DetectionScan]]:
-    """Yield (columns, scan over them), bins cut as finely as the columns need."""
+    """Yield scans over columns of rates, bins cut as finely as the columns need.
+
+    Args:
+        rate: (T, P), per cycle and bin.
+        dead_bins: dead time in bins.
+
+    Yields:
+        Columns, and the scan over them.
+    """
     dead = check_dead_bins(dead_bins)
     least = 1 if dead >= 1 - 1e-9 else 2
     level, present, _ = subdivision_levels(rate.T, least)

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import UnitError
-from torchtransient.sensing.base.layout import TIME
-from torchtransient.sensing.base.policies import gaussian_noise
+from torchtransient.sensing.checks import TIME
 from torchtransient.sensing.dead_time.clocked import (
     DeadTimeBlocks,
     DetectionScan,
@@ -37,7 +36,8 @@ from torchtransient.sensing.dead_time.renewal import (
     second_moment,
     split_dead_time,
 )
-from torchtransient.sensing.numerics.draws import halve, sample_multinomial
+from torchtransient.sensing.draws import halve, sample_multinomial
+from torchtransient.sensing.sensor import gaussian_noise
 
 _MOST_MERGED = 4  # pieces of the means that are drawn as one
 _MOST_STEPS = 40  # of Newton's method
@@ -85,7 +85,12 @@ class StepCounts:
 
 
 def bounded_ratio(part: Tensor, whole: Tensor) -> Tensor:
-    """part / whole within [0, 1], 0 where whole is 0."""
+    """Return part / whole within [0, 1], 0 where whole is 0.
+
+    Args:
+        part: numerator.
+        whole: denominator.
+    """
     some = whole > 1e-13
     share = part / torch.where(some, whole, torch.ones_like(whole))
     return torch.where(some, share, 0.0).clamp(0, 1)
@@ -94,15 +99,34 @@ def bounded_ratio(part: Tensor, whole: Tensor) -> Tensor:
 def step_probabilities(
     rate: Tensor, detected: Tensor, armed: Tensor, late: Tensor, back: Tensor, begin: Tensor | None, whole: int
 ) -> StepProbabilities:
-    """Step probabilities of bins with these means; `back`: rearmed in the bin."""
+    """Step probabilities of bins with given means; all arguments of one layout.
+
+    Args:
+        rate: per cycle and bin.
+        detected: mean detections.
+        armed: armed at the start of bins.
+        late: detections rearmed one bin after the whole dead time.
+        back: rearmed in the bin.
+        begin: armed when the first bin begins, or None.
+        whole: whole bins of the dead time.
+    """
     fire, soon = firing_probabilities(-torch.expm1(-rate), detected, armed, back)
     return StepProbabilities(begin=begin, fire=fire, soon=soon, late=bounded_ratio(late, detected), whole=whole)
 
 
 def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Tensor) -> tuple[Tensor, Tensor]:
-    """Probabilities to be detected when armed at the start (nearly `fire`), and when rearmed in the bin.
+    """Probabilities to be detected when armed at the start of a bin (nearly `fire`), and when rearmed in it.
 
     Where the straight lines leave too much or too little for the rearmed ones, one probability for both keeps the mean.
+
+    Args:
+        fire: probability of a photon in the bin.
+        detected: mean detections.
+        armed: armed at the start.
+        back: rearmed in the bin.
+
+    Returns:
+        Both probabilities.
     """
     rest = detected - armed * fire
     whole_chance = bounded_ratio(detected, armed + back)
@@ -111,12 +135,24 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
 
 
 def draw_binomial(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Binomial numbers of `number` trials."""
+    """Draw binomial numbers.
+
+    Args:
+        number: trials.
+        chance: probability.
+        generator: source of randomness.
+    """
     return torch.binomial(number, chance, generator=generator)
 
 
 def draw_normal(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Normal numbers with mean and variance of `draw_binomial`."""
+    """Draw normal numbers with mean and variance of `draw_binomial`.
+
+    Args:
+        number: trials.
+        chance: probability.
+        generator: source of randomness.
+    """
     z = torch.randn(number.shape, dtype=number.dtype, device=number.device, generator=generator)
     return number * chance + (number.clamp_min(0) * chance * (1 - chance)).sqrt() * z
 
@@ -166,12 +202,26 @@ def draw_steps(
 
 
 def safe_xlogy(count: Tensor, chance: Tensor) -> Tensor:
-    """count log(chance), with value and gradient 0 for count 0 (torch.xlogy has a NaN gradient at chance 0)."""
+    """Return count log(chance), with value and gradient 0 for count 0 (torch.xlogy has a NaN gradient at chance 0).
+
+    Args:
+        count: any shape.
+        chance: of a shape that broadcasts.
+    """
     return count * torch.log(torch.where(count != 0, chance, 1.0))
 
 
 def steps_log_prob(path: StepCounts, chances: StepProbabilities, periods: int) -> Tensor:
-    """Log-probability (..., H, W) of drawn steps, up to a constant in the light."""
+    """Log-probability of drawn steps, up to a constant in the light.
+
+    Args:
+        path: drawn steps, (..., T, H, W).
+        chances: their probabilities.
+        periods: independent periods.
+
+    Returns:
+        (..., H, W).
+    """
     total = torch.zeros_like(chances.fire.select(TIME, 0))
     if path.begin is not None and chances.begin is not None:
         dead = periods - path.begin.sum(TIME)  # all period long
@@ -377,7 +427,17 @@ def _replace_rows(into: Tensor, rows: Tensor | None, values: Tensor) -> Tensor:
 
 
 def cycles_log_prob(drawn: list[DrawnCycles], rate: Tensor, dead_bins: Tensor, cycles: int) -> Tensor:
-    """Log-probability (P,) of drawn steps, up to a constant in the light."""
+    """Log-probability of drawn steps of cycles, up to a constant in the light.
+
+    Args:
+        drawn: steps, by rows of one subdivision.
+        rate: (P, T), per cycle and bin.
+        dead_bins: dead time in bins.
+        cycles: number of cycles.
+
+    Returns:
+        (P,).
+    """
     total = torch.zeros_like(rate[:, 0])
     for one in drawn:
         own = rate if one.rows is None else rate[one.rows]
@@ -387,10 +447,19 @@ def cycles_log_prob(drawn: list[DrawnCycles], rate: Tensor, dead_bins: Tensor, c
 
 
 def normal_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch.Generator | None) -> Tensor:
-    """Normal counts (P, T) with mean and covariance of the draws, differentiable in rate and dead time.
+    """Draw normal counts with mean and covariance of the draws, differentiable in rate and dead time.
 
     Binomial steps of independent cycles: each adds its own noise, that of the mean number it draws from. Means are
     linear in the steps, so that the covariance is exact.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        dead_bins: dead time in bins.
+        cycles: number of cycles.
+        generator: source of randomness.
+
+    Returns:
+        (P, T).
     """
     counts = torch.zeros_like(rate)
     for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
@@ -621,7 +690,17 @@ def armed_time(counts: Tensor, cycles: int, dead_bins: float) -> ExposedCycles:
 
 
 def check_cycles(quiet: Tensor, cycles: int, least: float, where: str) -> None:
-    """Raise UnitError where fewer than `least` armed cycles are left by the detections of a bin."""
+    """Check that the detections of each bin leave enough armed cycles.
+
+    Args:
+        quiet: armed cycles that did not fire.
+        cycles: number of cycles, for errors.
+        least: least number that has to be left.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: for fewer.
+    """
     if bool((quiet < least).any()):
         raise UnitError(
             f"{where}: expected counts of at most {cycles} cycles, got a pixel with more detections "

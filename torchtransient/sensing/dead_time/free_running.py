@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.base.layout import TIME
+from torchtransient.sensing.checks import TIME
 from torchtransient.sensing.dead_time.clocked import rows_by_subdivision
 from torchtransient.sensing.dead_time.clocked_counts import (
     StepCounts,
@@ -37,7 +37,7 @@ from torchtransient.sensing.dead_time.renewal import (
     stationary_phases,
     sum_of_detections,
 )
-from torchtransient.sensing.numerics.draws import sample_multinomial
+from torchtransient.sensing.draws import sample_multinomial
 
 DARK = 1e-12  # photons per period; below, detections equal photons
 _BELOW_ZERO = 1e-5  # of the largest bin: counts as far below zero show bins too wide for the light in them
@@ -108,9 +108,15 @@ def _armed_in_the_light(rate: Tensor, state: FreeRunningState) -> Tensor:
 
 
 def rows_by_contrast(rate: Tensor) -> Iterator[tuple[Tensor | None, int]]:
-    """Yield (indices of rows, None for all; pieces of their bins), such that light changes by few photons a piece.
+    """Yield rows of rates and the pieces of their bins, such that light changes by few photons a piece.
 
     Constant light is exact in bins of any width: only the excess over the darkest bin counts.
+
+    Args:
+        rate: (P, T), per period and bin.
+
+    Yields:
+        Indices of rows, None for all, and pieces of their bins.
     """
     peak = torch.nan_to_num(rate.amax(-1) - rate.amin(-1)) / _CONTRAST
     level = torch.ceil(torch.log2(peak.clamp(1, _FINEST / 2)) - 1e-9).long()
@@ -154,19 +160,37 @@ def _solve_settled(safe: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningS
 
 
 def detections_per_period(chain: RenewalChain, lines: Tensor) -> Tensor:
-    """Stationary lines whose counts sum to 1 -> detections per period."""
+    """Detections per period of a stationary chain.
+
+    Args:
+        chain: the chain.
+        lines: stationary lines whose counts sum to 1.
+    """
     # from one detection to the next a detector is dead, then armed
     return lines * (chain.bins / (chain.whole + chain.part + chain.waiting(lines)))
 
 
 def late_lines(lines: Tensor, part: Tensor) -> Tensor:
-    """Detections (P, T) on lines (P, 2 T) that are rearmed one bin after the whole dead time."""
+    """Detections that are rearmed one bin after the whole dead time.
+
+    Args:
+        lines: (P, 2 T).
+        part: fraction of a bin of the dead time.
+
+    Returns:
+        (P, T).
+    """
     bins = lines.shape[-1] // 2
     return part * lines[:, :bins] + ROOT3 * (1 - part) * part * lines[:, bins:]
 
 
 def clamped_state(chain: RenewalChain, lines: Tensor) -> FreeRunningState:
-    """State of lines (P, 2 N) within the limits of probabilities; lines may dip below zero at edges."""
+    """State of lines within the limits of probabilities; lines may dip below zero at edges.
+
+    Args:
+        chain: the chain.
+        lines: (P, 2 N).
+    """
     count = lines[:, : chain.bins].clamp_min(0)
     late = torch.minimum(late_lines(lines, chain.part).clamp_min(0), count)
     armed = chain.at_start(chain.inflow(lines)).clamp(0, 1)
@@ -191,7 +215,12 @@ def _solve_cut(rate: Tensor, dead_bins: Tensor, pieces: int) -> FreeRunningState
 
 
 def stationary_steps(rate: Tensor, state: FreeRunningState) -> StepProbabilities:
-    """Step probabilities of a run with the means of `state`, both (..., T, H, W)."""
+    """Step probabilities of a run with the means of a stationary state.
+
+    Args:
+        rate: (..., T, H, W), per period and bin.
+        state: of the same layout.
+    """
     bins, whole = rate.shape[TIME], state.whole
     early = state.detected - state.late
     back_soon, back_late = early.roll(whole, TIME), state.late.roll(whole + 1, TIME)

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import TorchTransientError, UnitError
-from torchtransient.sensing.base.layout import one_number
+from torchtransient.sensing.checks import one_number
 
 ROOT3 = math.sqrt(3.0)
 _SERIES_BELOW = 1.0
@@ -45,6 +45,10 @@ _ROWS_OF_BLOCKS = 32
 def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> float:
     """Return a dead time in bins as a number.
 
+    Args:
+        dead_bins: number or scalar tensor, in bins.
+        where: name of the caller, for errors.
+
     Raises:
         UnitError: below half a bin, or not finite.
     """
@@ -59,7 +63,14 @@ def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> floa
 
 
 def split_dead_time(dead: Tensor) -> tuple[int, Tensor]:
-    """Whole bins of a dead time in bins, and the fraction of one that is left, differentiable."""
+    """Split a dead time into whole bins and the fraction of one that is left.
+
+    Args:
+        dead: scalar, in bins.
+
+    Returns:
+        Whole bins, and the fraction, differentiable.
+    """
     # a whole number that rounding has put just below itself is still that number
     whole = math.floor(float(dead.detach()) + 1e-9)
     part = dead - whole
@@ -97,9 +108,11 @@ def _series(x: Tensor, largest: float) -> Tensor:
 
 
 def moments(x: Tensor, largest: float | None = None) -> Moments:
-    """Moments of exponentials for x >= 0, float64: a series where x is small, recurrences that only add up otherwise.
+    """Moments of exponentials: a series where x is small, recurrences that only add up otherwise.
 
-    `largest`: known bound of x, for x that cannot be read (torch.func.vmap).
+    Args:
+        x: >= 0, float64.
+        largest: known bound of x, for x that cannot be read (torch.func.vmap).
     """
     if largest is not None and largest <= _SERIES_BELOW:
         hit_1 = _series(x, largest)
@@ -118,7 +131,11 @@ def moments(x: Tensor, largest: float | None = None) -> Moments:
 
 
 def second_moment(x: Tensor) -> Tensor:
-    """Integral over z in [0, 1] of z^2 exp(-x z) for x >= 0, float64."""
+    """Integral over z in [0, 1] of z^2 exp(-x z).
+
+    Args:
+        x: >= 0, float64.
+    """
     small = x < _SERIES_BELOW
     near, far = torch.where(small, x, torch.zeros_like(x)), torch.where(small, torch.ones_like(x), x)
     series = torch.zeros_like(x)

@@ -1,7 +1,7 @@
-"""Numbers in eight bits: what a page stores, and how far it is from what was given.
+"""Numbers in eight bits, as a page stores them, with the error that this makes.
 
 Code 0 is zero and 255 what is not finite. Light has logarithmic steps between, numbers of both signs half as many on
-either side, counts up to 254 themselves, phases and ratios equal steps.
+either side, counts up to 254 themselves, phases and ratios equal steps. Counts up to 65534 are kept in sixteen bits.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ _SIGNED_STEPS = 126
 _SIGNED_DECADES = 4.0
 # Numbers that are encoded at a time.
 _ENTRIES_AT_ONCE = 2**20
+# Counts in sixteen bits: what is not finite has the last code.
+_MOST_COUNTS = 2**16 - 2
 # Sign, exponent and the first bits of the fraction of a float32; half of what numbers with these bits differ by.
 _BITS = 18
 _SAME_BITS = 2.0**-10
@@ -30,15 +32,15 @@ _SAME_BITS = 2.0**-10
 
 @dataclass(frozen=True)
 class Table:
-    """Values of the 256 codes.
+    """Values of the 256 codes, or 65536 of the kind "wide".
 
     Attributes:
         name: what the codes are of.
-        values: (256,) float32, NaN for code 255.
+        values: (256,) float32, NaN for the last code.
         error: largest difference between a number and the value of its code, relative to the number for light and
             numbers of both signs, else absolute.
         floor: smallest size of a number whose code is not zero.
-        kind: "log", "signed", "whole", "phase" or "ratio".
+        kind: "log", "signed", "whole", "wide", "phase" or "ratio".
         decades: powers of ten between the smallest value and the largest.
     """
 
@@ -49,8 +51,11 @@ class Table:
     kind: str
     decades: float = 0.0
 
-    def encode(self, x: Tensor) -> NDArray[np.uint8]:
-        """Return the codes of real numbers of any shape, uint8."""
+    def encode(self, x: Tensor) -> NDArray[Any]:
+        """Return the codes of real numbers of any shape, uint8, uint16 of the kind "wide"."""
+        if self.kind == "wide":
+            counts = torch.where(torch.isfinite(x), x, float(_MOST_COUNTS + 1)).to(torch.int32)
+            return counts.numpy().astype("<u2")
         if self.kind == "phase":
             code = torch.remainder(torch.round(x * (255 / (2 * math.pi))), 255)
         elif self.kind == "ratio":
@@ -58,6 +63,12 @@ class Table:
         else:
             return self._looked_up(x)
         return torch.where(torch.isfinite(x), code, float(NOT_FINITE)).to(torch.uint8).numpy()
+
+    def plain(self) -> list[float | None] | str:
+        """Return the values as `view.js` reads them."""
+        if self.kind == "wide":
+            return "counts"
+        return [float(value) if np.isfinite(value) else None for value in self.values]
 
     def _looked_up(self, x: Tensor) -> NDArray[np.uint8]:
         """Codes by the upper bits of each number: a logarithm of each is thirty times slower."""
@@ -121,6 +132,7 @@ def _linear(name: str, kind: str, values: Any, error: float) -> Table:
 
 
 WHOLE = _linear("counts", "whole", np.arange(255.0), 0.0)
+WIDE = Table("counts", np.append(np.arange(_MOST_COUNTS + 1, dtype=np.float32), np.float32("nan")), 0.0, 0.0, "wide")
 PHASE = _linear("phase", "phase", np.arange(255) * (2 * math.pi / 255), math.pi / 255)
 RATIO = _linear("ratio", "ratio", np.arange(255) / 127 - 1.0, 0.5 / 127)
 
@@ -141,8 +153,8 @@ def table_of(name: str, cubes: list[Tensor]) -> Table:
             lowest = min(lowest, smallest) if smallest > 0 else lowest
     if bottom < 0:
         return signed_table(name, max(top, -bottom))
-    if 0 < top < 255 and all(_whole(cube) for cube in cubes):
-        return WHOLE
+    if 0 < top <= _MOST_COUNTS and all(_whole(cube) for cube in cubes):
+        return WHOLE if top < NOT_FINITE else WIDE
     return light_table(name, top, lowest if math.isfinite(lowest) else top)
 
 

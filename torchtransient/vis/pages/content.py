@@ -1,30 +1,24 @@
-"""Content of a page: light over a slider, a picture for each of its positions, of one thing or several of a kind."""
+"""Content of a page: light over a slider, a picture for each of its positions, of one thing or several of a kind.
+
+Nothing here imports torch: the server of large files starts without it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from torchtransient.axes import RateAxis, TimeAxis
-from torchtransient.capture import Capture
-from torchtransient.checks import shown
-from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.gates import Gate
 from torchtransient.units import SPEED_OF_LIGHT
-from torchtransient.vis.sources import as_tensor, frequencies_of, read_any
 
-_METRES = "optical path length"
+if TYPE_CHECKING:
+    from torch import Tensor
+
 _NS_PER_METRE = 1e9 / SPEED_OF_LIGHT
-# Samples of a data set on a page.
-_SAMPLES = 8
 
 
 @dataclass(frozen=True)
@@ -78,23 +72,16 @@ class Planes:
         assert light is not None
         return Planes(light, *others)
 
-    @classmethod
-    def cat(cls, parts: Sequence[Planes]) -> Planes:
-        """Return bins of several parts in one."""
-        first = parts[0]
-        held = [name for name in ("light", "ratios", "phase", "error") if getattr(first, name) is not None]
-        return cls(**{name: torch.cat([getattr(part, name) for part in parts], -3) for name in held})
-
 
 @dataclass(frozen=True)
 class Content:
     """Content of a page.
 
     Attributes:
-        kind: "transient", "gates", "counts", "polarized", "phasors", "rates", "beats", "capture" or "volume".
+        kind: "transient", "gates", "polarized", "phasors", "slow phasors", "rates", "beats", "capture" or "volume".
         slider: positions of the slider.
         items: names of results or samples.
-        layers: names of rates, chirps or laser spots, one empty name without any.
+        layers: names of rates, chirps, frequencies or laser spots, one empty name without any.
         planes: an entry for each item and layer, layers last.
         quantity: quantity of the numbers.
         layer_name: name of what differs between layers.
@@ -131,121 +118,14 @@ class Content:
         return t, h, w
 
 
-def content_of(
-    x: Any, who: str, *, axis: TimeAxis | None = None, rate_axis: RateAxis | None = None,
-    frequencies: Any = None, samples: int = _SAMPLES,
-) -> Content:  # fmt: skip
-    """Return what a page shows of ``x``; see :func:`torchtransient.vis.view`."""
-    known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
-    if isinstance(x, tuple) and len(x) == 2:
-        return _together([_single(part, who, **known) for part in x], ("A", "B"), who)
-    if not isinstance(x, Tensor | np.ndarray | Mapping | str | Path) and _is_sequence(x):
-        known["axis"] = getattr(x, "axis", None) if axis is None else axis
-        parts = list(islice(_each(x), samples))
-        if not parts:
-            raise ShapeError(f"{who}: expected at least one sample, got an empty {type(x).__name__}.")
-        found = _together(
-            [_single(part, who, **known) for part in parts], [f"sample {n}" for n in range(len(parts))], who
-        )
-        left = len(x) - len(parts) if hasattr(x, "__len__") else 0
-        return replace(found, notes=(*found.notes, f"The first {len(parts)} of {len(x)} samples.")) if left else found
-    return _single(x, who, **known)
+def time_slider(centers_opl: NDArray[np.float64]) -> Slider:
+    """Return the slider of bins of time around ``centers_opl`` (T,), metres."""
+    return Slider("optical path length", "m", centers_opl, "time", "ns", _NS_PER_METRE)
 
 
-def _is_sequence(x: Any) -> bool:
-    return hasattr(x, "__getitem__") or hasattr(x, "__iter__")
-
-
-def _each(x: Any) -> Iterator[Any]:
-    if hasattr(x, "__getitem__") and hasattr(x, "__len__"):
-        return (x[number] for number in range(len(x)))
-    return iter(x)
-
-
-def _together(parts: list[Content], names: Sequence[str], who: str) -> Content:
-    first = parts[0]
-    for part in parts[1:]:
-        same = (part.kind, part.shape, part.layers, part.planes[0].light.shape) == (
-            first.kind, first.shape, first.layers, first.planes[0].light.shape,
-        )  # fmt: skip
-        if not same or not np.allclose(part.slider.centers, first.slider.centers):
-            raise ShapeError(
-                f"{who}: expected results of one kind, shape and axis, got {first.kind} {first.shape} and {part.kind} "
-                f"{part.shape}."
-            )
-    return replace(first, items=tuple(names), planes=tuple(planes for part in parts for planes in part.planes))
-
-
-def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
-    if isinstance(x, str | Path):
-        x = read_any(Path(x))
-    if isinstance(x, Mapping):
-        x = _Named(x, axis)
-    if isinstance(x, Capture):
-        return _capture(x, who)
-    if hasattr(x, "grid") and hasattr(x, "picture"):
-        return _volume(x)
-    axis = getattr(x, "axis", None) if axis is None else axis
-    for name, make in (("rates", _rates), ("beats", _beats)):
-        if getattr(x, name, None) is not None:
-            given = getattr(x, "rate_axis", None) if rate_axis is None else rate_axis
-            return make(as_tensor(getattr(x, name), who), axis, given, who)
-    if getattr(x, "phasor", None) is not None:
-        known = getattr(x, "frequencies", None) if frequencies is None else frequencies
-        return _phasors(as_tensor(x.phasor, who), known, who)
-    if getattr(x, "gated", None) is not None:
-        slider = gate_slider(x.gated.shape[-3], getattr(x, "gates", None))
-        return light_content(as_tensor(x.gated, who), slider, "gates", _errors(x), who)
-    if getattr(x, "transient", None) is not None:
-        cube = as_tensor(x.transient, who)
-        return light_content(
-            cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who
-        )
-    return _plain(as_tensor(x, who), who, axis, rate_axis, frequencies)
-
-
-def _plain(cube: Tensor, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
-    if cube.is_complex():
-        return _phasors(cube, frequencies, who)
-    if frequencies is not None:
-        raise ArgumentError(f"{who}: frequencies are those of complex phasors (C, F, H, W), got {cube.dtype}.")
-    if rate_axis is not None:
-        return _rates(cube, axis, rate_axis, who)
-    if cube.ndim == 3 and len(cube) == 3 and axis is None:
-        raise ShapeError(
-            f"{who}: {tuple(cube.shape)} is a steady picture in colour, or three bins of time. Give light as "
-            "(C, T, H, W): steady[:, None] of a picture, cube[None] of bins."
-        )
-    if cube.ndim == 3:
-        cube = cube[None]
-    return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
-
-
-class _Named:
-    """Entries of a sample by name; its light is the measurement where it holds no other."""
-
-    def __init__(self, entries: Mapping[str, Any], axis: Any) -> None:
-        self.__dict__.update({"axis": axis, **entries})
-        if not {"transient", "phasor", "gated", "rates", "beats"} & set(entries):
-            self.__dict__["transient"] = entries.get("measurement")
-
-
-def _errors(x: Any) -> Tensor | None:
-    if getattr(x, "cells", None) is None:
-        return None
-    found = as_tensor(x.error_map(), "view")
-    return found[0] if found.ndim == 4 else found
-
-
-def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
-    """Return the slider of bins of time, which count where there is no axis."""
-    if axis is None:
-        return Slider("bin", "", np.arange(bins, dtype=np.float64))
-    if not isinstance(axis, TimeAxis):
-        raise ArgumentError(f"{who}: expected axis as a TimeAxis, got {shown(axis)}.")
-    if axis.num_bins != bins:
-        raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the light {bins}.")
-    return Slider(_METRES, "m", axis.centers_opl.numpy(), "time", "ns", _NS_PER_METRE)
+def bin_slider(bins: int) -> Slider:
+    """Return the slider of ``bins`` bins of unknown time."""
+    return Slider("bin", "", np.arange(bins, dtype=np.float64))
 
 
 def gate_slider(count: int, gates: Sequence[Gate] | None) -> Slider:
@@ -254,171 +134,8 @@ def gate_slider(count: int, gates: Sequence[Gate] | None) -> Slider:
     return Slider("gate", "", np.arange(count, dtype=np.float64), labels=labels)
 
 
-def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
-    """One channel or three; the mean of other numbers, and a note about it."""
-    count = len(cube)
-    if count in (1, 3):
-        return cube, ()
-    return cube.mean(0, keepdim=True), (f"Mean over {count} channels.",)
-
-
-def light_content(
-    cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None, who: str = "view"
-) -> Content:
-    """Return what a page shows of light (C, T, H, W), or polarized (4, C, T, H, W)."""
-    if cube.ndim == 5 and cube.shape[0] == 4:
-        mean = cube.mean(1)
-        ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
-        planes = Planes(mean[:1], ratios=ratios, error=error)
-        notes: tuple[str, ...] = () if cube.shape[1] == 1 else (f"Mean over {cube.shape[1]} channels.",)
-        return Content("polarized", slider, ("",), ("",), (planes,), notes=notes)
-    if cube.ndim != 4 or not cube.numel():
-        raise ShapeError(
-            f"{who}: expected light (C, T, H, W), polarized (4, C, T, H, W) or a result that has some, got "
-            f"{tuple(cube.shape)}; of a batch, choose one entry. Rates (C, R, T, H, W) need rate_axis=tt.RateAxis(...)."
-        )
-    light, notes = _grey(cube)
-    quantity = "radiance through a gate" if kind == "gates" else "radiance in a bin"
-    return Content(kind, slider, ("",), ("",), (Planes(light, error=error),), quantity=quantity, notes=notes)
-
-
-def _phasors(cube: Tensor, known: Any, who: str) -> Content:
-    cube = cube[0] if cube.ndim == 5 and cube.shape[0] == 4 else cube
-    if cube.ndim != 4 or not cube.is_complex() or not cube.numel():
-        raise ShapeError(f"{who}: expected complex phasors (C, F, H, W), got {cube.dtype} {tuple(cube.shape)}.")
-    notes: tuple[str, ...] = () if cube.shape[0] == 1 else (f"Mean over {cube.shape[0]} channels.",)
-    mean = cube.mean(0)
-    numbers = frequencies_of(known)
-    if numbers is None:
-        slider = Slider("frequency", "", np.arange(len(mean), dtype=np.float64))
-    elif len(numbers) != len(mean):
-        raise ShapeError(f"{who}: expected {len(mean)} frequencies, as the phasors have, got {len(numbers)}.")
-    else:
-        slider = Slider("frequency", "/m", np.array(numbers), "frequency", "GHz", SPEED_OF_LIGHT / 1e9)
-    planes = Planes(mean.abs()[None], phase=mean.angle())
-    return Content("phasors", slider, ("",), ("",), (planes,), quantity="amplitude", notes=notes)
-
-
-def _rows(cube: Tensor, who: str, what: str) -> tuple[Tensor, tuple[str, ...]]:
-    if cube.ndim != 5 or cube.is_complex() or not cube.numel():
-        raise ShapeError(f"{who}: expected {what}, got {tuple(cube.shape)}; of a batch, choose one entry.")
-    return cube.mean(0), () if cube.shape[0] == 1 else (f"Mean over {cube.shape[0]} channels.",)
-
-
-def _rates(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
-    mean, notes = _rows(cube, who, "light over rates and lengths (C, R, T, H, W)")
-    if not isinstance(rate_axis, RateAxis) or rate_axis.num_bins != len(mean):
-        raise ShapeError(f"{who}: light over {len(mean)} rates needs rate_axis=RateAxis(...), got {shown(rate_axis)}.")
-    centers = tuple(rate_axis.centers.tolist())
-    return Content(
-        "rates", slider_of(mean.shape[1], axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
-        tuple(Planes(part[None]) for part in mean), layer_name="rate", layer_numbers=centers, notes=notes,
-    )  # fmt: skip
-
-
-def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
-    mean, notes = _rows(cube, who, "beats (C, 2, T, H, W)")
-    planes = tuple(Planes(part[None]) for part in mean)
-    slider = slider_of(mean.shape[1], axis, who)
-    return Content(
-        "beats",
-        slider,
-        ("",),
-        ("up chirp", "down chirp"),
-        planes,
-        quantity="beat power",
-        layer_name="chirp",
-        notes=notes,
-    )
-
-
-def _capture(capture: Capture, who: str) -> Content:
-    tensor = capture.transient if capture.transient is not None else capture.phasor
-    assert tensor is not None  # a capture has one
-    cube = as_tensor(tensor, who)
-    scan, rank = capture.scan, len(capture.scan.shape)
-    if capture.polarized:
-        cube = cube.select(cube.ndim - rank - 3, 0)
-    if cube.ndim != rank + 2:
-        raise ShapeError(f"{who}: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
-    rows, columns = (1, *scan.sensor_shape)[-2:]
-    spots = scan.laser_shape if scan.kind == "exhaustive" else ()
-    cube = cube.reshape(*cube.shape[:2], -1, rows, columns)
-    laser_grid = (1, *spots)[-2:] if spots else ()
-    names = tuple(_spot_name(n, laser_grid) for n in range(cube.shape[2])) if spots else ("",)
-    common: dict[str, Any] = {"items": ("",), "layers": names, "layer_grid": laser_grid}
-    common |= {"layer_name": "laser spot" if spots else ""}
-    if len(scan.sensor_shape) == 2:
-        extent, across, up, middle = _wall(scan.sensor_points)
-        lasers = scan.laser_points.detach().cpu().double().reshape(-1, 3) - middle
-        marks = tuple((float(p @ across), float(p @ up)) for p in lasers) if scan.kind != "confocal" else ()
-        common |= {"extent": extent, "unit": "m", "marks": marks if scan.kind in ("single", "exhaustive") else ()}
-    if capture.transient is None:
-        parts = [_phasors(cube[:, :, n], capture.frequencies, who) for n in range(cube.shape[2])]
-        return replace(parts[0], planes=tuple(part.planes[0] for part in parts), **common)
-    light = [_grey(cube[:, :, n]) for n in range(cube.shape[2])]
-    slider = slider_of(cube.shape[1], capture.axis, who)
-    return Content("capture", slider, planes=tuple(Planes(part) for part, _ in light), notes=light[0][1], **common)
-
-
-def _spot_name(number: int, grid: tuple[int, ...]) -> str:
-    return f"({number // grid[1]}, {number % grid[1]})" if grid[0] > 1 else f"{number}"
-
-
-def _wall(points: Tensor) -> tuple[tuple[float, float, float, float], Tensor, Tensor, Tensor]:
-    """Extent of a grid of points around their mean, each with a cell of its own, and the wall's directions."""
-    points = points.detach().cpu().double()
-    middle = points.reshape(-1, 3).mean(0)
-    rows, columns = points.shape[:2]
-    steps = [
-        (points[:, -1] - points[:, 0]).mean(0) / max(1, columns - 1),
-        (points[-1] - points[0]).mean(0) / max(1, rows - 1),
-    ]
-    sizes = [float(step.norm()) or 1.0 for step in steps]
-    across, up = (step / size for step, size in zip(steps, sizes, strict=True))
-    half = (columns * sizes[0] / 2, rows * sizes[1] / 2)
-    return (-half[0], half[0], -half[1], half[1]), across, up, middle
-
-
-def _volume(volume: Any) -> Content:
-    values = as_tensor(volume.picture(), "view")
-    (rows, columns), (dy, dx) = values.shape[1:], volume.grid.pitch
-    extent = (-columns * dx / 2, columns * dx / 2, -rows * dy / 2, rows * dy / 2)
-    slider = Slider("depth", "m", volume.grid.depths.cpu().double().numpy())
-    return Content("volume", slider, ("",), ("",), (Planes(values[None]),), quantity="value", extent=extent, unit="m")
-
-
-def binned(content: Content, times: int, pixels: int) -> Content:
-    """Return the content with ``times`` bins and ``pixels`` x ``pixels`` pixels as one, light added up over bins and
-    averaged over pixels; what does not fill one at the ends is left out.
-    """
-    t, h, w = (n // k * k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
-
-    def mean(x: Tensor) -> Tensor:
-        part = x[..., :t, :h, :w].float()
-        sizes = (t // times, times, h // pixels, pixels, w // pixels, pixels)
-        return part.reshape(*x.shape[:-3], *sizes).mean((-5, -3, -1))
-
-    def reduced(planes: Planes) -> Planes:
-        light, ratios, phase, error = mean(planes.light) * times, None, None, None
-        if planes.ratios is not None:
-            ratios = torch.where(light > 0, mean(planes.ratios * planes.light) * times / light, 0.0)
-        if planes.phase is not None:
-            waves = torch.complex(*(mean(planes.light[0] * part) for part in (planes.phase.cos(), planes.phase.sin())))
-            light, phase = waves.abs()[None], waves.angle()
-        if planes.error is not None:
-            error = (mean(planes.error.square()) * times).sqrt() / pixels
-        return Planes(light, ratios, phase, error)
-
-    slider = replace(content.slider, centers=content.slider.centers[:t].reshape(-1, times).mean(1))
-    extent = content.extent
-    if extent is not None:
-        left, right, low, high = extent
-        rows, columns = content.shape[1:]
-        extent = (left, left + (right - left) * w / columns, low, low + (high - low) * h / rows)
-    parts = [f"adds up {times} bins"] * (times > 1) + [f"averages {pixels} x {pixels} pixels"] * (pixels > 1)
-    note = f"To be small, the page {' and '.join(parts)}."
-    return replace(
-        content, slider=slider, planes=tuple(map(reduced, content.planes)), extent=extent, notes=(*content.notes, note),
-        stride=pixels, block=pixels,
-    )  # fmt: skip
+def frequency_slider(frequencies_per_metre: Sequence[float] | None, count: int) -> Slider:
+    """Return the slider of ``count`` frequencies, which count where they are not known."""
+    if frequencies_per_metre is None:
+        return Slider("frequency", "", np.arange(count, dtype=np.float64))
+    return Slider("frequency", "/m", np.array(frequencies_per_metre), "frequency", "GHz", SPEED_OF_LIGHT / 1e9)

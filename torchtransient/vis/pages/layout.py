@@ -1,7 +1,11 @@
-"""The figures and controls of a page, as models of bokeh; `view.js` drives them by their names."""
+"""Figures and controls of a page, as models of bokeh, and its HTML; `view.js` drives the models by their names."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +15,12 @@ from torchtransient.vis.colour_maps import oklch
 from torchtransient.vis.colour_maps import rainbow as rainbow_colours
 from torchtransient.vis.pages.content import Content
 
+_SCRIPT = Path(__file__).with_name("view.js")
 # Okabe and Ito's colours, which are told apart without red, green or blue cones; lines have dashes of their own too.
 PIXEL_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 _DASHES = ("solid", "dashed", "dotted", "dashdot")
-_PICTURE = 440
+# Longer side of the picture, alone and over panels: a window on a screen of 800 rows has some 680 for the page.
+_PICTURE, _PICTURE_OVER_PANELS = 440, 330
 # Gates that have their start and end along the axis; more would cover each other.
 _GATE_TICKS = 6
 _OWN = "<div class='own'></div>"
@@ -38,16 +44,15 @@ def import_bokeh() -> Any:
     return bokeh
 
 
-def modes_of(content: Content, every_bin: bool = True) -> dict[str, str]:
-    """Return the modes of a page by their names. ``every_bin``: all bins are at hand, not the shown one alone."""
+def modes_of(content: Content) -> dict[str, str]:
+    """Return the modes of a page by their names."""
     first = content.planes[0]
     found = ["colour"] if first.light.shape[0] == 3 else []
     found.append("light")
     found += ["dop", "aolp"] if first.ratios is not None else []
     found += ["real", "phase"] if first.phase is not None else []
-    if every_bin:
-        found += ["peak", "rainbow"] if first.phase is None and content.kind != "gates" else []
-        found += ["speed"] if content.kind == "rates" else []
+    found += ["peak", "rainbow"] if first.phase is None and content.kind != "gates" else []
+    found += ["speed"] if content.kind == "rates" else []
     names = {name: _MODES[name] for name in found}
     if first.phase is not None:
         names["light"] = "amplitude"
@@ -85,7 +90,46 @@ def _hex(colour: Any) -> str:
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
-def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, maps: dict[str, list[str]]) -> Any:
+def described(content: Content, tables: dict[str, Any], modes: dict[str, str], maps: dict[str, Any]) -> dict[str, Any]:
+    """Return what `view.js` reads about a page, as plain data.
+
+    Args:
+        content: what the page shows.
+        tables: values of codes by the name of the plane.
+        modes: names of the modes by key.
+        maps: colours by name.
+    """
+    slider = content.slider
+    return {
+        "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
+        "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
+        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
+        "block": content.block,
+        "slider": {
+            "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
+            "secondUnit": slider.second_unit, "factor": slider.factor, "labels": slider.labels,
+        },
+        "tables": tables, "maps": maps, "modes": list(modes), "pair": content.items == ("A", "B"),
+    }  # fmt: skip
+
+
+def html_of(root: Any, title: str, meta: dict[str, Any], chunks: Sequence[str] = ()) -> str:
+    """Return the page of bokeh's models with bokeh, `view.js`, ``meta`` and ``chunks`` of numbers in it."""
+    from bokeh.embed import file_html
+    from bokeh.resources import INLINE
+
+    # Browsers ask servers for an icon.
+    html = file_html(root, INLINE, title=title).replace("<head>", '<head><link rel="icon" href="data:,">', 1)
+    head, end, rest = html.rpartition("</body>")
+    said = json.dumps(meta).replace("</", "<\\/")
+    data = f'<script type="application/json" id="meta">{said}</script>'
+    script = f"<script>\n{_SCRIPT.read_text(encoding='utf-8')}\n</script>"
+    return "\n".join([head, data, *chunks, script, end + rest])
+
+
+def layout_of(
+    content: Content, modes: dict[str, str], notes: str, title: str, maps: dict[str, list[str]], sums: bool = True
+) -> Any:
     """Return the root of the page's models.
 
     Args:
@@ -94,10 +138,9 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         notes: HTML about errors of the numbers and what was left out.
         title: heading.
         maps: colours by name.
+        sums: sums over bins are at hand.
     """
     m = import_bokeh().models
-    from html import escape
-
     bins = content.shape[0]
     heading = m.Div(text=f"<b>{escape(title)}</b> <span style='color:#555'>{notes}</span>", width=1220, name="notes")
     play = m.Button(label="▶ play", name="play", width=80, button_type="primary")
@@ -115,7 +158,7 @@ def layout_of(content: Content, modes: dict[str, str], notes: str, title: str, m
         m.Select(title="brightness", name="curve", options=["linear", "logarithmic"], value="linear", width=105),
         m.Slider(title="exposure (stops)", name="exposure", start=-10, end=20, value=0, step=0.5, width=170),
     ]
-    flags = [("accumulate", "peak" in modes and content.kind != "volume"), ("log axis", True)]
+    flags = [("accumulate", sums and "peak" in modes and content.kind != "volume"), ("log axis", True)]
     switches = [
         m.Toggle(label=name, name=name.replace(" ", "_"), width=100, margin=(20, 5, 5, 5))
         for name, shown in flags
@@ -184,7 +227,8 @@ def _picture(content: Content, maps: dict[str, list[str]]) -> Any:
         else content.extent
     )
     left, right, low, high = extent
-    scale = _PICTURE / max(right - left, high - low)
+    beside = content.kind in ("volume", "rates") or content.layer_grid
+    scale = (_PICTURE_OVER_PANELS if beside else _PICTURE) / max(right - left, high - low)
     width, height = max(120, round((right - left) * scale)), max(90, round((high - low) * scale))
     ranges = (high, low) if content.extent is None else (low, high)
     figure = bokeh.plotting.figure(
@@ -221,7 +265,7 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
     slider = content.slider
     name = slider.name + (f" ({slider.unit})" if slider.unit else "")
     figure = bokeh.plotting.figure(
-        width=690, height=330, tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag=None, active_scroll=None,
+        width=690, height=300, tools="xpan,xwheel_zoom,box_zoom,reset,save", active_drag=None, active_scroll=None,
         x_axis_label=name, y_axis_label=content.quantity, y_axis_type="log" if log else "linear",
         name="histogram_log" if log else "histogram", visible=not log,
     )  # fmt: skip
@@ -247,7 +291,11 @@ def _histogram(content: Content, curves: list[Any], log: bool) -> Any:
             figure.x_range.js_on_change(end, link)
     for source, colour, dash in zip(curves, PIXEL_COLOURS, _DASHES, strict=True):
         figure.varea("x", "low", "high", source=source, fill_color=colour, fill_alpha=0.25)
-        figure.step("x", "y", source=source, mode="center", line_color=colour, line_dash=dash, line_width=1.8)
+        if content.planes[0].phase is None:
+            figure.step("x", "y", source=source, mode="center", line_color=colour, line_dash=dash, line_width=1.8)
+        else:  # phasors are known at frequencies, not in bins
+            figure.line("x", "y", source=source, line_color=colour, line_dash=dash, line_width=1.2)
+            figure.scatter("x", "y", source=source, marker="circle", size=7, color=colour)
     figure.add_layout(
         m.Span(dimension="height", location=0.0, line_color="black", line_width=1.5, name=f"cursor_{int(log)}")
     )

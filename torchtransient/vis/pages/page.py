@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -15,11 +14,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.part_files import replacing
+from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.checks import Numbers, check_folder, count, positive
+from torchtransient.errors import UnitError
 from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
-from torchtransient.vis.pages.content import Content, Planes, binned
-from torchtransient.vis.pages.layout import colour_maps, import_bokeh, layout_of, modes_of
+from torchtransient.vis.pages.content import Content, Planes
+from torchtransient.vis.pages.kinds import binned, content_of
+from torchtransient.vis.pages.layout import colour_maps, described, html_of, import_bokeh, layout_of, modes_of
 
-_SCRIPT = Path(__file__).with_name("view.js")
 # A notebook keeps what it shows in its own file.
 NOTEBOOK_BYTES = 8_000_000
 # Beyond it the numbers of a page fill a browser's memory.
@@ -52,6 +55,56 @@ class Page:
         return f'<iframe srcdoc="{escape(self.html)}" width="100%" height="760" style="border:0"></iframe>'
 
 
+def view(
+    x: Any,
+    path: str | Path | None = None,
+    *,
+    axis: TimeAxis | None = None,
+    rate_axis: RateAxis | None = None,
+    frequencies: FrequencyAxis | Numbers | None = None,
+    title: str = "",
+    max_megabytes: float = 20.0,
+    samples: int = 8,
+) -> Page:
+    """Show a result as one HTML page that opens without server and network, in a notebook too.
+
+    Args:
+        x: a tensor or array (C, T, H, W), polarized (4, C, T, H, W) or complex (C, F, H, W); a result of a render with
+            `transient`, `phasor`, `gated`, `rates` or `beats`; a Capture; a HiddenVolume; the path of a file of one of
+            them; a tuple of two of a kind, shown as A, B and their difference; or a sequence of samples, of which one
+            is shown at a time.
+        path: file to write the page to.
+        axis, rate_axis, frequencies: axes of tensors that do not know their own. Rates (C, R, T, H, W) need
+            ``rate_axis``.
+        title: heading of the page.
+        max_megabytes: size of the page in 10^6 bytes, at least 2. What is larger is binned over time and pixels, and
+            the page says so.
+        samples: number of samples of a sequence that the page holds.
+
+    Returns:
+        The page, with its notes about errors of numbers. Light is kept in 256 logarithmic steps.
+
+    Raises:
+        ShapeError: for other shapes, and results that do not fit each other.
+        ArgumentError: for what is no result.
+        UnitError: for ``max_megabytes`` below 2, of which the page's own scripts take most.
+        StorageError: when a file cannot be read or the page not be written.
+        MissingPackageError: without bokeh, the extra ``view``.
+    """
+    megabytes, samples = positive("view: max_megabytes", max_megabytes), count("view: samples", samples)
+    if megabytes < 2:
+        raise UnitError(f"view: expected max_megabytes of at least 2, as an empty page takes, got {max_megabytes!r}.")
+    target = None if path is None else check_folder(path, "view")
+    heading = title or (Path(x).name if isinstance(x, str | Path) else "torchtransient")
+    content = content_of(x, "view", axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
+    page = page_of(content, heading, int(megabytes * 1e6))
+    if target is None:
+        return page
+    with replacing(target, "view") as unfinished:
+        unfinished.write_text(page.html, encoding="utf-8")
+    return replace(page, path=target)
+
+
 @dataclass(frozen=True)
 class Encoded:
     """Codes of a content: tables by the name of the plane, and compressed codes by entry and plane."""
@@ -81,51 +134,8 @@ def page_of(content: Content, title: str, max_bytes: int) -> Page:
         for entry, planes in enumerate(encoded.packed)
         for name, packed in planes.items()
     ]
-    meta = described(content, encoded.tables, modes, maps)
-    return Page(with_script(html_of(root, title), meta, chunks), notes)
-
-
-def html_of(root: Any, title: str) -> str:
-    """Return the page of bokeh's models, with bokeh in it."""
-    from bokeh.embed import file_html
-    from bokeh.resources import INLINE
-
-    html: str = file_html(root, INLINE, title=title)
-    return html
-
-
-def with_script(html: str, meta: dict[str, Any], chunks: list[str]) -> str:
-    """Return a page of bokeh with the page's own script and numbers before its end."""
-    # Browsers ask servers for an icon.
-    html = html.replace("<head>", '<head><link rel="icon" href="data:,">', 1)
-    head, end, rest = html.rpartition("</body>")
-    said = json.dumps(meta).replace("</", "<\\/")
-    script = _SCRIPT.read_text(encoding="utf-8")
-    data = f'<script type="application/json" id="meta">{said}</script>'
-    return "\n".join([head, data, *chunks, f"<script>\n{script}\n</script>", end + rest])
-
-
-def described(
-    content: Content, tables: dict[str, Table], modes: dict[str, str], maps: dict[str, Any]
-) -> dict[str, Any]:
-    """Return what `view.js` has to know, as plain data."""
-    slider = content.slider
-    return {
-        "kind": content.kind, "shape": content.shape, "items": len(content.items), "layers": len(content.layers),
-        "layerNumbers": content.layer_numbers, "layerGrid": content.layer_grid, "marks": content.marks,
-        "channels": content.planes[0].light.shape[0], "extent": content.extent, "stride": content.stride,
-        "block": content.block,
-        "slider": {
-            "name": slider.name, "unit": slider.unit, "centers": slider.centers.tolist(), "second": slider.second,
-            "secondUnit": slider.second_unit, "factor": slider.factor, "labels": slider.labels,
-        },
-        "tables": {name: _plain(table.values) for name, table in tables.items()}, "maps": maps, "modes": list(modes),
-        "pair": content.items == ("A", "B"), "signed": tables["c0"].kind == "signed",
-    }  # fmt: skip
-
-
-def _plain(values: NDArray[np.float32]) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
+    meta = described(content, {name: table.plain() for name, table in encoded.tables.items()}, modes, maps)
+    return Page(html_of(root, title, meta | {"signed": encoded.tables["c0"].kind == "signed"}, chunks), notes)
 
 
 def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
@@ -156,13 +166,19 @@ def _expected(content: Content, times: int, pixels: int) -> float:
     for start in ((2 * k + 1) * (bins - some) // (2 * number) for k in range(number)):
         planes = content.planes[:: max(1, len(content.planes) // _SAMPLED)]
         parts.append([part.map(lambda x, a=start: x[..., a : a + some, :, :]) for part in planes])  # type: ignore[misc]
-    joined = [Planes.cat([part[n] for part in parts]) for n in range(len(parts[0]))]
+    joined = [_joined([part[n] for part in parts]) for n in range(len(parts[0]))]
     share = len(parts) * some * len(joined) / (bins * len(content.planes))
     slider = replace(content.slider, centers=np.arange(float(len(parts) * some)))
     sample = replace(content, planes=tuple(joined), slider=slider)
     encoded = _encoded(sample if times == pixels == 1 else binned(sample, times, pixels))
     codes = len(encoded.packed[0]) * len(content.planes) * bins * rows * columns / (times * pixels**2)
     return encoded.size / share if codes <= _MOST_CODES else float("inf")
+
+
+def _joined(parts: list[Planes]) -> Planes:
+    """Return bins of several parts in one."""
+    held = [name for name in ("light", "ratios", "phase", "error") if getattr(parts[0], name) is not None]
+    return Planes(**{name: torch.cat([getattr(part, name) for part in parts], -3) for name in held})
 
 
 def _encoded(content: Content) -> Encoded:
@@ -209,7 +225,7 @@ def _not_finite_said(content: Content) -> list[str]:
 
 def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
     light = tables["c0"]
-    if light.kind == "whole":
+    if light.kind in ("whole", "wide"):
         said = ["Counts are exact."]
     else:
         said = [

@@ -1,6 +1,7 @@
 """A server on this machine for results too large for a page: bins and pixels are read when they are asked for.
 
 Its address has a random token, without which nothing is answered. Numbers are sent as the upper halves of float32.
+Nothing here imports torch, which takes longer than to open the file.
 """
 
 from __future__ import annotations
@@ -9,30 +10,35 @@ import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchtransient.array_files.hdf5 import hdf5_package
-from torchtransient.axes import TimeAxis
 from torchtransient.errors import StorageError
 from torchtransient.gates import gates_from_text
-from torchtransient.vis.pages.codes import light_table
-from torchtransient.vis.pages.content import Content, gate_slider, light_content, slider_of
-from torchtransient.vis.pages.layout import colour_maps, layout_of, modes_of
-from torchtransient.vis.pages.page import described, html_of, with_script
+from torchtransient.vis.pages.content import (
+    Content,
+    Planes,
+    Slider,
+    bin_slider,
+    frequency_slider,
+    gate_slider,
+    time_slider,
+)  # fmt: skip
+from torchtransient.vis.pages.layout import colour_maps, described, html_of, layout_of, modes_of
 
 # Bins that are looked at for the first picture.
 _LOOKED_AT = 12
 # Rows and columns of the picture.
 _MOST_PIXELS = 600
-_REQUEST = re.compile(r"/(frame|curve)/0/c([0-2])/(\d+)(?:/(\d+))?")
+_SHOWN = ("transient", "phasor", "gated")
+_REQUEST = re.compile(r"/(frame|curve)/0/(c[0-2]|s[1-3]|phase)/(\d+)(?:/(\d+))?")
 
 
 def cube_bytes(path: Path) -> int:
@@ -40,48 +46,107 @@ def cube_bytes(path: Path) -> int:
     if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
         return 0
     with hdf5_package("view").File(path, "r") as file:
-        found = [file[name].size * file[name].dtype.itemsize for name in ("transient", "gated") if name in file]
-    return max(found, default=0)
+        return max((file[name].nbytes for name in _SHOWN if name in file), default=0)
 
 
 class LargeResult:
-    """Light (C, T, H, W) of an HDF5 result, read bin by bin. Raises StorageError for other files."""
+    """Light of an HDF5 result, read bin by bin: a transient or gates (C, T, H, W), the same polarized (4, C, T, H, W),
+    or phasors (C, F, H, W).
+
+    Raises:
+        StorageError: for other files.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.file = hdf5_package("view").File(path, "r")
-        name = "transient" if "transient" in self.file else "gated"
-        if name not in self.file or self.file[name].ndim != 4 or self.file[name].shape[0] not in (1, 3):
+        try:
+            self.file = hdf5_package("view").File(path, "r")
+        except OSError as error:
+            raise StorageError(f"view: '{path}' could not be read as HDF5: {error}") from error
+        name = next((name for name in _SHOWN if name in self.file), "")
+        shape: tuple[int, ...] = self.file[name].shape if name else ()
+        self._polarized = len(shape) == 5 and shape[0] == 4
+        self._complex = name == "phasor"
+        good = len(shape) == 4 and (self._complex or shape[0] in (1, 3))
+        if not (good or (self._polarized and not self._complex)) or 0 in shape:
             raise StorageError(
-                f"view: '{path}' is too large for a page, and a server shows transients (C, T, H, W) of one channel or "
-                "three. Cut it, or choose one entry or channel."
+                f"view: '{path}' has no light that a server reads bin by bin: a transient or gates (C, T, H, W) of one "
+                f"channel or three, polarized (4, C, T, H, W), or phasors (C, F, H, W); found {name or 'none'} "
+                f"{tuple(shape)}. Show it as a page, torchtransient view -o page.html, or choose one entry or channel."
             )
         self.cube = self.file[name]
+        bins, rows, columns = shape[-3:]
+        self._stride = -(-max(rows, columns) // _MOST_PIXELS)
+        self._peaks: bytes | None = None
+        self._lock = Lock()
+        channels = 1 if self._polarized or self._complex else shape[0]
+        size = (bins, -(-rows // self._stride), -(-columns // self._stride))
+        nothing: Any = np.broadcast_to(np.float32(0), (3, *size))
+        planes = Planes(
+            nothing[:channels], ratios=nothing if self._polarized else None, phase=nothing[0] if self._complex else None
+        )
+        kind = {"phasor": "phasors", "gated": "gates"}.get(name, "polarized" if self._polarized else name)
+        quantity = {"phasor": "amplitude", "gated": "radiance through a gate"}.get(name, "radiance in a bin")
+        slider = self._slider(name, bins)
+        self.content = Content(kind, slider, ("",), ("",), (planes,), quantity=quantity, stride=self._stride)
+
+    def _slider(self, name: str, bins: int) -> Slider:
         known = self.file.attrs
-        axis = None
-        if name == "transient" and "num_bins" in known:
-            axis = TimeAxis(float(known["start_opl"]), float(known["bin_width_opl"]), int(known["num_bins"]))
-        channels, bins, rows, columns = self.cube.shape
-        stride = -(-max(rows, columns) // _MOST_PIXELS)
-        light = torch.zeros(channels, 1, 1, 1).expand(channels, bins, -(-rows // stride), -(-columns // stride))
+        if name == "phasor":
+            row = self.file.get("frequencies_per_metre")
+            return frequency_slider(None if row is None or row.shape != (bins,) else row[()].tolist(), bins)
         if name == "gated":
-            shown = light_content(light, gate_slider(bins, gates_from_text(str(known.get("gates", "")))), "gates")
-        else:
-            shown = light_content(light, slider_of(bins, axis, "view"))
-        self.content: Content = replace(shown, stride=stride)
+            return gate_slider(bins, gates_from_text(str(known["gates"])) if "gates" in known else None)
+        if "num_bins" not in known:
+            return bin_slider(bins)
+        if int(known["num_bins"]) != bins:
+            raise StorageError(f"view: the file's axis has {known['num_bins']} bins, its light {bins}.")
+        start, width = float(known["start_opl"]), float(known["bin_width_opl"])
+        return time_slider(start + (np.arange(bins, dtype=np.float64) + 0.5) * width)
 
-    def frame(self, channel: int, t: int) -> NDArray[np.uint16]:
+    def frame(self, plane: str, t: int) -> NDArray[np.uint16]:
         """Return the upper halves of the pixels that the picture shows of a bin."""
-        return _upper_halves(self.cube[channel, t][:: self.content.stride, :: self.content.stride])
+        return _upper_halves(self._numbers(plane, (t,))[..., :: self._stride, :: self._stride])
 
-    def curve(self, channel: int, row: int, column: int) -> NDArray[np.uint16]:
+    def curve(self, plane: str, row: int, column: int) -> NDArray[np.uint16]:
         """Return the upper halves of a pixel, (T,)."""
-        return _upper_halves(self.cube[channel, :, row, column])
+        return _upper_halves(self._numbers(plane, (slice(None), row, column)))
+
+    def _numbers(self, plane: str, where: tuple[Any, ...]) -> NDArray[Any]:
+        """Numbers of a plane, ``where`` of its (T, H, W)."""
+        if self._complex:
+            mean = self.cube[(slice(None), *where)].mean(0)
+            return np.asarray(np.angle(mean) if plane == "phase" else np.abs(mean))
+        if not self._polarized:
+            return np.asarray(self.cube[(int(plane[1]), *where)])
+        s0 = self.cube[(0, slice(None), *where)].mean(0)
+        if plane == "c0":
+            return np.asarray(s0)
+        part = self.cube[(int(plane[1]), slice(None), *where)].mean(0)
+        return np.asarray(np.divide(part, s0, out=np.zeros_like(part), where=s0 > 0))
+
+    def peaks(self) -> bytes:
+        """Return centres of the brightest bins and sums over all bins of the picture's pixels, float32. Reads the file
+        once from its beginning to its end.
+        """
+        with self._lock:
+            if self._peaks is None:
+                size, channels = self.content.shape[1:], len(self.content.planes[0].light)
+                peak, most, total = np.full(size, np.nan), np.zeros(size), np.zeros(size)
+                for t, center in enumerate(self.content.slider.centers):
+                    shown = [self._numbers(f"c{k}", (t,))[:: self._stride, :: self._stride] for k in range(channels)]
+                    light: NDArray[np.float64] = np.asarray(np.mean(shown, 0, dtype=np.float64))
+                    higher = light > most
+                    most[higher], peak[higher] = light[higher], center
+                    total += light
+                peak[~np.isfinite(total)] = np.nan
+                self._peaks = np.stack([peak, total]).astype(np.float32).tobytes()
+            return self._peaks
 
     def brightest(self) -> int:
         """Return the bin of a few in which most pixels see light."""
-        bins = self.cube.shape[1]
+        bins = self.content.shape[0]
         some = sorted({int((k + 0.5) * bins / _LOOKED_AT) for k in range(_LOOKED_AT)})
-        return max(some, key=lambda t: float(np.sqrt(np.abs(self.cube[0, t][::8, ::8])).sum()))
+        return max(some, key=lambda t: float(np.sqrt(np.abs(self._numbers("c0", (t,))[::8, ::8])).sum()))
 
 
 def _upper_halves(values: Any) -> NDArray[np.uint16]:
@@ -102,21 +167,23 @@ def serving(path: Path, title: str, port: int = 0) -> Iterator[tuple[ThreadingHT
     """
     held, token = LargeResult(path), secrets.token_urlsafe(16)
     content = held.content
-    modes, maps = modes_of(content, every_bin=False), colour_maps()
+    modes, maps = modes_of(content), colour_maps()
     notes = "Read from the file bin by bin: numbers are within 0.2 % of those of the file."
+    rows, columns = held.cube.shape[-2:]
     if content.stride > 1:
-        notes += (
-            f" The picture has one row and column of {content.stride}, of {held.cube.shape[2]} x {held.cube.shape[3]}."
-        )
-    meta = described(content, {f"c{k}": light_table("light", 1.0, 0.1) for k in range(held.cube.shape[0])}, modes, maps)
-    meta |= {"server": f"/{token}", "start": held.brightest()}
-    page = with_script(html_of(layout_of(content, modes, escape(notes), title, maps), title), meta, []).encode()
+        notes += f" The picture has one row and column of {content.stride}, of {rows} x {columns}."
+    if "peak" in modes:
+        notes += " Peak time and rainbow read the whole file first."
+    names = content.planes[0].named()
+    meta = described(content, {name: [] for name in names}, modes, maps)
+    meta |= {"server": f"/{token}", "start": held.brightest(), "signed": False}
+    page = html_of(layout_of(content, modes, escape(notes), title, maps, sums=False), title, meta).encode()
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def do_GET(self) -> None:
-            """Answer with the page, a bin or a pixel."""
+            """Answer with the page, a bin, a pixel or the peaks."""
             if not secrets.compare_digest(self.path[: len(token) + 1].encode(), f"/{token}".encode()):
                 self._answer(403, b"the address lacks its token", "text/plain")
                 return
@@ -126,13 +193,18 @@ def serving(path: Path, title: str, port: int = 0) -> Iterator[tuple[ThreadingHT
                 return
             asked = _REQUEST.fullmatch(rest)
             try:
-                found = _asked_for(held, asked)
+                if rest == "/peaks" and "peak" in modes:
+                    found = held.peaks()
+                elif asked is not None and asked[2] in names:
+                    found = _asked_for(held, asked)
+                else:
+                    found = b""
             except (IndexError, ValueError):
-                found = None
-            if found is None:
-                self._answer(404, b"no such bin or pixel", "text/plain")
+                found = b""
+            if found:
+                self._answer(200, found, "application/octet-stream")
             else:
-                self._answer(200, found.tobytes(), "application/octet-stream")
+                self._answer(404, b"no such bin or pixel", "text/plain")
 
         def _answer(self, status: int, body: bytes, kind: str) -> None:
             self.send_response(status)
@@ -153,10 +225,8 @@ def serving(path: Path, title: str, port: int = 0) -> Iterator[tuple[ThreadingHT
             held.file.close()
 
 
-def _asked_for(held: LargeResult, asked: re.Match[str] | None) -> NDArray[np.uint16] | None:
-    if asked is None:
-        return None
-    what, channel, first, second = asked.groups()
-    if what == "frame" and second is None:
-        return held.frame(int(channel), int(first))
-    return held.curve(int(channel), int(first), int(second)) if what == "curve" and second is not None else None
+def _asked_for(held: LargeResult, asked: re.Match[str]) -> bytes:
+    what, plane, first, second = asked.groups()
+    if what == "frame":
+        return held.frame(plane, int(first)).tobytes() if second is None else b""
+    return b"" if second is None else held.curve(plane, int(first), int(second)).tobytes()

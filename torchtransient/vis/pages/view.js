@@ -12,9 +12,14 @@
   // ------------------------------------------------------------------------------------------------- numbers
   // A store gives codes: of a bin, frame(entry, plane, t), and of a pixel over all bins, curve(entry, plane, i).
 
-  const tables = {};
+  const tables = {}, wide = new Set();
   for (const [name, values] of Object.entries(meta.tables)) {
-    tables[name] = Float32Array.from(values, (v) => (v === null ? NaN : v));
+    if (values === "counts") {  // sixteen bits, whose last code is what is not finite
+      wide.add(name);
+      tables[name] = Float32Array.from({ length: 65536 }, (_, i) => (i === 65535 ? NaN : i));
+    } else {
+      tables[name] = Float32Array.from(values, (v) => (v === null ? NaN : v));
+    }
   }
 
   async function unpacked(id) {
@@ -29,15 +34,15 @@
     constructor() { this.kept = new Map(); }
 
     plane(entry, name) {
-      const id = `codes-${entry}-${name}`;
-      if (!this.kept.has(id)) this.kept.set(id, unpacked(id));
+      const id = `codes-${entry}-${name}`, typed = (bytes) => (wide.has(name) ? new Uint16Array(bytes.buffer) : bytes);
+      if (!this.kept.has(id)) this.kept.set(id, unpacked(id).then(typed));
       return this.kept.get(id);
     }
 
     async frame(entry, name, t) { return (await this.plane(entry, name)).subarray(t * N, (t + 1) * N); }
 
     async curve(entry, name, i) {
-      const codes = await this.plane(entry, name), found = new Uint8Array(T);
+      const codes = await this.plane(entry, name), found = new codes.constructor(T);
       for (let t = 0; t < T; t++) found[t] = codes[t * N + i];
       return found;
     }
@@ -50,10 +55,10 @@
       for (const name of Object.keys(tables)) tables[name] = new Float32Array(bits.buffer);
     }
 
-    async read(what) {
+    async read(what, type = Uint16Array) {
       const answer = await fetch(`${meta.server}/${what}`);
       if (!answer.ok) throw new Error(`the server said ${answer.status}: ${await answer.text()}`);
-      return new Uint16Array(await answer.arrayBuffer());
+      return new type(await answer.arrayBuffer());
     }
 
     frame(entry, name, t) { return this.read(`frame/${entry}/${name}/${t}`); }
@@ -149,6 +154,11 @@
 
   // Centre of the brightest bin of each pixel, and its total.
   const peaksOf = (item) => kept_(`peak ${item} ${state.layer}`, async () => {
+    if (meta.server) {
+      write("where", "reading the whole file ...");
+      const both = await store.read("peaks", Float32Array);
+      return { peak: both.subarray(0, N), total: both.subarray(N) };
+    }
     const peak = new Float32Array(N).fill(NaN), most = new Float32Array(N), total = new Float32Array(N);
     const entries = entriesOf(item);
     for (let t = 0; t < T; t++) {
@@ -395,7 +405,8 @@
       addParts(parts, await Promise.all(planeNames.map((name) => store.curve(entry, name, i))), T);
       if (errors) (await store.curve(entry, "error", i)).forEach((code, t) => { errors[t] = tables.error[code]; });
     }
-    return { parts, y: Float32Array.from(centers, (_, t) => light(parts, t)), errors };
+    const value = complex ? perPixel[state.mode] : light;
+    return { parts, y: Float32Array.from(centers, (_, t) => value(parts, t)), errors };
   }
 
   let curves = [];
@@ -431,6 +442,10 @@
       }
     }
     high = high > 0 ? high : 1;
+    if (complex) {
+      const label = { light: "amplitude", real: "real part", phase: "phase (degrees)" }[state.mode];
+      for (const name of ["histogram", "histogram_log"]) model(name).left[0].axis_label = label;
+    }
     model("histogram").y_range.setv({ start: bottom < 0 ? 1.08 * bottom : 0, end: 1.08 * high });
     model("histogram_log").y_range.setv({ start: Math.max(low, high * 1e-6) / 2, end: 2 * high });
     await drawSides();
@@ -476,10 +491,10 @@
       const top = curve.y.reduce((best, v, t) => (v > curve.y[best] ? t : best), 0);
       const error = curve.errors && !state.accumulate && ["light", "colour"].includes(state.mode) ? ` ± ${number(curve.errors[state.t])}` : "";
       return `<tr class="pixel"><td style="color:${COLOURS[n]}">■</td><td>${curve.name} ${placeOf(curve.pixel)}</td>`
-        + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${number(total)}</td>`
+        + `<td class="value">${number(valueNow(curve))}${error}${unit}</td><td class="sum">${complex ? "" : number(total)}</td>`
         + `<td class="at">${curve.y.every(Number.isFinite) ? positionText(top) : "none"}</td></tr>`;
     });
-    write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor${curves.some((curve) => curve.errors) ? " (± one standard error)" : ""}</th><th>sum</th><th>highest at</th></tr>${rows.join("")}</table>`
+    write("readout", `<table cellpadding="4" style="font-size:13px"><tr><th></th><th>pixel</th><th>at the cursor${curves.some((curve) => curve.errors) ? " (± one standard error)" : ""}</th><th>${complex ? "" : "sum"}</th><th>highest at</th></tr>${rows.join("")}</table>`
       + `<div style="color:#555;margin-top:4px">Click: a pixel more, or one less. Drag a ring to move it. Space: play. Arrows: one step (shift: ten). Home, End. Click the histogram to go there.</div>`);
   }
 
@@ -654,7 +669,7 @@
   function connect() {
     model("slider").properties.value.change.connect(() => go(model("slider").value));
     model("play").on_event("button_click", () => play(!state.playing));
-    follow("mode", "value", (v) => { state.mode = v; }, false);
+    follow("mode", "value", (v) => { state.mode = v; }, complex);
     follow("map", "value", (v) => { state.map = v; });
     follow("curve", "value", (v) => { state.curve = v; });
     follow("exposure", "value", (v) => { state.exposure = v; });
@@ -689,7 +704,12 @@
   // The bin in which most pixels see light (brightness counts by its logarithm), and a pixel of middling brightness in
   // it; of a volume, the brightest voxel.
   async function begin() {
-    if (!meta.server) {
+    if (meta.kind === "volume") {
+      const codes = await store.plane(0, "c0"), table = tables.c0;
+      let best = 0;
+      for (let j = 1; j < codes.length; j++) if (table[codes[j]] > table[codes[best]]) best = j;
+      state.t = Math.floor(best / N);
+    } else if (!meta.server) {
       let best = -1;
       const step = Math.max(1, Math.floor(N / 512));
       const frames = complex ? 1 : T, smallest = quantile(tables.c0, 0, 1);

@@ -1,0 +1,356 @@
+"""Afterpulses by several exponentials, power laws and measured delays; and detectors whose dead time they obey."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from support.marks import long_rows
+from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
+from support.sweeps import together
+from torchtransient.sensing import (
+    Afterpulsing,
+    AfterpulsingSPAD,
+    Compose,
+    FreeRunningSPAD,
+    MeasuredDelays,
+    PowerLawDelays,
+    ScoreFunction,
+    SynchronousSPAD,
+)
+
+WIDTH = 1e-10  # of a bin
+BINS = 40
+
+
+def exponentials(dead, *parts, **keywords):
+    """`parts`: (probability, mean delay in bins)."""
+    p, tau = [q for q, _ in parts], [t * WIDTH for _, t in parts]
+    return Afterpulsing(p, tau, dead * WIDTH, bin_width_s=WIDTH, **keywords)
+
+
+def power_law(dead, exponent, longest, **keywords):
+    law = PowerLawDelays(exponent, longest * WIDTH)
+    return Afterpulsing(0.2, dead_time_s=dead * WIDTH, delays=law, bin_width_s=WIDTH, **keywords)
+
+
+def measured(dead, start=0.7, **keywords):
+    law = MeasuredDelays(torch.tensor([9.0, 40, 22, 13, 9, 6, 5]), 5.3 * WIDTH, start_s=start * WIDTH, floor=4.0)
+    return Afterpulsing(0.2, dead_time_s=dead * WIDTH, delays=law, bin_width_s=WIDTH, **keywords)
+
+
+LAWS = {
+    "two exponentials": lambda: exponentials(7.4, (0.06, 5.0), (0.14, 130.0)),
+    "no dead time": lambda: exponentials(0.0, (0.1, 0.3), (0.1, 90.0)),
+    "power law": lambda: power_law(7.4, 1.3, 400.0),
+    "power law with exponent 1": lambda: power_law(3.0, 1.0, 90.0),
+    "steep power law": lambda: power_law(0.6, 2.5, 50.0),
+    "measured": lambda: measured(7.4),
+    "measured, behind its dead time": lambda: measured(2.0, start=6.5),
+}
+each_law = pytest.mark.parametrize("name", LAWS)
+
+
+# --- laws -----------------------------------------------------------------------------------------------------------
+
+
+@each_law
+def test_every_afterpulse_has_its_bin(name):
+    """Folded round a period the shares add up to the probability, whatever the period."""
+    module = LAWS[name]()
+    for period in (1, 7, BINS, 1000):
+        assert float(module.kernel(period).sum()) == pytest.approx(0.2, rel=1e-9)
+    folded, first = module.kernel(7), module.first_kernel(7 * 20_000)
+    rest = 0.2 - float(first.sum())
+    torch.testing.assert_close(folded, first.view(-1, 7).sum(0), rtol=1e-6, atol=rest + 1e-12)
+
+
+@each_law
+def test_shares_are_those_of_drawn_delays(name):
+    """400 000 delays, begun anywhere in a bin, against the shares: chi square."""
+    module, number = LAWS[name](), 400_000
+    g = torch.Generator().manual_seed(0)
+    start = torch.rand(number, dtype=torch.float64, generator=g)
+    delay = module._draw_delays(start, g)
+    assert float(delay.min()) >= module.dead_time_s / WIDTH - 1e-9
+    seen = torch.bincount((start + delay).floor().long().clamp_max(600), minlength=601)[:600].double()
+    mean = module.first_kernel(600) * 5 * number
+    use = mean > 5
+    dof = int(use.sum())
+    chi2 = float((((seen - mean) ** 2 / mean)[use]).sum()) / dof
+    assert chi2 < 1 + 5 * (2 / dof) ** 0.5
+    assert float(seen[~use].sum()) == pytest.approx(float(mean[~use].sum()), abs=5 * float(mean[~use].sum()) ** 0.5 + 5)
+
+
+@each_law
+def test_constant_counts_stay_constant_and_grow_by_all_generations(name):
+    x = torch.full((1, BINS, 2, 2), 3.0, dtype=torch.float64)
+    torch.testing.assert_close(LAWS[name]()(x), x / (1 - 0.2), rtol=1e-9, atol=0)
+
+
+@each_law
+def test_draws_have_the_mean(name):
+    module, pixels = LAWS[name](), 4096
+    x = torch.zeros(1, BINS, 64, 64)
+    x[:, 5], x[:, 39] = 60, 20
+    added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double().mean((0, 2, 3))
+    mean = module.extra(x.double()).mean((0, 2, 3)).clamp_min(0)
+    assert torch.equal(added * pixels, (added * pixels).round())
+    assert bool(((added - mean).abs() < 5.5 * (1.5 * mean / pixels).sqrt() + 1e-3).all())
+
+
+@each_law
+@together("period", [BINS + 1, 75, 300])
+def test_constant_counts_in_a_window_of_a_longer_period(name, period):
+    """What goes on outside of the window triggers afterpulses inside: as in a window of the whole period."""
+    whole = LAWS[name]()
+    part = LAWS[name]()
+    part.period_bins, part.background = period, 3.0
+    x = torch.full((1, period, 2, 2), 3.0, dtype=torch.float64)
+    x[:, 7] += 50.0
+    torch.testing.assert_close(part(x[:, :BINS]), whole(x)[:, :BINS], rtol=1e-9, atol=0)
+    constant = torch.full((1, BINS, 2, 2), 3.0, dtype=torch.float64)
+    assert float(part(constant).max() / part(constant).min() - 1) < 1e-9
+
+
+def test_draws_of_a_window_of_a_longer_period():
+    """In each of 4096 pixels of every bin: the mean, and the variance of a Poisson number."""
+    module = exponentials(5.0, (0.1, 30.0), period_s=90 * WIDTH, background=20.0)
+    x = torch.full((1, BINS, 64, 64), 20.0)
+    added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double().mean((0, 2, 3))
+    mean = float(module.extra(x.double()).mean())
+    assert mean == pytest.approx(20 * 0.1 / 0.9, rel=1e-6)
+    assert float((added - mean).abs().max()) < 5 * (1.2 * mean / 4096) ** 0.5
+
+
+def test_one_of_several_exponentials_is_one():
+    x = torch.rand(1, BINS, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    one = Afterpulsing(0.1, 12e-10, 30e-10, bin_width_s=WIDTH)
+    torch.testing.assert_close(one(x), exponentials(30, (0.1, 12.0))(x), rtol=1e-14, atol=0)
+    assert one.logit_probability.shape == () and one.tau_s.shape == ()
+
+
+def test_a_measured_exponential_is_an_exponential():
+    """Histogram of an exponential from the avalanche on, in bins of a tenth of its mean: what dies in the dead time."""
+    tau, dead, width = 20.0, 13.7, 0.1
+    edges = torch.arange(0, 4001, dtype=torch.float64) * width
+    counts = torch.exp(-edges[:-1] / tau) - torch.exp(-edges[1:] / tau)
+    law = MeasuredDelays(counts, width * WIDTH)
+    given = {"dead_time_s": dead * WIDTH, "bin_width_s": WIDTH, "counted_from": "avalanche"}
+    found = Afterpulsing(0.3, delays=law, **given).kernel(BINS)
+    wanted = Afterpulsing(0.3, tau * WIDTH, **given).kernel(BINS)
+    assert float(wanted.sum()) == pytest.approx(0.3 * math.exp(-dead / tau), rel=1e-9)
+    # straight lines instead of a curve within bins of width/tau = 1/200: (1/200)^2 / 8 of what is yet to come
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0.3 / 200**2 / 8)
+
+
+@pytest.mark.slow
+def test_exponents_and_times_are_learnt():
+    law = PowerLawDelays(1.5, 300 * WIDTH, learnable=True)
+    module = Afterpulsing(0.1, dead_time_s=4 * WIDTH, delays=law, bin_width_s=WIDTH, learnable=True)
+    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
+    x[0, 3] = 1000.0
+    true = PowerLawDelays(1.1, 300 * WIDTH)
+    wanted = Afterpulsing(0.06, dead_time_s=4 * WIDTH, delays=true, bin_width_s=WIDTH)(x)
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
+    for _ in range(120):
+        optimizer.zero_grad()
+        (module(x) - wanted).square().sum().backward()
+        optimizer.step()
+    assert float(module.delays.log_exponent.exp().detach()) == pytest.approx(1.1, abs=0.01)
+    assert float(module.probability.detach()) == pytest.approx(0.06, rel=0.01)
+
+
+# --- detectors ------------------------------------------------------------------------------------------------------
+
+
+def detector(mode, dead, cycles=1, **keywords):
+    if mode == "free":
+        return FreeRunningSPAD(cycles, dead * WIDTH, bin_width_s=WIDTH, **keywords)
+    if mode == "first":
+        return SynchronousSPAD(cycles, **keywords)
+    return SynchronousSPAD(cycles, dead_time_s=dead * WIDTH, bin_width_s=WIDTH, **keywords)
+
+
+def light(total, kind):
+    k = np.arange(BINS)
+    rate = {"constant": np.ones(BINS), "pulse": 0.2 / BINS + 0.3 * (np.abs(k - 12) < 2)}.get(kind)
+    if rate is None:  # the last bin and the first
+        rate = 0.2 / BINS + 0.4 * (k == 0) + 0.4 * (k == BINS - 1)
+    return rate / rate.sum() * total
+
+
+def agreement(mode, dead, total, kind, parts, laws, seed=0, runs=300, periods=200, warm_up=15):
+    rate = light(total, kind)
+    events = detect(
+        np.random.default_rng(seed), rate, runs, periods, None if mode == "first" else dead,
+        free_running=mode == "free", afterpulses=laws, warm_up=warm_up,
+    )  # fmt: skip
+    sensor = AfterpulsingSPAD(detector(mode, dead), parts)
+    return compare(events, sensor.expected(torch.as_tensor(rate).view(1, -1, 1, 1)).numpy())
+
+
+def two(dead):
+    parts = ((0.02, 9.0), (0.02, 120.0))
+    return exponentials(dead, *parts), [Afterpulse(p, exponential_delays(t, after=dead)) for p, t in parts]
+
+
+@pytest.mark.parametrize("mode, dead, total", [("first", 12.3, 10.0), ("free", 12.3, 10.0)])
+def test_events(mode, dead, total):
+    """As events do that walk through every carrier, dead times and all. One run's ratio scatters by some 0.3."""
+    assert agreement(mode, dead, total, "pulse", *two(dead)).ratio < 1.5
+    # what this stage is there for: counts that know nothing of the dead time are off
+    sensor, laws = two(dead)
+    x = torch.as_tensor(light(total, "pulse")).view(1, -1, 1, 1)
+    events = detect(
+        np.random.default_rng(0), x.flatten().numpy(), 300, 200, None if mode == "first" else dead,
+        free_running=mode == "free", afterpulses=laws, warm_up=15,
+    )  # fmt: skip
+    assert compare(events, sensor.expected(detector(mode, dead).expected(x)).numpy()).ratio > 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
+@pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
+@pytest.mark.parametrize(
+    "mode, dead", [("first", 12.3), ("several", 1.3), ("several", 12.3), ("free", 12.3), ("free", 55.7)]
+)
+def test_events_everywhere(mode, dead, total, kind):
+    found = [agreement(mode, dead, total, kind, *two(dead), seed=s) for s in range(3)]
+    assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("total", [1.0, 30.0])
+def test_events_of_measured_delays(total):
+    """Carriers that are set free while the detector is dead are lost, and counted as such."""
+    counts, own, dead = [20.0, 30, 11, 7, 5, 4, 2, 1], 9.7, 12.3
+    law = MeasuredDelays(torch.tensor(counts), own * WIDTH)
+    parts = Afterpulsing(0.06, dead_time_s=dead * WIDTH, delays=law, counted_from="avalanche", bin_width_s=WIDTH)
+    laws = [Afterpulse(0.06, measured_delays(np.arange(9) * own, counts))]
+    found = [agreement("free", dead, total, "pulse", parts, laws, seed=s) for s in range(3)]
+    assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", [0.3, 5.0, 300.0])
+@pytest.mark.parametrize("mode, dead", [("several", 1.3), ("several", 12.3), ("free", 1.3), ("free", 25.0)])
+def test_frequent_afterpulses(mode, dead, tau):
+    """Of 30 %, from delays below a bin to carriers that are trapped for many dead times: shape and total."""
+    for total in (1.0, 100.0):
+        parts = exponentials(dead, (0.3, tau))
+        laws = [Afterpulse(0.3, exponential_delays(tau, after=dead))]
+        for kind in ("constant", "pulse"):
+            found = agreement(mode, dead, total, kind, parts, laws, runs=200, periods=60, warm_up=60)
+            assert found.within(1.5), (total, kind, found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "mode, dead, tau, total",
+    long_rows(
+        [(*mode, total) for mode in (("free", 25.0, 3.0), ("several", 1.3, 30.0)) for total in (1.0, 100.0)],
+        [("free", 25.0, 3.0, 1.0), ("several", 1.3, 30.0, 100.0)],
+    ),
+)
+def test_totals_of_frequent_afterpulses(mode, dead, tau, total):
+    """Within 4 standard errors of the runs' totals, of which 30 % of detections leave carriers."""
+    rate = light(total, "pulse")
+    events = detect(
+        np.random.default_rng(0), rate, 200, 40, dead, free_running=mode == "free",
+        afterpulses=[Afterpulse(0.3, exponential_delays(tau, after=dead))], warm_up=20,
+    )  # fmt: skip
+    sensor = AfterpulsingSPAD(detector(mode, dead), exponentials(dead, (0.3, tau)))
+    found = float(sensor.expected(torch.as_tensor(rate).view(1, -1, 1, 1)).sum())
+    totals = events.counts.sum(1) / events.periods
+    assert abs(found - totals.mean()) < 4 * totals.std(ddof=1) / len(totals) ** 0.5
+    bare = float(detector(mode, dead).expected(torch.as_tensor(rate).view(1, -1, 1, 1)).sum())
+    assert found > bare
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("total, probability", [(0.3, 0.3), (30.0, 0.3)])
+def test_totals_of_draws_vary_less_than_those_of_events(total, probability):
+    """By no more than twice the probability, in dim light; bright light has no room for clusters."""
+    dead, tau, periods = 12.3, 20.0, 200
+    rate = light(total, "constant")
+    events = detect(
+        np.random.default_rng(0), rate, 600, periods, dead, free_running=True,
+        afterpulses=[Afterpulse(probability, exponential_delays(tau, after=dead))], warm_up=15,
+    )  # fmt: skip
+    sensor = AfterpulsingSPAD(detector("free", dead, cycles=periods), exponentials(dead, (probability, tau)))
+    x = torch.as_tensor(rate).view(1, -1, 1, 1).expand(1, -1, 30, 20)
+    drawn = sensor.sample(x, torch.Generator().manual_seed(0)).sum(-3).flatten()
+    short = events.fano() - float(drawn.var() / drawn.mean())
+    # each of the two is known to 6 %
+    noise = 3 * (2 / 600) ** 0.5 * 1.5 * events.fano()
+    assert -noise < short < 2 * probability + noise
+    if total < 1:
+        assert short > noise
+
+
+@pytest.mark.parametrize(
+    "dead, total, p", [(12.3, 0.1, 0.3), (55.7, 1.0, 0.04), (12.3, 10.0, 0.04), (55.7, 100.0, 0.3)]
+)
+def test_constant_light_stays_constant(dead, total, p):
+    """Free-running, of photons at a rate n: 1/m = dead + (1 - p)/n + p/(n + 1/tau) of carriers gone with a dead time.
+    """
+    n, tau = total / BINS, 1.0
+    light_ = torch.full((1, BINS, 1, 1), n, dtype=torch.float64)
+    y = AfterpulsingSPAD(detector("free", dead), two(dead)[0])(light_)
+    assert float(y.max() / y.min() - 1) < 1e-6
+    y = AfterpulsingSPAD(detector("free", dead), exponentials(dead, (p, tau)))(light_)
+    assert float(y.mean()) == pytest.approx(1 / (dead + (1 - p) / n + p / (n + 1 / tau)), rel=3e-6)
+
+
+def test_dim_light_is_the_linear_stage():
+    rate = torch.full((1, BINS, 1, 1), 1e-7, dtype=torch.float64)
+    rate[0, 10] = 1e-6
+    spad, parts = detector("free", 12.3), two(12.3)[0]
+    torch.testing.assert_close(AfterpulsingSPAD(spad, parts)(rate), parts(spad(rate)), rtol=1e-4, atol=0)
+
+
+def test_one_detection_a_cycle_has_afterpulses_in_later_cycles_only():
+    """All light in the first bin: in its own cycle the detector is dead, the next is reached by what is late enough."""
+    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
+    x[0, 0] = 1e-4
+    sensor = AfterpulsingSPAD(SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0)))
+    # of delays beyond 39 to 40 bins, the mean over the place in bin 0; none else
+    late = 0.1 * 5 * math.exp(-(39 - 2) / 5) * (1 - math.exp(-1 / 5))
+    alone = SynchronousSPAD(1)(x).sum()
+    assert float(sensor(x).sum() / alone - 1) == pytest.approx(late, rel=1e-3)
+    longer = AfterpulsingSPAD(SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0), period_s=400 * WIDTH))
+    assert float(longer(x).sum() / alone - 1) < 1e-12
+
+
+def test_a_detector_in_a_window_of_a_longer_period():
+    """Constant light that goes on outside: as dim light in a window of the whole period, constant to 1e-6."""
+    level, period, cycles = 1e-8, 90, 1000
+    parts = exponentials(12.3, (0.1, 30.0), period_s=period * WIDTH, background=level * cycles)
+    sensor = AfterpulsingSPAD(detector("several", 12.3, cycles=cycles), parts)
+    y = sensor(torch.full((1, BINS, 1, 1), level, dtype=torch.float64))
+    assert float(y.max() / y.min() - 1) < 1e-6
+    # the cycle's own pile-up is 4e-7 of it
+    assert float(y.mean()) == pytest.approx(level * cycles / 0.9, rel=1e-6)
+
+
+@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
+def test_policies_are_the_detectors(policy):
+    sensor = AfterpulsingSPAD(detector("first", 12.3, cycles=1000), two(12.3)[0], grad=policy)
+    x = torch.full((50, 1, BINS, 2, 2), 0.05, dtype=torch.float64, requires_grad=True)
+    with ScoreFunction() as score:
+        y = sensor(x, generator=torch.Generator().manual_seed(0))
+        losses = y.sum((1, 2, 3, 4)) / 1000
+    if policy == "score":
+        losses = score.surrogate(losses, baseline="leave_one_out")
+    losses.sum().backward()
+    whole = AfterpulsingSPAD(detector("first", 12.3, cycles=1000), two(12.3)[0])
+    mean = torch.full((1, 1, BINS, 2, 2), 0.05, dtype=torch.float64, requires_grad=True)
+    (whole(mean).sum() / 1000).backward()
+    found, wanted = x.grad.mean(0).sum(), mean.grad.sum()
+    assert float(found) == pytest.approx(float(wanted), rel=0.35 if policy == "score" else 0.02)
+    chain = Compose([AfterpulsingSPAD(detector("first", 12.3, cycles=10), two(12.3)[0])], grad=policy)
+    assert chain.stages[0].detector.grad == policy

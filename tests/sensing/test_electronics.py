@@ -1,0 +1,194 @@
+"""Pixel electronics: every noise against its closed form, saturation against sampling."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchtransient import TimeAxis, sensing
+from torchtransient.errors import UnitError
+from torchtransient.sensing import PixelElectronics, ScoreFunction, fixed_pattern, ktc_noise
+from torchtransient.sensing.electronics import clipped_normal_mean, clipped_normal_variance
+
+COUNT = 200_000
+
+
+def pixels(mean):
+    return torch.full((1, 1, 1, COUNT), mean, dtype=torch.float64)
+
+
+def drawn(mean, **parts):
+    return PixelElectronics(**parts).sample(pixels(mean), torch.Generator().manual_seed(1))
+
+
+def test_ktc_noise():
+    assert abs(ktc_noise(10e-15, 300.0) - 40.2) < 0.05
+    with pytest.raises(UnitError, match="expected"):
+        ktc_noise(10.0)  # femtofarads given as farads
+
+
+@pytest.mark.parametrize("m", [-4.0, 0.0, 3.0, 9.0, 14.0, 40.0])
+def test_clipped_normal(m):
+    """Against quadrature over the density."""
+    v, low, high = 4.0, 1.0, 10.0
+    x = torch.linspace(-12, 12, 400_001, dtype=torch.float64)
+    p = torch.exp(-0.5 * x * x)
+    p = p / p.sum()
+    scale = math.sqrt(v + 1e-4)
+    values = (m + scale * x).clamp(low, high)
+    mean, variance = torch.tensor(m, dtype=torch.float64), torch.tensor(v, dtype=torch.float64)
+    assert abs(float(clipped_normal_mean(mean, variance, low, high)) - float((values * p).sum())) < 1e-9
+    upper = (m + 2.0 * x).clamp_max(high)
+    exact = float((upper**2 * p).sum() - (upper * p).sum() ** 2)
+    assert abs(float(clipped_normal_variance(mean, variance, high)) - exact) < 1e-3
+
+
+def test_clipped_normal_has_gradients():
+    m = torch.tensor([-3.0, 0.0, 9.9, 30.0], dtype=torch.float64, requires_grad=True)
+    v = torch.tensor([1.0, 2.0, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_mean(m, v, 0.0, 10.0), (m, v))
+    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_variance(m, v, 10.0), (m, v))
+
+
+@pytest.mark.parametrize(
+    "mean, parts, variance",
+    [
+        (50.0, {}, 50.0),
+        (50.0, {"read_noise_e": 6.0, "ktc_noise_e": 8.0}, 150.0),
+        (50.0, {"dark_e": 20.0}, 70.0),
+        (400.0, {"excess_noise": 2.0}, 800.0),
+        (400.0, {"gain_e_per_dn": 12.0, "bits": 10, "black_level_dn": 64.0}, 412.0),
+    ],
+)
+def test_variances_add(mean, parts, variance):
+    y = drawn(mean, **parts)
+    wanted = mean + parts.get("dark_e", 0.0)
+    assert abs(float(y.mean()) - wanted) < 5 * (variance / COUNT) ** 0.5
+    assert abs(float(y.var()) / variance - 1) < 0.02
+    model = PixelElectronics(**parts)
+    assert abs(float(model.expected(pixels(mean)[..., :1])) - wanted) < 1e-9
+    assert abs(float(model.variance(pixels(mean)[..., :1])) - variance) < 1e-9
+
+
+@pytest.mark.parametrize("mean", [985.0, 1000.0, 1200.0])
+def test_saturation(mean):
+    """The expectation of a full well near its limit, within 5 standard errors and the skewness left out (0.01 e)."""
+    parts = {"full_well_e": 1000.0, "read_noise_e": 3.0}
+    y = drawn(mean, **parts)
+    model = PixelElectronics(**parts)
+    found = float(model.expected(pixels(mean)[..., :1]))
+    assert abs(float(y.mean()) - found) < 5 * float(y.std()) / COUNT**0.5 + 0.1
+    assert abs(float(y.var()) / float(model.variance(pixels(mean)[..., :1])) - 1) < 0.05
+    assert found < min(mean, 1000.0) + 1e-9
+
+
+def test_converter_reports_its_steps_and_range():
+    parts = {"gain_e_per_dn": 4.0, "bits": 8, "black_level_dn": 10.0, "read_noise_e": 30.0}
+    y = drawn(20.0, **parts)
+    assert float((y / 4.0 - (y / 4.0).round()).abs().max()) == 0.0
+    assert PixelElectronics(**parts).range_e == (-40.0, 980.0)
+    assert float(y.min()) == -40.0
+    assert float(drawn(5000.0, **parts).max()) == 980.0
+    # A third of the draws below: the mean of what is left is the clipped mean, with rounding to 1 e.
+    model = PixelElectronics(**parts)
+    assert abs(float(y.mean()) - float(model.expected(pixels(20.0)[..., :1]))) < 0.3
+
+
+@pytest.mark.parametrize("policy", ["gaussian", "score"])
+def test_gradient_of_a_linear_loss(policy):
+    """d E[y] / dm against finite differences of the expectation, in the middle and at the edge of the full well."""
+    for mean in (60.0, 100.0):
+        model = PixelElectronics(full_well_e=100.0, read_noise_e=2.0, gain_e_per_dn=0.5, bits=12, grad=policy)
+        m = torch.full((COUNT,), mean, dtype=torch.float64, requires_grad=True)
+        with ScoreFunction() as score:
+            y = model(m.reshape(-1, 1, 1, 1, 1), torch.Generator().manual_seed(0)).flatten()
+        loss = score.surrogate(y, baseline=mean) if policy == "score" else y
+        loss.sum().backward()
+        h = 1.0
+        up, down = (float(model.expected(pixels(mean + s)[..., :1])) for s in (h, -h))
+        error = 5 * float(m.grad.std()) / COUNT**0.5
+        assert abs(float(m.grad.mean()) - (up - down) / (2 * h)) < error + 0.01
+
+
+def test_fixed_pattern_is_fixed():
+    g = torch.Generator().manual_seed(3)
+    gain = fixed_pattern((4, 8, 8), 0.02, center=1.0, generator=g)
+    offset = fixed_pattern((4, 8, 8), 5.0, generator=g)
+    model = PixelElectronics(gain_map=gain, offset_map_e=offset)
+    x = torch.full((2, 1, 4, 8, 8), 1000.0)
+    torch.testing.assert_close(model.expected(x), 1000 * gain.expand(2, 1, 4, 8, 8) + offset)
+    assert abs(float(gain.std()) - 0.02) < 0.004
+
+
+def light(*values):
+    return torch.tensor(values, dtype=torch.float64).reshape(1, -1, 1, 1)
+
+
+def flat(x):
+    return x.flatten().tolist()
+
+
+# ------------------------------------------------------------------------------------------------------ electronics
+
+
+def test_the_order_of_a_pixel():
+    """Gain, dark electrons, full well, offset, black level, rounding, range: one after the other."""
+    gain = torch.tensor([[[2.0]], [[0.5]], [[1.0]], [[1.0]]], dtype=torch.float64)
+    offset = torch.tensor([[[3.0]], [[-4.0]], [[7.0]], [[0.0]]], dtype=torch.float64)
+    pixel = sensing.PixelElectronics(shot_noise=False, dark_e=5.0, full_well_e=60.0, gain_e_per_dn=4.0, bits=4,
+                                     black_level_dn=2.0, gain_map=gain, offset_map_e=offset)  # fmt: skip
+    x = light(10.0, 8.0, 90.0, 20.0)
+    # 25 + 3 = 28; 9 - 4 = 5; 60 + 7 = 67, of at most 13 steps; 25
+    assert flat(pixel.collected(x)) == [25.0, 9.0, 95.0, 25.0]
+    assert flat(pixel.sample(x)) == [28.0, 4.0, 52.0, 24.0]
+    assert pixel.range_dn == (0.0, 15.0) and pixel.range_e == (-8.0, 52.0)
+    signed = sensing.PixelElectronics(shot_noise=False, gain_e_per_dn=4.0, bits=4, signed=True, black_level_dn=2.0)
+    assert signed.range_dn == (-8.0, 7.0) and signed.range_e == (-40.0, 20.0)
+    bare = sensing.PixelElectronics(full_well_e=60.0)
+    assert bare.range_e == (-math.inf, 60.0) and sensing.PixelElectronics().range_e == (-math.inf, math.inf)
+    for black in (-0.01, 15.01):
+        with pytest.raises(UnitError, match="black_level_dn"):
+            sensing.PixelElectronics(gain_e_per_dn=4.0, bits=4, black_level_dn=black)
+    sensing.PixelElectronics(gain_e_per_dn=4.0, bits=4, black_level_dn=15.0)
+
+
+def test_variances_by_hand():
+    x = light(50.0, 20.0)
+    given = {"read_noise_e": 3.0, "ktc_noise_e": 4.0, "dark_e": 6.0}
+    assert flat(sensing.PixelElectronics(**given).variance(x)) == [56 + 25, 26 + 25]
+    assert flat(sensing.PixelElectronics(**given, excess_noise=1.5).variance(x)) == [1.5 * 56 + 25, 1.5 * 26 + 25]
+    drawn = sensing.PixelElectronics(**given, excess_noise=1.5, shot_noise=False)
+    assert flat(drawn.variance(x)) == [0.5 * 56 + 25, 0.5 * 26 + 25]
+    rounded = sensing.PixelElectronics(gain_e_per_dn=6.0, bits=8)
+    assert flat(rounded.variance(x)) == [50 + 3.0, 20 + 3.0]
+    assert flat(sensing.PixelElectronics(**given).expected(x)) == [56.0, 26.0]
+
+
+@pytest.mark.parametrize("policy", ["gaussian", "score"])
+def test_gradients_through_a_converter(policy):
+    """One where the code is inside of the range, zero beyond it, whatever the rounding."""
+    pixel = sensing.PixelElectronics(shot_noise=False, gain_e_per_dn=4.0, bits=4, grad=policy)
+    x = light(-9.0, 13.0, 30.5, 90.0).requires_grad_()
+    y = pixel(x, generator=torch.Generator().manual_seed(0))
+    assert flat(y) == [0.0, 12.0, 32.0, 60.0]
+    assert flat(torch.autograd.grad(y.sum(), x)[0]) == [0.0, 1.0, 1.0, 0.0]
+
+
+# ---------------------------------------------------------------------------------------------------------- budgets
+
+AXIS = TimeAxis.from_seconds(0.0, 1e-9, 10)
+
+
+def budget(optics=None, **changes):
+    given = {"pulse_energy_j": 2e-9, "wavelength_m": 600e-9, "repetition_rate_hz": 20e6, "cycles": 3000, "axis": AXIS}
+    return sensing.PhotonBudget(optics or sensing.Optics(f_number=1.5), **(given | changes))
+
+
+def test_pile_up_is_said_above_five_percent():
+    model = budget(dark_count_rate_hz=1e6)
+    per_unit = float(model.detections_per_unit)
+    x = torch.zeros(1, 10, 1, 2, dtype=torch.float64)
+    x[:, 3] = torch.tensor([0.039, 0.041], dtype=torch.float64) / per_unit
+    assert flat(model.report(x).piles_up) == [False, True]

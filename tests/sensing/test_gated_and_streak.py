@@ -1,0 +1,140 @@
+"""Gate profiles and sweeps against closed forms, the streak camera against the moments of its draws."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchtransient.axes import TimeAxis
+from torchtransient.sensing import Compose, GatedIntegration, PixelElectronics, StreakCamera, SweepJitter, gate_profiles
+from torchtransient.units import SPEED_OF_LIGHT
+
+RISE_PER_SIGMA = 2 * 1.2815515655446004  # from 10 % to 90 % of a normal distribution
+AXIS = TimeAxis.from_seconds(1e-9, 50e-12, 200)
+
+
+def test_gate_profile_is_the_mean_over_bins():
+    delays, widths = torch.tensor([3e-9, 4e-9]), torch.tensor([2e-9, 0.3e-9])
+    found = gate_profiles(delays, widths, AXIS, rise_s=0.4e-9, fall_s=0.9e-9, leakage=0.01)
+    fine = TimeAxis.from_seconds(1e-9, 50e-12 / 400, 200 * 400)
+    t = fine.centers_s
+    for g in range(2):
+        rise = torch.special.ndtr((t - delays[g].double()) / (0.4e-9 / RISE_PER_SIGMA))
+        fall = torch.special.ndtr((t - delays[g].double() - widths[g].double()) / (0.9e-9 / RISE_PER_SIGMA))
+        exact = 0.01 + 0.99 * (rise - fall).reshape(200, 400).mean(1).clamp(min=0)
+        torch.testing.assert_close(found[g], exact, rtol=0, atol=1e-6)
+    # From 10 % to 90 % within the time that it says.
+    assert abs(float(torch.special.ndtr(torch.tensor(RISE_PER_SIGMA / 2))) - 0.9) < 1e-6
+
+
+def test_shut_gates_do_not_go_below_zero():
+    """Counting refuses negative light, rounding included, however far the gate is and however sharp its edges are."""
+    axis = TimeAxis(0.0, 0.02, 3000)
+    delays = torch.linspace(0, 190e-9, 40, dtype=torch.float64)
+    for rise_s in (1e-12, 0.5e-9, 5e-9):
+        profile = gate_profiles(delays, torch.full_like(delays, 4e-9), axis, rise_s=rise_s, fall_s=rise_s)
+        assert float(profile.min()) >= 0.0 and float(profile.max()) <= 1 + 1e-12
+        open_s = float((profile > 1e-9).double().sum(1).max()) * axis.bin_width_s
+        assert open_s < 4e-9 + 8 * rise_s + 3 * axis.bin_width_s
+
+
+def test_gates_in_a_row_give_the_distance():
+    """Two overlapping gates: the ratio of their pictures moves with depth, by a ramp in closed form."""
+    camera = GatedIntegration([2e-9, 6e-9], 4e-9, AXIS, rise_s=10e-12)
+    x = torch.zeros(1, 200, 1, 2, dtype=torch.float64)
+    x[0, 60, 0, 0] = x[0, 140, 0, 1] = 5.0  # at 4 ns and 8 ns
+    y = camera.expected(x)
+    torch.testing.assert_close(y[0, :, 0], torch.tensor([[5.0, 0.0], [0.0, 5.0]], dtype=torch.float64))
+
+
+def test_gate_times_are_learnt():
+    camera = GatedIntegration([4e-9], 1e-9, AXIS, rise_s=0.3e-9, learnable=True)
+    x = torch.rand(1, 200, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def f(delay_ps, log_width_s):
+        values = {"delay_ps": delay_ps, "log_width_s": log_width_s}
+        return torch.func.functional_call(camera, values, (x,))
+
+    values = tuple(p.detach().clone().requires_grad_() for p in (camera.delay_ps, camera.log_width_s))
+    assert torch.autograd.gradcheck(f, values)
+    assert {n for n, _ in camera.named_parameters()} == {"delay_ps", "log_width_s"}
+
+
+def test_gated_camera_with_an_intensifier():
+    camera = Compose(
+        [GatedIntegration([2e-9], 6e-9, AXIS), PixelElectronics(excess_noise=1.6, read_noise_e=5.0)], grad="gaussian"
+    )
+    x = torch.zeros(4000, 1, 200, 1, 1, dtype=torch.float64)
+    x[:, :, 80] = 900.0
+    y = camera(x, torch.Generator().manual_seed(0))
+    assert abs(float(y.var()) / (900 * 1.6 + 25) - 1) < 0.1
+    assert abs(float(y.mean()) - 900) < 5 * (1465 / 4000) ** 0.5
+
+
+def test_mean_of_the_sweep_jitter_is_a_blur_of_the_stated_width():
+    jitter = SweepJitter(4.0 * 2.3548200450309493e-12, bin_width_s=1e-12)
+    x = torch.zeros(1, 101, 1, 1, dtype=torch.float64)
+    x[0, 50] = 1.0
+    y = jitter.expected(x).flatten()
+    k = torch.arange(101, dtype=torch.float64) - 50
+    # Linear interpolation adds f (1 - f) for a part f of a bin: 1/6 in the mean.
+    assert abs(float((y * k**2).sum()) - (4.0**2 + 1 / 6)) < 1e-3
+    assert abs(float(y.sum()) - 1) < 1e-9
+    assert abs(float((y * k).sum())) < 1e-9
+
+
+def test_a_sweep_shifts_all_pixels_alike():
+    jitter = SweepJitter(10e-12, bin_width_s=1e-12, grad="straight_through")
+    x = torch.zeros(3, 2, 101, 2, 2, dtype=torch.float64)
+    x[:, :, 50] = 1.0
+    y = jitter(x, torch.Generator().manual_seed(1))
+    k = torch.arange(101, dtype=torch.float64).reshape(-1, 1, 1)
+    position = (y * k).sum(-3)
+    assert float((position - position[:, :1, :1, :1]).abs().max()) < 1e-9
+    assert float(position[:, 0, 0, 0].std()) > 0.5
+    assert int((y[0, 0, :, 0, 0] > 0).sum()) <= 2
+    many = SweepJitter(10e-12, bin_width_s=1e-12, sweeps=4000, grad="gaussian")
+    z = many(x[:1], torch.Generator().manual_seed(1))[0, 0, :, 0, 0]
+    assert float((z - many.expected(x[:1])[0, 0, :, 0, 0]).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("policy", ["gaussian", "straight_through", "score"])
+def test_gradient_through_the_jitter_is_that_of_the_draw(policy):
+    jitter = SweepJitter(3e-12, bin_width_s=1e-12, sweeps=2, grad=policy)
+    x = torch.rand(2, 1, 20, 1, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: jitter(v, torch.Generator().manual_seed(3)), x, fast_mode=True)
+
+
+@pytest.mark.slow
+def test_streak_camera_moments():
+    """Mean and variance of a flat field: gain noise and read noise; neighbours are correlated by the phosphor."""
+    axis = TimeAxis.from_seconds(0.0, 1e-12, 24)
+    camera = StreakCamera(
+        axis, jitter_fwhm_s=0.0, time_fwhm_s=2e-12, excess_noise=2.0, read_noise_e=3.0, phosphor_fwhm_px=2.0,
+        spatial_fwhm_px=1.5,
+    )  # fmt: skip
+    x = torch.full((400, 1, 24, 3, 16), 50.0, dtype=torch.float64)
+    y = camera.sample(x, torch.Generator().manual_seed(0))[:, 0, 8:16, 1, 4:12]
+    assert abs(float(y.mean()) / 50 - 1) < 0.005
+    clean = StreakCamera(axis, jitter_fwhm_s=0.0, excess_noise=2.0, read_noise_e=3.0)
+    z = clean.sample(x, torch.Generator().manual_seed(0))[:, 0, 8:16, 1, 4:12]
+    assert abs(float(z.var()) / (2 * 50 + 9) - 1) < 0.03
+    assert float(y.var()) < 0.5 * float(z.var())
+
+    def neighbours(v):
+        v = v - v.mean()
+        return float((v[..., 1:] * v[..., :-1]).mean() / v.var())
+
+    assert neighbours(y) > 0.4 and abs(neighbours(z)) < 0.02
+
+
+def test_arrival_in_metres_agrees_with_gates_in_seconds():
+    """A surface at 0.9 m answers after 6 ns: inside a gate of 5.9 to 6.1 ns, not before or after."""
+    axis = TimeAxis(0.0, 0.005, 600)
+    x = torch.zeros(1, 600, 1, 1)
+    x[0, int(axis.bin_index(1.8))] = 1.0
+    assert abs(1.8 / SPEED_OF_LIGHT - 6.004e-9) < 1e-12
+    y = GatedIntegration([5.8e-9, 5.9e-9, 6.1e-9], [0.1e-9, 0.2e-9, 0.1e-9], axis, rise_s=1e-12).expected(x).flatten()
+    assert math.isclose(float(y[1]), 1.0, abs_tol=1e-6) and float(y[0]) < 1e-6 and float(y[2]) < 1e-6

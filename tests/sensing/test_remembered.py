@@ -1,0 +1,144 @@
+"""What stages remember follows every number they have, however it is changed, and no derivative is lost."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import weakref
+
+import pytest
+import torch
+
+from torchtransient import sensing
+from torchtransient.sensing import parameters as remembered_module
+from torchtransient.sensing.responses import kernel_of
+
+WIDTH = 50e-12
+
+
+def fresh(response):
+    return response.kernel(WIDTH)[1]
+
+
+def kept(response):
+    return kernel_of(response, WIDTH, "uniform")[1]
+
+
+def by_data(response):
+    response.log_fwhm_s.data += 0.5
+
+
+def in_place(response):
+    with torch.no_grad():
+        response.log_fwhm_s.add_(0.5)
+
+
+def by_state(response):
+    state = {k: v + 0.5 for k, v in response.state_dict().items()}
+    response.load_state_dict(state)
+
+
+def by_another(response):
+    response.log_fwhm_s = response.log_fwhm_s + 0.5
+
+
+@pytest.mark.parametrize("change", [by_data, in_place, by_state, by_another])
+def test_what_is_remembered_follows_the_numbers(change):
+    response = sensing.GaussianResponse(200e-12)
+    before = kept(response)
+    assert kept(response) is before
+    change(response)
+    after = kept(response)
+    assert after.shape != before.shape or not torch.equal(after, before)
+    torch.testing.assert_close(after, fresh(response), rtol=0, atol=0)
+
+
+def test_derivatives_are_there():
+    response = sensing.GaussianResponse(200e-12, learnable=True)
+    with torch.no_grad():
+        assert not kept(response).requires_grad
+    place = torch.arange(kept(response).numel(), dtype=torch.float64)
+    for value in (kept(response), fresh(response)):
+        response.zero_grad()
+        (value * place**2).sum().backward()
+        assert float(response.log_fwhm_s.grad.abs()) > 0
+    plain = sensing.GaussianResponse(200e-12)
+
+    def second_moment(log_fwhm):
+        value = torch.func.functional_call(_Kernel(plain), {"response.log_fwhm_s": log_fwhm}, ())
+        return (value * torch.arange(value.numel(), dtype=torch.float64) ** 2).sum()
+
+    log_fwhm = plain.log_fwhm_s.clone()
+    second_moment(log_fwhm)
+    slope = torch.func.grad(second_moment)(log_fwhm)
+    tangent = torch.func.jvp(second_moment, (log_fwhm,), (torch.ones_like(log_fwhm),))[1]
+    assert float(slope) != 0
+    torch.testing.assert_close(slope, tangent)
+    assert float(second_moment(log_fwhm + 0.1)) != float(second_moment(log_fwhm))
+
+
+class _Kernel(torch.nn.Module):
+    def __init__(self, response):
+        super().__init__()
+        self.response = response
+
+    def forward(self):
+        return kept(self.response)
+
+
+def test_copies_and_pickles_know_nothing_of_it():
+    sensor = sensing.Afterpulsing(0.05, 30e-9, 75e-9, bin_width_s=WIDTH, period_s=100e-9, background=1.0)
+    x = torch.rand(1, 400, 2, 2)
+    found = sensor.expected(x)
+    for other in (copy.deepcopy(sensor), pickle.loads(pickle.dumps(sensor))):
+        torch.testing.assert_close(other.expected(x), found, rtol=0, atol=0)
+    changed = copy.deepcopy(sensor)
+    changed.logit_probability += 0.5
+    assert float((changed.expected(x) - x).sum()) > 1.2 * float((found - x).sum())
+    changed.dead_time_s = 10e-9
+    moved = sensing.Afterpulsing(
+        float(changed.probability), 30e-9, 10e-9, bin_width_s=WIDTH, period_s=100e-9, background=1.0
+    )
+    torch.testing.assert_close(changed.expected(x), moved.expected(x))
+    torch.testing.assert_close(sensor.expected(x), found, rtol=0, atol=0)
+
+
+def test_what_inference_mode_left_can_be_trained_with():
+    response = sensing.GaussianResponse(200e-12)
+    with torch.inference_mode():
+        kept(response)
+    x = torch.ones(kept(response).numel(), dtype=torch.float64, requires_grad=True)
+    (x * kept(response)).square().sum().backward()
+    assert x.grad is not None
+
+
+LIGHT = torch.linspace(0.1, 1, 32).view(1, -1, 1, 1)
+STAGES = {
+    "response": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(200e-12), bin_width_s=WIDTH),
+    "afterpulses": lambda: sensing.Afterpulsing(
+        0.1, 1e-9, 0, bin_width_s=WIDTH, period_s=100 * WIDTH, background=3.0
+    ),
+}
+TRANSFORMS = {
+    "grad": lambda f: torch.func.grad(lambda v: f(v).sum())(LIGHT),
+    "jvp": lambda f: torch.func.jvp(f, (LIGHT,), (LIGHT,)),
+    "hessian": lambda f: torch.func.hessian(lambda v: f(v).square().sum())(LIGHT),
+    "functionalize": lambda f: torch.func.functionalize(f)(LIGHT),
+    "vmap": lambda f: torch.func.vmap(f)(LIGHT[None]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("transform", TRANSFORMS)
+def test_nothing_of_a_transform_is_remembered(stage, transform, monkeypatch):
+    kept = weakref.WeakKeyDictionary()
+    monkeypatch.setattr(remembered_module, "_RESULTS", kept)
+    module = STAGES[stage]()
+    TRANSFORMS[transform](module.expected)
+    assert not any(kept.values())
+    module.expected(LIGHT)
+    assert all(kept.values())
+    assert len(kept) == 1
+    expected = module.expected(LIGHT)
+    TRANSFORMS[transform](module.expected)
+    assert torch.equal(module.expected(LIGHT), expected)

@@ -1,0 +1,269 @@
+"""Several detections in one cycle against events: means, draws, covariances, scores and the way back to the light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+from support.sensing.event_driven import compare, detect
+from torchtransient.sensing import (
+    ScoreFunction,
+    SynchronousSPAD,
+    coates,
+    detections_with_dead_time,
+    first_photon_log_prob,
+    sample_detections,
+)
+
+BINS = 24
+WIDTH_S = 1e-10
+
+
+def shapes(bins=BINS):
+    """Rows with sum 1: a pulse in ambient light, light in the first and the last bin, one bright bin in the dark."""
+    t = np.arange(bins)
+    pulse = 0.3 / bins + np.exp(-0.5 * ((t - 0.6 * bins) / 2) ** 2) / 7
+    ends = 0.3 / bins + 1.0 * ((t == 0) | (t == bins - 1))
+    spike = (t == 5) * 1.0
+    return {name: row / row.sum() for name, row in (("pulse", pulse), ("ends", ends), ("spike", spike))}
+
+
+def image(row):
+    return torch.as_tensor(np.asarray(row), dtype=torch.float64).reshape(1, -1, 1, 1)
+
+
+def spad(dead, cycles=50, grad="expected"):
+    return SynchronousSPAD(cycles, dead_time_s=dead * WIDTH_S, bin_width_s=WIDTH_S, grad=grad)
+
+
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+CASES = [
+    ("pulse", 1.0, 6.5), ("ends", 100.0, 0.6),
+    *(slow(s, r, d) for s in shapes() for r in (0.1, 1.0, 10.0, 100.0) for d in (0.83, 1.3, 23.7)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("shape, total, dead", CASES)
+def test_means_and_draws_against_events(shape, total, dead, request):
+    cycles = 40_000 if request.node.get_closest_marker("slow") else 6000
+    rate = total * shapes()[shape]
+    events = detect(np.random.default_rng(1), rate, cycles, 1, dead)
+    sensor = spad(dead)
+    agreement = compare(events, sensor.probabilities(image(rate)))
+    assert agreement.within(1.5, exact=1e-5), agreement
+    repeats = cycles // 50
+    x = image(rate).unsqueeze(0).expand(repeats, 1, BINS, 1, 1)
+    h = sensor.sample(x, torch.Generator().manual_seed(0)).view(repeats, BINS)
+    assert torch.equal(h, h.round())
+    # two noises of the same size; what was seen in none of the cycles may well happen three times in as many
+    agreement = compare(events, h.mean(0).numpy() / 50)
+    assert agreement.within(1.5 * 2**0.5, exact=1e-5 + 0.5 * 3 / len(events)), agreement
+    # variance of bins and of totals, per cycle; a normal estimate has an error of sqrt(2 / n), rare counts more
+    variance = sensor.variance(image(rate)).flatten().numpy() / 50
+    seen = events.variance()
+    fourth = ((events.counts - events.counts.mean(0)) ** 4).mean(0)
+    assert np.all(np.abs(seen - variance) < 5 * np.sqrt(fourth / cycles) + 5 / cycles)
+    totals = events.counts.sum(1)
+    spread = ((totals - totals.mean()) ** 4).mean() / cycles
+    error = 5 * (np.sqrt(spread) + totals.var() * np.sqrt(2 / repeats)) + 1e-3 * totals.mean()
+    assert abs(h.sum(1).var().item() / 50 - totals.var()) < error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape, total", [("pulse", 3.0), ("pulse", 30.0), ("ends", 100.0), ("spike", 60.0)])
+@pytest.mark.parametrize("dead", [0.6, 1.3, 7.0])
+def test_bins_cut_or_not_give_the_same(shape, total, dead):
+    """The solution with bins cut finer and finer, by hand."""
+    row, pieces = total * shapes()[shape], 32
+    fine = detections_with_dead_time(image(np.repeat(row / pieces, pieces)), dead * pieces).view(BINS, pieces).sum(-1)
+    found = detections_with_dead_time(image(row), dead).flatten()
+    assert float((found - fine).abs().sum() / fine.sum()) < 1e-5
+
+
+def test_closed_form_of_constant_light():
+    """Expected detections before the second can happen, and after it, are integrals that one can do by hand."""
+    n, dead = 0.7, 3.4
+    found = detections_with_dead_time(image(np.full(8, n)), dead).flatten().double()
+    t = torch.arange(9, dtype=torch.float64)
+    late = (t - dead).clamp_min(0)
+    once = 1 - torch.exp(-n * t)
+    twice = 1 - (1 + n * late) * torch.exp(-n * late)
+    rest = (t - 2 * dead).clamp_min(0)
+    thrice = 1 - (1 + n * rest + (n * rest) ** 2 / 2) * torch.exp(-n * rest)
+    torch.testing.assert_close(found, (once + twice + thrice).diff(), rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("dead", [slow(0.8), 1.3, slow(5.6)])
+def test_gaussian_has_the_covariance_of_the_cycles(dead):
+    rate, cycles, draws = 20 * shapes(10)["pulse"], 400, 6000
+    sensor = spad(dead, cycles, "gaussian")
+    x = image(rate).unsqueeze(0).expand(draws, 1, 10, 1, 1)
+    y = sensor(x, generator=torch.Generator().manual_seed(0)).view(draws, 10)
+    counts = detect(np.random.default_rng(3), rate, 40_000, 1, dead).counts
+    wanted = torch.as_tensor(np.cov(counts.T)) * cycles
+    scale = torch.outer(wanted.diag(), wanted.diag()).sqrt()
+    # noise of both, and what the smooth root near 0 takes
+    assert bool(((torch.cov(y.T) - wanted).abs() < 5 * scale * (2 / draws) ** 0.5 + 0.05 * scale.diag().mean()).all())
+    total = float(y.sum(1).var())
+    assert total == pytest.approx(cycles * counts.sum(1).var(), rel=0.08)
+    assert total < 0.75 * float(y.var(0).sum())  # independent bins would be wrong
+
+
+def mixed(requires_grad=False):
+    """Pixels whose bins are cut in 1, 4 and 32 pieces, and a dark one."""
+    x = torch.stack([image(r * shapes(8)["ends"]).squeeze(0) for r in (0.5, 8.0, 60.0, 0.0)], -1).view(1, 8, 1, 4)
+    return x.requires_grad_(requires_grad)
+
+
+def test_pixels_of_all_levels():
+    x = mixed()
+    together = detections_with_dead_time(x, 1.3)
+    for k in range(4):
+        torch.testing.assert_close(
+            together[..., k : k + 1], detections_with_dead_time(x[..., k : k + 1], 1.3), rtol=1e-12, atol=1e-14
+        )
+    stacked = torch.stack([x, x.flip(-1)])
+    mapped = torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked)
+    torch.testing.assert_close(mapped, detections_with_dead_time(stacked, 1.3), rtol=1e-12, atol=1e-14)
+    with torch.no_grad():
+        assert torch.equal(torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked), mapped)
+    by_func = torch.func.grad(lambda v: detections_with_dead_time(v, 1.3).square().sum())(x)
+    leaf = mixed(True)
+    detections_with_dead_time(leaf, 1.3).square().sum().backward()
+    torch.testing.assert_close(by_func, leaf.grad, rtol=1e-10, atol=1e-12)
+    assert detections_with_dead_time(torch.zeros(0, 1, 8, 2, 2), 1.3).shape == (0, 1, 8, 2, 2)
+    assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
+
+
+@pytest.mark.slow
+def test_batches_of_autograd_and_of_func():
+    """Jacobians and Hessians of every kind, one pixel."""
+    x = image(np.linspace(0.05, 0.3, 4))
+
+    def f(v):
+        return detections_with_dead_time(v, 1.3)
+
+    rows = torch.func.jacrev(f)(x)
+    torch.testing.assert_close(torch.func.jacfwd(f)(x), rows, rtol=1e-11, atol=1e-13)
+    leaf = x.clone().requires_grad_()
+    unit = torch.eye(4, dtype=torch.float64).view(4, *x.shape)
+    (together,) = torch.autograd.grad(f(leaf), leaf, unit, is_grads_batched=True)
+    torch.testing.assert_close(together.view(4, 4), rows.view(4, 4), rtol=1e-11, atol=1e-13)
+    bend = torch.func.hessian(lambda v: f(v).square().sum())(x)
+    numeric = torch.autograd.functional.hessian(lambda v: f(v).square().sum(), x)
+    torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_forward_derivatives_where_no_graph_is_built():
+    """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
+    x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
+    for of in (lambda t: (x + t * x, d), lambda t: (x, d + t)):
+        found = []
+        for grad in (True, False):
+            with forward_ad.dual_level(), torch.set_grad_enabled(grad):
+                t = forward_ad.make_dual(torch.zeros_like(d), torch.ones_like(d))
+                found.append(forward_ad.unpack_dual(detections_with_dead_time(*of(t))).tangent.clone())
+        assert float(found[0].abs().max()) > 0.1
+        torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dead", [slow(0.7), 1.3])
+def test_gradients(dead):
+    x = mixed()[..., :2] + 0.01  # not cut, and cut
+    x.requires_grad_()
+    d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(detections_with_dead_time, (x, d), check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradgradcheck(lambda v: detections_with_dead_time(v, dead), (x,), fast_mode=True)
+
+    def noisy(v):
+        return spad(dead, 50, "gaussian")(v, generator=torch.Generator().manual_seed(0))
+
+    assert torch.autograd.gradcheck(noisy, (x,), fast_mode=True, nondet_tol=1e-12)
+
+
+@pytest.mark.slow
+def test_score_of_draws_gives_the_gradient_of_the_mean():
+    rate, draws = 4 * shapes(6)["ends"], 10_000
+    brightness = torch.ones(draws, 1, 1, 1, 1, dtype=torch.float64, requires_grad=True)
+    sensor = spad(1.4, 5, "score")
+    weights = torch.linspace(-1, 2, 6, dtype=torch.float64)
+    with ScoreFunction() as score:
+        y = sensor(brightness * image(rate), generator=torch.Generator().manual_seed(2))
+        losses = score.surrogate((y.view(draws, 6) * weights).sum(-1), baseline="leave_one_out")
+    losses.sum().backward()
+    one = torch.ones((), dtype=torch.float64, requires_grad=True)
+    ((sensor.expected(one * image(rate)).flatten() * weights).sum()).backward()
+    found = brightness.grad.flatten()
+    assert abs(float(found.mean() - one.grad)) < 4.5 * float(found.std()) / draws**0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "total, dead", [(1.0, 1.3), slow(2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
+)
+def test_coates_undoes_the_mean(total, dead):
+    rate, cycles = image(total * shapes()["pulse"]), 10_000
+    sensor = spad(dead, cycles)
+    estimate = sensor.inverse(sensor(rate))
+    certain = rate < 20
+    torch.testing.assert_close(estimate.rate[certain], rate[certain], rtol=1e-6, atol=1e-9)
+    assert bool(estimate.valid[certain].all())
+    if total == 1.0:  # nothing to put right: the gradient is that of the estimate
+        counts = sensor(rate).requires_grad_()
+        assert torch.autograd.gradcheck(lambda c: coates(c, cycles, dead).rate, (counts,), eps=1e-3, fast_mode=True)
+
+
+def test_estimates_have_gradients_where_no_cycle_is_armed():
+    """All ten are dead for three bins: nothing is known of these, and nothing is infinite."""
+    counts = image([10.0, 0.4, 0.0, 6.0, 1.0]).requires_grad_()
+    rate, valid = coates(counts, 10, 3.0)
+    assert valid.flatten().tolist() == [False, False, False, True, True] and rate.flatten()[1:3].tolist() == [0.0, 0.0]
+    assert bool(rate.isfinite().all())
+    (slope,) = torch.autograd.grad(rate.sum(), counts)
+    assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
+
+
+@pytest.mark.slow
+def test_coates_of_draws_is_unbiased():
+    rate, repeats, cycles = image(5 * shapes()["pulse"]), 200, 20_000
+    h = spad(2.6, cycles).sample(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), torch.Generator().manual_seed(0))
+    found = coates(h, cycles, 2.6).rate
+    z = (found.mean(0) - rate).abs() / (found.std(0) / repeats**0.5)
+    assert float(z.max()) < 4.5
+
+
+@pytest.mark.parametrize(
+    "total, dead, error", [(1.0, 0.6, 2e-3), (1.0, 2.6, 2e-3), (5.0, 2.6, 0.03), (5.0, 7.0, 0.02), (20.0, 30.4, 2e-6)]
+)
+def test_the_likelihood_is_greatest_near_the_light(total, dead, error):
+    """Newton's step from the truth, in counts without noise; second order in the photons of a bin.
+
+    With a dead time beyond the window the formula is exact. What is left of the cycles, a share exp(-20), is then a
+    difference of 1 and sums: eps exp(20) = 1e-7 of it is rounding.
+    """
+    rate = image(total * shapes()["pulse"]).requires_grad_()
+    counts = spad(dead, 10_000)(rate).detach()
+    (slope,) = torch.autograd.grad(
+        first_photon_log_prob(counts, rate, 10_000, dead_bins=dead).sum(), rate, create_graph=True
+    )
+    (bend,) = torch.autograd.grad(slope.sum(), rate)
+    step = (slope / bend / rate).detach().abs()
+    assert float(step.max()) < error
+    assert bool((bend < 0).all())
+
+
+def test_log_prob_at_the_ends():
+    """Nothing seen in the dark, and everything where all fire; nothing else is certain."""
+    dark = first_photon_log_prob(torch.zeros(1, 6, 1, 1), torch.zeros(1, 6, 1, 1), 10, dead_bins=1.5)
+    assert not dark.any()
+    impossible = first_photon_log_prob(image([0, 1.0, 0, 0]), image([0, 0.0, 0, 0]), 10, dead_bins=1.5).flatten()
+    assert impossible[1] == -torch.inf
+    sure = first_photon_log_prob(image([10.0, 0, 0, 0]), image([50.0, 0, 0, 0]), 10, dead_bins=2.0)
+    assert abs(float(sure.flatten()[0])) < 1e-12

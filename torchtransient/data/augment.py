@@ -1,0 +1,511 @@
+"""Augmentation of samples: one map of the pixels for light, labels and camera, drawn for each sample of a data set."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset
+
+from torchtransient import geometry
+from torchtransient.array_files.array_file import tensor_in
+from torchtransient.checks import by_number, count, flag, shown
+from torchtransient.data.operations import Operation, PixelMap
+from torchtransient.data.recipe_dataset import RecipeDataset
+from torchtransient.data.sample import Epochs, checked_seed, sample_generator, sample_number
+from torchtransient.data.scene_values import check_values
+from torchtransient.data.stream import TransientStream
+from torchtransient.data.transient_dataset import TransientDataset
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.geometry.pinhole import camera_matrices, transforms
+from torchtransient.stokes import rotate_frame
+
+# Depth of the search for images in nested entries.
+_DEEPEST = 4
+# The sensor's horizontal axis is cross(ray, up), and up in kornia's camera is -y (docs/polarization.md).
+_UP = (0.0, -1.0, 0.0)
+Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
+# Light with an axis of rows before time.
+_ROWS = ("rates", "beats")
+KINDS: dict[str, Kind] = {
+    **dict.fromkeys(("transient", "steady", "phasor", "gated", *_ROWS), "light"),
+    # Counts are no light that could be interpolated: neighbours' noise would no longer be that of a detector.
+    "measurement": "label",
+    **dict.fromkeys(("depth", "z_depth", "uv", "albedo", "first_return", "radial_velocity"), "label"),
+    **dict.fromkeys(("shape", "primitive", "material"), "number"),
+    "position": "point",
+    **dict.fromkeys(("normals", "velocity"), "direction"),
+}
+# Entries besides images; `fields` cannot give these names another treatment.
+_NAMED = ("intrinsics", "to_world", "values", "outside")
+
+
+class Augment:
+    """Draw one map of the pixels and apply it to all of a sample: light, labels, and the camera.
+
+    A call takes a dictionary as of :class:`~torchtransient.data.TransientDataset`, or a tuple whose entries ``names``
+    lists; leading dimensions of a batch get the same map. It returns a new sample; entries that no map changes are
+    passed on, not copied. Images of numpy come back as tensors.
+
+    - ``transient``, ``steady``, ``phasor``, ``gated``, ``rates``, ``beats``: interpolated between pixels, bin by bin,
+      where pixels do not come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter.
+    - ``depth``, ``z_depth``, ``uv``, ``albedo``, ``first_return``, ``radial_velocity``: the nearest pixel, since
+      between two depths there is no surface; NaN beyond the rim. Distances stay as they are: the camera is turned
+      about its axis, mirrored, or has another matrix. ``measurement``: the nearest pixel; 0 beyond the rim.
+    - ``shape``, ``primitive``, ``material``: the nearest pixel; -1 beyond the rim. Truth values: False beyond the rim.
+    - ``position``, ``normals``, ``velocity``: the nearest pixel. Of a mirrored image the world is mirrored in the
+      camera's frame, for which ``to_world`` of the camera is needed.
+    - ``intrinsics``, ``to_world``: of the camera that has taken the new image (:mod:`torchtransient.geometry`).
+    - ``values``: stay; an error where the map makes one of them false (a place in a mirror, a field of view in a crop),
+      or where a key is not known to stay true. Read the data set without them (``fields=``).
+    - Stokes components (``polarized``): S2 and S3 change their signs in a mirror, and all are turned with the sensor's
+      frame, which needs ``intrinsics`` except for half turns.
+
+    Args:
+        operations: :class:`Flip`, :class:`QuarterTurn`, :class:`Crop`, :class:`Affine`, one or several in a row.
+        intrinsics: (..., 3, 3) of the camera, for samples without an entry of this name; results have the new one.
+        to_world: (..., 4, 4) of the camera, likewise.
+        polarized: light has four Stokes components before the channels.
+        fields: treatment of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim),
+            "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
+        names: entries of samples that are tuples.
+        sensor: name of the camera in the keys of ``values``, or several; without it every ``to_world`` might be the
+            camera's.
+        kept_values: keys of ``values`` that are known to stay true.
+
+    Raises:
+        ShapeError: for images of several sizes and wrong components.
+        SceneError: for entries of an image's size without a treatment, and values that become false.
+        UnitError: for types that can neither be interpolated nor hold the value beyond the rim. Flips, turns and crops
+            take every type.
+        ArgumentError: for other arguments.
+
+    Not supported: exhaustive scans, orthographic cameras where they are turned with Stokes components.
+    """
+
+    def __init__(
+        self,
+        operations: Operation | Sequence[Operation],
+        *,
+        intrinsics: Any = None,
+        to_world: Any = None,
+        polarized: bool = False,
+        fields: Mapping[str, Kind] | None = None,
+        names: Sequence[str] | None = None,
+        sensor: str | Sequence[str] = (),
+        kept_values: Sequence[str] = (),
+    ) -> None:
+        given = list(operations) if isinstance(operations, Sequence) else [operations]
+        for one in given:
+            if not isinstance(one, Operation):
+                raise ArgumentError(f"Augment: expected Flip, QuarterTurn, Crop or Affine, got {shown(one)}.")
+        self.operations = tuple(given)
+        # Copies: the caller may change its tensors afterwards.
+        self.camera = {
+            "intrinsics": None if intrinsics is None else camera_matrices(intrinsics, "Augment").clone(),
+            "to_world": None if to_world is None else transforms(to_world, "Augment").clone(),
+        }
+        self.polarized = flag("Augment: polarized", polarized)
+        self.kinds: dict[str, Kind] = {**KINDS, **_checked_fields(fields)}
+        self.names = None if names is None else _texts("names", names)
+        self.cameras = (sensor,) if isinstance(sensor, str) else _texts("sensor", sensor)
+        self.kept_values = _texts("kept_values", kept_values)
+
+    def __call__(self, sample: Any, *, generator: torch.Generator | None = None) -> Any:
+        """Return a new sample with one map drawn.
+
+        Args:
+            sample: dictionary, or a tuple of the entries ``names``.
+            generator: None for torch's own.
+
+        Returns:
+            Sample of the same kind.
+        """
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise ArgumentError(f"Augment: expected generator as a torch.Generator, got {shown(generator)}.")
+        if isinstance(sample, Mapping):
+            return self._augmented(dict(sample), generator)
+        if self.names is None or not isinstance(sample, Sequence) or len(sample) != len(self.names):
+            raise ArgumentError(
+                f"Augment: expected a dictionary, or with names= a tuple of as many, got {shown(sample)} with "
+                f"names={self.names}."
+            )
+        found = self._augmented(dict(zip(self.names, sample, strict=True)), generator)
+        return tuple(found[name] for name in self.names)
+
+    # ------------------------------------------------------------------------------------------------------ one call
+
+    def _augmented(self, sample: dict[str, Any], generator: torch.Generator | None) -> dict[str, Any]:
+        for name, default in self.camera.items():
+            if default is not None and sample.get(name) is None:
+                # A copy, since the caller may change the sample.
+                sample[name] = default.clone()
+        for name, check in (("intrinsics", camera_matrices), ("to_world", transforms)):
+            if sample.get(name) is not None:
+                sample[name] = check(sample[name], "Augment")
+        names = [name for name in sample if self._kind(name) != "unchanged"]
+        sample |= {name: as_image(name, sample[name]) for name in names}
+        size = size_of({name: sample[name] for name in names}, tuple(KINDS))
+        for name, given in sample.items():
+            if name not in self.kinds and name not in _NAMED:
+                check_unknown(name, given, size)
+        for operation in self.operations:
+            drawn = operation.draw(size, generator)
+            if drawn is None:
+                continue
+            if not isinstance(drawn, PixelMap) or drawn.size != size:
+                got = f"one of {drawn.size}" if isinstance(drawn, PixelMap) else shown(drawn)
+                raise SceneError(
+                    f"Augment: expected {type(operation).__name__}.draw to return a PixelMap of images of {size}, or "
+                    f"None, got {got}."
+                )
+            sample = self._mapped(sample, {name: sample[name] for name in names}, drawn)
+            size = drawn.new_size
+        return sample
+
+    def _kind(self, name: str) -> Kind:
+        return self.kinds.get(name, "unchanged")
+
+    def _mapped(self, sample: dict[str, Any], images: Mapping[str, Tensor], drawn: PixelMap) -> dict[str, Any]:
+        check_values(sample.get("values"), drawn, self.cameras, self.kept_values)
+        found = dict(sample)
+        for name, image in images.items():
+            kind = self._kind(name)
+            if kind == "light":
+                moved = drawn.smooth(image, name)
+                found[name] = self._stokes(name, moved, drawn, sample) if self.polarized else moved
+            elif kind in ("point", "direction"):
+                found[name] = _in_the_world(name, kind, image, drawn, sample.get("to_world"))
+            else:
+                found[name] = drawn.nearest(image, self._fill(name, image), name)
+        if self.polarized and "measurement" in images and (drawn.turns or drawn.mirror is not None):
+            raise SceneError(
+                "Augment: a measurement of polarized light does not tell what the turned or mirrored scene would give; "
+                "augment the transient, and measure afterwards."
+            )
+        if sample.get("intrinsics") is not None:
+            found["intrinsics"] = drawn.intrinsics(sample["intrinsics"])
+        if sample.get("to_world") is not None:
+            found["to_world"] = drawn.to_world(sample["to_world"])
+        return found
+
+    def _fill(self, name: str, image: Tensor) -> float:
+        if image.dtype == torch.bool or (name == "measurement" and self._kind(name) == "label"):
+            return 0
+        return -1 if self._kind(name) == "number" else torch.nan
+
+    def _stokes(self, name: str, light: Tensor, drawn: PixelMap, sample: Mapping[str, Any]) -> Tensor:
+        dim = {"steady": -4, **dict.fromkeys(_ROWS, -6)}.get(name, -5)
+        if light.ndim < -dim or light.shape[dim] != 4:
+            raise ShapeError(
+                f"Augment: expected the 4 Stokes components of {name!r} in dimension {dim}, got {tuple(light.shape)}."
+            )
+        moves = drawn.turns or drawn.mirror is not None
+        if moves and not light.is_floating_point() and not light.is_complex():
+            raise UnitError(
+                f"Augment: expected the Stokes components of {name!r} as a floating dtype, got {light.dtype}: they "
+                "change their signs, and are turned; convert them with .float()."
+            )
+        return turned_stokes(light, dim, drawn, sample.get("intrinsics"))
+
+
+class Augmented(Epochs, Dataset[Any]):
+    """Map-style data set with an :class:`Augment` of each sample; for streams see :class:`AugmentedStream`.
+
+    Pickles; for workers that were forked or spawned.
+
+    Args:
+        dataset: of samples by number.
+        augment: drawn anew for each sample.
+        seed: each sample has a generator of its own, so that it is the same in every worker, in every epoch until
+            :meth:`set_epoch`; None draws from torch's, anew each time.
+
+    Raises:
+        ArgumentError: for streams and other objects.
+        UnitError: for a seed or an epoch below zero.
+        IndexError: beyond the samples.
+    """
+
+    def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
+        super().__init__()
+        if isinstance(dataset, IterableDataset):
+            raise ArgumentError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
+        self.dataset, self.augment = by_number("Augmented", dataset), _checked(augment, "Augmented")
+        self.seed = checked_seed("Augmented", seed)
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, number: int) -> Any:
+        return self.sample(number, self.epoch)
+
+    def sample(self, number: int, epoch: int | None = None) -> Any:
+        """Return a sample.
+
+        Args:
+            number: of the sample, negative from the end.
+            epoch: distinguishes the maps of epochs, and the noise of a data set of this library with a seed of its own;
+                None is 0.
+
+        Returns:
+            Sample with its map drawn.
+        """
+        place = sample_number("Augmented", number, len(self.dataset))
+        generator = sample_generator("Augmented", self.seed, place, epoch)
+        has_epochs = isinstance(self.dataset, (Augmented, RecipeDataset, TransientDataset))
+        found = self.dataset.sample(place, epoch) if has_epochs else self.dataset[place]
+        return self.augment(found, generator=generator)
+
+
+class AugmentedStream(IterableDataset[Any]):
+    """Stream (``TransientStream``, ``OnlineDataset``) with an :class:`Augment` of each sample.
+
+    Other attributes of the stream (``set_epoch``, ``close``, ``made``) are found here too; a ``with`` block closes it.
+
+    Args:
+        dataset: iterable data set.
+        augment: drawn anew for each sample.
+        seed: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
+            often the sample came before, among the samples of a TransientStream or from this iterator. None draws from
+            torch's generator.
+
+    Raises:
+        ArgumentError: for other data sets.
+        UnitError: for a seed below zero.
+        SceneError: for samples without an ``index`` with a seed.
+    """
+
+    def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
+        if not isinstance(dataset, IterableDataset):
+            raise ArgumentError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
+        self.dataset = dataset
+        self.augment, self.seed = _checked(augment, "AugmentedStream"), checked_seed("AugmentedStream", seed)
+
+    def __iter__(self) -> Iterator[Any]:
+        epoch = int(getattr(self.dataset, "epoch", 0))
+        for sample, repeat in self._repeated():
+            generator = None
+            if self.seed is not None:
+                index = count("AugmentedStream: index", sample["index"], 0)
+                generator = sample_generator("AugmentedStream", self.seed, index, epoch, repeat)
+            yield self.augment(sample, generator=generator)
+
+    def _repeated(self) -> Iterator[tuple[Any, int]]:
+        """Samples, each with the number of times that it came before."""
+        if isinstance(self.dataset, TransientStream):
+            yield from self.dataset.repeated()
+            return
+        given = Counter[Any]()
+        for sample in self.dataset:
+            if self.seed is not None and (not isinstance(sample, Mapping) or "index" not in sample):
+                raise SceneError("AugmentedStream: expected samples with an 'index' for seed=; leave seed out.")
+            index = sample["index"] if self.seed is not None else None
+            yield sample, given[index]
+            given[index] += 1
+
+    def __enter__(self) -> AugmentedStream:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """Close the stream, if it can be closed."""
+        close = getattr(self.dataset, "close", None)
+        if close is not None:
+            close()
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "dataset":
+            raise AttributeError(name)
+        return getattr(self.dataset, name)
+
+
+def as_image(name: str, given: Any) -> Tensor:
+    """Convert an image of a sample to a tensor.
+
+    Args:
+        name: of the entry.
+        given: tensor (..., H, W), kept, or an array, copied.
+
+    Returns:
+        Tensor (..., H, W).
+
+    Raises:
+        ShapeError: for other things.
+    """
+    if isinstance(given, np.ndarray):
+        try:
+            given = tensor_in(given.copy())
+        except TypeError:
+            raise ShapeError(f"Augment: expected {name!r} as numbers, got an array of {given.dtype}.") from None
+    if not isinstance(given, Tensor) or given.ndim < 2:
+        got = tuple(given.shape) if isinstance(given, Tensor) else type(given).__name__
+        raise ShapeError(f"Augment: expected {name!r} as an image (..., H, W), got {got}.")
+    return given
+
+
+def size_of(images: Mapping[str, Tensor], known: Sequence[str]) -> tuple[int, int]:
+    """Height and width that all images share.
+
+    Args:
+        images: tensors (..., H, W) by name.
+        known: names of images, for the message.
+
+    Returns:
+        (height, width).
+
+    Raises:
+        SceneError: without images.
+        ShapeError: for several sizes.
+    """
+    sizes = {name: (int(image.shape[-2]), int(image.shape[-1])) for name, image in images.items()}
+    if not sizes:
+        raise SceneError(f"Augment: expected images among {', '.join(known)}, got none; name others in fields=.")
+    if len(set(sizes.values())) > 1:
+        raise ShapeError(f"Augment: expected images of one size, got {sizes}. Leave out those of other sizes.")
+    return next(iter(sizes.values()))
+
+
+def check_unknown(name: str, given: Any, size: tuple[int, int]) -> None:
+    """Refuse an entry that might be an image: tensors, arrays, pictures and nested lists with two neighbouring
+    dimensions of the image's size, dictionaries and records that hold one.
+
+    Args:
+        name: of the entry.
+        given: its value.
+        size: (height, width).
+
+    Raises:
+        SceneError: for such an entry.
+    """
+    for shape in _shapes(given, _DEEPEST):
+        if any(shape[k : k + 2] == size for k in range(len(shape) - 1)):
+            raise SceneError(
+                f"Augment: {name!r} has the size of an image, {shape}, and nothing says what it is; give "
+                f'fields={{"{name}": "label"}}, "number", "light", "point", "direction" or "unchanged".'
+            )
+
+
+def _shapes(given: Any, deepest: int) -> Iterator[tuple[int, ...]]:
+    if deepest == 0 or given is None or isinstance(given, (str, bytes)):
+        return
+    if isinstance(given, Mapping):
+        inside: Any = given.values()
+    elif dataclasses.is_dataclass(given):
+        inside = vars(given).values() if hasattr(given, "__dict__") else ()
+    else:
+        inside = given if isinstance(given, (list, tuple)) else ()
+        yield _shape(given)
+    for one in inside:
+        yield from _shapes(one, deepest - 1)
+
+
+def _shape(given: Any) -> tuple[int, ...]:
+    if isinstance(given, (list, tuple)) and any(isinstance(one, Tensor) for one in given):
+        return ()
+    try:
+        shape = given.shape if hasattr(given, "shape") else np.shape(given)
+        return tuple(int(one) for one in shape)
+    except (TypeError, ValueError, RuntimeError):
+        # Ragged lists and other objects.
+        return ()
+
+
+def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tensor | None) -> Tensor:
+    """Stokes components in the frames of a camera that has been turned or mirrored.
+
+    A mirror changes the signs of S2 and S3. A turn of the camera turns the frame of each pixel by an angle that depends
+    on its ray; half a turn leaves it.
+
+    Args:
+        light: (..., 4, ..., H, W), already moved.
+        dim: of the components, negative.
+        drawn: map of the pixels.
+        camera_matrix: (..., 3, 3) before the map, or None.
+
+    Returns:
+        As ``light``.
+
+    Raises:
+        SceneError: where the matrix is needed and None.
+    """
+    if light.is_complex():
+        parts = [turned_stokes(part, dim, drawn, camera_matrix) for part in (light.real, light.imag)]
+        return torch.complex(parts[0], parts[1])
+    if drawn.mirror is not None:
+        signs = torch.tensor([1.0, 1.0, -1.0, -1.0], dtype=light.dtype, device=light.device)
+        light = light * signs.reshape(4, *[1] * (-dim - 1))
+    turn = drawn.rotation
+    if np.array_equal(np.abs(turn), np.eye(3)):
+        return light
+    if camera_matrix is None:
+        raise SceneError(
+            "Augment: turning Stokes components wants intrinsics= of the camera, since the frame of each pixel depends "
+            "on its ray. Flips and half turns do without."
+        )
+    rays = geometry.ray_directions(drawn.intrinsics(camera_matrix.double()), drawn.new_size)
+    rotation = torch.tensor(turn, device=rays.device)
+    up = rays.new_tensor(_UP)[:, None, None].expand_as(rays)
+    before = _across(rays, torch.einsum("ij,...jhw->...ihw", rotation, up))
+    after = _across(rays, up)
+    upwards = torch.linalg.cross(before, rays, dim=-3)
+    angle = torch.atan2((after * upwards).sum(-3), (after * before).sum(-3)).to(light.dtype)
+    # Dimensions behind the components go between those of the camera's matrix and of the image.
+    angle = angle.reshape(*angle.shape[:-2], *[1] * (-dim - 3), *angle.shape[-2:])
+    return rotate_frame(light, angle, dim)
+
+
+def _across(rays: Tensor, up: Tensor) -> Tensor:
+    """Horizontal axes (..., 3, H, W) of frames."""
+    return torch.nn.functional.normalize(torch.linalg.cross(rays, up, dim=-3), dim=-3)
+
+
+def _checked_fields(fields: Any) -> dict[str, Kind]:
+    if fields is None:
+        return {}
+    if not isinstance(fields, Mapping):
+        raise ArgumentError(f'Augment: expected fields as a dictionary, {{"mask": "number"}}, got {shown(fields)}.')
+    for name, kind in fields.items():
+        if kind not in get_args(Kind):
+            raise ArgumentError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(kind)}.")
+        if name in _NAMED:
+            raise ArgumentError(
+                f"Augment: {name!r} is no image: expected other names than {', '.join(_NAMED)} in fields."
+            )
+    return dict(fields)
+
+
+def _texts(what: str, given: Any) -> tuple[str, ...]:
+    if isinstance(given, str) or not isinstance(given, Sequence) or not all(isinstance(one, str) for one in given):
+        raise ArgumentError(f"Augment: expected {what} as a sequence of names, got {shown(given)}.")
+    return tuple(given)
+
+
+def _in_the_world(name: str, kind: Kind, image: Tensor, drawn: PixelMap, to_world: Tensor | None) -> Tensor:
+    if image.ndim < 3 or image.shape[-3] != 3:
+        raise ShapeError(f"Augment: expected {name!r} as (..., 3, H, W), got {tuple(image.shape)}.")
+    if not image.is_floating_point():
+        raise UnitError(
+            f"Augment: expected {name!r} as a floating dtype, got {image.dtype}; convert it with .float(), or call it "
+            "a label in fields=."
+        )
+    image = drawn.nearest(image, torch.nan, name)
+    if drawn.mirror is None:
+        return image
+    if to_world is None:
+        raise SceneError(
+            f"Augment: {name!r} is of the world, which a flip mirrors in the camera's plane: give to_world= of the "
+            "sensor, or leave it out."
+        )
+    mirror = drawn.mirrored_world(to_world).to(image.device, image.dtype)
+    moved = torch.matmul(mirror[..., :3, :3], image.flatten(-2)).reshape(image.shape)
+    return moved if kind == "direction" else moved + mirror[..., :3, 3, None, None]
+
+
+def _checked(augment: Any, what: str) -> Augment:
+    if not isinstance(augment, Augment):
+        raise ArgumentError(f"{what}: expected an Augment, got {shown(augment)}.")
+    return augment

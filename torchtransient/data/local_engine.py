@@ -1,0 +1,254 @@
+"""Workers on this machine: processes that take shards one at a time, are replaced when they die or hang, and end with
+the run; and one without a process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from multiprocessing import connection
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+from torchtransient.array_files.part_files import remove_unfinished
+from torchtransient.data.crew import POLL_S, Crew, Ledger, Member
+from torchtransient.data.processes import interrupts_blocked, unpacked
+from torchtransient.data.run_settings import RunSettings
+from torchtransient.data.shard_making import Messages, ShardMaker, execute, fatal
+from torchtransient.rendering.threads import threads
+
+# Seconds for a render that is under way when the supervisor is gone, and for workers at the end of a run.
+LAST_SECONDS, END_S = 10.0, 10.0
+# Exit status of a worker without a supervisor.
+_GONE = 3
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+class LocalWorker(Member):
+    """Process and the pipe to it. It is spawned: a forked one has no threads of Dr.Jit.
+
+    Args:
+        settings: of the run.
+    """
+
+    def __init__(self, settings: RunSettings) -> None:
+        super().__init__()
+        context = multiprocessing.get_context("spawn")
+        self.link, theirs = context.Pipe()
+        self.process = context.Process(target=work, args=(theirs, pickle.dumps(settings)), daemon=True)
+        try:
+            with interrupts_blocked():
+                self.process.start()
+        finally:
+            theirs.close()
+
+    def send(self, task: tuple[Any, ...]) -> None:
+        """Send a task through the pipe.
+
+        Args:
+            task: see `Member.assign`.
+        """
+        with contextlib.suppress(OSError):
+            self.link.send(task)
+
+    def messages(self) -> Iterator[tuple[Any, ...]]:
+        """Yield the messages that have come."""
+        while True:
+            try:
+                if not self.link.poll():
+                    return
+                message = self.link.recv()
+            except (EOFError, OSError):
+                return
+            yield message
+
+    def end(self) -> None:
+        """Kill the process if it lives."""
+        self.process.kill()
+        # A process that hangs in the kernel, on a lost disk, is left behind.
+        self.process.join(END_S)
+        self.link.close()
+
+
+class Supervisor(Crew[LocalWorker]):
+    """Crew of one machine."""
+
+    hint = (
+        "Its own output stands above. Workers import a script that calls generate: put the call under "
+        "if __name__ == '__main__'."
+    )
+
+    def start(self) -> LocalWorker:
+        """Start a process."""
+        return LocalWorker(self.settings)
+
+    def poll(self) -> None:
+        """Read pipes, and find processes that have ended."""
+        connection.wait(
+            [end for worker in self.workers for end in (worker.link, worker.process.sentinel)], timeout=POLL_S
+        )
+        for worker in list(self.workers):
+            # Messages sent before a death come first.
+            dead = not worker.process.is_alive()
+            for message in worker.messages():
+                self.receive(worker, *message)
+            if dead:
+                self._remove_dead(worker, worker.process.exitcode or 0)
+
+    def _remove_dead(self, worker: LocalWorker, code: int) -> None:
+        if code < 0:
+            try:
+                reason = f"by {signal.Signals(-code).name}"
+            except ValueError:
+                reason = f"by signal {-code}"
+            self.remove(worker, reason, own_fault=-code not in _FROM_OUTSIDE)
+        else:
+            # An exit of its own, before its first message, comes again.
+            self.remove(worker, f"with status {code}", own_fault=True, for_good=True)
+
+    def close(self, stopped: bool) -> None:
+        """End the workers: idle ones are asked to, after ten seconds all are killed.
+
+        Args:
+            stopped: in the middle of their work; they are terminated.
+        """
+        try:
+            for worker in self.workers:
+                with contextlib.suppress(OSError):
+                    worker.process.terminate() if stopped else worker.link.send(("stop",))
+            until = time.monotonic() + END_S
+            for worker in self.workers:
+                worker.process.join(max(0.0, until - time.monotonic()))
+        finally:
+            for worker in self.workers:
+                worker.end()
+            self.workers.clear()
+
+
+class InProcessWorker(Member):
+    """Worker without a process, which executes its task when the crew polls.
+
+    Args:
+        settings: of the run.
+    """
+
+    def __init__(self, settings: RunSettings) -> None:
+        super().__init__()
+        self.maker = ShardMaker(settings)
+        self.task: tuple[Any, ...] | None = None
+
+    def send(self, task: tuple[Any, ...]) -> None:
+        """Keep a task.
+
+        Args:
+            task: see `Member.assign`.
+        """
+        self.task = task
+
+    def end(self) -> None:
+        """Free the scenes."""
+        self.maker.close()
+
+
+class InProcessCrew(Crew[InProcessWorker]):
+    """Crew of the calling process, which has one thread until the run ends. Errors of samples are retried as on other
+    engines; a crash ends the run.
+    """
+
+    def __init__(self, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None) -> None:
+        super().__init__(settings, 1, ledger, timeout_s)
+        self._threads = threads(1)
+
+    def start(self) -> InProcessWorker:
+        """Build the scenes."""
+        return InProcessWorker(self.settings)
+
+    def poll(self) -> None:
+        """Execute the task."""
+        for worker in self.workers:
+            task, worker.task = worker.task, None
+            if not worker.ready:
+                self.receive(worker, "ready")
+            elif task is not None:
+                messages = Messages(partial(self._take, worker))
+                self.receive(worker, *execute(task, worker.maker, messages))
+
+    def _take(self, worker: InProcessWorker, message: tuple[Any, ...]) -> None:
+        self.receive(worker, *message)
+
+    def close(self, stopped: bool) -> None:
+        """Free the scenes, and put back the numbers of threads.
+
+        Args:
+            stopped: without effect.
+        """
+        for worker in self.workers:
+            worker.end()
+        self.workers.clear()
+        with self._threads:
+            pass
+
+
+# ---------------------------------------------------------------------------------------------- in the worker's process
+
+
+def work(link: Connection, packed: bytes) -> None:
+    """Execute tasks until the supervisor ends: the life of a worker.
+
+    Args:
+        link: pipe to the supervisor.
+        packed: pickled `RunSettings`.
+    """
+    # Ctrl-C reaches the whole group of processes; the supervisor decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGTERM, _end)
+    _end_with_supervisor()
+    try:
+        maker = ShardMaker(unpacked(packed, "generate"))
+        link.send(("ready",))
+        while True:
+            task = link.recv()
+            if task[0] == "stop":
+                maker.close()
+                return
+            link.send(execute(task, maker, Messages(link.send)))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        sys.exit(_GONE)
+    except Exception as error:  # noqa: BLE001  sent, and raised by the supervisor
+        with contextlib.suppress(OSError):
+            link.send(("fatal", *fatal(error)))
+        sys.exit(1)
+    finally:
+        # The end of the interpreter need not be orderly.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _end(*_: Any) -> NoReturn:
+    # No exception: where Python calls back (of weak references, from plugins) it would be printed and forgotten, or
+    # become an error of the scene.
+    remove_unfinished()
+    os._exit(_GONE)
+
+
+def _end_with_supervisor() -> None:
+    """Start a thread that waits for the supervisor's end: a render takes no notice of a closed pipe."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def wait() -> None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(LAST_SECONDS)
+        _end()
+
+    threading.Thread(target=wait, daemon=True).start()

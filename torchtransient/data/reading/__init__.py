@@ -1,1 +1,0 @@
-"""Data sets as torch reads them: by index, as a stream, in windows of time and parts of the image."""

@@ -1,0 +1,118 @@
+"""Samples of a recipe by number, rendered where and when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from torchtransient.checks import a_recipe, count, shown
+from torchtransient.data.sample import (
+    Epochs,
+    checked_seed,
+    checked_transform,
+    outside_tensor,
+    sample_generator,
+    sample_number,
+    takes_generator,
+    transformed,
+)
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+
+_WHAT = "RecipeDataset"
+
+
+class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
+    """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders.
+
+    A sample is a dictionary as of :class:`~torchtransient.data.TransientDataset`: its arrays by name, ``values`` by
+    key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone, and the draws of a
+    ``transform`` on ``seed``, too: a run that reads it in the order of :class:`torchtransient.training.Batches` can be
+    stopped and goes on to the bit, which one with :class:`OnlineDataset` cannot. Each sample is rendered every time
+    that it is read; where a step waits for that, use OnlineDataset, or generate the data set.
+
+    ``DataLoader(data, num_workers=2, multiprocessing_context="spawn", persistent_workers=True,
+    worker_init_fn=torchtransient.training.worker_init)`` renders beside the training; processes that were forked raise
+    VariantError. The recipe is checked first (:meth:`Recipe.check`). The data set pickles, without its scenes.
+
+    Args:
+        recipe: :class:`Recipe`, or an object with ``maker()``.
+        size: number of samples.
+        first: number of the first sample.
+        transform: sensor, or function of the transient, without gradients; its result stands under ``measurement``.
+        seed: each sample has a generator of its own for the transform (its argument ``generator``), so that it has the
+            noise of a stored sample of this index in every process; :meth:`set_epoch` and :meth:`sample` distinguish
+            epochs. None draws from torch's, anew each time.
+
+    Raises:
+        UnitError: for sizes, seeds and epochs.
+        ArgumentError: for other recipes and functions, and a seed that the transform cannot take.
+        IndexError: beyond the sizes. Errors of the renderer pass.
+    """
+
+    def __init__(
+        self,
+        recipe: Any,
+        size: int,
+        *,
+        first: int = 0,
+        transform: Callable[..., Any] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.recipe = a_recipe(_WHAT, recipe, "maker")
+        self.transform = checked_transform(_WHAT, transform)
+        self.size = count(f"{_WHAT}: size", size, 1, UnitError)
+        self.first = count(f"{_WHAT}: first", first, 0, UnitError)
+        self.seed = checked_seed(_WHAT, seed)
+        if seed is not None and not takes_generator(transform):
+            raise ArgumentError(
+                f"{_WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
+            )
+        self._maker: Any = None
+        if (check := getattr(recipe, "check", None)) is not None:
+            self._maker = recipe.maker()
+            check(self._maker)
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        return self.sample(number, self.epoch)
+
+    def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
+        """Render a sample.
+
+        Args:
+            number: of the sample, negative from the end.
+            epoch: distinguishes the noise of epochs; None is 0.
+
+        Returns:
+            Sample.
+        """
+        index = self.first + sample_number(_WHAT, number, self.size)
+        generator = sample_generator(_WHAT, self.seed, index, epoch)
+        if self._maker is None:
+            self._maker = self.recipe.maker()
+        made = self._maker.sample(index)
+        found: dict[str, Any] = {name: torch.from_numpy(np.array(array)) for name, array in made.arrays.items()}
+        if self.transform is not None:
+            if "transient" not in found:
+                raise ShapeError(f"{_WHAT}: transform= is for transients, and samples have {', '.join(found)}.")
+            found["measurement"] = transformed(self.transform, found["transient"], generator)
+        values = made.values.items()
+        found["values"] = {key: v if isinstance(v, str) else torch.from_numpy(np.array(v)) for key, v in values}
+        found |= {"outside": outside_tensor(made.outside), "index": made.index}
+        return found
+
+    def close(self) -> None:
+        """Free the scenes, which are built again when a sample is read."""
+        if self._maker is not None:
+            self._maker.close()
+            self._maker = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_maker": None}

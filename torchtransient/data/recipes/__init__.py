@@ -1,1 +1,0 @@
-"""Randomised scenes: what may vary, what a sample is made of, and how it is made."""

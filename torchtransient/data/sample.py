@@ -1,0 +1,317 @@
+"""Samples in memory: their arrays, their light outside of the time window, and the generators that belong to them."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient.checks import count, function, shown
+from torchtransient.errors import PhysicsWarning, TorchTransientWarning, UnitError, level_of_user
+
+# Least size of arrays that are copied in blocks, and pixels of a block.
+_LARGE, _BLOCK = 2**15, 64
+# Share of light outside of the window above which a sample counts as cut.
+CUT = 0.01
+# Quantile of the normal distribution for an interval of 95 %.
+_Z = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Sample of a recipe.
+
+    ``arrays`` are in torch's layout: ``transient`` float32 (C, T, H, W) or ``phasor`` complex64 (C, F, H, W), ``gated``
+    (C, G, H, W), ``rates`` (C, R, T, H, W), ``beats`` (C, 2, T, H, W), ``steady`` (C, H, W), labels, ``measurement``;
+    leading dimensions as in :class:`~torchtransient.RenderOutput`; a capture has its scan's shape behind T.
+
+    Args:
+        index: its number.
+        seed: of the render, 0 to 2^32 - 1.
+        arrays: by name.
+        values: drawn values by key, numbers as arrays, everything else as a text.
+        outside: shares of the light before and after the window.
+        structure: scene of the recipe that it is made of.
+    """
+
+    index: int
+    seed: int
+    _: KW_ONLY
+    arrays: dict[str, NDArray[Any]]
+    values: dict[str, NDArray[Any] | str] = field(default_factory=dict)
+    outside: tuple[float, float] = (0.0, 0.0)
+    structure: str = ""
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """``arrays`` as tensors, on the same memory."""
+        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in self.arrays.items()}
+
+    def __repr__(self) -> str:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in self.arrays.items())
+        return f"Sample({self.index}: {shapes}; drawn: {', '.join(self.values) or 'nothing'})"
+
+
+@dataclass(frozen=True)
+class OutsideLight:
+    """Light outside of the time window, over some samples of a recipe.
+
+    Args:
+        samples: number of samples; 0 for films without a window.
+        cut: samples with more than 1 % of their light outside.
+        mean: share of the light outside, over samples.
+        most: largest share.
+        failed: samples that could not be rendered.
+        reason: of the first failure.
+    """
+
+    _: KW_ONLY
+    samples: int
+    cut: int
+    mean: float
+    most: float
+    failed: int = 0
+    reason: str = ""
+
+    @classmethod
+    def of(cls, shares: Iterable[Sequence[float]], failed: Sequence[str] = ()) -> Self:
+        """Summarize samples.
+
+        Args:
+            shares: of the light of each sample before and after the window.
+            failed: reasons of samples that could not be rendered.
+
+        Returns:
+            OutsideLight.
+        """
+        missed = np.array([sum(pair) for pair in shares], dtype=np.float64)
+        reason = failed[0] if failed else ""
+        if not len(missed):
+            return cls(samples=0, cut=0, mean=0.0, most=0.0, failed=len(failed), reason=reason)
+        mean, most, cut = float(missed.mean()), float(missed.max()), int((missed > CUT).sum())
+        return cls(samples=len(missed), cut=cut, mean=mean, most=most, failed=len(failed), reason=reason)
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """Share of cut samples among all of the recipe: ends of an interval of 95 % (Wilson 1927)."""
+        if not self.samples:
+            return 0.0, 1.0
+        n, p = self.samples, self.cut / self.samples
+        middle, half = p + _Z**2 / (2 * n), _Z * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
+        low, high = ((middle + sign * half) / (1 + _Z**2 / n) for sign in (-1, 1))
+        return max(low, 0.0) if self.cut else 0.0, min(high, 1.0) if self.cut < n else 1.0
+
+    def shares(self) -> str:
+        """Figures of these samples as text."""
+        if not self.samples:
+            return "not looked at"
+        return (
+            f"more than {CUT:.0%} in {self.cut} of {self.samples} samples, {self.mean:.2%} on average, {self.most:.2%} "
+            "at most"
+        )
+
+    def __str__(self) -> str:
+        text = self.shares()
+        if self.samples:
+            low, high = self.expected
+            text += f"; more than {CUT:.0%} in {low:.1%} to {high:.1%} of all samples (95% confidence)"
+        return text + (f"; {self.failed} of {self.failed + self.samples} samples failed" if self.failed else "")
+
+    def warn(self, what: str) -> None:
+        """Warn of cut samples (PhysicsWarning) and of failed ones (TorchTransientWarning).
+
+        Args:
+            what: caller for messages.
+        """
+        if self.failed:
+            warnings.warn(
+                f"{what}: {self.failed} of {self.failed + self.samples} samples that were looked at failed and do not "
+                f"count in the light outside of the time window. The first one: {self.reason}",
+                TorchTransientWarning,
+                level_of_user(),
+            )
+        if self.cut:
+            warnings.warn(
+                f"{what}: light outside of the time window: {self}. Samples are kept all the same, each with its "
+                "shares under 'outside'. A time_axis= that starts earlier or has more bins holds more.",
+                PhysicsWarning,
+                level_of_user(),
+            )
+
+
+class Epochs:
+    """Data set with an epoch, which workers of a DataLoader that stay receive."""
+
+    def __init__(self) -> None:
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of samples that are read by number."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the draws of ``seed`` for samples that are read from now on; call it before iterating over a loader.
+
+        Args:
+            epoch: from 0 on.
+
+        Raises:
+            UnitError: for other numbers.
+        """
+        self._epoch.fill_(count(f"{type(self).__name__}: epoch", epoch, 0, UnitError))
+
+
+def in_order(tensor: torch.Tensor) -> NDArray[Any]:
+    """Tensor as an array in C order. Films have the pixels first in memory and torch has them last: large arrays are
+    copied in blocks, since a copy from end to end meets one line of the cache again and again where bins are a power of
+    two.
+
+    Args:
+        tensor: any shape.
+
+    Returns:
+        Array of the same shape.
+    """
+    array: NDArray[Any] = tensor.cpu().numpy()
+    pixels = array.shape[-1] * array.shape[-2] if array.ndim > 2 else 0
+    if array.flags.c_contiguous or array.size < _LARGE or pixels < _BLOCK:
+        return np.ascontiguousarray(array)
+    found = np.empty(array.shape, array.dtype)
+    target = found.reshape(*array.shape[:-2], pixels)
+    try:
+        source = tensor.view(target.shape).cpu().numpy()
+    except RuntimeError:
+        # Rows and columns do not form one axis in memory.
+        return np.ascontiguousarray(array)
+    for first in range(0, pixels, _BLOCK):
+        target[..., first : first + _BLOCK] = source[..., first : first + _BLOCK]
+    return found
+
+
+def sample_number(what: str, number: Any, size: int) -> int:
+    """Place of a sample, negative numbers counted from the end.
+
+    Args:
+        what: caller for messages.
+        number: of the sample.
+        size: of the data set.
+
+    Returns:
+        0 to ``size`` - 1.
+
+    Raises:
+        IndexError: for other numbers, as loops over a data set expect it.
+    """
+    try:
+        found = count(what, number, -size)
+    except ValueError:
+        found = size
+    if not found < size:
+        raise IndexError(f"{what}: expected a number from 0 to {size - 1}, got {shown(number)}.")
+    return found % size
+
+
+def outside_tensor(shares: Any) -> Tensor:
+    """Shares of light before and after the window as a tensor.
+
+    Args:
+        shares: two numbers.
+
+    Returns:
+        float64 (2,).
+    """
+    return torch.tensor([float(share) for share in shares], dtype=torch.float64)
+
+
+def checked_seed(what: str, seed: Any) -> int | None:
+    """Check a seed.
+
+    Args:
+        what: caller for messages.
+        seed: whole number from 0 on, or None.
+
+    Returns:
+        The seed.
+
+    Raises:
+        UnitError: for other seeds.
+    """
+    return None if seed is None else count(f"{what}: seed", seed, 0, UnitError, None)
+
+
+def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None, *more: int) -> torch.Generator | None:
+    """Generator of one sample in one epoch: the same draws in every process.
+
+    Args:
+        what: caller for messages.
+        seed: None for no generator.
+        number: of the sample.
+        epoch: None is 0.
+        more: further numbers that distinguish samples.
+
+    Returns:
+        Generator, or None.
+
+    Raises:
+        UnitError: for other epochs.
+    """
+    places = [] if epoch is None else [count(f"{what}: epoch", epoch, 0, UnitError)]
+    if seed is None:
+        return None
+    key = np.random.SeedSequence([seed, number, *places, *more])
+    return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+
+
+def checked_transform(what: str, transform: Any) -> Callable[..., Any] | None:
+    """Check a transform.
+
+    Args:
+        what: caller for messages.
+        transform: function of transients, or None.
+
+    Returns:
+        The transform.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
+    return None if transform is None else function(f"{what}: transform", transform, "transients, as sensors are")
+
+
+def takes_generator(transform: Any) -> bool:
+    """Return True where a transform has an argument ``generator``.
+
+    Args:
+        transform: function or module.
+
+    Returns:
+        Truth value.
+    """
+    called = transform.forward if isinstance(transform, torch.nn.Module) else transform
+    try:
+        return "generator" in inspect.signature(called).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def transformed(transform: Callable[..., Any], transient: Tensor, generator: torch.Generator | None) -> Any:
+    """Transform a transient without gradients.
+
+    Args:
+        transform: function or module.
+        transient: tensor.
+        generator: None for torch's own.
+
+    Returns:
+        Its result.
+    """
+    with torch.no_grad():
+        return transform(transient) if generator is None else transform(transient, generator=generator)

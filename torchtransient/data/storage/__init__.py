@@ -1,1 +1,0 @@
-"""Samples of data sets on disk: shard files that appear whole or not at all, their manifest, and exports."""

@@ -1,0 +1,484 @@
+"""Shards as a map-style data set of torch, with windows of time and parts of the image."""
+
+from __future__ import annotations
+
+import glob
+import math
+import os
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from torchtransient.array_files.array_file import tensor_in
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number, count, path_of, several, shown
+from torchtransient.data.manifest import named_shards, shards_of
+from torchtransient.data.sample import (
+    Epochs,
+    checked_seed,
+    checked_transform,
+    outside_tensor,
+    sample_generator,
+    sample_number,
+    takes_generator,
+    transformed,
+)
+from torchtransient.data.shard_format import measured_names
+from torchtransient.data.shards import Shard
+from torchtransient.errors import (
+    ArgumentError,
+    StorageError,
+    TorchTransientError,
+    TorchTransientWarning,
+    UnitError,
+    level_of_user,
+)
+
+# Tolerance of window ends at the edges of bins, in bins.
+_SAME_EDGE = 1e-6
+WHAT = "data set"
+_OPEN = 32
+_MEASURED = "measurement"
+_VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient"
+
+
+class TransientDataset(Epochs, Dataset[dict[str, Any]]):
+    """Samples of shards by number, in the order of the files and their rows, without those that failed.
+
+    A sample is a dictionary of its arrays by name, ``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels, of
+    ``values``, the drawn values by key, of ``outside``, (2,), the shares of its light before and after the time window
+    that it was rendered with, and of ``index``, its number in the recipe. ``torch.utils.data.DataLoader`` makes batches
+    of them. Files are opened when they are first read, in every process anew: the data set pickles, and workers may be
+    forked or spawned.
+
+    Args:
+        where: folder, pattern of names, shard, or a list of these.
+        fields: names of entries that are read, None for all.
+        window: ``(start_opl, end_opl)`` in metres, or a slice of bins: only the slabs that hold them are read, of the
+            transient, and of a measurement with as many bins. ``axis`` is the time axis of the result.
+        pixels: slices (rows, columns) of every entry of the film's size.
+        transform: sensor, or function of the transient, without gradients; its result stands under ``measurement``, in
+            place of one that was stored. A sensor answers under its policy, the mean with "expected";
+            ``transform=sensor.sample`` always draws.
+        as_stored: keep the type of counts instead of float32.
+        seed: each sample has a generator of its own for the transform (its argument ``generator``), so that it has the
+            same noise in every process, in every epoch until :meth:`set_epoch`; None draws from torch's.
+
+    Raises:
+        StorageError: for files that cannot be read, or do not belong together, and windows beyond the axis.
+        ArgumentError: for unknown fields.
+        UnitError: for a seed or an epoch below zero.
+        IndexError: beyond the samples.
+    """
+
+    def __init__(
+        self, where: Any, *, fields: Sequence[str] | None = None, window: Any = None, pixels: Any = None,
+        transform: Callable[..., Any] | None = None, as_stored: bool = False, seed: int | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self._table = ShardTable(where)
+        self.about: dict[str, Any] = self._table.about
+        shapes = self._table.arrays
+        whole = axis_of(self.about)
+        self._bins = bins_of(window, whole)
+        self.axis: TimeAxis | None = cut_axis(whole, self._bins)
+        # Measured arrays are on the time axis of the film if they have as many bins.
+        self._timed = measured_names(self.about)
+        self._size = image_size(shapes, self._timed)
+        self._pixels = pixels_of(pixels, self._size)
+        self.transform, self.seed = checked_transform(WHAT, transform), checked_seed(WHAT, seed)
+        self.as_stored = bool(as_stored)
+        self._fields = self._read_fields(fields, shapes)
+        if seed is not None and not takes_generator(transform):
+            raise StorageError(
+                f"{WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
+            )
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        return self.sample(number, self.epoch)
+
+    @property
+    def index(self) -> Tensor:
+        """(N,) int64: the number of every sample in its recipe."""
+        return torch.from_numpy(self._table.index.copy())
+
+    @property
+    def outside(self) -> Tensor:
+        """(N, 2) float64: shares of every sample's light before and after the time window of the render."""
+        return torch.from_numpy(self._table.outside.copy())
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """Samples that could not be made, with their reasons."""
+        return dict(self._table.failed)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of a sample's entries, beside its index."""
+        made = () if self.transform is None else (_MEASURED,)
+        return tuple(dict.fromkeys((*self._fields, *made)))
+
+    @property
+    def repeats(self) -> Tensor:
+        """(N,) int64: number of samples before it that have the same ``index``, those of other folders."""
+        return torch.from_numpy(self._table.repeat.copy())
+
+    @property
+    def shards(self) -> Tensor:
+        """(N,) int64: the file of every sample, by its place among them."""
+        return torch.from_numpy(self._table.shard.copy())
+
+    def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
+        """Read a sample.
+
+        Args:
+            number: of the sample, negative from the end.
+            epoch: distinguishes the noise of epochs; None is 0.
+
+        Returns:
+            Sample.
+        """
+        number = sample_number(WHAT, number, len(self._table))
+        epoch = 0 if epoch is None else count(f"{WHAT}: epoch", epoch, 0, UnitError)
+        place, row = int(self._table.shard[number]), int(self._table.row[number])
+        shard = self._table.open(place)
+        found: dict[str, Any] = {name: self._read(shard, name, row) for name in self._fields if name != _VALUES}
+        index = int(self._table.index[number])
+        if self.transform is not None:
+            given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
+            # Samples of several folders may have one number in their recipes.
+            repeat = int(self._table.repeat[number])
+            generator = sample_generator(WHAT, self.seed, index, epoch, repeat)
+            found[_MEASURED] = transformed(self.transform, given, generator)
+        if _VALUES in self._fields:
+            values = shard.values(row)
+            found[_VALUES] = {k: v if isinstance(v, str) else tensor_in(v) for k, v in values.items()}
+        found |= {_OUTSIDE: outside_tensor(shard.outside[row]), _INDEX: index}
+        return found
+
+    def close(self) -> None:
+        """Close the files that this process has open. They are opened again when they are read."""
+        self._table.close()
+
+    # -------------------------------------------------------------------------------------------------------- reading
+
+    def _read_fields(self, fields: Sequence[str] | None, shapes: dict[str, Any]) -> tuple[str, ...]:
+        known = (*shapes, _VALUES)
+        if fields is None:
+            names = known
+        else:
+            listed = [fields] if isinstance(fields, str) else several(f"{WHAT}: fields", fields, "names", str)
+            names = tuple(listed)
+            made = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
+            unknown = [name for name in names if name not in (*known, *made)]
+            if unknown:
+                raise ArgumentError(f"{WHAT}: expected fields among {', '.join(known)}, got {shown(unknown[0])}.")
+        if self.transform is not None and _TRANSIENT not in shapes:
+            raise StorageError(f"{WHAT}: transform= is for transients, and the samples have {', '.join(shapes)}.")
+        left_out = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
+        return tuple(name for name in names if name not in left_out)
+
+    def _read(self, shard: Shard, name: str, row: int) -> Tensor:
+        shape = self._table.arrays[name]
+        bins = self._bins if name in self._timed and self._table.time_axes[name] is not None else None
+        pixels = self._pixels if shape[-2:] == self._size else None
+        array = shard.read(name, row, window=bins, pixels=pixels, as_stored=self.as_stored)
+        return torch.from_numpy(array) if array.dtype.isnative else tensor_in(array)
+
+
+class ShardTable:
+    """Samples of several shards in the order of files and rows, and the shards that are open.
+
+    ``shard`` and ``row`` int64 (N,), ``index`` int64 (N,): number of the sample in its recipe, ``repeat`` int64 (N,):
+    number of samples before it with the same one. ``about``: description of the render in all shards. Pickles without
+    open files; a process that was forked opens its own.
+
+    Args:
+        where: as of :class:`TransientDataset`.
+
+    Raises:
+        StorageError: for shards that do not belong together.
+    """
+
+    def __init__(self, where: Any) -> None:
+        self.paths = shard_paths(where)
+        self._open: OrderedDict[int, Shard] = OrderedDict()
+        self._process = os.getpid()
+        shards, rows, index = [], [], []
+        outside: list[Any] = []
+        first: dict[str, Any] | None = None
+        self.failed: dict[int, str] = {}
+        self.arrays: dict[str, tuple[int, ...]] = {}
+        self.time_axes: dict[str, int | None] = {}
+        self.keys: tuple[str, ...] = ()
+        self.about: dict[str, Any] = {}
+        for number, path in enumerate(self.paths):
+            with Shard(path) as shard:
+                shards += [number] * len(shard.index)
+                rows += list(shard.index.values())
+                index += list(shard.index)
+                outside += [shard.outside[row] for row in shard.index.values()]
+                self.failed |= shard.failed
+                if not shard.index:
+                    continue
+                kind = _kind(shard)
+                if first is None:
+                    first = kind
+                    self.arrays = {name: shard.shape(name) for name in shard.names}
+                    self.time_axes = {name: shard.time_axis(name) for name in shard.names}
+                    self.keys, self.about = shard.keys, kind["about"]
+                _check_alike(first, kind, self.paths[shards[0]], path)
+        if not shards:
+            raise StorageError(f"{WHAT}: expected samples, got none in {len(self.paths)} shards: all of them failed.")
+        self.shard, self.row = np.array(shards, np.int64), np.array(rows, np.int64)
+        self.index: NDArray[np.int64] = np.array(index, np.int64)
+        self.outside: NDArray[np.float64] = np.array(outside, np.float64).reshape(-1, 2)
+        self.repeat = _repeats(self.index)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def open(self, number: int) -> Shard:
+        """Open shard; those that were not used for long are closed.
+
+        Args:
+            number: of the file.
+
+        Returns:
+            Shard.
+        """
+        if self._process != os.getpid():
+            # The parent's files stay open: HDF5 shares its state with it.
+            self._open, self._process = OrderedDict(), os.getpid()
+        if number in self._open:
+            self._open.move_to_end(number)
+            return self._open[number]
+        shard = self._open[number] = Shard(self.paths[number])
+        while len(self._open) > _OPEN:
+            self._open.popitem(last=False)[1].close()
+        return shard
+
+    def close(self) -> None:
+        """Close the open files."""
+        while self._process == os.getpid() and self._open:
+            self._open.popitem()[1].close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_open": OrderedDict()}
+
+
+def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
+    """Time axis of a render.
+
+    Args:
+        about: entry `about` of a header.
+
+    Returns:
+        Axis, None for films without one.
+
+    Raises:
+        StorageError: for an entry that is no axis.
+    """
+    given = about.get("axis")
+    if not isinstance(given, Mapping) or "num_bins" not in given:
+        return None
+    try:
+        return TimeAxis(given["start_opl"], given["bin_width_opl"], given["num_bins"])
+    except (KeyError, TorchTransientError) as error:
+        raise StorageError(f"{WHAT}: the time axis of the shards is none: {error}") from None
+
+
+def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
+    """Bins of a window.
+
+    Args:
+        window: ``(start_opl, end_opl)`` in metres, all bins that it touches, None for an open end; or a slice of bins;
+            or None.
+        axis: time axis, or None.
+
+    Returns:
+        Slice, or None.
+
+    Raises:
+        StorageError: for a window that is not all on the axis, and without an axis.
+    """
+    if window is None:
+        return None
+    if axis is None:
+        raise StorageError(f"{WHAT}: window= is for transients, and these samples have no time axis.")
+    if isinstance(window, slice):
+        start, stop, step = window.indices(axis.num_bins)
+        if step != 1 or stop <= start:
+            raise StorageError(f"{WHAT}: expected window to be some of {axis.num_bins} bins, got {shown(window)}.")
+        return slice(start, stop)
+    ends = list(window) if isinstance(window, tuple | list) and len(window) == 2 else [object()]
+    metres = [
+        default if end is None else as_number(end)
+        for end, default in zip(ends, (axis.start_opl, axis.end_opl), strict=False)
+    ]
+    if len(metres) != 2 or None in metres:
+        raise StorageError(
+            f"{WHAT}: expected window as (start_opl, end_opl) in metres or a slice of bins, got {shown(window)}."
+        )
+    first, last = ((float(end) - axis.start_opl) / axis.bin_width_opl for end in metres if end is not None)
+    if not (-_SAME_EDGE <= first < last <= axis.num_bins + _SAME_EDGE):
+        raise StorageError(
+            f"{WHAT}: expected window to lie between {axis.start_opl:g} m and {axis.end_opl:g} m, got "
+            f"{shown(window)}. None is an end that is open."
+        )
+    start = min(axis.num_bins - 1, max(0, math.floor(first + _SAME_EDGE)))
+    return slice(start, min(axis.num_bins, max(start + 1, math.ceil(last - _SAME_EDGE))))
+
+
+def cut_axis(axis: TimeAxis | None, bins: slice | None) -> TimeAxis | None:
+    """Axis of some of its bins.
+
+    Args:
+        axis: time axis, or None.
+        bins: slice, or None.
+
+    Returns:
+        Axis, or None.
+    """
+    if axis is None or bins is None:
+        return axis
+    return TimeAxis(axis.start_opl + bins.start * axis.bin_width_opl, axis.bin_width_opl, bins.stop - bins.start)
+
+
+def image_size(shapes: Mapping[str, tuple[int, ...]], measured: Sequence[str]) -> tuple[int, ...]:
+    """Rows and columns of the images of samples: of the steady image and labels, else of measured arrays.
+
+    Args:
+        shapes: of the arrays by name.
+        measured: names of measured arrays, in order.
+
+    Returns:
+        (rows, columns), or ().
+    """
+    order = ["steady", *(name for name in shapes if name not in measured), *measured]
+    return next((shapes[name][-2:] for name in order if len(shapes.get(name, ())) >= 2), ())
+
+
+def pixels_of(pixels: Any, size: tuple[int, ...]) -> tuple[slice, slice] | None:
+    """Check a rectangle of pixels.
+
+    Args:
+        pixels: slices (rows, columns), or None.
+        size: of the image.
+
+    Returns:
+        Slices with their bounds, or None.
+
+    Raises:
+        StorageError: for other rectangles, and empty ones.
+    """
+    if pixels is None:
+        return None
+    fits = isinstance(pixels, tuple | list) and len(pixels) == 2 and all(isinstance(one, slice) for one in pixels)
+    if not fits or len(size) != 2:
+        raise StorageError(f"{WHAT}: expected pixels as slices (rows, columns) of an image, got {shown(pixels)}.")
+    cuts = []
+    for one, length in zip(pixels, size, strict=True):
+        start, stop, step = one.indices(length)
+        if step != 1 or stop <= start:
+            raise StorageError(f"{WHAT}: expected pixels to be some of {size} without steps, got {shown(pixels)}.")
+        cuts.append(slice(start, stop))
+    return cuts[0], cuts[1]
+
+
+def shard_paths(where: Any) -> list[Path]:
+    """Shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards that are
+    missing.
+
+    Args:
+        where: as of :class:`TransientDataset`.
+
+    Returns:
+        Paths.
+
+    Raises:
+        StorageError: where there is none.
+    """
+    if isinstance(where, str | os.PathLike):
+        text = os.fspath(where)
+        path = path_of(text, WHAT)
+        if path.is_dir():
+            found = _of_folder(path)
+        elif path.is_file():
+            found = [path]
+        else:
+            found = sorted(Path(name) for name in glob.glob(str(text), recursive=True))
+            if any(place.is_dir() for place in found):
+                found = [shard for place in found for shard in (_of_folder(place) if place.is_dir() else [place])]
+        if not found:
+            raise StorageError(
+                f"{WHAT}: expected a folder with shards, or a pattern of their names, got '{text}', where there is "
+                "none."
+            )
+        return [path.absolute() for path in found]
+    try:
+        places: list[Any] = several(WHAT, where, "folders", error=StorageError)
+    except StorageError:
+        places = []
+    paths = [path for one in places for path in shard_paths(one)]
+    if len(set(paths)) != len(paths):
+        raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
+    if not paths:
+        raise StorageError(f"{WHAT}: expected a folder, a pattern, or a list of them, got {shown(where)}.")
+    return paths
+
+
+def _of_folder(folder: Path) -> list[Path]:
+    """The shards of a folder, with a warning where its manifest names others."""
+    found = shards_of(folder)
+    gone = sorted(set(named_shards(folder)) - {path.name for path in found})
+    if found and gone:
+        warnings.warn(
+            f"{WHAT}: '{folder}' lacks {len(gone)} of the {len(gone) + len(found)} shards of its manifest.json: "
+            f"{shown(gone)}. Their samples are left out; generate makes them again.",
+            TorchTransientWarning,
+            level_of_user(),
+        )
+    return found
+
+
+def _kind(shard: Shard) -> dict[str, Any]:
+    """Properties that all shards of a data set share."""
+    about = shard.header.get("about")
+    return {
+        "arrays": {name: (shard.shape(name), shard.dtype(name)) for name in shard.names},
+        "values": shard.keys,
+        "about": about if isinstance(about, dict) else {},
+    }
+
+
+def _check_alike(first: dict[str, Any], other: dict[str, Any], here: Path, there: Path) -> None:
+    pairs = [(name, first[name], other[name]) for name in ("arrays", "values")]
+    pairs += [(name, first["about"].get(name), other["about"].get(name)) for name in ("axis", "channels", "measures")]
+    for name, a, b in pairs:
+        if a != b:
+            raise StorageError(
+                f"{WHAT}: expected the same {name} in all shards, got {shown(a)} in '{here}' and {shown(b)} in "
+                f"'{there}'. Read them as two data sets."
+            )
+
+
+def _repeats(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each entry, how many before it are equal to it."""
+    order = np.argsort(index, kind="stable")
+    ranked = index[order]
+    starts = np.flatnonzero(np.r_[True, ranked[1:] != ranked[:-1]])
+    found = np.empty(len(index), np.int64)
+    found[order] = np.arange(len(index)) - np.repeat(starts, np.diff(np.r_[starts, len(index)]))
+    return found

@@ -1,1 +1,0 @@
-"""Pixels that integrate: their electronics and gates."""

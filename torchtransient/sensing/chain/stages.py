@@ -1,0 +1,750 @@
+"""Stages of a chain: the walk through them, what each takes and gives, and the order that they need.
+
+A row is what light passes one after another: a `Compose`, an ``nn.Sequential``, an ``nn.ModuleList``. Branches are what
+it passes one of: the sensors of `PixelGroups`. Everything else is one stage. Stages in a row have to agree on bins,
+laser cycles, the laser period and on the quantity that one gives and the next takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number
+from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.sensing.afterpulsing import Afterpulsing
+from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
+from torchtransient.sensing.electronics import PixelElectronics
+from torchtransient.sensing.gated import GatedIntegration
+from torchtransient.sensing.impulse_response import ImpulseResponse
+from torchtransient.sensing.itof.correlation import TapDifference
+from torchtransient.sensing.photon_budget import PhotonBudget
+from torchtransient.sensing.sensor import SAME_BIN, GradPolicy, Quantity, RandomSensor, Sensor
+from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF
+from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, PixelSkew, SweepJitter
+
+Step = Callable[[nn.Module, Tensor], Tensor]
+
+
+def row_of(stage: nn.Module) -> nn.Module | None:
+    """Return the container of the stages that a row is made of; None for a single stage.
+
+    Args:
+        stage: a stage of a chain.
+    """
+    if isinstance(stage, nn.ModuleList):
+        return stage
+    if isinstance(stage, nn.Sequential):
+        return stage if type(stage).forward is nn.Sequential.forward else None
+    inner = getattr(stage, "stages", None) if isinstance(stage, Sensor) else None
+    return inner if isinstance(inner, (nn.Sequential, nn.ModuleList)) else None
+
+
+def branches_of(stage: nn.Module) -> Sequence[tuple[str, nn.Module]]:
+    """Return the sensors of which every pixel passes one, with their names; none for a stage without branches.
+
+    Args:
+        stage: a stage of a chain.
+    """
+    inner = getattr(stage, "sensors", None) if isinstance(stage, Sensor) else None
+    return named(inner) if isinstance(inner, nn.ModuleList) else []
+
+
+def named(row: nn.Module) -> list[tuple[str, nn.Module]]:
+    """Return the stages of a container by their names, a stage that stands there twice as well, which torch lists once.
+
+    Args:
+        row: a container.
+    """
+    return [(name, stage) for name, stage in row._modules.items() if stage is not None]
+
+
+def in_order(stages: Iterable[tuple[str, nn.Module]], prefix: str = "") -> Iterator[tuple[str, nn.Module]]:
+    """Yield the single stages of rows in rows, in the order of the light, with their places: ``0``, ``1.0``, ``1.1``.
+
+    Args:
+        stages: stages by their names.
+        prefix: put in front of names.
+    """
+    for name, stage in stages:
+        row = row_of(stage)
+        if row is None:
+            yield f"{prefix}{name}", stage
+        else:
+            yield from in_order(named(row), f"{prefix}{name}.")
+
+
+def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
+    """Return stages with their numbers for names.
+
+    Args:
+        stages: stages in a row.
+    """
+    return ((str(number), stage) for number, stage in enumerate(stages))
+
+
+def parts_of(chain: nn.Module) -> Iterator[tuple[str, Sensor]]:
+    """Yield every sensor in a chain with its place, parts of other sensors too.
+
+    Args:
+        chain: a chain, which is left out itself.
+    """
+    for name, part in chain.named_modules(remove_duplicate=False):
+        if part is not chain and isinstance(part, Sensor):
+            yield name.replace("stages.", ""), part
+
+
+def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
+    """Return stages to call one after another.
+
+    Rows of torch's own with sensors in them are opened: they know no generator.
+
+    Args:
+        stages: stages in a row.
+    """
+    found: list[nn.Module] = []
+    for stage in stages:
+        row = None if isinstance(stage, Sensor) else row_of(stage)
+        if row is None or (isinstance(row, nn.Sequential) and not any(isinstance(p, Sensor) for p in row.modules())):
+            found.append(stage)
+        else:
+            found += unrolled(part for _, part in named(row))
+    return found
+
+
+def draws(stage: nn.Module) -> bool:
+    """Return True if anything in a stage draws.
+
+    Args:
+        stage: a stage of a chain.
+    """
+    return any(isinstance(part, RandomSensor) for part in stage.modules())
+
+
+def policies_of(stage: nn.Module) -> set[GradPolicy]:
+    """Return the policies of the random stages in a stage, parts of other sensors left out.
+
+    Args:
+        stage: a stage of a chain.
+    """
+    found: set[GradPolicy] = set()
+    for _, part in in_order([("", stage)]):
+        inner = branches_of(part)
+        if inner:
+            found = found.union(*(policies_of(sensor) for _, sensor in inner))
+        elif isinstance(part, RandomSensor):
+            found.add(part.grad)
+    return found
+
+
+def check_draws(stages: Iterable[nn.Module], where: str) -> None:
+    """Check that stages with random sensors inside can be drawn: they would hand on means.
+
+    Args:
+        stages: stages in a row.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: for a stage without `expected` and `sample`.
+    """
+    for name, stage in in_order(numbered(stages)):
+        if draws(stage) and not (isinstance(stage, Sensor) and callable(getattr(stage, "sample", None))):
+            inside = sorted({type(part).__name__ for part in stage.modules() if isinstance(part, RandomSensor)})
+            raise ArgumentError(
+                f"{where}: expected sensors that can be drawn, got stage '{name}' ({type(stage).__name__}) with "
+                f"{', '.join(inside)} inside and without expected(x) and sample(x, generator) of a RandomSensor. Give "
+                "its parts as stages, or make it a RandomSensor."
+            )
+
+
+def ends_of(stages: Iterable[nn.Module]) -> tuple[tuple[Quantity, ...], Quantity | str | None]:
+    """Return the quantities that a row takes and gives, as `Sensor.takes` and `Sensor.gives`.
+
+    Args:
+        stages: stages in a row.
+    """
+    takes: tuple[Quantity, ...] = ()
+    gives: Quantity | str | None = "the same"
+    for _, stage in in_order(numbered(stages)):
+        if not isinstance(stage, Sensor):
+            gives = None
+            continue
+        if gives == "the same" and not takes:
+            takes = stage.takes
+        if stage.gives != "the same":
+            gives = stage.gives
+    return takes, gives
+
+
+# --------------------------------------------------------------------------------------- one stage, in four ways
+
+
+def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
+    """Mean of one stage.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+    """
+    result: Tensor = stage.expected(x) if isinstance(stage, Sensor) else stage(x)
+    return result
+
+
+def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Draw one stage whatever its policy; the mean of one that draws nothing.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
+    if isinstance(stage, Sensor) and hasattr(stage, "sample"):
+        result: Tensor = stage.sample(x, generator)  # type: ignore[operator]
+        return result
+    return mean_of(stage, x)
+
+
+def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Draw the normal surrogate of one stage; the mean of one that draws nothing.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
+    if isinstance(stage, Sensor) and hasattr(stage, "gaussian"):
+        result: Tensor = stage.gaussian(x, generator)  # type: ignore[operator]
+        return result
+    return mean_of(stage, x)
+
+
+def measurement_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Measure light with one stage under its own policy.
+
+    Args:
+        stage: a stage of a chain.
+        x: its light.
+        generator: source of randomness.
+    """
+    result: Tensor = stage(x, generator=generator) if isinstance(stage, Sensor) else stage(x)
+    return result
+
+
+# -------------------------------------------------------------------- agreement of bins, quantities, cycles and periods
+
+
+# Periods written as 1/rate or as a number of bins were rounded on the way.
+_SAME_PERIOD = 1e-6
+
+_WORDS: dict[Quantity, str] = {
+    "radiance": "radiance",
+    "rate": "detections per laser cycle and bin",
+    "electrons": "mean electrons, or photons, of a whole exposure",
+    "counts": "counts that a detector has drawn",
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Sensor in a chain, with its name for messages."""
+
+    name: str
+    sensor: Sensor
+
+    def __str__(self) -> str:
+        return f"stage '{self.name}' ({type(self.sensor).__name__})"
+
+
+@dataclass(frozen=True)
+class _Light:
+    """Light between two stages, and the stages that its quantity and bins are known from."""
+
+    quantity: Quantity | None = None
+    giver: Stage | None = None
+    cycles: int = 1  # of the exposure that a rate per cycle belongs to
+    width: Stage | None = None
+    number: Stage | None = None  # of bins
+
+
+def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
+    """Yield the sensors of a chain in their order, those of nested chains too; None for modules of another kind.
+
+    Args:
+        chain: a chain.
+    """
+    for name, stage in in_order(named(getattr(chain, "stages", chain))):
+        yield Stage(name, stage) if isinstance(stage, Sensor) else None
+
+
+def check_stages(chain: nn.Module) -> bool:
+    """Check that each stage takes what the stages before it give.
+
+    Compared are bins, `cycles`, laser periods and quantities. The output of a module of another kind, or of a sensor
+    without `gives`, is unknown: behind these, bins and quantities are compared anew.
+
+    Args:
+        chain: a chain.
+
+    Returns:
+        True if `check_window` has to be called again for light whose bins are known.
+
+    Raises:
+        UnitError: for stages that do not go together.
+    """
+    _through(stages_of(chain), _Light())
+    parts = _parts_of(chain)
+    _check_cycles(parts)
+    check_dead_times(chain)
+    check_window(chain, None)
+    return has_period(chain) and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
+
+
+def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
+    """Compare each stage in a row with its light, every branch with the same, and return the light behind."""
+    for stage in stages:
+        if stage is None:
+            light = _Light()
+            continue
+        _check_quantity(light, stage)
+        before = _same_bins(light, stage)
+        for name, sensor in branches_of(stage.sensor):
+            row = in_order([(f"{stage.name}.{name}", sensor)])
+            end = _through((Stage(n, s) if isinstance(s, Sensor) else None for n, s in row), light)
+            before = replace(before, width=end.width, number=end.number)
+        light = _after(stage, before)
+    return light
+
+
+def _parts_of(chain: nn.Module) -> list[Stage]:
+    """Return every sensor of a chain, parts of other sensors too."""
+    return [Stage(name, part) for name, part in parts_of(chain)]
+
+
+# ------------------------------------------------------------------------------------------------------------- bins
+
+
+def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
+    """Check that a sensor and its parts were made for the bins of an axis.
+
+    Args:
+        sensor: sensor or chain.
+        axis: axis of the light.
+
+    Raises:
+        UnitError: for other bins.
+    """
+    for name, module in sensor.named_modules():
+        if not isinstance(module, Sensor):
+            continue  # a measured response has bins of its own
+        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
+        slack = SAME_BIN * axis.bin_width_opl
+        same, made_for = module.num_bins in (None, axis.num_bins), f"{module.num_bins} bins"
+        if isinstance(own, TimeAxis):
+            made_for = str(own)
+            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
+            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
+        elif isinstance(width_s, float):
+            made_for = f"bins of {width_s:g} s" if module.num_bins is None else f"{made_for} of {width_s:g} s"
+            same = same and abs(width_s - axis.bin_width_s) * axis.num_bins <= SAME_BIN * axis.bin_width_s
+        if not same:
+            raise UnitError(
+                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {made_for}), got {axis}. "
+                "Make the sensor with the renderer's axis."
+            )
+
+
+def _same_bins(light: _Light, stage: Stage) -> _Light:
+    """Add the bins of a stage to the light; UnitError for a stage that was made for others."""
+    width, number = _bins(stage)
+    other: Stage | None = None
+    if light.number is not None and number not in (None, _bins(light.number)[1]):
+        other = light.number
+    if light.width is not None and width is not None:
+        known, bins = _bins(light.width)
+        if abs(width - (known or 0.0)) * max(number or 1, bins or 1) > SAME_BIN * width:
+            other = light.width
+    if other is not None:
+        raise UnitError(
+            f"Compose: expected one time axis for all stages, got {_shown(_bins(other))} in {other} and "
+            f"{_shown((width, number))} in {stage}. Make both with the axis of the light."
+        )
+    return replace(
+        light, width=light.width if width is None else stage, number=light.number if number is None else stage
+    )
+
+
+def _bins(stage: Stage) -> tuple[float | None, int | None]:
+    """Return width in seconds and number of the bins that a sensor was made for; None where any fits."""
+    axis, width = getattr(stage.sensor, "axis", None), as_number(getattr(stage.sensor, "bin_width_s", None))
+    if isinstance(axis, TimeAxis):
+        return axis.bin_width_s, axis.num_bins
+    return width, stage.sensor.num_bins
+
+
+def _shown(bins: tuple[float | None, int | None]) -> str:
+    width, number = bins
+    if width is None:
+        return f"{number} bins"
+    return f"bins of {width:g} s" if number is None else f"{number} bins of {width:g} s"
+
+
+# ------------------------------------------------------------------------------------------------------- quantities
+
+
+def _check_quantity(light: _Light, stage: Stage) -> None:
+    """Raise UnitError for a stage that takes other light than the stages before it give."""
+    takes, given = stage.sensor.takes, light.quantity
+    if not takes or given is None or given in takes:
+        return
+    per_cycle = given == "rate" and "electrons" in takes
+    # of one cycle, or made into those of all of them
+    if per_cycle and (light.cycles == 1 or getattr(stage.sensor, "electrons_per_unit", 1.0) != 1.0):
+        return
+    wanted = " or ".join(_WORDS[t] for t in takes)
+    raise UnitError(
+        f"Compose: expected {wanted} for {stage}, got {_WORDS[given]} of {light.giver}. {_what_to_do(light, takes)}"
+    )
+
+
+def _what_to_do(light: _Light, takes: tuple[Quantity, ...]) -> str:
+    if light.quantity == "rate" and "electrons" in takes:
+        return (
+            f"They are those of one of {light.cycles} cycles. Count them with SynchronousSPAD({light.cycles}), give "
+            f"electrons_per_unit={light.cycles} where the stage has it, or make the budget with cycles=1 and the "
+            "energy of them all."
+        )
+    if light.quantity == "rate" and "counts" in takes:
+        return "Put the detector between them: SynchronousSPAD, FreeRunningSPAD or BinaryFrames."
+    if "radiance" in takes:
+        return "PhotonBudget takes what a renderer gives; leave out what has made detections of it before."
+    if light.quantity == "counts":
+        return "Light is counted once: leave one of them out, or say PixelElectronics(shot_noise=False)."
+    return "Electrons of an exposure are no rates per cycle: leave one of the two out."
+
+
+def _after(stage: Stage, light: _Light) -> _Light:
+    gives = stage.sensor.gives
+    if gives == "the same":
+        return light
+    if gives is None:
+        return _Light()
+    cycles = getattr(stage.sensor, "cycles", 1)
+    light = _Light() if gives == "electrons" else light  # taps and gates stand where bins were
+    return replace(light, quantity=gives, giver=stage, cycles=cycles if isinstance(cycles, int) else 1)
+
+
+# ----------------------------------------------------------------------------------------------- cycles and periods
+
+
+def _check_cycles(stages: list[Stage]) -> None:
+    """Raise UnitError for stages that count different numbers of laser cycles."""
+    counting = [(s, s.sensor.cycles) for s in stages if isinstance(getattr(s.sensor, "cycles", None), int)]
+    for stage, cycles in counting[1:]:
+        first, wanted = counting[0]
+        if cycles != wanted:
+            raise UnitError(
+                f"Compose: expected one number of cycles in all stages, got {wanted} in {first} and {cycles} in "
+                f"{stage}. Give the detector budget.cycles; change both in a Device."
+            )
+
+
+def check_window(chain: nn.Module, num_bins: int | None) -> None:
+    """Check that bins, dead times and the laser period of a chain go together.
+
+    A `FreeRunningSPAD` takes its bins for the whole period, and so does an `Afterpulsing` without `period_s`; any other
+    detector has to be armed again when the next cycle begins, with the dead time of its afterpulses as with its own.
+    The period is that of a `PhotonBudget`, or without one the `period_s` of an Afterpulsing.
+
+    Args:
+        chain: a chain.
+        num_bins: bins of the light; None leaves out the window of stages that were made with a width alone.
+
+    Raises:
+        UnitError: if they do not.
+    """
+    stages = _parts_of(chain)
+    budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
+    for budget in budgets:
+        period_s = 1 / float(budget.sensor.repetition_rate_hz)  # type: ignore[arg-type]
+        for stage in stages:
+            _check_period(budget, period_s, stage, num_bins)
+    goes_on = any(s.sensor.takes == ("rate",) and s.sensor.window_is_period for s in stages)
+    for stage in stages:
+        own = getattr(stage.sensor, "period_s", None)
+        if not goes_on and isinstance(_dead_time(stage), float):
+            for budget in budgets:
+                _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
+            if not budgets and isinstance(own, float):
+                _check_armed(stage, own, stage, num_bins)
+
+
+def has_period(chain: nn.Module) -> bool:
+    """Return True if a laser period is known in a chain.
+
+    Args:
+        chain: a chain.
+    """
+    names = ("repetition_rate_hz", "period_s")
+    return any(isinstance(getattr(part.sensor, name, None), float) for part in _parts_of(chain) for name in names)
+
+
+def _dead_time(stage: Stage) -> float | None:
+    dead_s = getattr(stage.sensor, "dead_time_s", None)
+    if isinstance(dead_s, Tensor):  # learnt
+        return float(dead_s.detach()) if dead_s.numel() == 1 else None
+    return float(dead_s) if isinstance(dead_s, (int, float)) else None
+
+
+def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
+    own = getattr(stage.sensor, "period_s", None)
+    if isinstance(own, float):
+        if not math.isclose(own, period_s, rel_tol=_SAME_PERIOD):
+            raise UnitError(
+                f"Compose: expected the laser period of {budget}, {period_s:g} s, in {stage}, got {own:g} s. Give it "
+                "period_s=1 / repetition_rate_hz."
+            )
+        return
+    width_s, own_number = _bins(stage)
+    number = own_number or num_bins
+    if width_s is None or number is None or not stage.sensor.window_is_period:
+        return
+    if not math.isclose(number * width_s, period_s, rel_tol=_SAME_PERIOD):
+        raise UnitError(
+            f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
+            f"bins of {width_s:g} s, {number * width_s:g} s. Take an axis of the whole period; Afterpulsing takes "
+            "period_s= as well."
+        )
+
+
+def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | None) -> None:
+    """Raise UnitError for a detector that is still dead when the next cycle begins."""
+    (width_s, number), dead_s = _bins(stage), _dead_time(stage) or 0.0
+    # what is not known yet is looked at when light comes
+    window_s = 0.0 if width_s is None else (number or num_bins or 0) * width_s
+    if dead_s and window_s + dead_s > period_s * (1 + _SAME_PERIOD):
+        raise UnitError(
+            f"Compose: expected {stage} to be armed again before the next cycle of {giver}, {period_s:g} s later, got "
+            f"a window of {window_s:g} s and a dead time of {dead_s:g} s. A detector that goes on into the next cycle "
+            "is a FreeRunningSPAD on an axis of the whole period; or lower repetition_rate_hz."
+        )
+
+
+def check_dead_times(chain: nn.Module) -> None:
+    """Check that an `Afterpulsing` has the dead time of the detector before it: one detector has one.
+
+    A detector of one detection per cycle has none of its own. In `PixelGroups`, whose sensors stand beside one another,
+    the dead time has to be that of one of them.
+
+    Args:
+        chain: a chain.
+
+    Raises:
+        UnitError: for another dead time.
+    """
+    before: list[Stage] = []
+    for stage in _parts_of(chain):
+        dead_s = _dead_time(stage)
+        if dead_s is None:
+            continue
+        if stage.sensor.takes == ("rate",):
+            before.append(stage)
+        elif stage.sensor.takes == ("counts",):
+            others = [s for s in before if not math.isclose(_dead_time(s) or 0.0, dead_s, rel_tol=1e-6, abs_tol=1e-15)]
+            grouped = ".sensors." in f".{stage.name}."
+            if others and (not grouped or len(others) == len(before)):
+                raise UnitError(
+                    f"Compose: expected the dead time of {others[0]}, {_dead_time(others[0]):g} s, in {stage}, got "
+                    f"{dead_s:g} s. One detector has one dead time: give both the same."
+                )
+
+
+# ---------------------------------------------------------------------------------------------------------------- order
+
+
+_MOVES = (DetectionJitter, DetectionSkew)
+# what spreads light over bins or pixels, and would average counts
+_SPREADS = (ImpulseResponse, LensBlur, PixelSkew, SpatialPSF, SweepJitter)
+# share of a gate outside the window that starves no image by more than the rounding of a count
+_OUTSIDE = 1e-6
+
+_PULSE_AND_JITTER = (
+    "The pulse of the laser stays an ImpulseResponse and goes in front of the PhotonBudget; the jitter of the detector "
+    "and its timing becomes a DetectionJitter of the same response behind the detector, where every detection moves."
+)
+
+
+def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
+    """Return the remedy for a zero boundary; a camera that is made of responses has a boundary of its own."""
+    within = any(getattr(o, "boundary", None) and o is not stage and stage in list(o.modules()) for o in outer)
+    return _PULSE_AND_JITTER if isinstance(stage, ImpulseResponse) and not within else "Use boundary='periodic'."
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Properties of the light so far.
+
+    Attributes:
+        background: True behind a budget with ambient light or dark counts.
+        behind: detector that has made counts of it.
+        codes: converter that has made codes of its bins.
+        difference: True behind a difference of taps.
+        pulses: True if the detector has afterpulses of its own.
+        outer: stages of the chain as they were given.
+    """
+
+    background: bool = False
+    behind: str | None = None
+    codes: str | None = None
+    difference: bool = False
+    pulses: bool = False
+    outer: tuple[nn.Module, ...] = ()
+
+    def also(self, other: _Seen) -> _Seen:
+        """Return the properties of light of which pixels have passed one or the other."""
+        return _Seen(
+            background=self.background or other.background,
+            behind=self.behind or other.behind,
+            codes=self.codes or other.codes,
+            difference=self.difference or other.difference,
+            pulses=self.pulses or other.pulses,
+            outer=self.outer,
+        )
+
+
+def has_background(budget: PhotonBudget) -> bool:
+    """Return True if a budget adds ambient light or dark counts, or may learn to.
+
+    Args:
+        budget: the budget.
+    """
+    ambient, dark = torch.as_tensor(budget.ambient_rate_hz), torch.as_tensor(budget.dark_count_rate_hz)
+    efficiency = torch.as_tensor(budget.quantum_efficiency)
+    if ambient.requires_grad or dark.requires_grad:
+        return True
+    lit = ambient > 0 if efficiency.requires_grad else ambient * efficiency > 0
+    return bool(lit.any()) or bool((dark > 0).any())
+
+
+def _detects(stage: nn.Module) -> bool:
+    """Return True if a stage makes counts of light."""
+    return isinstance(stage, Sensor) and stage.gives == "counts" and bool({"rate", "electrons"} & set(stage.takes))
+
+
+def check_order(stages: Iterable[nn.Module], where: str) -> None:
+    """Check the order of a chain: constant light and ends of windows, rates and counts.
+
+    Args:
+        stages: stages in a row.
+        where: name of the caller, for errors.
+
+    Raises:
+        UnitError: where constant light would starve at the end of a window, or counts would be averaged.
+    """
+    outer = list(stages)
+    _follow([stage for _, stage in in_order(numbered(outer))], _Seen(outer=tuple(outer)), [], where)
+
+
+def _follow(row: list[nn.Module], seen: _Seen, after: list[nn.Module], where: str) -> _Seen:
+    """Check a row of single stages with the stages `after` it, and return the properties of the light behind."""
+    for number, stage in enumerate(row):
+        rest = row[number + 1 :] + after
+        branches = branches_of(stage)
+        if branches:
+            ends = [_follow([s for _, s in in_order([branch])], seen, rest, where) for branch in branches]
+            for end in ends:
+                seen = seen.also(end)
+        else:
+            _check_stage(stage, seen, rest, where)
+            seen = _passed(stage, seen)
+    return seen
+
+
+def _passed(stage: nn.Module, seen: _Seen) -> _Seen:
+    if isinstance(stage, PhotonBudget):
+        return replace(seen, background=seen.background or has_background(stage))
+    if isinstance(stage, TDC) and stage.acts_on == "detections":
+        return replace(seen, codes=type(stage).__name__)
+    if isinstance(stage, TapDifference):
+        return replace(seen, difference=True)
+    # charge behind an amplifier is spread like light, by a phosphor for instance
+    if isinstance(stage, Sensor) and stage.gives == "counts" and not isinstance(stage, PixelElectronics):
+        pulses = seen.pulses or any(isinstance(part, AfterpulsingSPAD) for part in stage.modules())
+        return replace(seen, behind=seen.behind or type(stage).__name__, pulses=pulses)
+    return seen
+
+
+def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: str) -> None:
+    name = type(stage).__name__
+    if seen.background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
+        raise UnitError(
+            f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
+            f"ambient light and dark counts would starve at the ends of the window. {_instead(stage, seen.outer)}"
+        )
+    if seen.background and isinstance(stage, GatedIntegration):
+        _check_gates(stage, where)
+    if seen.difference and isinstance(stage, PixelElectronics):
+        _check_signed(stage, where)
+    if seen.behind is not None and isinstance(stage, ImpulseResponse):
+        raise UnitError(
+            f"{where}: expected no ImpulseResponse behind {seen.behind}: it would average counts. {_PULSE_AND_JITTER}"
+        )
+    if seen.behind is not None and (isinstance(stage, _SPREADS) or (isinstance(stage, TDC) and not _codes(stage))):
+        instead = {"PixelSkew": "Use DetectionSkew, which moves every detection", "TDC": "Say acts_on='detections'"}
+        raise UnitError(
+            f"{where}: expected no {name} behind {seen.behind}: it would average counts. "
+            f"{instead.get(name, 'It acts on light')}; or put it in front of the detector."
+        )
+    if seen.codes is not None and isinstance(stage, (*_MOVES, Afterpulsing)):
+        raise UnitError(
+            f"{where}: expected {name} in front of {seen.codes}, got it behind: bins are codes there, of unequal "
+            "widths, and it needs times. The converter is the last that acts on detections."
+        )
+    if seen.pulses and isinstance(stage, Afterpulsing):
+        raise UnitError(
+            f"{where}: expected no {name} behind {seen.behind} with an AfterpulsingSPAD, which has afterpulses of its "
+            "own, got both. Leave one of them out."
+        )
+    later = next((type(s).__name__ for s in rest if _detects(s)), None)
+    if (isinstance(stage, _MOVES) or _codes(stage)) and later is not None:
+        raise UnitError(
+            f"{where}: expected {name} behind the detector, got it in front of {later}. It acts on detections. "
+            + ("Say acts_on='rates'" if isinstance(stage, TDC) else "Take an ImpulseResponse or a PixelSkew")
+            + " for light."
+        )
+
+
+def _codes(stage: nn.Module) -> bool:
+    return isinstance(stage, TDC) and stage.acts_on == "detections"
+
+
+def _check_signed(stage: PixelElectronics, where: str) -> None:
+    """Raise UnitError for the electronics of a difference that know no numbers below zero."""
+    if stage.shot_noise:
+        raise UnitError(
+            f"{where}: expected no shot noise behind a TapDifference, whose negative numbers are no light, got a "
+            "PixelElectronics that draws it. Put it in front of the difference, where both taps have theirs; the one "
+            "behind is PixelElectronics(shot_noise=False, ...)."
+        )
+    low, high = stage.range_dn
+    if stage.bits is not None and stage.black_level_dn - low < 0.25 * (high - low):
+        raise UnitError(
+            f"{where}: expected a converter with room below zero behind a TapDifference, got codes from {low:g} to "
+            f"{high:g} and a black level of {stage.black_level_dn:g}, which clip negative differences. Say signed=True "
+            "(codes in two's complement), or a black_level_dn in the middle of the range."
+        )
+
+
+def _check_gates(stage: GatedIntegration, where: str) -> None:
+    missed = stage.outside()
+    worst = int(missed.argmax())
+    if float(missed[worst]) > _OUTSIDE:
+        raise UnitError(
+            f"{where}: expected gates inside the window of {stage.axis} behind a background, got gate {worst} with "
+            f"{float(missed[worst]):.2g} of its time outside, where the ambient light is not known. Move the gate or "
+            "lengthen the axis."
+        )

@@ -1,1 +1,0 @@
-"""Correlated noise: afterpulsing on counts and in the detector, optical crosstalk."""

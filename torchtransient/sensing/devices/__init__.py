@@ -1,1 +1,0 @@
-"""Devices as data, and those that have a name."""

@@ -1,1 +1,0 @@
-"""Random draws of whole histograms, convolutions and running sums along time."""

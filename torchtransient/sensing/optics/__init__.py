@@ -1,1 +1,0 @@
-"""In front of the pixels: photon budget, lens blur, analyzers."""

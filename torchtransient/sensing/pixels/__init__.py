@@ -1,1 +1,0 @@
-"""Pixels of several SPADs, and the histograms that a pixel can afford."""

@@ -1,1 +1,0 @@
-"""Single-photon avalanche diodes: in step with the laser, running free, as binary frames."""

@@ -1,1 +1,0 @@
-"""What moves time stamps: jitter of detections and sweeps, late pixels, converters."""

@@ -1,0 +1,556 @@
+"""Still pictures of a render: overview, arrival times, time as hue, streaks, moments, histograms, gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchtransient import checks
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import as_number, is_one_of, of_class, several, shown
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.units import opl_to_seconds
+from torchtransient.vis import colour_maps
+from torchtransient.vis.files import Image, figure_type, picture_figure, save_figure, save_image, to_bytes
+from torchtransient.vis.sources import Source, as_tensor, axis_of, images_of, pixel_of, real_tensor, transient_of
+from torchtransient.vis.tone_mapping import BROKEN, checked_positive, exposure_of, tone_map
+from torchtransient.vis.videos import moment
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STYLES = ("peak", "fusion")
+_ROWS_AT_ONCE = 32
+
+# ------------------------------------------------------------------------------------------- when light arrives
+
+
+def light_curve(transient: Tensor) -> Tensor:
+    """(T,) float64: when the light of a pixel arrives, averaged over the pixels; sums to 1, or is 0 without light.
+
+    Every pixel that sees light counts alike, whether it sees the lamp itself or a dark corner. `transient` is
+    (C, T, H, W), else ShapeError.
+    """
+    transient = _checked(transient, "light_curve")
+    total = torch.zeros(transient.shape[1], dtype=torch.float64, device=transient.device)
+    lit = 0
+    for part in _row_bands(transient):
+        values = part.sum(0).clamp(min=0)
+        energy = values.sum(0)
+        seen = energy > 0
+        lit += int(seen.sum())
+        total += torch.where(seen, values / energy.where(seen, 1), 0).sum((1, 2), dtype=torch.float64)
+    return total / max(lit, 1)
+
+
+def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
+    """(H, W) float64, metres: centre of the bin in which most light (sum over channels) arrives; NaN where none does.
+
+    The first of equal bins counts. Raises ShapeError when the transient is not (C, T, H, W) with the axis' T.
+    """
+    transient = _on_axis(transient, axis, "peak_time")
+    centers = axis.centers_opl.to(transient.device)
+    rows = []
+    for part in _row_bands(transient):
+        highest, index = part.sum(0).max(0)
+        rows.append(torch.where(highest > 0, centers[index], torch.nan))
+    return torch.cat(rows)
+
+
+def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5, 0.9)) -> list[int]:
+    """Indices of the bins by which the given shares of the `light_curve` have arrived; they differ if they can.
+
+    Without any light they are spread evenly. Raises ShapeError when the transient is not (C, T, H, W).
+    """
+    arrived = light_curve(transient).cumsum(0)
+    bins = arrived.numel()
+    if not float(arrived[-1]) > 0:
+        return [int(share * (bins - 1)) for share in shares]
+    wanted = torch.tensor(shares, dtype=torch.float64, device=arrived.device) * arrived[-1]
+    # Shares that are reached exactly at an edge must not depend on the last digit of a sum.
+    found = [min(int(i), bins - 1) for i in torch.searchsorted(arrived, wanted - 1e-9)]
+    for n in range(1, len(found)):
+        found[n] = min(max(found[n], found[n - 1] + 1), bins - 1)
+    return found
+
+
+def median_pixel(steady: Tensor) -> tuple[int, int]:
+    """(row, column) of the pixel of median brightness among those of a steady image (C, H, W) that see light.
+
+    Neither the lamp nor a corner in the dark. Raises ShapeError for another shape.
+    """
+    steady = real_tensor(steady, "median_pixel")
+    if steady.ndim != 3 or steady.numel() == 0:
+        raise ShapeError(f"median_pixel: expected a steady image (C, H, W), got {tuple(steady.shape)}.")
+    brightness = steady.sum(0).flatten()
+    order = brightness.argsort(stable=True)
+    order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
+    flat = int(order[(order.numel() - 1) // 2])
+    return flat // steady.shape[-1], flat % steady.shape[-1]
+
+
+def _row_bands(transient: Tensor) -> Iterator[Tensor]:
+    """Parts of some rows: the sum over channels of a whole cube would be a third of it once more."""
+    for row in range(0, transient.shape[2], _ROWS_AT_ONCE):
+        yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
+
+
+def _checked(given: Any, who: str) -> Tensor:
+    transient = real_tensor(given, who)
+    if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.numel() == 0:
+        raise ShapeError(
+            f"{who}: expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, "
+            "choose one."
+        )
+    return transient
+
+
+def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
+    transient = _checked(given, who)
+    if transient.shape[1] != of_class(f"{who}: axis", axis, TimeAxis).num_bins:
+        raise ShapeError(
+            f"{who}: expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."
+        )
+    return transient
+
+
+# -------------------------------------------------------------------------------------------------- one page of all
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What `plot_overview` draws beside the images: the moments shown (bins) and the pixel (row, column)."""
+
+    frames: tuple[int, ...]
+    pixel: tuple[int, int]
+
+
+def plot_overview(
+    transient: Tensor,
+    steady: Tensor,
+    axis: TimeAxis,
+    *,
+    path: str | Path,
+    pixel: tuple[int, int] | None = None,
+    title: str = "",
+    errors: Tensor | None = None,
+) -> Overview:
+    """Write a picture (PNG, or what the ending says) of a render and return what it shows.
+
+    `transient` (C, T, H, W) and `steady` (C, H, W), C = 1 or 3 in linear sRGB. `pixel` (row, column) defaults to the
+    `median_pixel`. Each image has its own exposure. `errors` (T, H, W), the `error_map` of a render with `errors=`: a
+    band of two standard errors around the mean over channels in the histogram of the pixel.
+
+    Raises ShapeError for other shapes or a pixel outside, and StorageError when the file cannot be written. Needs
+    matplotlib (extra `vis`).
+    """
+    transient, steady = _on_axis(transient, axis, "plot_overview"), real_tensor(steady, "plot_overview: steady")
+    height, width = transient.shape[-2:]
+    if tuple(steady.shape) != (transient.shape[0], height, width):
+        expected = (transient.shape[0], height, width)
+        raise ShapeError(f"plot_overview: expected steady of shape {expected}, got {tuple(steady.shape)}.")
+    if errors is not None:
+        errors = real_tensor(errors, "plot_overview: errors")
+        if errors.shape != transient.shape[1:]:
+            raise ShapeError(
+                f"plot_overview: expected errors of shape {tuple(transient.shape[1:])}, got {tuple(errors.shape)}."
+            )
+    row, column = pixel_of(median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
+    overview = Overview(tuple(moments_of_arrival(transient)), (row, column))
+    figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, squeeze=False).flat
+    panels = upper.subplots(1, 3)
+    _draw_steady(panels[0], steady, overview.pixel)
+    _draw_peak_time(upper, panels[1], transient, axis)
+    _draw_histogram(panels[2], transient, axis, overview.pixel, errors)
+    for panel, index in zip(lower.subplots(1, 3), overview.frames, strict=True):
+        panel.imshow(tone_map(transient[:, index].cpu()).numpy(), interpolation="nearest")
+        opl, time_s = float(axis.centers_opl[index]), float(axis.centers_s[index])
+        panel.set_title(f"{opl:.3f} m = {time_s * 1e9:.3f} ns (bin {index})", fontsize=10)
+        panel.set_axis_off()
+    if title:
+        figure.suptitle(title, fontsize=11)
+    save_figure(figure, path, "plot_overview")
+    return overview
+
+
+def _draw_steady(panel: Any, steady: Tensor, pixel: tuple[int, int]) -> None:
+    panel.imshow(tone_map(steady.cpu()).numpy(), interpolation="nearest")
+    panel.plot(pixel[1], pixel[0], marker="o", markersize=9, markerfacecolor="none", color="deepskyblue")
+    panel.set_title("steady", fontsize=10)
+    panel.set_axis_off()
+
+
+def _draw_peak_time(figure: Any, panel: Any, transient: Tensor, axis: TimeAxis) -> None:
+    image = panel.imshow(peak_time(transient, axis).cpu().numpy(), interpolation="nearest", cmap="viridis")
+    figure.colorbar(image, ax=panel, label="optical path length (m)", shrink=0.85)
+    panel.set_title("time of the peak", fontsize=10)
+    panel.set_axis_off()
+
+
+def _draw_histogram(
+    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None = None
+) -> None:
+    values = transient[:, :, pixel[0], pixel[1]].detach().cpu().numpy()
+    if errors is not None:
+        band, mean = 2 * errors[:, pixel[0], pixel[1]].detach().cpu().numpy(), values.mean(0)
+        edges = axis.edges_opl.numpy()
+        panel.stairs(mean + band, edges, baseline=mean - band, fill=True, color="0.85")
+        label = "mean over channels, 2 standard errors of its cell"
+        panel.stairs(mean, edges, color="0.4", linewidth=0.8, label=label)
+        panel.legend(fontsize=8, frameon=False)
+    colours = ("tab:red", "tab:green", "tab:blue") if len(values) == 3 else ("black",)
+    for curve, colour in zip(values, colours, strict=True):
+        panel.stairs(curve, axis.edges_opl.numpy(), color=colour, linewidth=1.0)
+    panel.set_xlabel("optical path length (m)")
+    panel.set_ylabel("radiance in a bin")
+    panel.set_title(f"pixel at row {pixel[0]}, column {pixel[1]}", fontsize=10)
+    panel.margins(x=0)
+
+
+# ----------------------------------------------------------------------------------------------- time as a colour
+
+
+def peak_time_picture(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    axis: TimeAxis | None = None,
+    limits: tuple[float, float] | None = None,
+    title: str = "",
+) -> Figure:
+    """A matplotlib figure of the `peak_time` of every pixel, with a colour bar in metres and in nanoseconds.
+
+    `source` and `axis` as in `frames`; `limits` are the ends of the scale in metres (None: where 1 % and 99 % of the
+    pixels are). Pixels without light are grey. Writes the figure when `path` is given. Raises ShapeError, also without
+    an axis, UnitError for limits that do not rise, and StorageError.
+    """
+    cube, axis = transient_of(source, axis, "peak_time_picture")
+    axis = axis_of(cube, axis, "peak_time_picture")
+    peaks = peak_time(torch.nan_to_num(cube, posinf=0.0, neginf=0.0), axis).numpy()
+    low, high = _limits(peaks, axis, limits)
+    figure, (panel,) = picture_figure(peaks.shape[0], peaks.shape[1], side=5.0)
+    panel.set_facecolor("0.6")
+    panel.set_axis_on()
+    panel.set_xticks([])
+    panel.set_yticks([])
+    image = panel.imshow(peaks, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
+    panel.set_title(title or "arrival of the peak", fontsize=10)
+    bar_in_metres_and_nanoseconds(figure, image, panel, low, high)
+    return save_figure(figure, path, "peak_time_picture")
+
+
+def rainbow(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    axis: TimeAxis | None = None,
+    style: str = "peak",
+    limits: tuple[float, float] | None = None,
+    period_opl: float | None = None,
+    exposure: float | None = None,
+) -> Image:
+    """RGB (H, W, 3) uint8: hue says when, brightness how much light arrives. Red is early, violet late.
+
+    `style` "peak" gives every pixel the hue of its `peak_time`; "fusion" adds up the light of all bins, each in its own
+    hue, so that early and late light mix as coloured lamps do. Hues run once over `limits` (metres; None: from 1 % to
+    99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time.
+    Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % of it white.
+    Pixels that are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path`
+    is given. Raises ArgumentError, ShapeError, UnitError and StorageError.
+    """
+    if not is_one_of(style, STYLES):
+        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {shown(style)}.")
+    cube, axis = transient_of(source, axis, "rainbow")
+    axis = axis or TimeAxis(0.0, 1.0, cube.shape[1])
+    steady = cube.sum((0, 1))
+    broken = ~torch.isfinite(steady).numpy()
+    cube = torch.nan_to_num(cube, posinf=0.0, neginf=0.0)
+    image = torch.nan_to_num(steady, nan=0.0, posinf=0.0, neginf=0.0)[None]
+    level = tone_map(image, exposure_of(image, 0.95) if exposure is None else exposure)[..., 0].numpy()
+    low, high = _arrival_limits(cube, axis) if limits is None else checked_limits(limits)
+    if style == "peak":
+        colours = colour_maps.rainbow(_hue(peak_time(cube, axis).numpy(), low, high, period_opl), level)
+    else:
+        colours = _fused(cube, _hue(axis.centers_opl.numpy(), low, high, period_opl), level)
+    colours[broken] = BROKEN
+    return save_image(to_bytes(colours), path, "rainbow")
+
+
+def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: float, high: float) -> None:
+    """A colour bar with metres on its right and nanoseconds on its left."""
+    bar = figure.colorbar(image, ax=panel, shrink=0.85, pad=0.2)
+    bar.set_label("optical path length (m)")
+    twin = bar.ax.twinx()
+    twin.set_ylim(1e9 * opl_to_seconds(low), 1e9 * opl_to_seconds(high))
+    # A twin pushes the first axis to the left; here it is the other way round.
+    bar.ax.yaxis.set_ticks_position("right")
+    bar.ax.yaxis.set_label_position("right")
+    twin.yaxis.set_ticks_position("left")
+    twin.yaxis.set_label_position("left")
+    twin.set_ylabel("time (ns)")
+
+
+def _hue(opl: NDArray[np.float64], low: float, high: float, period: float | None) -> NDArray[np.float64]:
+    if period is None:
+        return np.asarray((opl - low) / (high - low))
+    period = checked_positive("period_opl", period, "rainbow")
+    return np.asarray(np.mod((opl - low) / period, 1.0))
+
+
+def _fused(cube: Tensor, hues: NDArray[np.float64], level: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear colours of the bins, mixed with their share of a pixel's light and brought to its brightness."""
+    colours = torch.from_numpy(_to_linear(colour_maps.rainbow(hues)))
+    values = cube.sum(0).clamp(min=0)
+    share = values / values.sum(0).clamp(min=torch.finfo(values.dtype).tiny)
+    mixed = torch.einsum("thw,tc->hwc", share.double(), colours)
+    shown = tone_map(mixed.permute(2, 0, 1), exposure=1.0).numpy()
+    return np.asarray(shown * level[..., None])
+
+
+def _to_linear(shown: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4))
+
+
+def _limits(peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, float] | None) -> tuple[float, float]:
+    if limits is not None:
+        return checked_limits(limits)
+    known = peaks[np.isfinite(peaks)]
+    if not known.size:
+        return axis.start_opl, axis.end_opl
+    low, high = np.percentile(known, [1, 99])
+    return float(low), float(max(high, low + axis.bin_width_opl))
+
+
+def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
+    arrived = light_curve(cube).cumsum(0)
+    if not float(arrived[-1]) > 0:
+        return axis.start_opl, axis.end_opl
+    edges = torch.searchsorted(arrived / arrived[-1], torch.tensor([0.01, 0.99], dtype=torch.float64))
+    first, last = (axis.start_opl + float(k) * axis.bin_width_opl for k in edges)
+    return first, last + axis.bin_width_opl
+
+
+def checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
+    """Two lengths in metres. Raises ShapeError for what is no pair of numbers, UnitError for those that do not rise."""
+    pair = checks.real_array(limits)
+    if pair is None or pair.shape != (2,):
+        raise ShapeError(f"limits: expected two lengths in metres, got {shown(limits)}.")
+    low, high = pair.tolist()
+    if not (np.isfinite(pair).all() and low < high):
+        raise UnitError(f"limits: expected two lengths in metres, the first below the second, got {limits!r}.")
+    return low, high
+
+
+# ------------------------------------------------------------------------------------ cuts, moments and histograms
+
+
+def streak(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    row: int | None = None,
+    column: int | None = None,
+    axis: TimeAxis | None = None,
+    exposure: float | None = None,
+    curve: str = "log",
+) -> Figure:
+    """A matplotlib figure as a streak camera sees it: one row (or one column) of pixels over time, time downwards.
+
+    Give `row` or `column` (None: the middle row). `source` and `axis` as in `frames`; `exposure` and `curve` as in
+    `tone_map`, whose "log" shows the front and what follows it. Writes the figure when `path` is given. Raises
+    ShapeError for a line outside of the image, or both given; UnitError; StorageError.
+    """
+    cube, axis = transient_of(source, axis, "streak")
+    if row is not None and column is not None:
+        raise ArgumentError("streak: expected row or column, got both.")
+    number, what = (column, "column") if column is not None else (row, "row")
+    count = cube.shape[3] if what == "column" else cube.shape[2]
+    number = count // 2 if number is None else number
+    place = checks.as_whole(number)
+    if place is None or not -count <= place < count:
+        raise ShapeError(
+            f"streak: {what} {shown(number)} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}."
+        )
+    number = place % count
+    line: Tensor = cube[:, :, :, number] if what == "column" else cube[:, :, number]
+    picture = tone_map(line, exposure_of(line, 0.999) if exposure is None else exposure, curve).numpy()
+    figure = figure_type()(figsize=(6.2, 5.2), layout="constrained")
+    panel = figure.subplots()
+    pixels = line.shape[2]
+    start, end = (0.0, float(cube.shape[1])) if axis is None else (axis.start_opl, axis.end_opl)
+    panel.imshow(picture, aspect="auto", interpolation="nearest", extent=(-0.5, pixels - 0.5, end, start))
+    panel.set_xlabel("row of the image" if what == "column" else "column of the image")
+    panel.set_ylabel("bin" if axis is None else "optical path length (m)")
+    if axis is not None:
+        other = panel.secondary_yaxis("right", functions=(_to_nanoseconds, _to_metres))
+        other.set_ylabel("time (ns)")
+    scale = ", logarithmic" if curve == "log" else ""
+    panel.set_title(f"light along {what} {number}{scale}", fontsize=10)
+    return save_figure(figure, path, "streak")
+
+
+def frame_grid(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    axis: TimeAxis | None = None,
+    bins: Sequence[int] | None = None,
+    count: int = 12,
+    columns: int = 4,
+    exposure: float | None = None,
+    curve: str = "srgb",
+    title: str = "",
+) -> Figure:
+    """A matplotlib figure of moments, each with its time.
+
+    `bins` names them; None takes `count` moments between which equal shares of the light arrive. `exposure` None lets
+    every frame have its own, since late light is far weaker than early light; give a number to compare frames.
+    `source`, `axis` and `curve` as in `frames`. Writes the figure when `path` is given. Raises ShapeError for a bin
+    outside of the axis or no bins, UnitError and StorageError.
+    """
+    cube, axis, word = images_of(source, axis, "frame_grid")
+    total = cube.shape[1]
+    columns, number = (
+        checks.count(f"frame_grid: {name}", value, 1, ShapeError)
+        for name, value in (("columns", columns), ("count", count))
+    )
+    if bins is None:
+        shares = tuple(float(s) for s in (np.arange(number) + 0.5) / number)
+        bins = moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
+    bins = several("frame_grid: bins", bins, "numbers of bins")
+    if not bins:
+        raise ShapeError("frame_grid: expected some bins, got none.")
+    for index in bins:
+        if (place := checks.as_whole(index)) is None or not 0 <= place < total:
+            raise ShapeError(f"frame_grid: bin {shown(index)} lies outside of {total} bins.")
+    bins = [int(index) for index in bins]
+    figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
+    for panel, index in zip(panels, bins, strict=False):
+        panel.imshow(tone_map(cube[:, index], exposure, curve).numpy(), interpolation="nearest")
+        panel.set_title(moment(axis, index, total, word).replace("   ", " = "), fontsize=8)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path, "frame_grid")
+
+
+def histogram(
+    source: Source,
+    path: str | Path | None = None,
+    *,
+    pixels: Sequence[tuple[int, int]],
+    axis: TimeAxis | None = None,
+    log: bool = False,
+    title: str = "",
+) -> Figure:
+    """A matplotlib figure of what some pixels (row, column) see over time, a panel each.
+
+    Three channels are red, green and blue lines, one is black, others go from violet to yellow; `log` takes a
+    logarithmic scale. `source` and `axis` as in `frames`, with any number of channels. Writes the figure when `path` is
+    given. Raises ShapeError without pixels, or for one outside of the image, and StorageError.
+    """
+    cube, axis, word = images_of(source, axis, "histogram", any_channels=True)
+    height, width = cube.shape[2:]
+    pixels = several("histogram", pixels, "pixels (row, column)")
+    if not pixels:
+        raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
+    pixels = [pixel_of(pixel, (height, width), "histogram") for pixel in pixels]
+    figure = figure_type()(figsize=(7.0, 0.5 + 2.1 * len(pixels)), layout="constrained")
+    panels = figure.subplots(len(pixels), 1, sharex=True, squeeze=False)[:, 0]
+    edges = np.arange(cube.shape[1] + 1) if axis is None else axis.edges_opl.numpy()
+    for panel, (row, column) in zip(panels, pixels, strict=True):
+        curves = cube[:, :, row, column].numpy()
+        colours = _line_colours(len(curves))
+        # On a logarithmic scale an empty bin is a gap, not a line down to the frame.
+        drawn = np.where(curves > 0, curves, np.nan) if log and bool((curves > 0).any()) else curves
+        for curve, colour in zip(drawn, colours, strict=True):
+            panel.stairs(curve, edges, baseline=None if log else 0, color=colour, linewidth=1.0)
+        panel.set_title(f"row {row}, column {column}", fontsize=9, loc="left")
+        panel.set_ylabel(f"radiance in a {word}")
+        if log and bool((curves > 0).any()):
+            panel.set_yscale("log")
+        panel.margins(x=0)
+        panel.grid(True, color="0.9", linewidth=0.6)
+    panels[-1].set_xlabel(word if axis is None else "optical path length (m)")
+    if axis is not None:
+        top = panels[0].secondary_xaxis("top", functions=(_to_nanoseconds, _to_metres))
+        top.set_xlabel("time (ns)")
+        panels[0].set_title(f"row {pixels[0][0]}, column {pixels[0][1]}", fontsize=9, loc="left", pad=6)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path, "histogram")
+
+
+def _line_colours(count: int) -> Any:
+    import matplotlib
+
+    if count in (1, 3):
+        return ("tab:red", "tab:green", "tab:blue") if count == 3 else ("black",)
+    return matplotlib.colormaps["viridis"](np.linspace(0, 0.9, count))
+
+
+def _to_nanoseconds(opl: Any) -> Any:
+    return np.asarray(opl) * (1e9 * opl_to_seconds(1.0))
+
+
+def _to_metres(time_ns: Any) -> Any:
+    return np.asarray(time_ns) / (1e9 * opl_to_seconds(1.0))
+
+
+# -------------------------------------------------------------------------------------------------------- gradients
+
+
+def gradient_picture(
+    gradient: Source,
+    path: str | Path | None = None,
+    *,
+    percentile: float = 99.0,
+    limit: float | None = None,
+    per_channel: bool = False,
+    label: str = "",
+    title: str = "",
+) -> Figure:
+    """A matplotlib figure of a gradient (C, H, W) or (H, W): blue is negative, white zero, red positive.
+
+    The scale is symmetric around zero and ends at `limit`, or at the given percentile of the absolute values: some
+    noisy pixels then do not hide the others. Channels are added up, or shown in a panel each with `per_channel`, on one
+    scale. A tensor that requires gradients is taken with its `.grad` by you: this draws the values it is given. A
+    texture's gradient (H, W, C) is drawn after `.permute(2, 0, 1)`. Pixels that are not finite are green. Writes the
+    figure when `path` is given. Raises ShapeError, UnitError for a percentile outside of (0, 100] or a limit that is
+    not positive, StorageError.
+    """
+    values = as_tensor(gradient, "gradient_picture")
+    if values.ndim == 2:
+        values = values[None]
+    if values.ndim != 3 or values.numel() == 0 or values.is_complex():
+        raise ShapeError(f"gradient_picture: expected (C, H, W) or (H, W), got {tuple(values.shape)}.")
+    share = as_number(percentile)
+    if share is None or not 0 < share <= 100:
+        raise UnitError(f"gradient_picture: expected 0 < percentile <= 100, got {shown(percentile)}.")
+    images = values.double().numpy() if per_channel else values.double().sum(0, keepdim=True).numpy()
+    if limit is None:
+        limit = colour_maps.symmetric_limit(images, percentile)
+    else:
+        limit = checked_positive("limit", limit, "gradient_picture")
+    figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
+    import matplotlib
+
+    colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="limegreen")
+    names = ("red", "green", "blue") if len(images) == 3 else tuple(f"channel {n}" for n in range(len(images)))
+    drawn: list[Any] = []
+    for panel, image, name in zip(panels, images, names, strict=False):
+        drawn.append(panel.imshow(image, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest"))
+        panel.set_title(name if per_channel else title, fontsize=10)
+    outside = np.abs(images[np.isfinite(images)]) > limit
+    extend = "both" if outside.any() else "neither"
+    figure.colorbar(drawn[-1], ax=panels[: len(images)], shrink=0.85, label=label, extend=extend)
+    if title and per_channel:
+        figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path, "gradient_picture")

@@ -1,0 +1,378 @@
+"""A transient as frames and as a video: `.mp4` (H.264) or `.gif`, with the time in a strip under each frame."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchtransient import checks
+from torchtransient.array_files.part_files import replacing
+from torchtransient.axes import TimeAxis
+from torchtransient.checks import check_folder, function, one_by_one, path_of, positive, short_message, shown
+from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.units import opl_to_seconds
+from torchtransient.vis.files import Image, enlarge, missing, to_bytes
+from torchtransient.vis.sources import Source, images_of
+from torchtransient.vis.tone_mapping import checked_positive, exposure_of, exposure_of_video, tone_map
+
+# Pixels: smaller pictures are enlarged to about this, else a player shows a stamp.
+_VISIBLE = 320
+INK, DIM, GROUND = (235, 235, 235), (95, 95, 95), (20, 20, 20)
+ENDINGS = (".mp4", ".gif")
+_PALETTE_FRAMES = 24
+_PALETTE_PIXELS = 2**18
+# Mixed with neighbours, these would look tinted: the strip with the time, the greys of its letters, black and white.
+_GREYS = [(level, level, level) for level in range(GROUND[0] + 24, INK[0], 24)]
+_KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
+
+
+class FrameSettings(TypedDict, total=False):
+    """What `frames` is told besides what it shows; its own defaults hold for what is left out."""
+
+    exposure: float | None
+    curve: str
+    accumulate: bool
+    stamp: bool
+    scale: int | None
+    every: int
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames (H, W, 3) uint8 that are made when they are asked for; `len`, iteration (any number of times), indices."""
+
+    count: int
+    make: Callable[[int], Image]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "count", checks.count("Frames: count", self.count, 0, ShapeError))
+        function("Frames: make", self.make, "the number of a frame")
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Image:
+        if not -self.count <= index < self.count:
+            raise IndexError(f"frame {index} of {self.count}")
+        return self.make(index % self.count)
+
+    def __iter__(self) -> Iterator[Image]:
+        return (self.make(index) for index in range(self.count))
+
+
+def frames(
+    source: Source,
+    *,
+    axis: TimeAxis | None = None,
+    exposure: float | None = None,
+    curve: str = "srgb",
+    accumulate: bool = False,
+    stamp: bool = True,
+    scale: int | None = None,
+    every: int = 1,
+) -> Frames:
+    """The frames of a transient under one exposure, one after the other in time.
+
+    `source`: a transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, or a file; `axis` for sources that
+    have none. The images of a gated film are frames too, in the order of its gates. `exposure` multiplies the radiance
+    of a bin (None: 99 % of the lit pixels of all frames are below white); `curve` as in `tone_map`. `accumulate` shows
+    the light that has arrived so far. `every` adds up that many bins to a frame. `scale` enlarges pixels (None: small
+    pictures to some 320 pixels). `stamp` puts the time under each frame. Pixels that are not finite are magenta. Raises
+    ShapeError and UnitError.
+    """
+    cube, axis, word = images_of(source, axis, "frames")
+    every = checks.count("frames: every", every, 1, ShapeError)
+    bins, (height, width) = cube.shape[1], cube.shape[2:]
+    count = -(-bins // every)
+    if exposure is not None:
+        exposure = checked_positive("exposure", exposure, "frames")
+    else:
+        exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
+    factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
+    factor = checks.count("frames: scale", factor, 1, ShapeError)
+    running = _Running(cube) if accumulate else None
+
+    def make(index: int) -> Image:
+        first, last = index * every, min((index + 1) * every, bins)
+        light = cube[:, first:last].sum(1) if running is None else running.until(last)
+        shown = enlarge(to_bytes(tone_map(light, exposure, curve).numpy()), factor)
+        middle = (first + last - 1) // 2 if running is None else last - 1
+        return with_strip(shown, moment(axis, middle, bins, word), last / bins) if stamp else shown
+
+    return Frames(count, make)
+
+
+def video(
+    source: Source,
+    path: str | Path,
+    *,
+    fps: float = 25.0,
+    progress: bool = False,
+    axis: TimeAxis | None = None,
+    **settings: Unpack[FrameSettings],
+) -> Path:
+    """Write the `frames` of a transient as `.mp4` or `.gif`; returns the path.
+
+    `progress` shows a bar. `axis` and `settings` (exposure, curve, accumulate, stamp, scale, every) are those of
+    `frames`. Raises StorageError for another ending, a folder that is
+    missing, or a missing package (`pip install 'torchtransient[vis]'`), before any frame is made.
+    """
+    check_video(path)
+    shown = frames(source, axis=axis, **settings)
+    return write_video(path, shown, len(shown), fps=fps, progress=progress)
+
+
+def _added(cube: Tensor, every: int) -> Tensor:
+    """The cube in bins of `every`, of which a copy is only made when it is smaller."""
+    if every == 1:
+        return cube
+    return torch.stack([cube[:, k : k + every].sum(1) for k in range(0, cube.shape[1], every)], dim=1)
+
+
+class _Running:
+    """The sum of the frames until one of them; asked for in order, each frame is added once."""
+
+    def __init__(self, cube: Tensor) -> None:
+        self.cube, self.last = cube, 0
+        self.total = torch.zeros_like(cube[:, 0], dtype=torch.float64)
+
+    def until(self, last: int) -> Tensor:
+        if last < self.last:
+            self.last = 0
+            self.total = torch.zeros_like(self.total)
+        self.total += self.cube[:, self.last : last].sum(1)
+        self.last = last
+        return self.total
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+
+
+def check_video(path: str | Path) -> Path:
+    """Return `path`, or raise StorageError when `write_video` could not write there. For before a long render."""
+    target = path_of(path, "video")
+    if target.suffix.lower() not in ENDINGS:
+        raise StorageError(f"video: expected a name that ends in .mp4 or .gif, got '{path}'.")
+    check_folder(target, "video")
+    if target.suffix.lower() == ".mp4":
+        _ffmpeg()
+    else:
+        _pillow()
+    return target
+
+
+def write_video(
+    path: str | Path, frames: Iterable[Image], count: int, *, fps: float = 25.0, progress: bool = False
+) -> Path:
+    """Write `count` frames (H, W, 3) uint8 of equal size; returns the path.
+
+    Frames are taken one after the other, so a generator needs no memory for all of them; a GIF looks at up to 24 of
+    them first for its palette, which is one for all frames (colours of one palette per frame would flicker), and
+    therefore takes a second look at the iterable: give a list, or an object that can be iterated twice. An MP4 has an
+    even number of rows and columns: an odd last one is repeated. GIF players know hundredths of a second: `fps` is
+    rounded to that, and equal frames that follow each other become one that is shown longer. Raises ShapeError without
+    frames or for frames of different size, UnitError unless fps > 0, StorageError when the file cannot be written or
+    imageio-ffmpeg is missing (extra `vis`).
+    """
+    target = check_video(path)
+    try:
+        fps = positive("fps", fps)
+    except UnitError:
+        raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
+    one_by_one("video", frames, "frames (H, W, 3) of uint8")
+    many = checks.count("video: count", count, 0, ShapeError)
+    if not many:
+        raise ShapeError("video: expected at least one frame, got none.")
+    if target.suffix.lower() != ".mp4" and fps > 50:
+        raise UnitError(f"video: a GIF shows at most 50 frames a second, got fps={fps!r}. Write an .mp4.")
+    with replacing(target, "video") as unfinished:
+        try:
+            if target.suffix.lower() == ".mp4":
+                _write_mp4(unfinished, _followed(frames, many, progress), fps)
+            else:
+                palette = _palette(frames, many)
+                _write_gif(unfinished, _followed(frames, many, progress), palette, fps)
+        except OSError as error:  # with the command and its output, where it is ffmpeg's
+            raise StorageError(f"video: '{target}' could not be written: {short_message(error)}.") from error
+    return target
+
+
+def checked_frame(frame: Any, who: str) -> Image:
+    """An image (H, W, 3) of uint8. Raises ShapeError for what is none."""
+    if not isinstance(frame, np.ndarray):
+        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {frame.dtype} {tuple(frame.shape)}.")
+    return frame
+
+
+def _followed(frames: Iterable[Image], count: int, progress: bool) -> Iterator[Image]:
+    """The frames, checked, behind a progress bar."""
+    from tqdm import tqdm
+
+    size: tuple[int, ...] | None = None
+    for given in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
+        frame = checked_frame(given, "video")
+        if size is not None and frame.shape != size:
+            raise ShapeError(f"video: expected frames of equal size {size}, got {tuple(frame.shape)}.")
+        size = frame.shape
+        yield frame
+
+
+def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
+    writer = None
+    try:
+        for frame in frames:
+            odd = [(0, n % 2) for n in frame.shape[:2]]
+            even = np.pad(frame, (*odd, (0, 0)), mode="edge")
+            if writer is None:
+                height, width = even.shape[:2]
+                # yuv420p is what browsers and slides play; crf 18 keeps small pixels sharp.
+                writer = _ffmpeg().write_frames(
+                    str(target), (width, height), fps=fps, codec="libx264", pix_fmt_in="rgb24", pix_fmt_out="yuv420p",
+                    macro_block_size=2, quality=None, ffmpeg_log_level="error",
+                    output_params=["-crf", "18", "-movflags", "+faststart", "-f", "mp4"],
+                )  # fmt: skip
+                writer.send(None)
+            writer.send(np.ascontiguousarray(even))
+    finally:
+        if writer is not None:
+            writer.close()
+    if not _is_whole(target):  # which ffmpeg says on stderr alone
+        raise StorageError("video: ffmpeg ended before the file was whole. Is the disk full?")
+
+
+def _is_whole(mp4: Path) -> bool:
+    """Whether the boxes that an MP4 consists of, each with its length before it, fill the file, with a table."""
+    kinds, place, size = set(), 0, mp4.stat().st_size
+    with mp4.open("rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            length, kind = struct.unpack(">I4s", file.read(8))
+            if length == 1:  # it follows, in 64 bits
+                length = int.from_bytes(file.read(8), "big")
+            if length < 8:
+                return False
+            kinds.add(kind)
+            place += length
+    return place == size and kinds >= {b"moov", b"mdat"}
+
+
+def _palette(frames: Iterable[Image], count: int) -> Any:
+    """256 colours that serve up to 24 frames out of all."""
+    pillow = _pillow()
+    step = max(1, math.ceil(count / _PALETTE_FRAMES))
+    seen = []
+    for number, frame in enumerate(frames):
+        if number % step == 0:
+            pixels = checked_frame(frame, "video").reshape(-1, 3)
+            seen.append(pixels[:: max(1, pixels.shape[0] * _PALETTE_FRAMES // _PALETTE_PIXELS)])
+    if not seen:
+        raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none.")
+    # A colour that fills the picture, such as black, must not use up the palette.
+    colours = np.unique(np.concatenate(seen) & 0xFC, axis=0)
+    row = pillow.fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
+    chosen = row.quantize(256 - len(_KEPT), method=pillow.Quantize.MEDIANCUT).getpalette() or []
+    palette = pillow.new("P", (1, 1))
+    kept = [level for colour in _KEPT for level in colour]
+    palette.putpalette(kept + chosen[: 768 - len(kept)])
+    return palette
+
+
+def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) -> None:
+    pillow = _pillow()
+    images = (pillow.fromarray(frame).quantize(palette=palette, dither=pillow.Dither.NONE) for frame in frames)
+    first = next(images, None)
+    if first is None:
+        raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none the second time.")
+    duration = max(2, round(100 / fps)) * 10
+    first.save(target, format="GIF", save_all=True, append_images=images, duration=duration, loop=0, optimize=False)
+
+
+def _ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise MissingPackageError(
+            "video: an .mp4 needs the package imageio-ffmpeg, which brings ffmpeg along. Install it with pip install "
+            "'torchtransient[vis]', or choose a name that ends in .gif."
+        ) from error
+    return imageio_ffmpeg
+
+
+def _pillow() -> Any:
+    try:
+        from PIL import Image as Pillow
+    except ImportError as error:
+        raise MissingPackageError(
+            "video: a .gif needs the package pillow. Install it with pip install 'torchtransient[vis]'."
+        ) from error
+    return Pillow
+
+
+# ------------------------------------------------------------------------------------------- the strip with the time
+
+
+def moment(axis: TimeAxis | None, index: int, bins: int, word: str = "bin") -> str:
+    """What a stamp says about a bin: its centre in metres and nanoseconds, or its number when no axis is known.
+
+    `word`: what an entry is without an axis, "gate" for those of a gated film.
+    """
+    if axis is None:
+        return f"{word} {index} of {bins}"
+    opl = axis.start_opl + (index + 0.5) * axis.bin_width_opl
+    return f"{_digits(opl, axis.bin_width_opl)} m   {_digits(*_nanoseconds(opl, axis.bin_width_opl))} ns"
+
+
+def _nanoseconds(*lengths: float) -> list[float]:
+    return [1e9 * opl_to_seconds(length) for length in lengths]
+
+
+def _digits(value: float, step: float) -> str:
+    """As many decimals as tell the halves of a bin apart."""
+    decimals = int(np.clip(np.ceil(-np.log10(step / 2)), 0, 6))
+    return f"{value:.{decimals}f}"
+
+
+def with_strip(image: Image, text: str, share: float | None = None) -> Image:
+    """The image over a dark strip with `text` and, with `share` in [0, 1], a bar that fills from left to right.
+
+    The strip does not cover the picture. Its text is made smaller until it fits the width.
+    """
+    try:
+        from PIL import Image as Pillow
+        from PIL import ImageDraw
+    except ImportError as error:
+        raise missing("pillow") from error
+
+    height, width = image.shape[:2]
+    rows = max(16, round(0.075 * max(height, width)))
+    strip = Pillow.new("RGB", (width, rows), GROUND)
+    draw = ImageDraw.Draw(strip)
+    bar = max(2, rows // 9)
+    font = _font(draw, text, 0.58 * rows, width - rows // 2)
+    draw.text((rows // 4, (rows - bar) / 2 + bar), text, fill=INK, font=font, anchor="lm")
+    if share is not None:
+        draw.rectangle((0, 0, width, bar - 1), fill=DIM)
+        filled = round(share * width)
+        if filled:
+            draw.rectangle((0, 0, filled - 1, bar - 1), fill=INK)
+    return np.concatenate([image, np.asarray(strip)])
+
+
+def _font(draw: Any, text: str, size: float, room: float) -> Any:
+    from PIL import ImageFont
+
+    font = ImageFont.load_default(size)
+    while size > 6 and draw.textlength(text, font=font) > room:
+        size *= 0.9
+        font = ImageFont.load_default(size)
+    return font
