@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import ast
 import builtins
+import functools
+import gc
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import torchtransient
 from support import walks
 from support.sweeps import together
-from support.syntax import statements, syntax_of
 
 PACKAGE = Path(torchtransient.__file__).parent
 TESTS = Path(__file__).parent
@@ -54,6 +56,24 @@ HEAVY = {
 }  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES = {"file": 800, "function": 160}
+
+
+@functools.cache
+def syntax_of(path: Path) -> ast.Module:
+    """Syntax tree of a file, which nothing changes meanwhile."""
+    gc.disable()  # which walks through all trees kept so far, over and over: 80 % of the time
+    try:
+        return ast.parse(path.read_text(encoding="utf-8"))
+    finally:
+        gc.enable()
+
+
+def statements(tree: ast.AST) -> Iterator[ast.AST]:
+    """Nodes of a syntax tree without its expressions, which are nine nodes of ten and hold no statements."""
+    for node in ast.iter_child_nodes(tree):
+        if not isinstance(node, ast.expr | ast.arguments):
+            yield node
+            yield from statements(node)
 
 
 def dotted(path):
@@ -172,7 +192,7 @@ def from_tests(path):
     # Most files name none of them where an import or a path could stand.
     if not re.search(rf"\btests\b|^\s*(?:from|import)\s.*\b(?:{'|'.join(sorted(own))})\b", text, re.MULTILINE):
         return
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(syntax_of(path)):
         if isinstance(node, ast.Import):
             yield from (f"import {a.name}" for a in node.names if a.name.split(".")[0] in own)
         elif isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] in own:
@@ -194,7 +214,7 @@ def test_tests_share_through_their_support():
     for path in TESTS.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         # Most files import none, by the look of it.
-        for node in statements(ast.parse(text)) if named.search(text) else ():
+        for node in statements(syntax_of(path)) if named.search(text) else ():
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             assert not {n.split(".")[0] for n in names} & shared, f"{path.relative_to(TESTS)}:{node.lineno}"
