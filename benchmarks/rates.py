@@ -4,8 +4,8 @@ Closed forms, monochromatic, at 4096 samples: mean rates and lengths of a wall h
 plane, a mirror, a slab of glass that grows, fog that blows; distance and speed from two beats. Cost is CPU time of the
 Cornell box, 64 x 64 pixels at 64 samples, in which everything moves, over the same with a static film of as many bins:
 a render, with the backward pass by three albedos, by a pose, and by all velocities, the last over a static render. A
-film of beats spreads arrivals by the chirp's line shape, over ten bins: "a line shape" is a static film that does so
-too. All take turns in one process.
+film of beats has the chirp's line shape, ten bins wide: "a line shape" is a static film that adds every arrival to so
+many. All take turns in one process.
 
     python benchmarks/rates.py [--quick] [--json FILE]
 """

@@ -109,8 +109,8 @@ def phasors(taps: Tensor) -> Tensor:
 
 
 def formula(beat: Tensor, plain: Tensor) -> Tensor:
-    """Speeds of approach from both phasors if all light goes there and back: P sinc(1 + e), e = 2 v f T / c."""
-    return -(beat / plain).real * tt.units.SPEED_OF_LIGHT / (2 * HERTZ * EXPOSURE_S)
+    """Speeds of approach from both phasors if all light goes there and back."""
+    return sensing.heterodyne_speed(beat, plain, HERTZ, duration_s=EXPOSURE_S)
 
 
 def values_of(albedos: Tensor) -> dict[str, Tensor]:

@@ -57,7 +57,7 @@ def histograms():
     """What compares histograms, by the first case of the list: (options, what tensors are given beside them)."""
     found = {}
     for case in CASES:
-        if taken_by(case.function) in ("Light", "Transient") and case.function not in (*OTHER, *found):
+        if taken_by(case.function) in ("Light", "Transient", "Binned") and case.function not in (*OTHER, *found):
             options = {**case.options, **case.of_renders}
             known = {name: KNOWN[name] for name in options.keys() & KNOWN.keys()}
             found[case.function] = ({name: value for name, value in options.items() if name not in KNOWN}, known)

@@ -156,7 +156,8 @@ def test_distances_between_results_over_rates():
     found = losses.wasserstein_loss(a, b, dim=-3, reduction="none")
     torch.testing.assert_close(found, losses.wasserstein_loss(x, y, AXIS.bin_width_opl, dim=-3, reduction="none"))
     for loss in (losses.wasserstein_loss, losses.cumulative_loss):
-        torch.testing.assert_close(loss(a, y), loss(x, y, 0.5, dim=-4))
+        for dim in (None, -4, 1):
+            torch.testing.assert_close(loss(a, y, dim=dim), loss(x, y, 0.5, dim=-4))
     torch.testing.assert_close(losses.multiscale_loss(a, b), losses.multiscale_loss(x, y, dim=-4))
     beats = torch.rand(2, 1, 2, BINS, 3, 3)
     found = losses.wasserstein_loss(*(result(t, "beats") for t in beats))

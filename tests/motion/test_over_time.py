@@ -69,6 +69,11 @@ def test_a_wall_that_comes_nearer(facing):
     out = tt.over_time(facing, {"wall": TOWARDS}, HETERODYNE, seed=0)
     assert out.phasor.shape == (3, 1, 1, 1) and out.phasor.dtype == torch.complex64
     assert relative(out.phasor, np.full((3, 1, 1, 1), truth)) < 2e-4
+    plain = tt.over_time(facing, {"wall": TOWARDS}, tt.Exposure(EXPOSURE_S), seed=0)
+    speed = tt.sensing.heterodyne_speed(out.phasor, plain.phasor, MODULATION_HZ, duration_s=EXPOSURE_S)
+    # The curvature of the brightness, 3 (v t / d)^2, has a beat of 3 (v T / d)^2 / (2 pi^2).
+    curved = 3 * (10 * EXPOSURE_S / 2) ** 2 / (2 * np.pi**2) / (2 * 10 * MODULATION_HZ * EXPOSURE_S / 299792458)
+    torch.testing.assert_close(speed, torch.full_like(speed, 10 * (1 + curved)), rtol=5e-4, atol=0)
     as_bright = (g / 2 * wall_phasor(2 - 10 * t) * (1 - 5 * t) ** 2 * np.exp(2j * np.pi * BEAT_HZ * t)).sum()
     assert abs(as_bright - truth) / abs(truth) == pytest.approx(0.62, abs=0.01)
     steady = (g / 2 * 0.5 / np.pi / (2 - 10 * t) ** 2).sum()

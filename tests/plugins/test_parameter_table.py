@@ -78,6 +78,7 @@ MOVES = [
     ("diff_principled", "specular", "L", "index"),
     ("roughdielectric diff_rough_dielectric", "eta", "L", "index"),
     ("delayed", "lifetime", "L", "delay"),
+    ("normalmap", "normalmap.data", "S", "value"),
     ("rigid_motion", "linear angular center", "L", "velocity"),
     ("heterogeneous", "data", "M", "medium"),
     ("homogeneous", "sigma_t.value.value", "M", "medium"),

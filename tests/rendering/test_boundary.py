@@ -83,6 +83,24 @@ def test_both_modes_agree(depth):
     assert float(tangent) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("boundary", [True, False])
+def test_what_moves_as_one_has_no_derivative(boundary):
+    """Scene, light and camera shifted together: zero at each seed, not on average alone."""
+    facing_down = pose(0.5, 0.3, 3, 0.2) @ np.diag([1.0, -1, -1, 1])
+    lamp = {"type": "rectangle", "to_world": facing_down, "emitter": {"type": "area", "radiance": 20.0}}
+    facing_right = np.array([[0, 0, 1, -1.5], [0, 1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    side = {"type": "rectangle", "to_world": facing_right}
+    keys = [f"{name}.to_world" for name in ("body", "wall", "side", "light", "sensor")]
+    scene = plate(light=lamp, side=side, integrator={"type": "transient_path", "max_depth": 4})
+    renderer = tt.TransientRenderer(scene, keys, spp=64, boundary=boundary)
+    for seed in range(3):
+        renderer.zero_grad()
+        said(lambda seed=seed: weighed(renderer(seed=seed)).backward())
+        shifts = torch.stack([renderer.values[key].grad[:3, 3] for key in keys])
+        assert (shifts.abs().amax(0) > 0.01).all()
+        assert (shifts.sum(0).abs() < 1e-4 * shifts.abs().sum(0)).all()
+
+
 @pytest.mark.slow
 def test_every_entry_of_a_batch_has_the_term():
     renderer = tt.TransientRenderer(plate(), [BODY, PAINT], spp=16)
@@ -212,6 +230,23 @@ OBLIQUE = np.array([[7, -4, 4, 0], [1, 8, 4, 0], [-8, -4, 1, 0], [0, 0, 0, 9]]) 
 STEPS = {"type": "bitmap", "data": np.eye(4)[..., None] * 0.6 + 0.2, "raw": True, "filter_type": "nearest"}
 STRIPED = {"type": "rectangle", "to_world": pose(scale=5.0), "bsdf": {"type": "diffuse", "reflectance": STEPS}}
 DISTANT = {"type": "distant", "direction": [0.1, 0, -1], "film": FILM | {"width": 1, "height": 1}}
+STEEP = np.array([[[0.95, 0.5, 0.72], [0.05, 0.5, 0.72]]] * 2, np.float32)  # normals at 64 degrees to both sides
+TILT = np.array([[0.6, 0, 0.8, 0], [0, 1, 0, 0], [-0.8, 0, 0.6, 0], [0, 0, 0, 1]])
+
+
+def mapped(normals, tilt):
+    """A plate with a normal map."""
+    texture = {"type": "bitmap", "data": normals, "raw": True}
+    bsdf = {"type": "normalmap", "normalmap": texture, "b": {"type": "diffuse", "reflectance": 0.4}}
+    return {"type": "rectangle", "to_world": pose(0, 0, 0.8) @ tilt @ np.diag([0.45, 0.35, 1, 1]), "bsdf": bsdf}
+
+
+def shaded(*normal):
+    """A triangle that faces the camera, with one normal at all of its vertices."""
+    return {"type": "mesh_arrays", "vertices": np.array([[0, 0, 0.8], [0.4, 0, 0.8], [0, 0.4, 0.8]]),
+            "faces": np.array([[0, 1, 2]]), "normals": np.array([normal] * 3, float)}  # fmt: skip
+
+
 SPOT = {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20}
 SHORT = {"type": "perspective", "fov": 40, "far_clip": 2.5, "to_world": CAMERA, "film": FILM}
 LAMP = {"type": "rectangle", "to_world": pose(0, 0, 3, 0.1) @ np.diag([1.0, -1, -1, 1]),
@@ -238,6 +273,10 @@ def box(z, tilt=UPRIGHT):
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
     ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
+    ({"body": mapped(STEEP, TILT)}, BODY, "normals away from the camera"),
+    ({"body": mapped(STEEP, TILT)}, "body.bsdf.normalmap.data", "normals away from the camera"),
+    ({"body": mapped(STEEP, TILT)}, "sensor.to_world", "normals away from the camera"),
+    ({"body": shaded(0.9, 0, -0.1)}, "body.vertex_normals", "rim of 'body'"),
     ({"box": box(0.1)}, "box.vertex_positions", "where 'box' and 'wall' run into each other"),
 ])  # fmt: skip
 def test_edges_that_are_not_followed(more, key, words):
@@ -261,6 +300,11 @@ def test_what_is_called_correct(tmp_path):
     smooth = SPOT | {"texture": STEPS | {"filter_type": "bilinear"}}
     for key in ("ball.to_world", BODY, "light.to_world", "sensor.to_world"):
         assert plate(sensor=SHORT, ball=beside, light=smooth).parameters()[key].edges_missing == ()
+    # Normals of which none turns away, whether flat or seen from the front.
+    for body in (mapped(STEEP, np.eye(4)), mapped(0.3 * STEEP + np.float32([0.35, 0.35, 0.7]), TILT)):
+        table = plate(body=body).parameters()
+        assert table[BODY].edges_missing == table["body.bsdf.normalmap.data"].edges_missing == ()
+    assert plate(body=shaded(0.6, 0, 0.8)).parameters()["body.vertex_normals"].edges_missing == ()
     off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
     assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
     (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")

@@ -17,9 +17,11 @@ from tools.gradient_sweep.stages import (
     grouped,
     lit_by,
     matte,
+    move,
     moving,
     polarizing_sheet,
     seen_by,
+    stretch,
     with_rates,
 )
 
@@ -302,7 +304,9 @@ def velocity_settings() -> Iterator[Setting]:
     for kind in ("homogeneous", "heterogeneous"):
         fog = media.medium(kind, thin, bright, {"type": "hg", "g": 0.4}) | {"id": "mist"}
         yield setting(kind, "mist", lambda _, f=fog: filled(f))
+        yield Setting("velocity", "gridvolume", kind, lambda _, f=fog: _blown(f), ("mist.velocity.",))
     yield Setting("velocity", "mesh_arrays", "", _bending, ("plate.vertex_velocity",))
+    yield Setting("velocity", "mesh_arrays", "area light", _bending_lamp, ("lamp.vertex_velocity",))
 
 
 def _bending(folder: Path) -> Description:
@@ -311,6 +315,23 @@ def _bending(folder: Path) -> Description:
     speeds = np.random.default_rng(5).normal(size=np.shape(mesh["vertices"]))
     scene = between_lights(matte())
     return {**scene, "plate": mesh | {"vertex_velocity": speeds}, "sensor": with_rates(scene["sensor"])}
+
+
+def _bending_lamp(folder: Path) -> Description:
+    """A lamp with velocities at its vertices."""
+    mesh = shapes.shapes()["mesh_arrays"](folder) | {"emitter": lights.area_emitters()["area"]()}
+    speeds = np.random.default_rng(6).normal(size=np.shape(mesh["vertices"]))
+    pose = shapes.lamp_shapes()["rectangle"](folder)["to_world"]
+    scene = lit_by(mesh | {"to_world": pose, "vertex_velocity": speeds})
+    return {**scene, "sensor": with_rates(scene["sensor"])}
+
+
+def _blown(fog: Description) -> Description:
+    """Fog with a wind on a grid."""
+    data = np.random.default_rng(7).normal(size=(3, 4, 4, 3)).astype(np.float32)
+    wind = {"type": "gridvolume", "data": data, "to_world": move(-3.0, -3.0, 0.0) @ stretch(6.0, 6.0, 2.5)}
+    scene = filled({**fog, "velocity": wind})
+    return {**scene, "sensor": with_rates(scene["sensor"])}
 
 
 def scan_settings() -> Iterator[Setting]:

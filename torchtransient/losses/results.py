@@ -142,8 +142,12 @@ def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known
     for name, attribute in taken.items():
         x = results[name]
         arguments[name] = getattr(x, attribute)
-        along = _RATES if attribute == "rates" and measures[name] == BINNED else _IMAGES
-        for setting, value in _settings(x, attribute, known, arguments.get("dim") or along, where).items():
+        dim = arguments.get("dim")
+        if dim is None:
+            dim = _RATES if attribute == "rates" and measures[name] == BINNED else _IMAGES
+        elif isinstance(dim, int) and dim >= 0:
+            dim -= arguments[name].ndim
+        for setting, value in _settings(x, attribute, known, dim, where).items():
             if setting in known and arguments.get(setting) is None:
                 arguments[setting] = value
 

@@ -149,6 +149,7 @@ class PluginModule:
 PLUGIN_MODULES: tuple[PluginModule, ...] = (
     PluginModule("torchtransient.plugins.films.base"),
     PluginModule("torchtransient.plugins.films.histogram", (("film", "transient_hdr_film"),)),
+    PluginModule("torchtransient.plugins.films.splined"),
     PluginModule("torchtransient.plugins.films.phasor", (("film", "phasor_hdr_film"),)),
     PluginModule("torchtransient.plugins.films.gated", (("film", "gated_hdr_film"),)),
     PluginModule(

@@ -99,7 +99,8 @@ DARK = ParameterEffect(
     supported=False,
     reason="directionalarea shines in one direction, which no path from the sensor meets: it stays dark",
 )
-# Texture coordinates move no point, and what they move is smooth but for the steps of what a texture shows.
+# Texture coordinates and normals move no point, and what they move is smooth but for the steps of what a texture shows
+# and where normals turn away from the viewer.
 COORDINATES = ParameterEffect(moves_silhouette=True)
 PATTERN = replace(COORDINATES, role="shape")
 PATTERN_AND_NORMALS = replace(NORMAL, role="shape")
@@ -169,6 +170,14 @@ def _is_normal(site: Site) -> bool:
     """Return True if a texture holds normals or heights of a delta lobe."""
     return any(
         isinstance(holder, mi.BSDF) and normal_texture(holder) == name and _turns_delta_lobes(holder)
+        for holder, name in site.owners
+    )
+
+
+def _is_other_normal(site: Site) -> bool:
+    """Return True if a texture holds normals of a BSDF without a delta lobe."""
+    return any(
+        isinstance(holder, mi.BSDF) and normal_texture(holder) == name and not is_bump_map(holder)
         for holder, name in site.owners
     )
 
@@ -268,12 +277,13 @@ def _is_wind(site: Site) -> bool:
 WIND = Row(ParameterEffect(moves_length=True, role="velocity"), _is_wind, "the velocity of a medium")
 IN_HAIR = Row(FIBRE, _is_in_hair, "the absorption of hair")
 IN_NORMALS = Row(NORMAL, _is_normal, "normals or heights of a BSDF with a delta lobe")
+IN_OTHER_NORMALS = Row(COORDINATES, _is_other_normal, "normals of another BSDF")
 IN_EXTINCTION = Row(MEDIUM, _is_extinction, "in a medium: its extinction, or a phase function of flakes (sggx)")
 
 IN_DARK_LIGHT = Row(DARK, _lies_in_dark_light, "the radiance of a directionalarea")
 
 # Of what gives numbers to other plugins: textures, volumes, attributes of meshes.
-NUMBER_ROWS = (IN_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
+NUMBER_ROWS = (IN_NORMALS, IN_OTHER_NORMALS, IN_EXTINCTION, *_rows_of_weights(), IN_HAIR, IN_DARK_LIGHT)
 
 # ---------------------------------------------------------------------------------------------------------------- rows
 

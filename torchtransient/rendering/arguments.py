@@ -22,7 +22,15 @@ TEMPORAL_FILTERS = ("auto", "box", "tent", "gaussian")
 
 
 def checked_samples(name: str, value: int | None) -> int | None:
-    """Return a number of samples per pixel, or None. Raises ``UnitError`` for other values."""
+    """Return a number of samples per pixel, or None.
+
+    Args:
+        name: name of the argument, for messages.
+        value: the argument of a user.
+
+    Raises:
+        UnitError: for anything but a positive whole number of at most ``MOST_SAMPLES``, or None.
+    """
     if value is None:
         return None
     number = as_whole(value)
@@ -37,7 +45,14 @@ def checked_samples(name: str, value: int | None) -> int | None:
 
 
 def checked_depth(value: Any) -> int | None:
-    """Return a ``max_depth``, or None. Raises ``ArgumentError`` for other values."""
+    """Return a ``max_depth``, or None.
+
+    Args:
+        value: the argument of a user.
+
+    Raises:
+        ArgumentError: for anything but a whole number from -1 (no limit) on, or None.
+    """
     if value is None:
         return None
     number = as_whole(value)
@@ -49,14 +64,28 @@ def checked_depth(value: Any) -> int | None:
 
 
 def checked_filter(name: str) -> str:
-    """Return the name of a temporal filter, or "auto". Raises ``ArgumentError`` for other values."""
+    """Return the name of a temporal filter, or "auto".
+
+    Args:
+        name: the argument of a user.
+
+    Raises:
+        ArgumentError: for other values.
+    """
     if not is_one_of(name, TEMPORAL_FILTERS):
         raise ArgumentError(f"temporal_filter: expected one of {', '.join(TEMPORAL_FILTERS)}, got {shown(name)}.")
     return name
 
 
 def checked_sampler(name: Any) -> str | None:
-    """Return the plugin name of a sampler, "scene", or None. Raises ``ArgumentError`` for other types."""
+    """Return the plugin name of a sampler, "scene", or None.
+
+    Args:
+        name: the argument of a user.
+
+    Raises:
+        ArgumentError: for other types.
+    """
     return None if name is None else text("sampler", name, "the plugin name of a sampler, 'scene', or None")
 
 
@@ -83,7 +112,14 @@ def checked_keys(keys: Any, known: Sequence[str] | None = None) -> tuple[str, ..
 
 
 def checked_grad_seed(value: int | str | None) -> int | str | None:
-    """Return a seed of derivatives: None, "same" or an integer. Raises ``ArgumentError`` for other values."""
+    """Return a seed of derivatives: None, "same" or an integer.
+
+    Args:
+        value: the argument of a user.
+
+    Raises:
+        ArgumentError: for other values.
+    """
     if value is None or (isinstance(value, str) and value == "same"):
         return value
     number = as_whole(value)
@@ -120,7 +156,14 @@ def sensor_list(sensors: int | Sequence[int] | str, count: int) -> tuple[tuple[i
 
 
 def torch_names(keys: Sequence[str]) -> dict[str, str]:
-    """Return names that torch allows for parameters, by key: slashes in place of dots."""
+    """Return names that torch allows for parameters, by key: slashes in place of dots.
+
+    Args:
+        keys: keys of parameters.
+
+    Raises:
+        ArgumentError: for keys that are given twice, or would have one name.
+    """
     names = {key: key.replace(".", "/") for key in keys}
     if len(set(names.values())) != len(keys):
         raise ArgumentError(
@@ -152,7 +195,14 @@ def requested_film(film: Any, named: Mapping[str, Any]) -> FilmLayout | None:
 
 
 def checked_values(values: Any) -> dict[str, Any]:
-    """Return the values of a call by key. Raises ``ArgumentError`` for anything but a mapping, most likely a seed."""
+    """Return the values of a call by key.
+
+    Args:
+        values: the argument of a user.
+
+    Raises:
+        ArgumentError: for anything but a mapping, most likely a seed.
+    """
     if values is not None and not isinstance(values, Mapping):
         raise ArgumentError(
             f"values: expected a mapping from keys to values, got {type(values).__name__}; write {{key: value}}, and a "

@@ -63,7 +63,12 @@ class Replayable(Protocol):
 
 
 def run(job: Replayable, *tensors: torch.Tensor) -> Tensors:
-    """Return the outputs of a call, differentiable by the real ones of its tensors."""
+    """Return the outputs of a call, differentiable by the real ones of its tensors.
+
+    Args:
+        job: job that is executed now, and again for its derivatives.
+        tensors: values of its parameters, in the order of its keys.
+    """
     outputs: Tensors = Run.apply(job, *tensors)  # type: ignore[no-untyped-call]
     return outputs
 

@@ -20,6 +20,10 @@ _BATCH = 0xBA7C4
 def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
     """Execute a job whose ``errors`` ask for error bars.
 
+    Args:
+        job: the job.
+        values: values of its parameters, in the order of its keys.
+
     Returns:
         Steady and response, as :func:`.engine.run`; the differences are added to ``job.errors``.
     """
@@ -76,7 +80,13 @@ def with_differences(output: RenderOutput, request: BatchErrors, leading: tuple[
 
 
 def joined(job: RenderJob, runs: Sequence[RunLog], weights: Sequence[float]) -> RunLog:
-    """Return the report of a whole call; ``recorded`` is that of the last batch."""
+    """Return the report of a whole call; ``recorded`` is that of the last batch.
+
+    Args:
+        job: job of the call.
+        runs: reports of its batches.
+        weights: share of the samples of each.
+    """
 
     def energies(name: str) -> tuple[float, ...]:
         rows = [getattr(run, name) for run in runs]

@@ -17,7 +17,12 @@ Tensors = tuple[torch.Tensor, ...]
 
 
 def broken_entries(tensor: torch.Tensor, count: int) -> list[bool]:
-    """Return for each entry along the first dimension of size ``count`` whether it has numbers that are not finite."""
+    """Return for each entry along the first dimension of size ``count`` whether it has numbers that are not finite.
+
+    Args:
+        tensor: (count, ...).
+        count: number of entries.
+    """
     return [False] * count if all_finite(tensor) else [not all_finite(tensor[n]) for n in range(count)]
 
 
@@ -44,6 +49,10 @@ def _marks(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def fill_broken(tensors: Iterable[torch.Tensor]) -> None:
-    """Fill tensors with NaN in place."""
+    """Fill tensors with NaN in place.
+
+    Args:
+        tensors: tensors of any shapes.
+    """
     for tensor in tensors:
         tensor.fill_(math.nan)

@@ -165,7 +165,12 @@ class Session:
 
 
 def plugin_of_sampler(integrator: Any, asked: str | None) -> str:
-    """Return the ``sampler`` of an integrator for a job: the one asked for, its own, or "auto"."""
+    """Return the ``sampler`` of an integrator for a job: the one asked for, its own, or "auto".
+
+    Args:
+        integrator: built integrator.
+        asked: plugin name of a sampler, or None.
+    """
     return asked or integrator.sampler or AUTO
 
 
@@ -212,7 +217,11 @@ def boundary_settings(boundary: bool, spp: int | None, integrator: Any) -> list[
 
 @contextmanager
 def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
-    """Set attributes of plugins for the time of a block."""
+    """Set attributes of plugins for the time of a block.
+
+    Args:
+        settings: plugin, name of the attribute and its value, one after the other.
+    """
     before = [(plugin, name, getattr(plugin, name)) for plugin, name, _ in settings]
 
     def put_back() -> None:
@@ -229,7 +238,14 @@ def with_settings(settings: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
 
 @contextmanager
 def open_session(job: RenderJob) -> Iterator[Session]:
-    """Hold the engine lock with the job's scene built, in its variant and with the settings of the job."""
+    """Hold the engine lock with the job's scene built, in its variant and with the settings of the job.
+
+    Args:
+        job: the job.
+
+    Raises:
+        VariantError: if Dr.Jit's flag SymbolicLoops is off.
+    """
     import drjit as dr
 
     with active_variant(job.scene.variant), no_collection(), named_errors():

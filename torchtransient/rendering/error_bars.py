@@ -217,7 +217,15 @@ def variance(
 
 
 def local_mean(values: torch.Tensor, dims: tuple[int, ...]) -> torch.Tensor:
-    """Return the mean over each entry and its neighbours along ``dims``; at rims over those that exist."""
+    """Return the mean over each entry and its neighbours along ``dims``; at rims over those that exist.
+
+    Args:
+        values: any shape.
+        dims: dimensions, each with its neighbours on both sides.
+
+    Returns:
+        The shape of ``values``.
+    """
     for dim in dims:
         size = values.shape[dim]
         if size == 1:

@@ -188,7 +188,12 @@ class FilmLayout(abc.ABC):
 
 
 def measured(output: Any, name: str) -> Any:
-    """Return an attribute of an output or a result, or one of its ``others``; None where it has neither."""
+    """Return an attribute of an output or a result, or one of its ``others``; None where it has neither.
+
+    Args:
+        output: `RenderOutput` or `Result`.
+        name: what the film measures, such as "transient".
+    """
     found = getattr(output, name, None)
     return getattr(output, "others", {}).get(name) if found is None else found
 

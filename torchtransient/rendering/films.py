@@ -545,6 +545,9 @@ def film_of_arguments(arguments: Mapping[str, Any]) -> FilmLayout | None:
 def layout_of_film(film: Any) -> FilmLayout:
     """Return the layout of a built film.
 
+    Args:
+        film: film of a built sensor.
+
     Raises:
         SceneError: for films that are not time-resolved, or not listed.
     """
@@ -564,12 +567,19 @@ def layout_of_film(film: Any) -> FilmLayout:
 
 
 def layout_of_output(output: Any) -> FilmLayout | None:
-    """Return the layout of a ``RenderOutput`` or a ``Result``, None where it holds a steady image alone."""
+    """Return the layout of a ``RenderOutput`` or a ``Result``, None where it holds a steady image alone.
+
+    Args:
+        output: the result.
+    """
     return next((found for kind in FILMS if (found := kind.from_output(output)) is not None), None)
 
 
 def layout_of_entries(values: Mapping[str, Any]) -> FilmLayout:
     """Return the layout of the arrays and numbers of a result file.
+
+    Args:
+        values: entries by name.
 
     Raises:
         KeyError: for a file of none of the films.
@@ -582,10 +592,18 @@ def layout_of_entries(values: Mapping[str, Any]) -> FilmLayout:
 
 
 def layout_of_plugin(plugin: str) -> type[FilmLayout] | None:
-    """Return the class for a film plugin, None for plugins that are not listed."""
+    """Return the class for a film plugin, None for plugins that are not listed.
+
+    Args:
+        plugin: plugin name.
+    """
     return next((kind for kind in FILMS if kind.plugin == plugin), None)
 
 
 def film_plugins(kinds: Sequence[type[FilmLayout]] | None = None) -> str:
-    """Return the names of film plugins, for messages."""
+    """Return the names of film plugins, for messages.
+
+    Args:
+        kinds: layouts, all of them by default.
+    """
     return ", ".join(kind.plugin for kind in (FILMS if kinds is None else kinds))

@@ -156,7 +156,11 @@ class RenderJob:
 
 
 def warn_of_range(seeds: list[int]) -> None:
-    """Warn of seeds that count as others."""
+    """Warn of seeds that count as others.
+
+    Args:
+        seeds: seeds of a call.
+    """
     beyond = [seed for seed in seeds if not 0 <= seed < SEED_RANGE]
     if beyond:
         warnings.warn(
@@ -209,7 +213,14 @@ def draw_seed(seed: int | Sequence[int] | torch.Tensor | None) -> tuple[Any, tor
 
 
 def whole_number(seed: Any) -> int | None:
-    """Return a seed as one number; None for a sequence. Raises ``UnitError`` for anything else."""
+    """Return a seed as one number; None for a sequence.
+
+    Args:
+        seed: the argument of a user.
+
+    Raises:
+        UnitError: for anything else.
+    """
     number = as_whole(seed)
     if number is not None:
         return number
@@ -231,6 +242,10 @@ def _each_number(seed: Any) -> int:
 
 def mix_seed(seed: int, number: int) -> int:
     """Return a 32-bit seed that looks unrelated to ``seed``; for number 0 ``seed`` itself, modulo 2^32.
+
+    Args:
+        seed: seed of a call.
+        number: number of the stream.
 
     A step of splitmix64 (Steele et al. 2014).
     """
@@ -266,6 +281,10 @@ def rounded_count(spp: int, known: dict[int, int], count: Callable[[int], int]) 
 
 def samples_drawn(sampler: Any, count: int | None) -> int:
     """Set a sampler's number of samples, None for its own, and return the number that it draws.
+
+    Args:
+        sampler: built sampler.
+        count: samples per pixel, or None.
 
     Mitsuba's message that it rounds is held back: it comes at every call. Under the engine lock.
     """

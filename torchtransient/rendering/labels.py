@@ -253,7 +253,11 @@ def _tables(renderer: TransientRenderer) -> Any:
 
 
 def label_tables(built: Any) -> Any:
-    """Return the tables of a built scene. Called inside its variant."""
+    """Return the tables of a built scene. Called inside its variant.
+
+    Args:
+        built: the built scene, which keeps them.
+    """
     from torchtransient.plugins.labels import LabelTables
 
     if built.label_tables is None:

@@ -14,7 +14,11 @@ _SMALL = 2**22
 
 
 def available_bytes(variant: str) -> int | None:
-    """Return the free memory of a variant's device in bytes, None where the system does not say."""
+    """Return the free memory of a variant's device in bytes, None where the system does not say.
+
+    Args:
+        variant: name of a variant.
+    """
     if device_type(variant) == "cuda":
         import torch
 

@@ -42,13 +42,27 @@ def samples_of_pass(sampler: str, pixels: int) -> int:
 
 
 def moderated_variance(variance: torch.Tensor, freedom: torch.Tensor | float, dims: tuple[int, ...]) -> torch.Tensor:
-    """Return sample variances, of so many degrees of freedom, drawn to the mean of neighbours along ``dims``."""
+    """Return sample variances, of so many degrees of freedom, drawn to the mean of neighbours along ``dims``.
+
+    Args:
+        variance: sample variances, any shape.
+        freedom: degrees of freedom, broadcastable.
+        dims: dimensions with neighbours.
+
+    Returns:
+        The shape of ``variance``.
+    """
     moderated: torch.Tensor = (variance * freedom).add_(local_mean(variance, dims), alpha=_NEIGHBORS)
     return moderated.div_(freedom + _NEIGHBORS)
 
 
 def freedom_of_halves(even: torch.Tensor, odd: torch.Tensor, passes: int, dims: tuple[int, ...]) -> torch.Tensor:
     """Return the degrees of freedom of sample variances, of which two halves of the passes have ``even`` and ``odd``.
+
+    Args:
+        even, odd: sample variances of both halves, of one shape.
+        passes: number of all passes.
+        dims: dimensions with neighbours.
 
     The variance of a sample variance over its square is 2 / freedom.
     """

@@ -108,7 +108,11 @@ class PlannedFilm:
 
 
 def planned(outputs: Sequence[str]) -> PlannedFilm:
-    """Return the film of a plan for some outputs."""
+    """Return the film of a plan for some outputs.
+
+    Args:
+        outputs: names of outputs, such as "transient".
+    """
     kind = next((kind for kind in FILMS if kind.output in outputs), Histogram)
     if kind is not Histogram:
         note = "; no time axis is stored" if kind is Phasors else ""
@@ -438,8 +442,9 @@ def known_outputs() -> tuple[str, ...]:
 
 
 def _checked_outputs(outputs: Sequence[str] | str | None, given: FilmLayout | None) -> tuple[str, ...]:
+    """Return the outputs of a plan; ``given``: film that the call asks for, None without one."""
     if outputs is None:
-        outputs = "transient" if given is None else given.output
+        return ("transient" if given is None else given.output,)
     wanted = (outputs,) if isinstance(outputs, str) else tuple(several("tt.plan: outputs", outputs, "names"))
     films, known = tuple(kind.output for kind in FILMS), known_outputs()
     if not wanted or not all(is_one_of(name, known) for name in wanted):

@@ -34,17 +34,29 @@ def pose_of(renderer: TransientRenderer, values: Mapping[str, Any] | None, name:
 
 
 def film_rows(renderer: TransientRenderer) -> int:
-    """Return the height of the film, or of its crop window, in pixels."""
+    """Return the height of the film, or of its crop window, in pixels.
+
+    Args:
+        renderer: the renderer.
+    """
     return int(renderer._cube_shape[0])
 
 
 def watch_of(renderer: TransientRenderer) -> PhysicsWatch:
-    """Return what warns of what no physical system has, as ``physics`` of the renderer says."""
+    """Return what warns of what no physical system has, as ``physics`` of the renderer says.
+
+    Args:
+        renderer: the renderer.
+    """
     return renderer._watch
 
 
 def scene_size(renderer: TransientRenderer) -> float:
-    """Return the diagonal of the box around shapes and sensors, metres; infinite without shapes."""
+    """Return the diagonal of the box around shapes and sensors, metres; infinite without shapes.
+
+    Args:
+        renderer: the renderer.
+    """
     with active_variant(renderer.scene.variant):
         scene = renderer.scene.built(renderer._options).scene
         box = scene.bbox()

@@ -47,7 +47,13 @@ class ForecastBar:
 
 
 def with_bar(things: Sequence[_T], name: str, progress: bool) -> Iterator[_T]:
-    """Yield the entries of a sequence; show a bar called ``name`` if ``progress``."""
+    """Yield the entries of a sequence; show a bar called ``name`` if ``progress``.
+
+    Args:
+        things: what is iterated over.
+        name: text before the bar.
+        progress: show the bar.
+    """
     bar = Bar(name) if progress else None
     try:
         for done, thing in enumerate(things):

@@ -63,6 +63,9 @@ Numbered = tuple[int, Item]
 def groups_of(session: Any) -> Iterator[list[Numbered]]:
     """Yield the items of a call, numbered, in groups that share their values and are executed together.
 
+    Args:
+        session: session of a job.
+
     A group holds the sensors of one entry of a batch if their films are small, else a single item.
     """
     group: list[Numbered] = []
@@ -216,7 +219,15 @@ def reason_to_trace(session: Any, progress: bool = False, lent: bool = False) ->
 
 
 def raise_if_broken(session: Any, error: NotRecordedError) -> None:
-    """Raise ``SceneError``, and forget the built scene, where a recording that failed has left it broken."""
+    """Raise ``SceneError``, and forget the built scene, where a recording that failed has left it broken.
+
+    Args:
+        session: session of the job.
+        error: the recording's error.
+
+    Raises:
+        SceneError: if the scene is broken.
+    """
     if error.broken:
         session.job.scene.drop(session.job.options)
         raise SceneError(

@@ -53,7 +53,12 @@ _FEW_PASSES, _MOST_OF_ONE, _MANY_PASSES, _FURTHEST, _LEAST_INDEX = 24, 1 / 3, 88
 
 
 def quantile_of(values: torch.Tensor, quantile: float) -> float:
-    """Return the smallest of the values that a share ``quantile`` of them does not exceed, NaN without any."""
+    """Return the smallest of the values that a share ``quantile`` of them does not exceed, NaN without any.
+
+    Args:
+        values: any shape.
+        quantile: in (0, 1].
+    """
     number = values.numel()
     if number == 0:
         return math.nan
@@ -62,12 +67,20 @@ def quantile_of(values: torch.Tensor, quantile: float) -> float:
 
 
 def next_look(passes: int, forecast: float) -> int:
-    """Return the number of passes at the next look: those of the forecast, an eighth to as many more."""
+    """Return the number of passes at the next look: those of the forecast, an eighth to as many more.
+
+    Args:
+        passes: passes so far.
+        forecast: passes that are expected to be needed.
+    """
     return math.ceil(min(max(1.05 * forecast, passes + passes / 8), 2.0 * passes))
 
 
 def share_to_aim_at(freedom: float) -> float:
     """Return the share of the tolerance to aim at, for a variance of so many degrees of freedom.
+
+    Args:
+        freedom: degrees of freedom of the variance.
 
     5 % less than the tolerance, and less than what chance hides in one of 20 estimates: the root of the 5 % quantile of
     chi squared over its mean (Wilson and Hilferty 1931).
@@ -81,7 +94,11 @@ def share_to_aim_at(freedom: float) -> float:
 
 
 def is_heavy(squared: list[float]) -> bool:
-    """Return whether few passes decide about a variance: their squared distances from the mean, in any unit."""
+    """Return True if few passes decide about a variance.
+
+    Args:
+        squared: squared distance of each pass from the mean, in any unit.
+    """
     total = sum(squared)
     if len(squared) < _FEW_PASSES or not total > 0:
         return False
@@ -211,7 +228,12 @@ class Look:
 
 
 def look(sums: PassSums, request: Request) -> Look:
-    """Return the error of the mean of ``sums``."""
+    """Return the error of the mean of ``sums``.
+
+    Args:
+        sums: sums of the passes.
+        request: tolerance, and what it is of.
+    """
     if request.loss is not None:
         return _look_at_loss(sums, request.rtol)
     mean = local_mean(sums.mean_bins().abs(), sums.near)
@@ -251,7 +273,16 @@ def _look_at_loss(sums: PassSums, rtol: float) -> Look:
 
 
 def counted_bins(mean: torch.Tensor, on: Any, sums: PassSums) -> torch.Tensor:
-    """Return the mask of bins that count, of their local ``mean``. Raises ShapeError for a mask of another shape."""
+    """Return the mask of bins that count.
+
+    Args:
+        mean: local means of the bins, (..., T, H, W).
+        on: mask of a user that broadcasts to it or to (C, T, H, W), or None.
+        sums: sums of the passes.
+
+    Raises:
+        ShapeError: for a mask of another shape.
+    """
     if on is None:
         bins = tuple(range(sums.leading, mean.ndim))
         return mean > _LIT * mean.mean(dim=bins, keepdim=True)

@@ -35,6 +35,9 @@ def flatten(tree: Any) -> tuple[Any, list[Any]]:
 
     Lists, tuples (named ones too), dictionaries, dataclasses, and classes with ``DRJIT_STRUCT`` are branches. The
     structures of Mitsuba and Dr.Jit are leaves: their fields have types of their own.
+
+    Args:
+        tree: any nesting of these.
     """
     leaves: list[Any] = []
 
@@ -46,12 +49,21 @@ def flatten(tree: Any) -> tuple[Any, list[Any]]:
 
 
 def unflatten(structure: Any, leaves: Sequence[Any]) -> Any:
-    """Return the PyTree of a structure of :func:`flatten`, with ``leaves`` in the order of its slots."""
+    """Return the PyTree of a structure of :func:`flatten`, with ``leaves`` in the order of its slots.
+
+    Args:
+        structure: structure of a tree.
+        leaves: its leaves.
+    """
     return _map_leaves(lambda slot: leaves[slot.number], structure)
 
 
 def same_structure(a: Any, b: Any) -> bool:
-    """Return whether two structures have the same classes and names, in the same order."""
+    """Return True if two structures have the same classes and names, in the same order.
+
+    Args:
+        a, b: structures of :func:`flatten`.
+    """
     names, parts = _branches(a)
     others, other_parts = _branches(b)
     return type(a) is type(b) and names == others and all(map(same_structure, parts, other_parts))
@@ -94,7 +106,11 @@ def _branches(tree: Any) -> tuple[list[Any] | None, list[Any]]:
 
 
 def is_typed_structure(value: Any) -> bool:
-    """Return whether a value is a structure of Mitsuba or Dr.Jit, whose fields cannot be tensors."""
+    """Return True if a value is a structure of Mitsuba or Dr.Jit, whose fields cannot be tensors.
+
+    Args:
+        value: any value.
+    """
     kind = type(value)
     described = isinstance(getattr(kind, "DRJIT_STRUCT", None), dict)
     return described and kind.__module__.partition(".")[0] in ("drjit", "mitsuba") and not hasattr(value, "__dict__")
@@ -151,7 +167,11 @@ def computable(tensor: torch.Tensor, name: str) -> torch.Tensor:
 
 
 def drjit_copy(tensor: torch.Tensor) -> Any:
-    """Return a copy of a torch tensor as a Dr.Jit tensor: a scene never aliases memory of the caller."""
+    """Return a copy of a torch tensor as a Dr.Jit tensor: a scene never aliases memory of the caller.
+
+    Args:
+        tensor: tensor of any shape, on the CPU or a GPU.
+    """
     import drjit as dr
 
     kind = getattr(importlib.import_module(_MODULES[tensor.device.type]), _NAMES[tensor.dtype])
@@ -172,6 +192,9 @@ def drjit_copy(tensor: torch.Tensor) -> Any:
 def as_tensor(array: Any) -> Any:
     """Return any Dr.Jit array of numbers as a Dr.Jit tensor, attached where the array is.
 
+    Args:
+        array: array, tensor, matrix or structure of arrays.
+
     Raises:
         ShapeError: if the array holds pointers.
     """
@@ -190,6 +213,9 @@ def fresh(array: Any) -> Any:
 
     A product by one costs nothing where the array is not computed yet, and is a copy where it is. Scatters that wait
     in the array are carried out.
+
+    Args:
+        array: array, tensor, matrix or structure of arrays.
     """
     import drjit as dr
 
@@ -202,7 +228,11 @@ def fresh(array: Any) -> Any:
 
 
 def as_torch(tensors: Sequence[Any]) -> tuple[torch.Tensor, ...]:
-    """Return fresh Dr.Jit tensors as torch tensors of the same memory, computed in as few kernels as possible."""
+    """Return fresh Dr.Jit tensors as torch tensors of the same memory, computed in as few kernels as possible.
+
+    Args:
+        tensors: tensors that nothing else holds.
+    """
     import drjit as dr
 
     plain = [dr.detach(tensor) for tensor in tensors]
@@ -215,14 +245,22 @@ def as_torch(tensors: Sequence[Any]) -> tuple[torch.Tensor, ...]:
 
 
 def variant_of(params: Any) -> str | None:
-    """Return the variant of the scene behind ``params``, None if there is no parameter."""
+    """Return the variant of the scene behind ``params``, None if there is no parameter.
+
+    Args:
+        params: parameters of a scene (`mi.SceneParameters`).
+    """
     for _, _, node, _ in params.properties.values():
         return str(node.variant_name())
     return None
 
 
 def values_of(params: Any) -> dict[str, Any]:
-    """Return every value that can be written, by key: handles, no copies of memory."""
+    """Return every value that can be written, by key: handles, no copies of memory.
+
+    Args:
+        params: parameters of a scene (`mi.SceneParameters`).
+    """
     import mitsuba as mi
 
     found = {}
@@ -284,7 +322,11 @@ def _update(params: Any, keys: Sequence[str]) -> None:
 
 
 def detached(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values without derivatives of Dr.Jit."""
+    """Return the values without derivatives of Dr.Jit.
+
+    Args:
+        values: values by key.
+    """
     import drjit as dr
 
     return {key: dr.detach(value) if dr.grad_enabled(value) else value for key, value in values.items()}

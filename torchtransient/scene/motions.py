@@ -96,6 +96,7 @@ def _place(state: Any, node: Any, key: str, index: int) -> None:
             raise SceneError(f"{name!r}: expected a {PLUGIN} as its {CHILD}; volumes are those of media alone.")
         of = props.id().removesuffix(f".{CHILD}") if props.id().endswith(f".{CHILD}") else name
         props["raw"] = True  # no colours
+        props["accel"] = False  # textures of GPUs interpolate with eight bits
     else:
         of = props.get("of", name)
         props["of"] = name

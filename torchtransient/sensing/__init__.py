@@ -85,6 +85,7 @@ from torchtransient.sensing.itof.depth import tap_phasor as tap_phasor
 from torchtransient.sensing.itof.depth import unambiguous_range_m as unambiguous_range_m
 from torchtransient.sensing.itof.depth import unwrap_depth as unwrap_depth
 from torchtransient.sensing.itof.depth import wrapped_difference as wrapped_difference
+from torchtransient.sensing.itof.heterodyne import heterodyne_speed as heterodyne_speed
 from torchtransient.sensing.itof.reading import ItofNoise as ItofNoise
 from torchtransient.sensing.itof.reading import ItofReading as ItofReading
 from torchtransient.sensing.itof.reading import decode_code as decode_code

@@ -159,6 +159,9 @@ CALLS = {
         {"response": RESPONSE}),
     "mosaic_rows": (
         {"angles_deg": 90 * rand(2, 2), "extinction_ratio": number(100.0), "transmission": number(0.5)}, {}),
+    "heterodyne_speed": (
+        {"beat": 0.1 * PHASOR, "plain": PHASOR, "frequencies_hz": number(60e6), "duration_s": number(5e-3)},
+        {"beats": 2}),
     "multi_return": ({"scores": LIGHT, "threshold": number(0.5)}, {"max_returns": 2}),
     "nonparalyzable_histogram": ({"rate": LIGHT, "dead_bins": number(2.5)}, {}),
     "offset_of": ({"taps": TAPS}, {"num_taps": 4}),

@@ -355,9 +355,21 @@ class TimeResolvedFilm(mi.Film):
         """Return the dimensions of the array that belong to the laser: (Lh, Lw), or none."""
         return (self.laser_scan_height, self.laser_scan_width) if self.exhaustive_scan else ()
 
+    def storage_shape(self) -> tuple[int, ...]:
+        """Return the shape of the array while it is rendered; `finish_render` makes it :meth:`cube_shape`."""
+        return self.cube_shape()
+
+    def stored_adjoint(self, adjoint):
+        """Return the adjoint of the array that is rendered to, of that of the film.
+
+        Args:
+            adjoint: (flat array, offset, strides) of :meth:`cube_shape`; returned for :meth:`storage_shape`.
+        """
+        return adjoint
+
     def entries_per_array(self) -> int:
-        """Return the number of floats of one pixel and laser position."""
-        return self.row_count() * math.prod(self.cube_shape()[-2:])
+        """Return the number of floats of one pixel and laser position while it is rendered."""
+        return self.row_count() * math.prod(self.storage_shape()[-2:])
 
     def entries_per_pixel(self) -> int:
         """Return the number of floats behind one pixel."""

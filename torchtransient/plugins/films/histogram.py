@@ -109,6 +109,7 @@ class TransientHDRFilm(TimeResolvedFilm):
     plugin = "transient_hdr_film"
     knows_exclusive_lanes = knows_crowds = True
     measures = "transient"
+    pulsed_filter = PulsedFilter
 
     def __init__(self, props):
         super().__init__(props)
@@ -168,7 +169,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         if found is None:
             found = make_temporal_filter(name, stddev)
             if self.pulses:
-                found = PulsedFilter(found, self.pulses, self.bin_width_opl)
+                found = self.pulsed_filter(found, self.pulses, self.bin_width_opl)
         self._filters[made_for] = found
         while len(self._filters) > MAX_FILTERS:
             del self._filters[next(iter(self._filters))]

@@ -13,6 +13,7 @@ from torchtransient.plugins._registry import register
 from torchtransient.plugins.films.block import AdjointBlock, FilmBlock
 from torchtransient.plugins.films.histogram import TransientHDRFilm
 from torchtransient.plugins.films.phasor import PhasorHDRFilm
+from torchtransient.plugins.films.splined import SplinedHDRFilm
 from torchtransient.plugins.films.temporal_filters import make_temporal_filter
 from torchtransient.plugins.properties import number, whole_number
 
@@ -177,14 +178,14 @@ class RateHDRFilm(film_of_rows(TransientHDRFilm)):
         return rows
 
 
-class BeatHDRFilm(film_of_rows(TransientHDRFilm)):
+class BeatHDRFilm(film_of_rows(SplinedHDRFilm)):
     r"""Film of the beats of frequency-modulated light (:monosp:`beat_hdr_film`): two spectra a pixel.
 
     ``chirp_bandwidth`` (Hz), ``chirp_duration`` (s), ``chirp_wavelength`` (m), ``chirp_window`` (string, hann): chirps
     up and down, see :class:`torchtransient.Chirps`. The axis of the film is that of a target at rest: the beat of an
     arrival on the up chirp is that of a length ``opl + k rate``, on the down chirp of ``opl - k rate``, with ``k`` the
-    frequency of the light times duration over bandwidth, and spread by the line shape of the window. Layout ``(H, W, 2,
-    T, C)``.
+    frequency of the light times duration over bandwidth, and spread by the line shape of the window, to 1e-3 of its
+    peak (:mod:`.splined`). Layout ``(H, W, 2, T, C)``.
 
     Not supported: exhaustive scans, ``steady`` = false, a further impulse response.
     """

@@ -126,7 +126,7 @@ def make_temporal_filter(name: str, stddev: float = 0.5):
 
 # Nodes of the table of F over the length of the kernel; it is linear in between.
 NODES = 2048
-MAX_NODES_PER_BIN = 1 << 14
+MIN_NODES_PER_BIN, MAX_NODES_PER_BIN = 1 << 5, 1 << 14
 # A kernel of more bins than this is better applied to the rendered transient.
 MAX_BINS = 4096
 
@@ -141,11 +141,7 @@ class PulsedFilter:
 
     def __init__(self, base, pulses, bin_width_opl: float):
         self.name = base.name
-        spread = list(pulses)
-        if isinstance(base, TentFilter):
-            spread.append(Pulse.rectangular(bin_width_opl))
-        elif isinstance(base, GaussianFilter):
-            spread.append(Pulse.gaussian(base.stddev * FWHM_PER_STDDEV * bin_width_opl))
+        spread = with_filter(pulses, base, bin_width_opl)
         low, high = (sum(p.support_opl[side] for p in spread) / bin_width_opl for side in (0, 1))
         if high - low > MAX_BINS:
             raise SceneError(
@@ -154,7 +150,7 @@ class PulsedFilter:
                 "afterwards (torchtransient.sensing.apply_pulse)."
             )
         per_bin = 2 ** math.ceil(math.log2(NODES / (high - low)))
-        self.nodes_per_bin = int(min(max(per_bin, 8), MAX_NODES_PER_BIN))
+        self.nodes_per_bin = int(min(max(per_bin, MIN_NODES_PER_BIN), MAX_NODES_PER_BIN))
         first, values = cumulative_of_sum(spread, bin_width_opl / self.nodes_per_bin)
         # The first bin that an arrival at the start of bin 0 can reach, and one edge more than any arrival needs.
         self.first = math.floor(first / self.nodes_per_bin)
@@ -191,6 +187,15 @@ class PulsedFilter:
             taps.append((k, high[0] - low[0], low[1] - high[1]))
             low = high
         return first, taps
+
+
+def with_filter(pulses, base, bin_width_opl: float) -> list[Pulse]:
+    """Return ``pulses`` and that of the temporal filter ``base`` for bins of a width in metres."""
+    if isinstance(base, TentFilter):
+        return [*pulses, Pulse.rectangular(bin_width_opl)]
+    if isinstance(base, GaussianFilter):
+        return [*pulses, Pulse.gaussian(base.stddev * FWHM_PER_STDDEV * bin_width_opl)]
+    return list(pulses)
 
 
 def pulse_of(props, prefix: str, plugin: str) -> Pulse | None:

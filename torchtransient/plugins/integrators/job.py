@@ -262,7 +262,7 @@ class IncomingAdjoint:
 
     def __init__(self, film: Any, steady: Any, transient: Any) -> None:
         self.film, self.steady = film, steady
-        self.transient = None if transient is None else self._layout(transient)
+        self.transient = None if transient is None else film.stored_adjoint(self._layout(transient))
 
     def _layout(self, transient: Any) -> Any:
         if isinstance(transient, tuple):

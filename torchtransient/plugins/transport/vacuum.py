@@ -367,7 +367,9 @@ class Vacuum(Segment):
         radius = context.contents.damping_radius
         motion = self.motion_to(context, v, mi.Vector3f(0), end, first & end.valid, radius)
         n = dr.select(first, self.meter_normal, mi.Normal3f(v.ray.d))
-        J = motion.J * dr.relative_grad(dr.select(first, dr.abs_dot(n, motion.d), 1))
+        cos = dr.abs_dot(n, motion.d)
+        # Of rays edge-on to the meter the cosine is rounding, and its relative change is one over it.
+        J = motion.J * dr.relative_grad(dr.select(first & (dr.detach(cos) > EDGE_ON), cos, 1))
         return replace(
             carry,
             β=carry.β * dr.select(first, J, 1),

@@ -74,7 +74,7 @@ def range_and_speed(
     """
     me = "range_and_speed"
     if not isinstance(beats, Tensor) and isinstance(held := getattr(beats, "beats", None), Tensor):
-        chirps, axis = chirps or beats.chirps, axis or beats.axis
+        chirps, axis = beats.chirps if chirps is None else chirps, beats.axis if axis is None else axis
         beats = held
     beats = check_bins(beats, me)  # type: ignore[arg-type]
     chirps, axis = of_class(f"{me}: chirps", chirps, Chirps), check_time_axis(axis, me)

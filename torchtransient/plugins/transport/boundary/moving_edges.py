@@ -18,7 +18,9 @@ from torchtransient.plugins.mitsuba_compat import (
     TEXCOORDS,
     attribute_name,
     has_limb,
+    has_normals,
     has_surface,
+    has_vertices,
     is_bump_map,
     is_flat,
     is_instance,
@@ -27,8 +29,9 @@ from torchtransient.plugins.mitsuba_compat import (
     mesh_faces,
     mesh_positions,
     near_clip,
+    normal_texture,
 )
-from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, shapes_of_scene
+from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, objects_of, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
@@ -90,7 +93,8 @@ class MovingEdges:
     Args:
         always: gaps of every parameter that moves edges.
         bent: gaps of what bends light alone.
-        scene: scene that is searched for textures with steps and for bodies that run into each other, or None.
+        scene: scene that is searched for textures with steps, for bodies that run into each other, for what clip planes
+            cut and for normals that turn away, or None.
         words: gaps that only the table of parameters names, whatever the scene.
         has_term: there is a boundary term.
         sensors: sensors of the scene that see the edges.
@@ -127,6 +131,11 @@ class MovingEdges:
             # Mitsuba does not show the members of an instance; relative to a moving sensor all shapes move.
             alone = effect.role != "sensor" and isinstance(node, mi.Shape) and not is_instance(node)
             found += self._jumps(node if alone else None)
+        if (moves and effect.role in ("shape", "sensor")) or effect.role == "value":
+            found += self._turned_away(None if effect.role == "sensor" or is_instance(node) else node)
+        if name == NORMALS and any(node.ptr == shape.ptr for shape in self._turned_away_shapes[1]):
+            where = f"at the rim of {_name(node)}, where normals of its vertices turn away from the camera"
+            found += (Gap(where, "Move its vertices, or take finer faces, of which the rim is narrower."),)
         if moves and (effect.role == "sensor" or isinstance(node, mi.Shape)):
             moving = None if effect.role == "sensor" else node
             found += self._crossings(moving) + self._clipped(moving)
@@ -174,6 +183,20 @@ class MovingEdges:
         where = f"where {_listed([_named_pair(*pair) for pair in pairs])} run into each other"
         return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
 
+
+    @cached_property
+    def _turned_away_shapes(self) -> tuple[list[Any], list[Any]]:
+        return ([], []) if self._scene is None else _shapes_turned_away(self._scene, self._sensors)
+
+    def _turned_away(self, node: Any) -> tuple[Gap, ...]:
+        """Return the gap of normal maps on a shape, or in a texture, that turn away from a sensor; of any for None."""
+        shapes, _ = self._turned_away_shapes
+        if node is not None:
+            shapes = [one for one in shapes if node.ptr in _addresses(one)]
+        if not shapes:
+            return ()
+        where = f"where the normal maps of {_listed_shapes(shapes)} turn normals away from the camera"
+        return (Gap(where, "Take flatter normals, or look at them less obliquely."),)
 
     @cached_property
     def _clipped_shapes(self) -> list[Any]:
@@ -345,6 +368,52 @@ def has_delta_lobe(shape: Any) -> bool:
     """Return True if a shape has a BSDF with a delta lobe."""
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
+
+
+def _addresses(shape: Any) -> set[int]:
+    """Return the addresses of a shape and of the textures of its BSDF."""
+    return {shape.ptr, *(texture.ptr for texture in objects_below(shape.bsdf(), mi.Texture))}
+
+
+def _normal_maps(shape: Any) -> list[Any]:
+    """Return the textures of normals of a shape's BSDF."""
+    if not has_surface(shape) or shape.bsdf() is None:
+        return []
+    bsdfs = [one for one in (shape.bsdf(), *objects_below(shape.bsdf(), mi.BSDF)) if isinstance(one, mi.BSDF)]
+    names = [(bsdf, normal_texture(bsdf)) for bsdf in bsdfs if not is_bump_map(bsdf)]
+    return [dict(objects_of(bsdf))[name] for bsdf, name in names if name is not None]
+
+
+def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    """Return the shapes of which a sensor sees places where a normal map turns the normal away from it, and those where
+    normals at vertices do.
+
+    Mitsuba draws such places with another normal, or black: the light jumps there.
+    """
+    shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape)]
+    mapped = [(shape, maps) for shape in shapes if (maps := _normal_maps(shape))]
+    smooth = [shape for shape in shapes if has_vertices(shape) and has_normals(shape)]
+    found: tuple[dict[int, Any], dict[int, Any]] = {}, {}
+    if not (mapped or smooth):
+        return [], []
+    with dr.suspend_grad():
+        for sensor in sensors:
+            random = mi.PCG32(size=_PROBES * _PROBES)
+            uniform = lambda random=random: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
+            ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, uniform(), uniform())
+            si = scene.ray_intersect(ray)
+            wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
+            for shape, maps in mapped:
+                hit = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+                for texture in maps:
+                    n = mi.Vector3f(texture.eval_3(si, hit)) * 2 - 1
+                    if bool(dr.any(hit & (dr.dot(n, wi) < 0))):
+                        found[0][shape.ptr] = shape
+            away = si.is_valid() & (dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d) < 0)
+            for shape in smooth:
+                if bool(dr.any(away & (si.shape == mi.ShapePtr(shape)))):
+                    found[1][shape.ptr] = shape
+    return list(found[0].values()), list(found[1].values())
 
 
 def _is_stepped(shape: Any) -> bool:

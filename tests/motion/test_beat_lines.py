@@ -1,0 +1,123 @@
+"""Spectra of beats against the line of the window around each arrival, to a thousandth of its largest value."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torchtransient as tt  # isort: skip
+import mitsuba as mi
+
+from support.rates import plate, scene
+from torchtransient.pulses import Pulse, cumulative_of_sum
+
+DISTANCE, SPEED = 3.217, 1.83
+
+
+def wall(variant="llvm_ad_mono"):
+    """A wall head on, which comes nearer: light of one length and one rate."""
+    loaded = tt.load(scene(wall=plate((0, 0, DISTANCE), (0, 0, 0))), variant=variant)
+    return loaded.moving({"wall": tt.Motion(linear=(0, 0, -SPEED))})
+
+
+def shares(chirps, axis, temporal_filter):
+    """Share of the light in each bin of both spectra, before and after them, (2, T), (2,), (2,); the largest of a bin
+    in whose middle the light arrives.
+    """
+    pulses = [chirps.line_shape] + [Pulse.rectangular(axis.bin_width_opl)] * (temporal_filter == "tent")
+    step = axis.bin_width_opl / 512
+    first, values = cumulative_of_sum(pulses, step)
+
+    def cumulative(opl):
+        return np.interp(opl / step, first + np.arange(values.size), values)
+
+    places = 2 * DISTANCE + np.array([[1], [-1]]) * chirps.rate_scale_s * -2 * SPEED
+    below = cumulative(axis.edges_opl.numpy() - places)
+    largest = 2 * cumulative(axis.bin_width_opl / 2) - 1
+    return np.diff(below), below[:, 0], 1 - below[:, -1], largest
+
+
+def compare(out, chirps, axis, temporal_filter="box"):
+    expected, before, after, largest = shares(chirps, axis, temporal_filter)
+    beats, steady = (x.double()[..., 0, 0].numpy() for x in (out.beats, out.steady))
+    if beats.ndim == 4:  # Stokes components
+        beats, steady = beats[0], steady[0]
+    for light, whole in zip(beats, steady, strict=True):
+        np.testing.assert_allclose(light / whole, expected, rtol=0, atol=1e-3 * largest)
+    assert beats.min() >= 0
+    whole, outside = steady.mean(), (out.stats.energy_before[0], out.stats.energy_after[0])
+    for found, share in zip(outside, (before, after), strict=True):
+        assert found == pytest.approx(whole * share.mean(), abs=1e-3 * whole)
+    assert beats.mean(0).sum() / 2 + sum(outside) == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.parametrize("temporal_filter", ["box", "tent"])
+@pytest.mark.parametrize("window", ["rectangular", "hann", "blackmanharris"])
+def test_windows_and_widths_of_bins(window, temporal_filter):
+    """From a quarter of a line to a width of eight lines, with the arrival anywhere in its bin."""
+    chirps, moving = tt.Chirps(1e9, 10e-6, 1550e-9, window=window), wall()
+    line = chirps.resolution_opl
+    for lines in (1 / 4, 1 / 2, 1, 2, 8):
+        count = round(60 / lines)
+        for shift in (0.13, 0.71):
+            axis = tt.TimeAxis(-2.0 - shift * lines * line, lines * line, count)
+            settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": temporal_filter}
+            compare(tt.render(moving, seed=0, spp=16, **settings), chirps, axis, temporal_filter)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+def test_what_the_window_cuts_off(variant):
+    """Both spectra have their middle near a rim of the axis, which lets part of the line through."""
+    chirps = tt.Chirps(1e9, 10e-6, 1550e-9)
+    width = chirps.resolution_opl / 2
+    places = 2 * DISTANCE + np.array([1, -1]) * chirps.rate_scale_s * -2 * SPEED
+    for before, after in ((0.4, 12), (-9, -2.3)):
+        start, end = places[0] + before * width, places[1] + after * width
+        axis = tt.TimeAxis(start, width, round((end - start) / width))
+        settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": "box", "physics": "ignore"}
+        compare(tt.TransientRenderer(wall(variant), spp=16, **settings)(seed=0), chirps, axis)
+
+
+def test_sums_in_double_precision():
+    """More samples than single precision adds up."""
+    chirps = tt.Chirps(1e9, 10e-6, 1550e-9)
+    axis = tt.TimeAxis(-2.1, chirps.resolution_opl, 40)
+    for variant in ("llvm_ad_mono", "llvm_ad_rgb"):
+        settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": "box"}
+        compare(tt.render(wall(variant), seed=0, spp=2**16 + 2**12, **settings), chirps, axis)
+
+
+def test_batches_of_a_crop():
+    """Each item of a batch is a render with its values; all pixels have the steady image's light."""
+    chirps = tt.Chirps(1e9, 10e-6, 1550e-9)
+    axis = tt.TimeAxis(-6.0, chirps.resolution_opl, 80)
+    nodes = scene(4, 20.0, wall=plate((0, 0, DISTANCE), (0.3, 0.2, 0), half=3.0))
+    nodes["sensor"]["film"] |= {"crop_width": 3, "crop_height": 2, "crop_offset_x": 1, "crop_offset_y": 1}
+    moving = tt.load(nodes, variant="llvm_ad_rgb").moving({"wall": tt.Motion(linear=(0, 0, -SPEED))})
+    key = "wall.bsdf.reflectance.value"
+    renderer = tt.TransientRenderer(moving, [key], chirps=chirps, time_axis=axis, spp=64)
+    albedos = torch.tensor([0.2, 0.7])
+    with torch.no_grad():
+        batch = renderer({key: albedos}, seed=[3, 3])
+        assert batch.beats.shape == (2, 3, 2, 80, 2, 3)
+        whole = batch.steady[:, :, None].expand(2, 3, 2, 2, 3)
+        torch.testing.assert_close(batch.beats.sum(-3), whole, rtol=2e-3, atol=0)
+        for albedo, beats in zip(albedos, batch.beats, strict=True):
+            torch.testing.assert_close(beats, renderer({key: albedo}, seed=3).beats, rtol=1e-4, atol=1e-7)
+
+
+def test_renders_of_mitsuba():
+    """The plugin alone, and its tensor in torch."""
+    film = {"type": "beat_hdr_film", "chirp_bandwidth": 1e9, "chirp_duration": 10e-6, "chirp_wavelength": 1550e-9}
+    axis = {"temporal_bins": 80, "bin_width_opl": 0.3, "start_opl": -6.0}
+    motion = {"type": "rigid_motion", "linear": [0.0, 0.0, -SPEED]}
+    nodes = scene(2, 20.0, wall=plate((0, 0, DISTANCE), (0.3, 0.2, 0), half=3.0, velocity=motion))
+    nodes["sensor"]["film"] |= film | axis
+    expected = tt.render(tt.load(nodes, variant="llvm_ad_rgb"), spp=64, seed=5, sampler="scene", temporal_filter="box")
+    mi.set_variant("llvm_ad_rgb")
+    loaded = mi.load_dict(nodes)
+    steady, beats = loaded.integrator().render(loaded, spp=64, seed=5)
+    assert beats.shape == (2, 2, 2, 80, 3)
+    torch.testing.assert_close(beats.torch().movedim((-1, 2, 3), (0, 1, 2)), expected.beats, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(steady.torch().movedim(-1, 0), expected.steady, rtol=1e-4, atol=1e-7)
