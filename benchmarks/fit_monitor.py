@@ -1,9 +1,9 @@
 """What `tt.vis.FitMonitor` adds to a training step, in CPU seconds of one thread, loops with and without it in turns.
 
 `page`: losses, parameters, light and noise of gradients, for a page at the end. `log`: a TensorBoard log too, where the
-package is installed; figures, which come on top in logs and notebooks, take no more than 1 % of the time by their
-schedule. `without`: the step over itself without the time inside of `FitMonitor.step`, which steps of some milliseconds
-need to tell costs from noise. Fits of the Cornell box, from small to large films, nine albedos.
+package is installed. Looks and figures take no more than 1 % of the time each, by their schedule. `without`: the step
+over itself without the time inside of `FitMonitor.step`, which steps of some milliseconds need to tell costs from
+noise. Fits of the Cornell box, from small to large films, nine albedos.
 """
 
 from __future__ import annotations

@@ -60,12 +60,6 @@ def test_the_guide_falls_as_independent_samples_do(drawn):
         np.testing.assert_allclose(lines(panel)["slope -1"], (x, y))
 
 
-def test_nothing_above_zero_is_nothing_drawn(drawn):
-    _, panels = drawn([Curve("transient", "path", [0], [0.0], [0.0])])
-    for panel in panels.flat:
-        assert lines(panel) == {"path": ([], [])}
-
-
 def collections(panel):
     return [kept.get_paths() for kept in panel.collections]
 
@@ -87,13 +81,6 @@ def test_bands_totals_and_the_front(drawn):
     words = [text.get_text().split("\n")[0] for text in right.get_legend().texts]
     assert words == ["deep", "shallow", "slope -1", "Pareto front"]
     assert [panel.get_title(loc="right") for panel in (left, right)] == ["noise and bias", "noise alone"]
-
-
-def test_the_picture_is_that_of_the_points(drawn):
-    """Not of a band that goes anywhere."""
-    wide = Curve("q", "a", [4, 16], [1.0, 2.0], [0.4, 0.1], band=[(1e-20, 1e20), (0.05, 0.2)])
-    _, panels = drawn([wide])
-    assert panels[0, 0].get_ylim() == panels[0, 1].get_ylim() == pytest.approx((0.025, 1.6))
 
 
 def test_of_many_curves_those_on_the_front_have_colours(drawn):

@@ -39,15 +39,6 @@ def test_samples_stand_in_rows_from_the_upper_left():
         np.testing.assert_allclose(curve, [left, low + 0.06, 2.65, 0.33], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "count, curves, across, down",
-    [(2, False, 1, 2), (5, True, 2, 3)],
-)
-def test_a_sheet_is_about_as_high_as_it_is_wide(count, curves, across, down):
-    size = contact_sheet(cells(count, curves)).get_size_inches()
-    np.testing.assert_allclose(size, [2.85 * across, (2.0 if curves else 1.55) * down + 0.3])
-
-
 def test_pictures_are_what_is_given_and_numbers_share_a_scale():
     figure = contact_sheet(cells(), columns=3)
     for number in range(5):

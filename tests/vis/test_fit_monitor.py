@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+import time
 import types
 
 import numpy as np
@@ -14,7 +15,6 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
-from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 AXIS = tt.TimeAxis(2.0, 0.5, 4)
 TARGET = torch.rand(3, 4, 5, 6, generator=torch.Generator().manual_seed(0)) + 0.1
@@ -25,6 +25,7 @@ def fitted(steps=21, *, noise=0.0, **given):
     colour = torch.nn.Parameter(torch.full((3,), 0.2))
     generator = torch.Generator().manual_seed(1)
     settings = {"target": TARGET, "pixels": [(1, 2)], "truth": {"colour": [0.7] * 3}, "axis": AXIS, "live": False}
+    settings["every"] = 10
     monitor = tt.vis.FitMonitor({"colour": colour}, **settings | given)
     for step in range(steps):
         light = TARGET * (colour / 0.7)[:, None, None, None]
@@ -79,7 +80,7 @@ def test_the_noise_is_that_of_recent_gradients(tmp_path):
     """A constant of 1 and white noise of spread 2, after gradients a thousand times larger: 4 of 5 parts are noise."""
     generator = torch.Generator().manual_seed(3)
     x = torch.zeros(100, requires_grad=True)
-    monitor = tt.vis.FitMonitor({"x": x}, live=False)
+    monitor = tt.vis.FitMonitor({"x": x}, live=False, every=10)
     for step in range(101):
         x.grad = torch.full((100,), 1000.0) if step < 30 else 1 + 2 * torch.randn(100, generator=generator)
         monitor.step(1.0)
@@ -95,6 +96,32 @@ def test_every_step_and_steps_of_ones_own(tmp_path):
     monitor.step(1.0, step=40)
     monitor.step(0.5)
     assert saved(monitor, tmp_path)["panels"][0]["curves"][0]["x"] == [40, 41]
+
+
+@pytest.mark.parametrize("look_ms", [0.3, 3.0])
+def test_looks_take_one_hundredth_of_the_time(tmp_path, monkeypatch, look_ms):
+    """By a clock that goes on by 3 ms in each step of the loop, and by so much where light is read."""
+    now = [5.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    class Output:
+        axis = None
+
+        @property
+        def transient(self):
+            now[0] += look_ms / 1e3 / 10
+            return TARGET
+
+    monitor = tt.vis.FitMonitor({"x": torch.ones(3, requires_grad=True)}, target=TARGET, live=False)
+    spent, output = 0.0, Output()
+    for _ in range(1000):
+        now[0] += 3e-3
+        begin = now[0]
+        monitor.step(1.0, output)
+        spent += now[0] - begin
+    steps = [moment["step"] for moment in saved(monitor, tmp_path)["moments"]]
+    assert steps[0] == 0 and 0.004 * (now[0] - 5.0) < spent < 0.0105 * (now[0] - 5.0)
+    assert np.ptp(np.diff(steps[:-1])) <= 1
 
 
 def test_long_fits_keep_evenly_spread_moments(tmp_path):
@@ -158,8 +185,7 @@ def test_a_figure_shows_the_state(tmp_path):
     pictures = [axes for axes in figure.axes if axes.images]
     expected = ["start", "target", "step 20"]
     assert [axes.get_title() for axes in pictures][:3] == expected
-    exposure = exposure_of(TARGET.sum(1))
-    np.testing.assert_allclose(pictures[1].images[0].get_array() / 255, tone_map(TARGET.sum(1), exposure), atol=0.003)
+    np.testing.assert_allclose(pictures[1].images[0].get_array() / 255, tt.vis.tone_map(TARGET.sum(1)), atol=0.003)
     titles = [axes.get_title() for axes in figure.axes[4:]]
     assert titles == ["row 1, column 2", "loss", "noise of the gradient (1: random)", "colour"]
     monitor.save(tmp_path / "fit.png")
@@ -201,7 +227,7 @@ def test_tensorboard(tmp_path):
     colours = [f"parameter/colour/{n}" for n in range(3)]
     assert set(log.Tags()["scalars"]) == {"loss/data", "loss/prior", "gradient_noise/colour", *colours}
     prior, colour = log.Scalars("loss/prior"), log.Scalars("parameter/colour/1")
-    assert [(event.step, event.value) for event in prior] == [(n, n + 1.0) for n in range(21)]
+    assert [(event.step, event.value) for event in prior] == [(n, n + 1.0) for n in (0, 10, 20)]
     assert [event.step for event in colour] == [0, 10, 20]
     assert [event.value for event in colour] == pytest.approx([0.2 + 0.5 * n / 21 for n in (0, 10, 20)], rel=1e-5)
     assert log.Images("fit")[-1].step == 20 and log.Images("fit")[-1].width > 500
@@ -271,7 +297,7 @@ def test_the_page_in_a_browser(tmp_path):
 
 def test_losses_that_are_not_finite_are_named(tmp_path):
     """One from a step on, another now and then, beside one that is finite; the axis stays logarithmic."""
-    monitor = tt.vis.FitMonitor({"x": torch.zeros(2)}, target=TARGET, live=False)
+    monitor = tt.vis.FitMonitor({"x": torch.zeros(2)}, target=TARGET, live=False, every=10)
     nan, inf = float("nan"), float("inf")
     for step in range(11):
         light = TARGET * (nan if step > 6 else 1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 import torchtransient as tt
 from support.cubes import AXIS, sweep
 from torchtransient.errors import ShapeError, StorageError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.vis.sources import images_of, phasor_of, steady_of, stokes_of, transient_of
 
 
@@ -128,35 +127,6 @@ def test_which_shapes_are_what():
         phasor_of(turned[:3])
     back = np.arange(30.0).reshape(1, 5, 2, 3)[..., ::-1]
     assert transient_of(back)[0].tolist() == back.tolist()
-
-
-def test_bins_of_stokes_vectors():
-    stokes = torch.rand(4, 3, 5, 2, 6)
-    for frame in (0, 4, -1, -5):
-        assert torch.equal(stokes_of(stokes, frame), stokes[:, :, frame])
-    for frame in (5, -6, 0.5, "x"):
-        with pytest.raises(ShapeError, match="of 5 does not exist"):
-            stokes_of(stokes, frame)
-    assert torch.equal(stokes_of(Output(gated=stokes, polarized=True), 1), stokes[:, :, 1])
-    # A steady image alone has no bins to choose of.
-    assert torch.equal(stokes_of(Output(steady=stokes[:, :, 0], polarized=True), 2), stokes[:, :, 0])
-    # One of all times that is not polarized says less than the transient.
-    assert torch.equal(stokes_of(Output(stokes, stokes[0, :, 0], polarized=True)), stokes.sum(2))
-    for wrong, said in ((Output(stokes[:3], polarized=True), r"got \(3, 3, 5, 2, 6\)"), (Output(), "got neither"),
-                        (Output(steady=stokes[:3, :, 0]), r"got \(3, 3, 2, 6\)")):  # fmt: skip
-        with pytest.raises(ShapeError, match=said):
-            stokes_of(wrong)
-
-
-def test_batches_of_gated_images():
-    with pytest.raises(ShapeError, match="got a batch or several sensors"):
-        images_of(Output(gated=torch.rand(4, 3, 5, 2, 6)))
-    known = SimpleNamespace(transient=torch.rand(4, 1, 5, 2, 3), metadata={"stats": {"variant": "llvm_ad_rgb"}})
-    with pytest.raises(ShapeError, match="got a batch or several sensors"):
-        transient_of(known)
-    for metadata in ({"stats": {"variant": "llvm_mono_polarized"}}, {"stats": None}, {}, None):
-        known.metadata = metadata
-        assert torch.equal(transient_of(known)[0], known.transient[0])
 
 
 def test_names_in_files(tmp_path):

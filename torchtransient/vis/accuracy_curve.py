@@ -40,12 +40,19 @@ class Curve:
 
 
 def plot_accuracy(curves: Sequence[Curve], path: str | Path) -> None:
-    """Write a log-log PNG of squared relative errors, a row per quantity: with the bias, where it is known, and the
-    Pareto front against seconds (left), of the noise against samples per pixel (right).
+    """Write a log-log PNG of squared relative errors, a row per quantity.
 
-    A dashed guide of slope -1 starts at the first point of the first curve: independent samples fall along it. Of more
-    than six curves those on the front have colours, the first ones where there is none, and the others are grey.
-    Raises ShapeError without curves and StorageError when `path` cannot be written. Needs matplotlib (extra `vis`).
+    On the left with the bias, where it is known, and the Pareto front against seconds, on the right of the noise
+    against samples per pixel. A dashed guide of slope -1 starts at the first point of the first curve: independent
+    samples fall along it. Of more than six curves those on the front have colours, the first ones where there is none.
+
+    Args:
+        curves: the lines.
+        path: file to write the picture to.
+
+    Raises:
+        ShapeError: without curves.
+        StorageError: when it cannot be written.
     """
     from matplotlib.figure import Figure
 

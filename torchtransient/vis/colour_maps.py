@@ -39,7 +39,13 @@ CYCLES = ("even", "hsv")
 
 
 def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
-    """sRGB (..., 3) in [0, 1] of Oklch colours; arguments broadcast. Channels out of gamut are clipped."""
+    """Return sRGB colours (..., 3) in [0, 1] of Oklch colours; arguments broadcast, channels out of gamut are clipped.
+
+    Args:
+        lightness: 0 to 1.
+        chroma: 0 for grey.
+        hue_deg: degrees.
+    """
     light, chrom, hue = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (lightness, chroma, hue_deg)))
     angle = np.radians(hue)
     lab = np.stack([light, chrom * np.cos(angle), chrom * np.sin(angle)], axis=-1)
@@ -50,10 +56,11 @@ def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
 
 
 def rainbow(position: Any, value: Any = 1.0) -> Array:
-    """sRGB (..., 3): hue by `position` in [0, 1], from red to violet; brightness by `value` in [0, 1], black at 0.
+    """Return sRGB colours (..., 3) of equal lightness, hue by position from red to violet.
 
-    Hues of one `value` are equally light; at 1 they are as vivid as the screen allows. Positions that are not finite
-    become grey.
+    Args:
+        position: 0 to 1; grey where it is not finite.
+        value: brightness from 0, black, to 1, as vivid as the screen allows.
     """
     place = np.asarray(position, dtype=np.float64)
     known = np.isfinite(place)
@@ -63,9 +70,11 @@ def rainbow(position: Any, value: Any = 1.0) -> Array:
 
 
 def cyclic(turns: Any, value: Any = 1.0) -> Array:
-    """sRGB (..., 3): hue by `turns`, of period 1; brightness by `value` in [0, 1], black at 0. 0 is red.
+    """Return sRGB colours (..., 3) for phases and angles: no jump, and no angle brighter than another.
 
-    For phases and angles of polarization: no jump where the angle has none, and no angle brighter than another.
+    Args:
+        turns: hue, of period 1; 0 is red.
+        value: brightness from 0, black, to 1.
     """
     turn = np.mod(np.nan_to_num(numbers("cyclic: turns", turns)), 1.0)
     level = np.clip(np.nan_to_num(numbers("cyclic: value", value)), 0, 1)
@@ -73,10 +82,14 @@ def cyclic(turns: Any, value: Any = 1.0) -> Array:
 
 
 def cyclic_map(kind: str = "even") -> ListedColormap:
-    """A cyclic matplotlib colour map for bars that run over one period with angle 0 in the middle.
+    """Return a cyclic matplotlib colour map for bars over one period with angle 0 in the middle.
 
-    "even" is `cyclic`; "hsv" is the hue circle of HSV, which papers on polarization often use: its yellow and cyan are
-    lighter than its blue. Raises ArgumentError for another kind.
+    Args:
+        kind: "even" for :func:`cyclic`, or "hsv" for the hue circle of HSV, which papers on polarization often use: its
+            yellow and cyan are lighter than its blue.
+
+    Raises:
+        ArgumentError: for another kind.
     """
     if not is_one_of(kind, CYCLES):
         raise ArgumentError(f"cyclic_map: expected a kind out of {', '.join(CYCLES)}, got {shown(kind)}.")
@@ -98,8 +111,18 @@ def rainbow_map() -> ListedColormap:
 
 
 def symmetric_limit(values: Any, percentile: float = 99.0) -> float:
-    """Half the width of a scale centred at zero: the percentile of |values|; their maximum where that is zero; 1 where
-    all are zero or not finite."""
+    """Return half the width of a scale centred at zero.
+
+    Args:
+        values: numbers of any shape; those that are not finite are left out.
+        percentile: percentile of their sizes.
+
+    Returns:
+        The percentile; the maximum where that is zero, 1 where all are.
+
+    Raises:
+        UnitError: for a percentile outside of 0 to 100.
+    """
     share = as_number(percentile)
     if share is None or not 0 <= share <= 100:
         raise UnitError(f"percentile: expected a number from 0 to 100, got {shown(percentile)}.")

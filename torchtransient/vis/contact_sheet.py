@@ -53,9 +53,21 @@ def contact_sheet(
     times: NDArray[Any] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw samples beside each other. ``times``: (T + 1,) edges of the bins of the curves, metres of optical path.
-    Returns the matplotlib figure; written to ``path`` if given. Raises ShapeError for no cell, StorageError without
-    matplotlib or where it cannot be written.
+    """Draw samples beside each other.
+
+    Args:
+        cells: the samples, all with the same images.
+        path: file to write the figure to.
+        columns: samples in a row; None for a sheet about as high as wide.
+        times: (T + 1,) edges of the bins of the curves, metres of optical path.
+        title: text above the sheet.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: without samples, for different images, and times that do not fit.
+        StorageError: when the figure cannot be written.
     """
     cells = several("contact_sheet", cells, "samples, each a Cell", Cell)
     if not cells:
@@ -115,7 +127,7 @@ def _checked_times(times: Any, cells: Sequence[Cell]) -> NDArray[np.float64] | N
 
 
 def _plain_size(image: Any) -> tuple[int, ...]:
-    """The shape of an image; of one dimension for what is no array of numbers."""
+    """Return the shape of an image; (0,) for anything but an array of numbers."""
     plain = np.asarray(image) if hasattr(image, "__array__") else np.asarray(None)
     return plain.shape if plain.dtype.kind in "biuf" else (0,)
 
@@ -126,7 +138,7 @@ def _cut(title: str, pictures: int) -> str:
 
 
 def _share(box: tuple[float, float, float, float], figure: Any) -> tuple[float, float, float, float]:
-    """Inches from the lower left as shares of the figure."""
+    """Return inches from the lower left as shares of the figure."""
     width, height = figure.get_size_inches()
     return box[0] / width, box[1] / height, box[2] / width, box[3] / height
 

@@ -22,12 +22,25 @@ Image = NDArray[np.uint8]
 
 
 def to_bytes(image: Any) -> Image:
-    """[0, 1] to uint8, rounded to nearest."""
+    """Round [0, 1] to uint8.
+
+    Args:
+        image: numbers of any shape; those outside are clipped.
+    """
     return np.asarray(np.clip(np.asarray(image, dtype=np.float64), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def save_image(image: Image, path: str | Path | None, who: str) -> Image:
-    """Write an RGB image (H, W, 3) uint8 as PNG or JPEG, unless `path` is None; returns it. Raises StorageError."""
+    """Write an RGB image and return it.
+
+    Args:
+        image: (H, W, 3) uint8.
+        path: file, PNG or JPEG by its ending; None writes none.
+        who: beginning of messages.
+
+    Raises:
+        StorageError: when it cannot be written.
+    """
     if path is None:
         return image
     try:
@@ -40,7 +53,17 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
 
 
 def save_figure(figure: Figure, path: str | Path | None, who: str, dpi: int = 120) -> Figure:
-    """Write a matplotlib figure, unless `path` is None; returns it. Raises StorageError."""
+    """Write a matplotlib figure and return it.
+
+    Args:
+        figure: the figure.
+        path: file, ``.png`` where it has no ending; None writes none.
+        who: beginning of messages.
+        dpi: dots per inch.
+
+    Raises:
+        StorageError: when it cannot be written.
+    """
     if path is None:
         return figure
     if isinstance(path, (str, Path)) and not Path(path).suffix:  # as matplotlib has it
@@ -51,8 +74,16 @@ def save_figure(figure: Figure, path: str | Path | None, who: str, dpi: int = 12
 
 
 def check_picture(path: str | Path, who: str = "picture") -> None:
-    """Raise StorageError when matplotlib could not write to `path`, MissingPackageError without it. For before a long
-    render."""
+    """Check before a long render that matplotlib can write a picture.
+
+    Args:
+        path: file of the picture.
+        who: beginning of messages.
+
+    Raises:
+        StorageError: for a folder that is missing, or an ending that matplotlib does not know.
+        MissingPackageError: without matplotlib.
+    """
     check_folder(path, who)
     figure_type()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -65,7 +96,7 @@ def check_picture(path: str | Path, who: str = "picture") -> None:
 
 @contextmanager
 def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
-    """A name to write a picture to that takes the place of `path` once it is whole, and the ending of `path`."""
+    """Yield a name to write to, which takes the place of `path` once it is whole, and the ending of `path`."""
     try:
         target = check_folder(path, who)
         with replacing(target, who) as unfinished:
@@ -79,8 +110,10 @@ def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
 
 
 def to_palette(path: str | Path) -> None:
-    """Write the picture of a PNG file again with 256 colours: plots and renders in a third of the bytes, off by 2 of
-    255 in the mean and 20 at most. Files of other kinds are left as they are.
+    """Write a PNG file again with 256 colours: a third of the bytes, off by 2 of 255 in the mean and 20 at most.
+
+    Args:
+        path: the file; of other kinds it is left as it is.
     """
     from PIL import Image as Pillow
 
@@ -92,7 +125,7 @@ def to_palette(path: str | Path) -> None:
 
 
 def figure_type() -> type[Figure]:
-    """matplotlib's Figure, which draws without a window; MissingPackageError when matplotlib is not there."""
+    """Return matplotlib's Figure, which draws without a window. Raises MissingPackageError without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -101,7 +134,14 @@ def figure_type() -> type[Figure]:
 
 
 def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, columns: int = 4) -> tuple[Figure, Any]:
-    """A figure for `panels` images of the given size in pixels, and its axes as a flat list without frames."""
+    """Return a figure for images of one size, and its axes as a flat list without frames.
+
+    Args:
+        height, width: pixels of an image.
+        panels: number of images.
+        side: width of an image, inches.
+        columns: most images in a row.
+    """
     rows = math.ceil(panels / columns)
     columns = math.ceil(panels / rows)  # five as three and two, not as four and one
     ratio = min(max(height / width, 0.25), 4.0)
@@ -115,13 +155,21 @@ def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, 
 
 
 def enlarge(image: Image, factor: int) -> Image:
-    """Every pixel as a square of `factor` pixels. Raises ShapeError when `factor` is not a whole number >= 1."""
+    """Return an image with every pixel as a square.
+
+    Args:
+        image: (H, W, 3) uint8.
+        factor: side of the square.
+
+    Raises:
+        ShapeError: unless the factor is a whole number of at least 1.
+    """
     factor = count("picture: scale", factor, 1, ShapeError)
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def missing(package: str) -> MissingPackageError:
-    """The error for a package that pictures need."""
+    """Return the error for a package that pictures need."""
     return MissingPackageError(
         f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
     )

@@ -36,7 +36,7 @@ MOST_CURVES = 12
 # A page has up to twice as many moments: of more, every second is dropped.
 MOST_MOMENTS = 60
 MOST_PIXELS = 128
-# Figures of notebooks and TensorBoard take this share of the time of the loop, after the first.
+# Looks take this share of the time of the loop by default, and figures of notebooks and TensorBoard as much.
 SHARE = 0.01
 # Pairs of successive gradients of which the noise is a mean: none is of a larger gradient long ago.
 _WINDOW = 20
@@ -57,29 +57,55 @@ class _Light:
 
 
 class _Gradient:
-    """Norms of the last gradients and of the differences of successive ones, on their device until they are asked."""
+    """Norms and differences of the last pairs of successive gradients, on their device until they are asked."""
 
     def __init__(self) -> None:
         self._before: Tensor | None = None
-        self._norms: deque[Tensor] = deque(maxlen=_WINDOW + 1)
-        self._changes: deque[Tensor] = deque(maxlen=_WINDOW)
+        self._step = -1
+        self._norm: Tensor | None = None
+        self._pairs: deque[tuple[Tensor, Tensor, Tensor]] = deque(maxlen=_WINDOW)
 
-    def add(self, now: Tensor) -> None:
-        self._norms.append(torch.linalg.vector_norm(now))
-        if self._before is None:
+    def add(self, step: int, now: Tensor) -> None:
+        norm = torch.linalg.vector_norm(now)
+        if self._before is None or self._norm is None:
             self._before = now.clone()
-            return
-        self._changes.append(torch.dist(now, self._before))
-        self._before.copy_(now)
+        else:
+            if step == self._step + 1:
+                self._pairs.append((self._norm, norm, torch.dist(now, self._before)))
+            self._before.copy_(now)
+        self._step, self._norm = step, norm
 
     def share(self) -> float | None:
-        """Half of the squared differences over the squares of the gradients; None before there are two."""
-        if not self._changes:
+        """Half of the squared differences over the mean squares of their gradients; None before there is a pair."""
+        if not self._pairs:
             return None
-        squares = [number * number for number in torch.stack([*self._norms, *self._changes]).tolist()]
-        norms, changes = squares[: len(self._norms)], squares[len(self._norms) :]
-        power = sum(norms[1:]) + sum(norms[:-1])
-        return sum(changes) / power if power > 0 else float("nan")
+        first, second, changes = torch.stack([torch.stack(pair) for pair in self._pairs]).double().square().sum(0)
+        power = float(first + second)
+        return float(changes) / power if power > 0 else float("nan")
+
+
+class _Turns:
+    """Steps that are looked at: each ``every``-th, or as often as looks take ``SHARE`` of the time since the last."""
+
+    def __init__(self, every: int | None) -> None:
+        self._every = every
+        self._again, self._paired, self._cost = 0.0, False, 0.0
+
+    def begin(self, number: int, now: float) -> tuple[bool, bool]:
+        """Return masks of a step: it is looked at; its gradient is taken."""
+        if self._every is not None:
+            return number % self._every == 0, True
+        # The gradients of a look are those of its step and of the one before.
+        look = self._paired or self._again == 0.0
+        self._paired = not look and now >= self._again
+        return look, look or self._paired
+
+    def end(self, begin: float, look: bool) -> None:
+        """Count the time of a step."""
+        now = time.perf_counter()
+        self._cost += now - begin
+        if look:
+            self._again, self._cost = now + self._cost / SHARE, 0.0
 
 
 @dataclass
@@ -98,13 +124,15 @@ class FitMonitor:
     """Losses, parameters, light beside its target and the noise of gradients of a training loop, as it runs.
 
     Call :meth:`step` once in each step, after ``backward``. In a notebook one figure is shown and brought up to date,
-    ``log_dir`` makes a TensorBoard log, and :meth:`save` writes a page for a browser. After the first figure, those of
-    notebooks and logs are drawn so rarely that they take 1 % of the loop's time; pages are drawn when they are saved.
-    Needs matplotlib and Pillow (extra ``vis``).
+    ``log_dir`` makes a TensorBoard log, and :meth:`save` writes a page for a browser. Looks at parameters, light and
+    gradients come so rarely that they take 1 % of the loop's time, unless ``every`` says how often; figures of
+    notebooks and logs take as much, after the first. Pages are drawn when they are saved. Needs matplotlib and Pillow
+    (extra ``vis``).
 
     The noise of a gradient is the part of its square that changes from one step to the next: half the square of the
-    difference of successive gradients over their mean square, both averaged over the last 20 steps. It is 0 for equal
-    gradients, 1 for random ones, and up to 2 where steps overshoot.
+    difference of successive gradients over their mean square, both averaged over 20 pairs of successive steps, the last
+    ones with ``every``, else those that were looked at. It is 0 for equal gradients, 1 for random ones, and up to 2
+    where steps overshoot.
 
     Args:
         parameters: a renderer, whose ``values`` are shown; another ``nn.Module``; or ``{name: tensor}``. Up to 12
@@ -114,10 +142,10 @@ class FitMonitor:
         pixels: pixels (row, column) whose histograms are shown, measured and rendered, summed over channels.
         truth: values aimed at by name, dashed.
         axis: time axis of the histograms; None takes the output's or the renderer's.
-        every: steps from one point of the curves, and one moment of a page, to the next; losses have all points. A
-            page has 120 moments at most, evenly spread.
+        every: steps from one point of the curves, and one moment of a page, to the next; None for as many as take 1 %
+            of the time. Losses have all points. A page has 120 moments at most, evenly spread.
         log_dir: folder of a TensorBoard log: scalars ``loss/NAME``, ``parameter/NAME``, ``gradient_noise/NAME``, and
-            the picture ``fit``. Needs the package tensorboard (extra ``tensorboard``).
+            the picture ``fit``, all of them at looks. Needs the package tensorboard (extra ``tensorboard``).
         live: True shows the figure with IPython; None does so in notebooks.
 
     Raises:
@@ -134,7 +162,7 @@ class FitMonitor:
         pixels: Sequence[tuple[int, int]] = (),
         truth: Mapping[str, Any] | None = None,
         axis: TimeAxis | None = None,
-        every: int = 10,
+        every: int | None = None,
         log_dir: str | Path | None = None,
         live: bool | None = None,
     ) -> None:
@@ -142,7 +170,7 @@ class FitMonitor:
             given = mapping("FitMonitor: parameters", parameters, "{name: tensor}, or a module")
             parameters = {name: given_tensor(value, f"FitMonitor: {name!r}") for name, value in given.items()}
         self._parameters = parameters
-        self._every = count("FitMonitor: every", every, error=ShapeError)
+        self._turns = _Turns(None if every is None else count("FitMonitor: every", every, error=ShapeError))
         self._axis = axis if axis is not None else getattr(parameters, "axis", None)
         self._pixels: list[Any] = list(several("FitMonitor: pixels", pixels, "pixels (row, column)"))
         self._target = None if target is None else self._light(0, target)
@@ -159,13 +187,13 @@ class FitMonitor:
         self._gradients = {name: _Gradient() for name, _ in self._differentiated}
         self._lights: list[_Light] = []
         self._now: _Light | None = None
-        self._between = self._every
+        self._looks, self._between = 0, 1
         self._live = _in_notebook() if live is None else live
         self._writer = None if log_dir is None else _writer(path_of(log_dir, "FitMonitor: log_dir"))
         if self._live or self._writer is not None:
             figure_type()  # whose import is no cost of a step
         self._handle: Any = None
-        self._begin, self._spent, self._last = time.perf_counter(), 0.0, 0.0
+        self._draw_again = 0.0
 
     # -------------------------------------------------------------------------------------------------- in the loop
 
@@ -177,7 +205,7 @@ class FitMonitor:
 
         Args:
             loss: a number, or several by name.
-            output: light of the step, in the form and unit of ``target``; looked at every ``every`` steps.
+            output: light of the step, in the form and unit of ``target``; read in steps that are looked at.
             step: number of the step; None counts on.
 
         Raises:
@@ -186,13 +214,18 @@ class FitMonitor:
         """
         number = self._next if step is None else count("FitMonitor.step: step", step, 0, ArgumentError)
         self._next = number + 1
+        begin = time.perf_counter()
+        look, taken = self._turns.begin(number, begin)
         losses = loss if isinstance(loss, Mapping) else {"loss": loss}
         self._pending.append((number, {name: _number(name, value) for name, value in losses.items()}))
-        for key, leaf in self._differentiated:
+        for key, leaf in self._differentiated if taken else ():
             if leaf.grad is not None:
-                self._gradients[key].add(leaf.grad)
-        if number % self._every == 0:
+                self._gradients[key].add(number, leaf.grad)
+        if look:
             self._look(number, output)
+        self._turns.end(begin, look)
+        if look and (self._live or self._writer is not None) and time.perf_counter() >= self._draw_again:
+            self._show()
 
     def _look(self, number: int, output: Source | None) -> None:
         self._take_losses()
@@ -205,17 +238,15 @@ class FitMonitor:
         if output is not None:
             self._take_light(self._light(number, output))
         if self._writer is not None:
+            for name, track in self._losses.items():
+                if track.steps[-1] == number:
+                    self._writer.add_scalar(f"loss/{name}", track.rows[-1][0], number)
             for kind, tracks in (("parameter", self._values), ("gradient_noise", self._noise)):
                 for name, track in tracks.items():
                     row = track.rows[-1] if track.steps[-1] == number else []
                     for n, entry in enumerate(row):
                         word = _word(name, n, len(row), of_many=kind == "parameter" and self._is_many(name))
                         self._writer.add_scalar(f"{kind}/{word}", entry, number)
-        if (self._live or self._writer is not None) and self._may_draw():
-            self._show()
-
-    def _may_draw(self) -> bool:
-        return self._last == 0 or self._spent + self._last <= SHARE * (time.perf_counter() - self._begin)
 
     def _leaves(self) -> Iterator[tuple[str, Tensor]]:
         if isinstance(self._parameters, nn.Module):
@@ -250,8 +281,6 @@ class FitMonitor:
         for number, losses in self._pending:
             for name, value in losses.items():
                 self._losses.setdefault(name, _Track()).add(number, [float(value)])
-                if self._writer is not None:
-                    self._writer.add_scalar(f"loss/{name}", float(value), number)
         self._pending.clear()
 
     def _light(self, number: int, source: Source) -> _Light:
@@ -282,12 +311,13 @@ class FitMonitor:
                 f"{tuple(self._target.image.shape)}, got {tuple(light.image.shape)}."
             )
         self._now = light
-        if self._lights and light.step % self._between:
+        self._looks += 1
+        if (self._looks - 1) % self._between:
             return
         self._lights.append(light)
         if len(self._lights) > 2 * MOST_MOMENTS:
             self._between *= 2
-            self._lights = self._lights[:1] + [kept for kept in self._lights[1:] if kept.step % self._between == 0]
+            self._lights = self._lights[::2]
 
     # ------------------------------------------------------------------------------------------------------ pictures
 
@@ -377,8 +407,8 @@ class FitMonitor:
             self._writer.add_image("fit", _drawn(figure), self._next - 1, dataformats="HWC")
         if self._live:
             self._handle = _display(figure, self._handle)
-        self._last = time.perf_counter() - begin
-        self._spent += self._last
+        now = time.perf_counter()
+        self._draw_again = now + (now - begin) / SHARE
 
     def _panels(self) -> list[Panel]:
         """Losses, gradient noise, and each parameter over the steps."""

@@ -51,7 +51,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Moment:
-    """What the slider shows at a step."""
+    """Pictures and panels of a position of the slider."""
 
     step: int
     pictures: Sequence[Picture]
@@ -61,7 +61,18 @@ class Moment:
 def write_page(
     path: str | Path, panels: Sequence[Panel], moments: Sequence[Moment], fixed: Sequence[Picture], who: str
 ) -> None:
-    """Write the page: `panels` over the steps, `fixed` pictures, and those of `moments`. Raises StorageError."""
+    """Write a page with a slider over moments.
+
+    Args:
+        path: the file.
+        panels: curves over the steps.
+        moments: positions of the slider.
+        fixed: pictures that stay.
+        who: beginning of messages.
+
+    Raises:
+        StorageError: when it cannot be written.
+    """
     data = {
         "panels": [_panel(panel) for panel in panels],
         "fixed": [_picture(picture) for picture in fixed],

@@ -38,14 +38,25 @@ def phasor_picture(
     percentile: float = 99.0,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of phasor images: a row for each frequency of `which`, a panel for each of `show`.
+    """Draw phasor images, a row for each frequency and a panel for each quantity.
 
-    "real" and "imaginary": blue to red around zero, on one symmetric scale that holds `percentile` of the pixels;
-    "amplitude"; "phase": cyclic hue, grey where dark; "domain": hue by phase and brightness by amplitude. `source`:
-    complex (C, F, H, W) or a result with such a `phasor`; channels are added up. `frequencies` (cycles per metre of
-    optical path, or a FrequencyAxis) are for the titles. Pixels that are not finite are grey. Writes the figure when
-    `path` is given. Raises ShapeError for another shape or an index outside, UnitError for an unknown panel,
-    StorageError.
+    Args:
+        source: complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
+        path: file to write the figure to.
+        show: panels. "real" and "imaginary", blue to red around zero on one symmetric scale; "amplitude"; "phase",
+            cyclic hue, grey where dark; "domain", hue by phase and brightness by amplitude.
+        which: indices of the frequencies.
+        frequencies: cycles per metre of optical path, for titles; None takes those of the source.
+        percentile: percentile of the pixels that scales hold.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure. Pixels that are not finite are grey.
+
+    Raises:
+        ShapeError: for another shape, an index outside, other numbers of frequencies.
+        UnitError: for an unknown panel.
+        StorageError: when the figure cannot be written.
     """
     show = several("phasor_picture: show", show, "names of panels", str, UnitError)
     if not show or any(name not in SHOWS for name in show):
@@ -76,11 +87,27 @@ def phasor_video(
     scale: int | None = None,
     progress: bool = False,
 ) -> Path:
-    """Write one period of `Re(P exp(i phi))` as a video that can be looped: the wave that the modulated light makes.
+    """Write one period of ``Re(P exp(i phi))``, the wave that modulated light makes, as a video that can be looped.
 
-    `phi` grows, and with the phasor `exp(-2 pi i nu opl)` of this library crests run from early to late pixels, as
-    light does. Blue to red around zero on one symmetric scale. `source` as in `phasor_picture`. Returns the path.
-    Raises ShapeError, and StorageError as `video` does.
+    With growing ``phi`` and phasors ``exp(-2 pi i nu opl)`` crests run from early to late pixels, as light does. Blue
+    to red around zero on one symmetric scale.
+
+    Args:
+        source: as for :func:`phasor_picture`.
+        path: file, ``.mp4`` or ``.gif``.
+        which: index of the frequency.
+        steps: number of frames.
+        fps: frames per second.
+        frequencies: cycles per metre, for the text; None takes those of the source.
+        scale: screen pixels of a pixel; None for some 320 in all.
+        progress: show a bar.
+
+    Returns:
+        The path.
+
+    Raises:
+        ShapeError: for another shape or an index outside.
+        StorageError: as of ``video``.
     """
     check_video(path)
     images, known = _images(source, "phasor_video")
@@ -103,10 +130,11 @@ def phasor_video(
 
 
 def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.float64]:
-    """RGB (..., 3) in [0, 1] of complex values: hue by phase (0 is red), brightness by the root of the amplitude.
+    """Return RGB (..., 3) in [0, 1] of complex values: hue by phase, red at 0, brightness by the root of the amplitude.
 
-    White-balanced hues of equal lightness; the given percentile of the amplitudes is fully bright. Values that are not
-    finite are grey.
+    Args:
+        values: complex numbers of any shape; grey where they are not finite.
+        percentile: percentile of the amplitudes that is fully bright.
     """
     values = _plain(values)
     finite = np.isfinite(values)
@@ -119,7 +147,7 @@ def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.
 
 
 def _plain(values: Any) -> NDArray[Any]:
-    """Real or complex numbers as an array."""
+    """Return real or complex numbers as an array."""
     try:
         plain = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
     except ValueError:  # rows of different lengths

@@ -33,10 +33,16 @@ _ROWS_AT_ONCE = 32
 
 
 def light_curve(transient: Tensor) -> Tensor:
-    """(T,) float64: when the light of a pixel arrives, averaged over the pixels; sums to 1, or is 0 without light.
+    """Return the share of a pixel's light that arrives in each bin, averaged over the pixels that see light.
 
-    Every pixel that sees light counts alike, whether it sees the lamp itself or a dark corner. `transient` is
-    (C, T, H, W), else ShapeError.
+    Args:
+        transient: (C, T, H, W), C = 1 or 3.
+
+    Returns:
+        (T,) float64, which sums to 1; 0 without light.
+
+    Raises:
+        ShapeError: for another shape.
     """
     transient = _checked(transient, "light_curve")
     total = torch.zeros(transient.shape[1], dtype=torch.float64, device=transient.device)
@@ -51,9 +57,17 @@ def light_curve(transient: Tensor) -> Tensor:
 
 
 def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
-    """(H, W) float64, metres: centre of the bin in which most light (sum over channels) arrives; NaN where none does.
+    """Return when most light (sum over channels) arrives at each pixel.
 
-    The first of equal bins counts. Raises ShapeError when the transient is not (C, T, H, W) with the axis' T.
+    Args:
+        transient: (C, T, H, W), C = 1 or 3.
+        axis: its time axis.
+
+    Returns:
+        (H, W) float64, metres: centre of the brightest bin, the first of equal ones; NaN without light.
+
+    Raises:
+        ShapeError: for another shape, and another number of bins.
     """
     transient = _on_axis(transient, axis, "peak_time")
     centers = axis.centers_opl.to(transient.device)
@@ -65,9 +79,14 @@ def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
 
 
 def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5, 0.9)) -> list[int]:
-    """Indices of the bins by which the given shares of the `light_curve` have arrived; they differ if they can.
+    """Return the bins by which shares of the :func:`light_curve` have arrived, different ones if they can be.
 
-    Without any light they are spread evenly. Raises ShapeError when the transient is not (C, T, H, W).
+    Args:
+        transient: (C, T, H, W), C = 1 or 3.
+        shares: shares of the light, rising; without any light, of the bins.
+
+    Raises:
+        ShapeError: for another shape.
     """
     arrived = light_curve(transient).cumsum(0)
     bins = arrived.numel()
@@ -82,9 +101,13 @@ def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5,
 
 
 def median_pixel(steady: Tensor) -> tuple[int, int]:
-    """(row, column) of the pixel of median brightness among those of a steady image (C, H, W) that see light.
+    """Return (row, column) of the pixel of median brightness among those that see light: neither the lamp nor darkness.
 
-    Neither the lamp nor a corner in the dark. Raises ShapeError for another shape.
+    Args:
+        steady: (C, H, W).
+
+    Raises:
+        ShapeError: for another shape.
     """
     steady = real_tensor(steady, "median_pixel")
     if steady.ndim != 3 or steady.numel() == 0:
@@ -97,7 +120,7 @@ def median_pixel(steady: Tensor) -> tuple[int, int]:
 
 
 def _row_bands(transient: Tensor) -> Iterator[Tensor]:
-    """Parts of some rows: the sum over channels of a whole cube would be a third of it once more."""
+    """Yield parts of some rows: the sum over channels of a whole cube would be a third of it once more."""
     for row in range(0, transient.shape[2], _ROWS_AT_ONCE):
         yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
 
@@ -126,7 +149,7 @@ def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
 
 @dataclass(frozen=True)
 class Overview:
-    """What `plot_overview` draws beside the images: the moments shown (bins) and the pixel (row, column)."""
+    """Moments (bins) and pixel (row, column) that `plot_overview` has drawn."""
 
     frames: tuple[int, ...]
     pixel: tuple[int, int]
@@ -142,14 +165,25 @@ def plot_overview(
     title: str = "",
     errors: Tensor | None = None,
 ) -> Overview:
-    """Write a picture (PNG, or what the ending says) of a render and return what it shows.
+    """Draw a render on one page: steady image, time of the peak, three moments, the histogram of a pixel.
 
-    `transient` (C, T, H, W) and `steady` (C, H, W), C = 1 or 3 in linear sRGB. `pixel` (row, column) defaults to the
-    `median_pixel`. Each image has its own exposure. `errors` (T, H, W), the `error_map` of a render with `errors=`: a
-    band of two standard errors around the mean over channels in the histogram of the pixel.
+    Args:
+        transient: (C, T, H, W), C = 1 or 3 in linear sRGB.
+        steady: (C, H, W). Each image has its own exposure.
+        axis: time axis.
+        path: file to write the picture to.
+        pixel: (row, column); None for one of median brightness.
+        title: text above the picture.
+        errors: (T, H, W), the ``error_map`` of a render with ``errors=``: a band of two standard errors around the mean
+            over channels in the histogram.
 
-    Raises ShapeError for other shapes or a pixel outside, and StorageError when the file cannot be written. Needs
-    matplotlib (extra `vis`).
+    Returns:
+        The moments and the pixel that are shown.
+
+    Raises:
+        ShapeError: for other shapes or a pixel outside.
+        StorageError: when the file cannot be written.
+        MissingPackageError: without matplotlib (extra ``vis``).
     """
     transient, steady = _on_axis(transient, axis, "plot_overview"), real_tensor(steady, "plot_overview: steady")
     height, width = transient.shape[-2:]
@@ -226,11 +260,21 @@ def peak_time_picture(
     limits: tuple[float, float] | None = None,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of the `peak_time` of every pixel, with a colour bar in metres and in nanoseconds.
+    """Draw the :func:`peak_time` of every pixel, with a colour bar in metres and in nanoseconds.
 
-    `source` and `axis` as in `frames`; `limits` are the ends of the scale in metres (None: where 1 % and 99 % of the
-    pixels are). Pixels without light are grey. Writes the figure when `path` is given. Raises ShapeError, also without
-    an axis, UnitError for limits that do not rise, and StorageError.
+    Args:
+        source, axis: as in ``frames``.
+        path: file to write the figure to.
+        limits: ends of the scale, metres; None for where 1 % and 99 % of the pixels are.
+        title: text above the picture.
+
+    Returns:
+        The matplotlib figure. Pixels without light are grey.
+
+    Raises:
+        ShapeError: for other shapes, and without an axis.
+        UnitError: for limits that do not rise.
+        StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "peak_time_picture")
     axis = axis_of(cube, axis, "peak_time_picture")
@@ -257,14 +301,25 @@ def rainbow(
     period_opl: float | None = None,
     exposure: float | None = None,
 ) -> Image:
-    """RGB (H, W, 3) uint8: hue says when, brightness how much light arrives. Red is early, violet late.
+    """Draw when light arrives as hue, red is early and violet late, and how much as brightness.
 
-    `style` "peak" gives every pixel the hue of its `peak_time`; "fusion" adds up the light of all bins, each in its own
-    hue, so that early and late light mix as coloured lamps do. Hues run once over `limits` (metres; None: from 1 % to
-    99 % of the `light_curve`), or again and again every `period_opl` metres, which draws lines of equal time.
-    Brightness is the steady intensity (sum over channels) on the sRGB curve; `exposure` None makes 5 % of it white.
-    Pixels that are not finite are magenta. Without an axis, lengths are counted in bins. Writes the image when `path`
-    is given. Raises ArgumentError, ShapeError, UnitError and StorageError.
+    Args:
+        source, axis: as in ``frames``. Without an axis, lengths are counted in bins.
+        path: file to write the image to.
+        style: "peak" gives every pixel the hue of its :func:`peak_time`; "fusion" adds up the light of all bins, each
+            in its own hue, so that early and late light mix as coloured lamps do.
+        limits: lengths over which hues run once, metres; None for 1 % to 99 % of the :func:`light_curve`.
+        period_opl: metres after which hues repeat, which draws lines of equal time.
+        exposure: factor of the sum over channels before the sRGB curve; None makes 5 % of the pixels white.
+
+    Returns:
+        RGB (H, W, 3) uint8. Pixels that are not finite are magenta.
+
+    Raises:
+        ArgumentError: for another style.
+        ShapeError: for other shapes.
+        UnitError: for limits that do not rise, and a period or an exposure that is not positive.
+        StorageError: when the image cannot be written.
     """
     if not is_one_of(style, STYLES):
         raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {shown(style)}.")
@@ -285,7 +340,7 @@ def rainbow(
 
 
 def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: float, high: float) -> None:
-    """A colour bar with metres on its right and nanoseconds on its left."""
+    """Draw a colour bar with metres on its right and nanoseconds on its left."""
     bar = figure.colorbar(image, ax=panel, shrink=0.85, pad=0.2)
     bar.set_label("optical path length (m)")
     twin = bar.ax.twinx()
@@ -306,7 +361,7 @@ def _hue(opl: NDArray[np.float64], low: float, high: float, period: float | None
 
 
 def _fused(cube: Tensor, hues: NDArray[np.float64], level: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear colours of the bins, mixed with their share of a pixel's light and brought to its brightness."""
+    """Return linear colours of the bins, mixed with their share of a pixel's light and brought to its brightness."""
     colours = torch.from_numpy(_to_linear(colour_maps.rainbow(hues)))
     values = cube.sum(0).clamp(min=0)
     share = values / values.sum(0).clamp(min=torch.finfo(values.dtype).tiny)
@@ -339,7 +394,15 @@ def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
 
 
 def checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
-    """Two lengths in metres. Raises ShapeError for what is no pair of numbers, UnitError for those that do not rise."""
+    """Return two lengths in metres.
+
+    Args:
+        limits: the pair.
+
+    Raises:
+        ShapeError: for anything else than two numbers.
+        UnitError: for lengths that do not rise.
+    """
     pair = checks.real_array(limits)
     if pair is None or pair.shape != (2,):
         raise ShapeError(f"limits: expected two lengths in metres, got {shown(limits)}.")
@@ -362,11 +425,21 @@ def streak(
     exposure: float | None = None,
     curve: str = "log",
 ) -> Figure:
-    """A matplotlib figure as a streak camera sees it: one row (or one column) of pixels over time, time downwards.
+    """Draw one row or column of pixels over time, as a streak camera sees it, time downwards.
 
-    Give `row` or `column` (None: the middle row). `source` and `axis` as in `frames`; `exposure` and `curve` as in
-    `tone_map`, whose "log" shows the front and what follows it. Writes the figure when `path` is given. Raises
-    ShapeError for a line outside of the image, or both given; UnitError; StorageError.
+    Args:
+        source, axis: as in ``frames``.
+        path: file to write the figure to.
+        row, column: the line, one of both; None for the middle row.
+        exposure, curve: as in ``tone_map``, whose "log" shows the front and weak light behind it.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ArgumentError: for a row and a column.
+        ShapeError: for other shapes and a line outside of the image.
+        StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "streak")
     if row is not None and column is not None:
@@ -409,12 +482,24 @@ def frame_grid(
     curve: str = "srgb",
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of moments, each with its time.
+    """Draw moments beside each other, each with its time.
 
-    `bins` names them; None takes `count` moments between which equal shares of the light arrive. `exposure` None lets
-    every frame have its own, since late light is far weaker than early light; give a number to compare frames.
-    `source`, `axis` and `curve` as in `frames`. Writes the figure when `path` is given. Raises ShapeError for a bin
-    outside of the axis or no bins, UnitError and StorageError.
+    Args:
+        source, axis: as in ``frames``.
+        path: file to write the figure to.
+        bins: bins that are shown; None takes ``count`` moments between which equal shares of the light arrive.
+        count: number of moments.
+        columns: most moments in a row.
+        exposure: factor for all moments; None gives each its own, for late light is far weaker than early light.
+        curve: as in ``tone_map``.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: for other shapes, no bins, and bins outside of the axis.
+        StorageError: when the figure cannot be written.
     """
     cube, axis, word = images_of(source, axis, "frame_grid")
     total = cube.shape[1]
@@ -450,11 +535,22 @@ def histogram(
     log: bool = False,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of what some pixels (row, column) see over time, a panel each.
+    """Draw light over time of some pixels, a panel each.
 
-    Three channels are red, green and blue lines, one is black, others go from violet to yellow; `log` takes a
-    logarithmic scale. `source` and `axis` as in `frames`, with any number of channels. Writes the figure when `path` is
-    given. Raises ShapeError without pixels, or for one outside of the image, and StorageError.
+    Args:
+        source, axis: as in ``frames``, with any number of channels: three are red, green and blue lines, one is black,
+            others go from violet to yellow.
+        path: file to write the figure to.
+        pixels: (row, column) of each.
+        log: take a logarithmic scale.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: without pixels, and for one outside of the image.
+        StorageError: when the figure cannot be written.
     """
     cube, axis, word = images_of(source, axis, "histogram", any_channels=True)
     height, width = cube.shape[2:]
@@ -517,14 +613,25 @@ def gradient_picture(
     label: str = "",
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of a gradient (C, H, W) or (H, W): blue is negative, white zero, red positive.
+    """Draw a gradient: blue is negative, white zero, red positive.
 
-    The scale is symmetric around zero and ends at `limit`, or at the given percentile of the absolute values: some
-    noisy pixels then do not hide the others. Channels are added up, or shown in a panel each with `per_channel`, on one
-    scale. A tensor that requires gradients is taken with its `.grad` by you: this draws the values it is given. A
-    texture's gradient (H, W, C) is drawn after `.permute(2, 0, 1)`. Pixels that are not finite are green. Writes the
-    figure when `path` is given. Raises ShapeError, UnitError for a percentile outside of (0, 100] or a limit that is
-    not positive, StorageError.
+    Args:
+        gradient: (C, H, W) or (H, W), numbers themselves, not a tensor that has them as ``.grad``.
+        path: file to write the figure to.
+        percentile: percentile of the sizes at which the symmetric scale ends, so that some noisy pixels do not hide the
+            others.
+        limit: end of the scale in place of the percentile.
+        per_channel: a panel for each channel on one scale, in place of their sum.
+        label: text at the colour bar.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure. Pixels that are not finite are green.
+
+    Raises:
+        ShapeError: for other shapes.
+        UnitError: for a percentile outside of (0, 100] or a limit that is not positive.
+        StorageError: when the figure cannot be written.
     """
     values = as_tensor(gradient, "gradient_picture")
     if values.ndim == 2:

@@ -47,17 +47,27 @@ def polarization_picture(
     angle_map: str = "even",
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of polarization, a panel for each of `quantities`.
+    """Draw polarization, a panel for each quantity.
 
-    Quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow), "aolp" (-90 to 90 degrees, cyclic,
-    the more colourful the more linearly polarized), "docp" (-1 to 1, blue is left and red right circular), "s1", "s2",
-    "s3" (blue to red around zero). Channels are added up before; noise can make degrees exceed one, which are shown as
-    one. Pixels with an intensity below `floor` (None: a hundredth of the median of what is lit) are grey.
+    Args:
+        source: Stokes vectors (4, C, T, H, W) or (4, C, H, W), a result with such, or its file; channels are added up.
+        path: file to write the figure to.
+        quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow; noise above one is shown as one),
+            "aolp" (-90 to 90 degrees, cyclic, the more colourful the more linearly polarized), "docp" (-1 to 1, blue is
+            left and red right circular), "s1", "s2", "s3" (blue to red around zero).
+        frame: bin; None for the light of all times.
+        floor: intensity below which pixels are grey; None for a hundredth of the median of lit pixels.
+        angle_map: "even" for hues of equal lightness, "hsv" for the hue circle of many papers.
+        title: text above the figure.
 
-    `source`: Stokes vectors (4, C, T, H, W) or (4, C, H, W), or a RenderOutput or file with such; `frame` picks a bin,
-    None shows the light of all times. `angle_map` "even" has hues of equal lightness, "hsv" the hue circle of many
-    papers. Writes the figure when `path` is given. Raises ShapeError for unpolarized sources, ArgumentError for
-    unknown names, UnitError for a negative `floor`, StorageError.
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: for unpolarized sources and bins outside.
+        ArgumentError: for unknown names.
+        UnitError: for a negative ``floor``.
+        StorageError: when the figure cannot be written.
     """
     quantities = several("polarization_picture: quantities", quantities, "names", str, ArgumentError)
     unknown = [q for q in quantities if q not in QUANTITIES]
@@ -93,10 +103,12 @@ def polarization_picture(
 
 
 def angle_image(stokes: Tensor, dark: NDArray[np.bool_], angle_map: str = "even") -> NDArray[np.float64]:
-    """RGB (H, W, 3) in [0, 1]: hue by the angle of linear polarization of `stokes` (4, H, W), colourful by its degree.
+    """Return RGB (H, W, 3) in [0, 1]: hue by the angle of linear polarization, colourful by its degree.
 
-    Where `dark`, grey. "even" goes from grey of the same lightness to the full hue, so that the picture's lightness
-    says nothing.
+    Args:
+        stokes: (4, H, W).
+        dark: (H, W), pixels that are grey.
+        angle_map: "even" goes from grey to a hue of the same lightness; "hsv" is the hue circle of HSV.
     """
     turns = st.angle_of_linear_polarization(stokes, 0).numpy() / math.pi
     degree = np.clip(st.degree_of_linear_polarization(stokes, 0).numpy(), 0, 1)

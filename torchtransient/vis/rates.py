@@ -29,10 +29,10 @@ def range_doppler(
     decades: float = 4.0,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of light over the rate and the length of its paths, brightness on a logarithmic scale.
+    """Draw light over the rate and the length of its paths, brightness on a logarithmic scale.
 
     Rates run to the right, lengths upwards; the other edges have the speed of approach, half the rate with its sign
-    changed, and the distance, half the length, of what is seen from beside the light.
+    changed, and the distance, half the length, of targets seen from beside the light.
 
     Args:
         source: light (C, R, T, H, W), or a result or its file that has it as ``rates``; channels are added up.
@@ -41,6 +41,9 @@ def range_doppler(
         pixel: (row, column); None for the mean over all pixels.
         decades: powers of ten from the brightest bin to the darkest colour.
         title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
 
     Raises:
         ShapeError: for other shapes, axes that do not fit or are not known, a pixel outside.
@@ -81,7 +84,7 @@ def range_doppler(
 def _rates_of(
     source: Source, axis: TimeAxis | None, rate_axis: RateAxis | None, who: str
 ) -> tuple[Tensor, TimeAxis | None, RateAxis]:
-    """Light (R, T, H, W), float64, channels added up, and its axes."""
+    """Return light (R, T, H, W), float64, channels added up, and its axes."""
     if isinstance(source, str | Path):
         source = read_rates(Path(source))
     held = getattr(source, "rates", None)

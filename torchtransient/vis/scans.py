@@ -48,14 +48,27 @@ def transients_grid(
     limits: tuple[float, float] | None = None,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of the transients of a capture, point by point.
+    """Draw the transients of a capture, point by point.
 
-    `style` "curves" draws a small histogram for each of up to `rows` x `columns` sensor points, evenly chosen, where
-    they stand on the wall, on one scale, under their (row, column); "image" a picture of all points (downwards) against
-    time, of which the channels are added up. None: curves of a grid, an image of a list of points. `laser` chooses the
-    spot of an exhaustive capture, by its index (None: the middle one). `limits` in metres cut the time axis. Writes the
-    figure when `path` is given. Raises ShapeError for a batch, more than 3 channels or no transient, UnitError for
-    limits without a bin, ArgumentError for an unknown style, StorageError.
+    Args:
+        capture: one capture of one channel or three.
+        path: file to write the figure to.
+        style: "curves" draws a histogram for each of up to ``rows`` x ``columns`` sensor points, evenly chosen, where
+            they stand on the wall, under their (row, column); "image" all points downwards against time. None: curves
+            of a grid, an image of a list.
+        rows, columns: most histograms beside each other.
+        laser: index of the spot of an exhaustive capture; None for the middle one.
+        limits: ends of the time axis, metres.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ArgumentError: for another object or style.
+        ShapeError: for a batch, other numbers of channels, no transient.
+        UnitError: for limits without a bin.
+        StorageError: when the figure cannot be written.
     """
     cube, axis, scan = of_one_spot(capture, laser, "transients_grid")
     if limits is not None:
@@ -91,7 +104,7 @@ def _title(capture: Capture, laser: Any) -> str:
 
 
 def _chosen(available: int, wanted: int) -> list[int]:
-    """Indices of `wanted` places in the middles of equal parts, all of them where there are no more."""
+    """Return indices of `wanted` places in the middles of equal parts, all of them where there are no more."""
     count = min(available, wanted)
     return [int((k + 0.5) * available / count) for k in range(count)]
 
@@ -113,7 +126,7 @@ def _curves(cube: Tensor, axis: TimeAxis, rows: list[int], columns: list[int]) -
 
 
 def _image(cube: Tensor, axis: TimeAxis) -> Figure:
-    """All points against time, the brightest bin white."""
+    """Draw all points against time, the brightest bin white."""
     lines = cube.sum(0).flatten(1).T
     figure = figure_type()(figsize=(8.0, 4.5), layout="constrained")
     panel = figure.subplots()
@@ -139,11 +152,22 @@ def scan_layout(
     hidden: Any = None,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of a scan in space: wall, sensor points, laser spots and both origins; lengths in metres.
+    """Draw a scan in space: wall, sensor points, laser spots and both origins; lengths in metres.
 
-    `hidden`: as in `tt.nlos.simulate`, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
-    with both, of meshes as arrays, rectangles, cubes, disks, spheres and cylinders. Writes the figure when `path` is
-    given. Raises ArgumentError for what is no scan, SceneError for other shapes and mesh files, StorageError.
+    Args:
+        scan: a Scan, or a Capture with its own.
+        path: file to write the figure to.
+        hidden: as in ``tt.nlos.simulate``, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
+            with both; meshes as arrays, rectangles, cubes, disks, spheres and cylinders.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: for anything that is no scan.
+        SceneError: for other shapes and mesh files.
+        StorageError: when the figure cannot be written.
     """
     scan = scan.scan if isinstance(scan, Capture) else scan
     if not isinstance(scan, Scan):
@@ -195,7 +219,7 @@ def _draw_faces(panel: Any, polygons: list[NDArray[np.float64]], colour: str, al
 
 
 def _equal_box(panel: Any, points: NDArray[np.float64]) -> None:
-    """One scale for the three axes."""
+    """Set one scale for the three axes."""
     low, high = points.min(0), points.max(0)
     size = np.maximum(high - low, 0.05 * float((high - low).max() or 1.0))
     middle = (low + high) / 2
@@ -208,11 +232,16 @@ def _equal_box(panel: Any, points: NDArray[np.float64]) -> None:
 
 
 def hidden_polygons(hidden: Any, who: str) -> list[list[Array]]:
-    """Of each hidden thing the corners (N, 3) of its faces, metres.
+    """Return the corners (N, 3) of the faces of each hidden shape, metres.
 
-    ``hidden``: shapes of Mitsuba by name, a single one, (vertices (V, 3), faces (F, 3)), an object with both, or None.
-    Nodes that a shape refers to are left out. Raises SceneError for other shapes than :data:`DRAWN`
-    (mesh files among them) and for what is no shape; ShapeError and UnitError for meshes and transforms that are none.
+    Args:
+        hidden: shapes of Mitsuba by name, a single one, (vertices (V, 3), faces (F, 3)), an object with both, or None.
+            Nodes that a shape refers to are left out.
+        who: beginning of messages.
+
+    Raises:
+        SceneError: for other shapes than :data:`DRAWN`, mesh files among them.
+        ShapeError, UnitError: for meshes and transforms that are none.
     """
     if hidden is None:
         return []
@@ -247,7 +276,7 @@ def _of_shape(name: str, shape: Any, who: str) -> list[Array]:
 
 
 def _references(nodes: Any) -> Iterator[str]:
-    """Names that nodes refer to."""
+    """Yield names that nodes refer to."""
     for node in nodes.values():
         if isinstance(node, Mapping):
             if node.get("type") == "ref":
@@ -302,7 +331,7 @@ def _cylinder(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
 
 
 def _cells(grid: Array) -> list[Array]:
-    """The quadrilaterals (4, 3) of a grid of points (M, N, 3)."""
+    """Return the quadrilaterals (4, 3) of a grid of points (M, N, 3)."""
     corners = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], 2)
     return list(corners.reshape(-1, 4, 3))
 

@@ -1,4 +1,4 @@
-"""What the pictures take: tensors, arrays, results of a render, or files that hold one."""
+"""Sources of pictures: tensors, arrays, results of a render, captures, or files that hold one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _KNOWN = {
 
 @dataclass(frozen=True)
 class Loaded:
-    """What a source offers; None for what it lacks."""
+    """Tensors of a source with their axes; None for those that it lacks."""
 
     transient: Tensor | None = None
     steady: Tensor | None = None
@@ -53,12 +53,22 @@ class Loaded:
 def transient_of(
     source: Source, axis: TimeAxis | None = None, who: str = "picture", any_channels: bool = False
 ) -> tuple[Tensor, TimeAxis | None]:
-    """The intensity over time (C, T, H, W), C = 1 or 3, on the CPU without gradients, and its axis if it is known.
+    """Return the intensity over time of a source.
 
-    `source`: a tensor or array (C, T, H, W), or polarized (4, C, T, H, W) of which the first component is taken; an
-    object with `transient` (and `axis`), such as a RenderOutput; or a file, `.h5`, `.npz` or `.npy`. Of light by rates
-    the sum over these. `axis` replaces the source's. Raises ShapeError for another shape, an empty cube, or an axis of
-    another number of bins; StorageError for a file that cannot be read.
+    Args:
+        source: a tensor or array (C, T, H, W), or polarized (4, C, T, H, W) of which the first component is taken; an
+            object with ``transient`` (and ``axis``), such as a RenderOutput; a Capture; or a file, ``.h5``, ``.npz`` or
+            ``.npy``. Light by rates is added up over these.
+        axis: time axis in place of the source's.
+        who: beginning of messages.
+        any_channels: take other numbers of channels than 1 and 3.
+
+    Returns:
+        (C, T, H, W) on the CPU without gradients, and its axis if it is known.
+
+    Raises:
+        ShapeError: for another shape, an empty cube, or an axis of another number of bins.
+        StorageError: for a file that cannot be read.
     """
     loaded = _load(source, "transient")
     if loaded.transient is None and loaded.gated is not None:
@@ -78,7 +88,14 @@ def transient_of(
 def images_of(
     source: Source, axis: TimeAxis | None = None, who: str = "picture", any_channels: bool = False
 ) -> tuple[Tensor, TimeAxis | None, str]:
-    """As :func:`transient_of`, and also the images of time gates (C, G, H, W); what one of them is: "bin" or "gate"."""
+    """Return the intensity over time, or images of time gates (C, G, H, W), its axis, and "bin" or "gate".
+
+    Args:
+        source, axis, who, any_channels: as of :func:`transient_of`.
+
+    Raises:
+        ShapeError: as of ``transient_of``, and for gates with an axis.
+    """
     loaded = _load(source, "transient")
     if loaded.transient is not None or loaded.gated is None:
         return *transient_of(loaded, axis, who, any_channels), "bin"
@@ -101,7 +118,16 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
 
 
 def axis_of(cube: Tensor, axis: TimeAxis | None, who: str) -> TimeAxis:
-    """`axis`, which a picture of lengths in metres cannot do without; ShapeError when it is None."""
+    """Return the axis of a picture that shows lengths in metres.
+
+    Args:
+        cube: the transient.
+        axis: its axis, if it is known.
+        who: beginning of messages.
+
+    Raises:
+        ShapeError: without an axis.
+    """
     if axis is None:
         raise ShapeError(
             f"{who}: a transient of {cube.shape[1]} bins without an axis has no times. Give axis=TimeAxis(...), or a "
@@ -111,8 +137,15 @@ def axis_of(cube: Tensor, axis: TimeAxis | None, who: str) -> TimeAxis:
 
 
 def steady_of(source: Source, who: str = "picture") -> Tensor:
-    """The intensity (C, H, W), C = 1 or 3: a tensor (C, H, W) or (4, C, H, W), the `steady` of a result or file, or the
-    sum over time of a transient. Errors as `transient_of`.
+    """Return an intensity (C, H, W), C = 1 or 3.
+
+    Args:
+        source: a tensor (C, H, W) or (4, C, H, W), the ``steady`` of a result or file, or a transient, which is added
+            up over time.
+        who: beginning of messages.
+
+    Raises:
+        ShapeError, StorageError: as of :func:`transient_of`.
     """
     loaded = _load(source, "")
     image = loaded.steady
@@ -126,9 +159,15 @@ def steady_of(source: Source, who: str = "picture") -> Tensor:
 
 
 def stokes_of(source: Source, frame: int | None = None, who: str = "picture") -> Tensor:
-    """Stokes vectors (4, C, H, W): of one bin of a transient (4, C, T, H, W), or of the light of all times (`frame`
-    None: the `steady` of a result, or the sum over time). Raises ShapeError when the source is not polarized or has
-    no such bin.
+    """Return Stokes vectors (4, C, H, W).
+
+    Args:
+        source: a polarized transient (4, C, T, H, W), image (4, C, H, W), or a result or file with one.
+        frame: bin; None for the light of all times, the ``steady`` of a result or the sum over time.
+        who: beginning of messages.
+
+    Raises:
+        ShapeError: for sources without polarization, and bins outside.
     """
     loaded = _load(source, "")
     cube, image = loaded.gated if loaded.transient is None else loaded.transient, loaded.steady
@@ -152,7 +191,16 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
 
 
 def pixel_of(pixel: Any, size: tuple[int, int], who: str) -> tuple[int, int]:
-    """(row, column) of a pixel in an image of ``size``. Raises ShapeError for one outside, and for what is none."""
+    """Return (row, column) of a pixel.
+
+    Args:
+        pixel: two whole numbers.
+        size: height and width of the image.
+        who: beginning of messages.
+
+    Raises:
+        ShapeError: for a pixel outside, and for anything else.
+    """
     several = isinstance(pixel, Sequence) or getattr(pixel, "ndim", 0) == 1
     row, column = [as_whole(n) for n in pixel] if several and len(pixel) == 2 else (None, None)
     if row is None or column is None:
@@ -163,10 +211,15 @@ def pixel_of(pixel: Any, size: tuple[int, int], who: str) -> tuple[int, int]:
 
 
 def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float, ...] | None]:
-    """Phasor images, complex (C, F, H, W), and their frequencies in cycles per metre if the source knows them.
+    """Return phasor images and their frequencies in cycles per metre, if the source knows them.
 
-    A complex tensor or array (C, F, H, W), or polarized (4, C, F, H, W) of which the first component is taken, or the
-    `phasor` of a result. Raises ShapeError for another shape or a real dtype.
+    Args:
+        source: complex (C, F, H, W), polarized (4, C, F, H, W) of which the first component is taken, or a result with
+            such a ``phasor``.
+        who: beginning of messages.
+
+    Raises:
+        ShapeError: for another shape or a real dtype.
     """
     loaded = _load(source, "phasor")
     phasor = _only(loaded.phasor, "phasor", "complex (C, F, H, W)", who)
@@ -180,8 +233,16 @@ def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float
 
 
 def given_tensor(value: Any, who: str, expected: str = "a tensor or an array") -> Tensor:
-    """A tensor as it is, and one of the numbers of an array. Raises ArgumentError for anything else, ShapeError for
-    arrays of what is no number.
+    """Return a tensor as it is, and one of the numbers of an array.
+
+    Args:
+        value: tensor or array.
+        who: beginning of messages.
+        expected: description of what is expected.
+
+    Raises:
+        ArgumentError: for anything else.
+        ShapeError: for arrays of other things than numbers.
     """
     if isinstance(value, Tensor):
         return value
@@ -194,7 +255,7 @@ def given_tensor(value: Any, who: str, expected: str = "a tensor or an array") -
 
 
 def real_tensor(value: Any, who: str) -> Tensor:
-    """As :func:`given_tensor`. Raises ShapeError for complex numbers, too."""
+    """Return a tensor as :func:`given_tensor`. Raises ShapeError for complex numbers, too."""
     tensor = given_tensor(value, who)
     if tensor.is_complex():
         raise ShapeError(f"{who}: expected real numbers, got {tensor.dtype}.")
@@ -202,7 +263,7 @@ def real_tensor(value: Any, who: str) -> Tensor:
 
 
 def as_tensor(value: Any, who: str) -> Tensor:
-    """A tensor or array on the CPU without gradients; errors as :func:`given_tensor`. 16 bit becomes float32."""
+    """Return a tensor or array on the CPU without gradients; 16 bit become float32. Errors as `given_tensor`."""
     tensor = given_tensor(value, who, "a tensor, an array, a RenderOutput or the path of a result").detach().cpu()
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
         return tensor
@@ -210,7 +271,7 @@ def as_tensor(value: Any, who: str) -> Tensor:
 
 
 def _refuse_batch(source: Any) -> None:
-    """Four entries of a batch must not pass for four components of polarized light, where the source can tell."""
+    """Refuse four entries of a batch as components of polarized light, where the source can tell."""
     given = {name: getattr(source, name, None) for name in _DIMENSIONS}
     name, cube = next(((n, c) for n, c in given.items() if c is not None), ("", None))
     polarized = getattr(source, "polarized", None)
@@ -229,7 +290,14 @@ def _variant_is_polarized(metadata: dict[str, Any]) -> bool | None:
 
 
 def frequencies_of(given: Any) -> tuple[float, ...] | None:
-    """Cycles per metre of a FrequencyAxis or of a row of numbers; None stays None."""
+    """Return cycles per metre.
+
+    Args:
+        given: a FrequencyAxis, a row of numbers, or None, which stays None.
+
+    Raises:
+        UnitError: for anything else.
+    """
     if given is None:
         return None
     if isinstance(given, FrequencyAxis):
@@ -247,8 +315,10 @@ def _only(value: Tensor | None, name: str, shape: str, who: str) -> Tensor:
 
 
 def _load(source: Source, name: str) -> Loaded:
-    """What a source offers. A bare tensor is taken for `name`; without one, 5 dimensions or 4 that do not begin with
-    four components are a transient, and the rest a steady image.
+    """Return the tensors of a source.
+
+    A bare tensor is taken for ``name``; without one, 5 dimensions or 4 that do not begin with four components are a
+    transient, and the rest a steady image.
     """
     if isinstance(source, str | Path):
         source = read_file(Path(source))
@@ -325,9 +395,13 @@ def middle_spot(scan: Scan) -> tuple[int, ...]:
 
 
 def read_any(path: Path) -> Any:
-    """Return what a file of the library holds: a result, a capture or a volume; of other files, what `read_file` finds.
+    """Return the content of a file: a result, a capture or a volume; of other files as :func:`read_file`.
 
-    Raises StorageError for a missing, damaged or unknown file.
+    Args:
+        path: the file.
+
+    Raises:
+        StorageError: for a missing, damaged or unknown file.
     """
     if path.suffix.lower() in (*_HDF5, ".npz"):
         form = str(read_some(path, "view", "format".__eq__).get("format", ""))
@@ -344,7 +418,7 @@ def _axis_in(values: Mapping[str, Any]) -> TimeAxis | None:
 
 
 def read_rates(path: Path) -> Any:
-    """Light by rates of a file with its axes: an object with `rates`, `axis` and `rate_axis`. Errors as `read_file`."""
+    """Return light by rates of a file: an object with `rates`, `axis` and `rate_axis`. Errors as `read_file`."""
     if path.suffix.lower() not in (*_HDF5, ".npz"):
         raise StorageError(f"picture: expected a result, .h5 or .npz, got '{path}'.")
     names = ("rates_start", "rates_bin_width", "rates_num_bins")
@@ -358,17 +432,21 @@ def read_rates(path: Path) -> Any:
 
 
 def _summed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors with the sum over rates in place of light by rates."""
+    """Return tensors with the sum over rates in place of light by rates."""
     rates = tensors.pop("rates", None)
     return tensors if rates is None else {**tensors, "transient": rates.sum(-4)}
 
 
 def read_file(path: Path) -> Any:
-    """A file as a source: a result (`.h5`, `.hdf5`, `.npz`) with its axis, or the one array of a `.npy`.
+    """Return a file as a source: a result (``.h5``, ``.hdf5``, ``.npz``) with its axis, or the one array of a ``.npy``.
 
-    Of a result, the names `transient`, `steady`, `phasor`, `gated`, `rates`, `beats` and the numbers of the axis are
-    read, each if it is there, and compared with their checksums. Raises StorageError for a missing, damaged or unknown
-    file.
+    Tensors and numbers of the axis are read, each if it is there, and compared with their checksums.
+
+    Args:
+        path: the file.
+
+    Raises:
+        StorageError: for a missing, damaged or unknown file.
     """
     if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
         raise StorageError(f"picture: expected a result, .h5, .npz or .npy, got '{path}'.")

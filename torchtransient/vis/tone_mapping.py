@@ -19,9 +19,18 @@ _LOG_STEPS = 4096
 
 
 def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
-    """The factor that brings the given quantile of the pixels' brightest channel to white; 1 for a black image.
+    """Return the factor that brings a quantile of the pixels' brightest channel to white.
 
-    `image`: (C, H, W) linear radiance. Values that are not finite are left out. Raises ShapeError and UnitError.
+    Args:
+        image: linear radiance (C, H, W), C = 1 or 3. Values that are not finite are left out.
+        quantile: share of the pixels below white, above 0 and at most 1.
+
+    Returns:
+        The factor, 1 for a black image.
+
+    Raises:
+        ShapeError: for another shape.
+        UnitError: for another quantile.
     """
     image = _checked(image, "exposure_of")
     quantile = _quantile(quantile, "exposure_of")
@@ -36,11 +45,21 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
 
 
 def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
-    """One factor for all frames: it brings the given quantile of the *lit* pixels of all frames to white.
+    """Return one factor for all frames, which brings a quantile of the *lit* pixels of all frames to white.
 
-    `transient`: (C, T, H, W) linear radiance in a bin. Most pixels of most frames are black: only what is lit counts.
-    The quantile is found to 1 % of its value over nine decades below the maximum; nothing of the size of the cube is
-    allocated. 1 for a black cube. Raises ShapeError and UnitError.
+    Most pixels of most frames are black. The quantile is found to half a hundredth of its value over nine decades below
+    the maximum, without memory of the size of the cube.
+
+    Args:
+        transient: linear radiance in a bin (C, T, H, W), C = 1 or 3.
+        quantile: share of the lit pixels below white, above 0 and at most 1.
+
+    Returns:
+        The factor, 1 for a black cube.
+
+    Raises:
+        ShapeError: for another shape.
+        UnitError: for another quantile.
     """
     transient = real_tensor(transient, "exposure_of_video")
     if transient.ndim != 4 or transient.shape[0] not in (1, 3):
@@ -71,7 +90,16 @@ def _quantile(given: float, who: str) -> float:
 
 
 def checked_positive(name: str, given: float, who: str = "tone_map") -> float:
-    """A finite number above zero. Raises UnitError."""
+    """Return a finite number above zero.
+
+    Args:
+        name: name of the argument.
+        given: its value.
+        who: beginning of the message.
+
+    Raises:
+        UnitError: for anything else.
+    """
     number = as_number(given)
     if number is None or not (math.isfinite(number) and number > 0):
         raise UnitError(f"{who}: expected {name} > 0, got {shown(given)}.")
@@ -86,13 +114,24 @@ def _lit(transient: Tensor, start: int) -> Tensor:
 def tone_map(
     image: Tensor, exposure: float | None = None, curve: str = "srgb", *, gamma: float = 2.2, stops: float = 10.0
 ) -> Tensor:
-    """(C, H, W) linear radiance, C = 1 or 3 (linear sRGB), to (H, W, 3) float64 in [0, 1].
+    """Map linear radiance to colours of a screen.
 
-    `exposure` multiplies before the curve; None takes `exposure_of(image)`. `curve`: "srgb" (IEC 61966-2-1), "gamma"
-    (`x ** (1 / gamma)`), "linear", or "log", which spreads `stops` factors of two below white evenly over the scale,
-    for direct and late light in one picture; there the brightest channel is mapped and the others keep their ratio
-    to it. Negative values become black; pixels that are not finite magenta. Raises ShapeError for another shape,
-    ArgumentError for an unknown curve, UnitError for an exposure, gamma or number of stops that is not positive.
+    Args:
+        image: (C, H, W), C = 1 or 3 (linear sRGB).
+        exposure: factor before the curve; None takes ``exposure_of(image)``.
+        curve: "srgb" (IEC 61966-2-1), "gamma" (``x ** (1 / gamma)``), "linear", or "log", which spreads ``stops``
+            factors of two below white evenly over the scale: the brightest channel is mapped, the others keep their
+            ratio to it.
+        gamma: exponent of "gamma".
+        stops: range of "log".
+
+    Returns:
+        (H, W, 3) float64 in [0, 1]. Negative values are black, pixels that are not finite magenta.
+
+    Raises:
+        ShapeError: for another shape.
+        ArgumentError: for an unknown curve.
+        UnitError: unless exposure, gamma and stops are positive.
     """
     image = _checked(image, "tone_map")
     factor = checked_positive("exposure", exposure_of(image) if exposure is None else exposure)

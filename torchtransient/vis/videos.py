@@ -35,7 +35,7 @@ _KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
 
 
 class FrameSettings(TypedDict, total=False):
-    """What `frames` is told besides what it shows; its own defaults hold for what is left out."""
+    """Settings of :func:`frames`, whose defaults hold for those that are left out."""
 
     exposure: float | None
     curve: str
@@ -79,14 +79,25 @@ def frames(
     scale: int | None = None,
     every: int = 1,
 ) -> Frames:
-    """The frames of a transient under one exposure, one after the other in time.
+    """Return the frames of a transient under one exposure, one after the other in time.
 
-    `source`: a transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, or a file; `axis` for sources that
-    have none. The images of a gated film are frames too, in the order of its gates. `exposure` multiplies the radiance
-    of a bin (None: 99 % of the lit pixels of all frames are below white); `curve` as in `tone_map`. `accumulate` shows
-    the light that has arrived so far. `every` adds up that many bins to a frame. `scale` enlarges pixels (None: small
-    pictures to some 320 pixels). `stamp` puts the time under each frame. Pixels that are not finite are magenta. Raises
-    ShapeError and UnitError.
+    Args:
+        source: transient (C, T, H, W), polarized (4, C, T, H, W), a RenderOutput, a Capture (a grid; of exhaustive ones
+            the middle laser spot), or a file. Gated images are frames in the order of their gates.
+        axis: time axis; None takes that of the source.
+        exposure: factor of the radiance in a bin; None leaves 1 % of the lit pixels of all frames white.
+        curve: as in ``tone_map``.
+        accumulate: show the light that has arrived so far.
+        stamp: put the time under each frame.
+        scale: side of a pixel on the screen; None enlarges small pictures to some 320 pixels.
+        every: bins that are added up to a frame.
+
+    Returns:
+        Frames (H, W, 3) uint8, made when they are asked for. Pixels that are not finite are magenta.
+
+    Raises:
+        ShapeError: for other shapes, and an axis that does not fit.
+        UnitError: for an exposure that is not positive.
     """
     cube, axis, word = images_of(source, axis, "frames")
     every = checks.count("frames: every", every, 1, ShapeError)
@@ -119,11 +130,22 @@ def video(
     axis: TimeAxis | None = None,
     **settings: Unpack[FrameSettings],
 ) -> Path:
-    """Write the `frames` of a transient as `.mp4` or `.gif`; returns the path.
+    """Write the :func:`frames` of a transient as ``.mp4`` or ``.gif``.
 
-    `progress` shows a bar. `axis` and `settings` (exposure, curve, accumulate, stamp, scale, every) are those of
-    `frames`. Raises StorageError for another ending, a folder that is
-    missing, or a missing package (`pip install 'torchtransient[vis]'`), before any frame is made.
+    Args:
+        source, axis: as of ``frames``.
+        path: file.
+        fps: frames per second.
+        progress: show a bar.
+        **settings: exposure, curve, accumulate, stamp, scale, every of ``frames``.
+
+    Returns:
+        The path.
+
+    Raises:
+        StorageError: for another ending or a folder that is missing, before any frame is made.
+        MissingPackageError: without imageio-ffmpeg or Pillow (extra ``vis``).
+        ShapeError, UnitError: as of ``frames``.
     """
     check_video(path)
     shown = frames(source, axis=axis, **settings)
@@ -131,7 +153,7 @@ def video(
 
 
 def _added(cube: Tensor, every: int) -> Tensor:
-    """The cube in bins of `every`, of which a copy is only made when it is smaller."""
+    """Return the cube in bins of `every`; a copy is only made when it is smaller."""
     if every == 1:
         return cube
     return torch.stack([cube[:, k : k + every].sum(1) for k in range(0, cube.shape[1], every)], dim=1)
@@ -157,7 +179,15 @@ class _Running:
 
 
 def check_video(path: str | Path) -> Path:
-    """Return `path`, or raise StorageError when `write_video` could not write there. For before a long render."""
+    """Return the path, checked before a long render.
+
+    Args:
+        path: file of a video.
+
+    Raises:
+        StorageError: for another ending than .mp4 and .gif, or a folder that is missing.
+        MissingPackageError: without the package that writes it.
+    """
     target = path_of(path, "video")
     if target.suffix.lower() not in ENDINGS:
         raise StorageError(f"video: expected a name that ends in .mp4 or .gif, got '{path}'.")
@@ -172,15 +202,28 @@ def check_video(path: str | Path) -> Path:
 def write_video(
     path: str | Path, frames: Iterable[Image], count: int, *, fps: float = 25.0, progress: bool = False
 ) -> Path:
-    """Write `count` frames (H, W, 3) uint8 of equal size; returns the path.
+    """Write frames as ``.mp4`` or ``.gif``.
 
-    Frames are taken one after the other, so a generator needs no memory for all of them; a GIF looks at up to 24 of
-    them first for its palette, which is one for all frames (colours of one palette per frame would flicker), and
-    therefore takes a second look at the iterable: give a list, or an object that can be iterated twice. An MP4 has an
-    even number of rows and columns: an odd last one is repeated. GIF players know hundredths of a second: `fps` is
-    rounded to that, and equal frames that follow each other become one that is shown longer. Raises ShapeError without
-    frames or for frames of different size, UnitError unless fps > 0, StorageError when the file cannot be written or
-    imageio-ffmpeg is missing (extra `vis`).
+    A GIF looks at up to 24 frames first for its palette, one for all frames (colours of one palette per frame would
+    flicker), and iterates twice. An MP4 has an even number of rows and columns: an odd last one is repeated. GIF
+    players know hundredths of a second: ``fps`` is rounded to that, and equal frames that follow each other become one
+    that is shown longer.
+
+    Args:
+        path: file.
+        frames: (H, W, 3) uint8 of equal size, taken one after the other; for a GIF an object that iterates twice.
+        count: number of frames.
+        fps: frames per second.
+        progress: show a bar.
+
+    Returns:
+        The path.
+
+    Raises:
+        ShapeError: without frames, and for frames of several sizes.
+        UnitError: unless ``fps`` is positive, and at most 50 of a GIF.
+        StorageError: when the file cannot be written.
+        MissingPackageError: without imageio-ffmpeg or Pillow (extra ``vis``).
     """
     target = check_video(path)
     try:
@@ -206,7 +249,7 @@ def write_video(
 
 
 def checked_frame(frame: Any, who: str) -> Image:
-    """An image (H, W, 3) of uint8. Raises ShapeError for what is none."""
+    """Return an image (H, W, 3) of uint8. Raises ShapeError for anything else."""
     if not isinstance(frame, np.ndarray):
         raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
     if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
@@ -215,7 +258,7 @@ def checked_frame(frame: Any, who: str) -> Image:
 
 
 def _followed(frames: Iterable[Image], count: int, progress: bool) -> Iterator[Image]:
-    """The frames, checked, behind a progress bar."""
+    """Yield the frames, checked, behind a progress bar."""
     from tqdm import tqdm
 
     size: tuple[int, ...] | None = None
@@ -251,7 +294,7 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
 
 
 def _is_whole(mp4: Path) -> bool:
-    """Whether the boxes that an MP4 consists of, each with its length before it, fill the file, with a table."""
+    """Return True for an MP4 whose boxes, each with its length before it, fill the file, with a table."""
     kinds, place, size = set(), 0, mp4.stat().st_size
     with mp4.open("rb") as file:
         while place + 8 <= size:
@@ -267,7 +310,7 @@ def _is_whole(mp4: Path) -> bool:
 
 
 def _palette(frames: Iterable[Image], count: int) -> Any:
-    """256 colours that serve up to 24 frames out of all."""
+    """Return 256 colours that serve up to 24 frames out of all."""
     pillow = _pillow()
     step = max(1, math.ceil(count / _PALETTE_FRAMES))
     seen = []
@@ -322,9 +365,13 @@ def _pillow() -> Any:
 
 
 def moment(axis: TimeAxis | None, index: int, bins: int, word: str = "bin") -> str:
-    """What a stamp says about a bin: its centre in metres and nanoseconds, or its number when no axis is known.
+    """Return the text of a stamp: the centre of a bin in metres and nanoseconds, or its number without an axis.
 
-    `word`: what an entry is without an axis, "gate" for those of a gated film.
+    Args:
+        axis: time axis, None for none.
+        index: number of the bin.
+        bins: number of bins.
+        word: name of an entry without an axis, "gate" for those of a gated film.
     """
     if axis is None:
         return f"{word} {index} of {bins}"
@@ -337,15 +384,18 @@ def _nanoseconds(*lengths: float) -> list[float]:
 
 
 def _digits(value: float, step: float) -> str:
-    """As many decimals as tell the halves of a bin apart."""
+    """Format with as many decimals as tell the halves of a bin apart."""
     decimals = int(np.clip(np.ceil(-np.log10(step / 2)), 0, 6))
     return f"{value:.{decimals}f}"
 
 
 def with_strip(image: Image, text: str, share: float | None = None) -> Image:
-    """The image over a dark strip with `text` and, with `share` in [0, 1], a bar that fills from left to right.
+    """Return the image over a dark strip with a text, made smaller until it fits the width.
 
-    The strip does not cover the picture. Its text is made smaller until it fits the width.
+    Args:
+        image: (H, W, 3) uint8.
+        text: text in the strip.
+        share: 0 to 1, draws a bar that fills from left to right.
     """
     try:
         from PIL import Image as Pillow

@@ -39,14 +39,27 @@ def volume_views(
     gamma: float = 1.0,
     title: str = "",
 ) -> Figure:
-    """A matplotlib figure of a volume: the highest values seen from the front, from the top and from the side.
+    """Draw a volume: the highest values seen from the front, from the top and from the side.
 
-    ``volume`` (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, the
-    highest finite one and infinite ones white, what is not a number is red; `gamma` < 1 lightens what is dim.
-    ``depths`` (Z,), which increase, and ``extent`` (width, height) in metres scale the axes (those of a voxel grid:
-    `grid.depths`, `grid.extent`), x and y from the middle; without them they count voxels. Planes reach to the middle
-    between them. With ``depth`` (Y, X) in metres a panel shows it, with ``normals`` (3, Y, X) another, both where
-    ``mask`` (Y, X) is true. Writes the figure when `path` is given. Raises ShapeError, UnitError, StorageError.
+    Args:
+        volume: (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, infinite
+            ones white, NaN red.
+        path: file to write the figure to.
+        depths: (Z,) metres, increasing; planes reach to the middle between them. None counts voxels.
+        extent: width and height, metres; x and y count from the middle. None counts voxels.
+        depth: (Y, X) metres, drawn in a panel of its own.
+        mask: (Y, X), pixels of ``depth`` and ``normals`` that are drawn.
+        normals: (3, Y, X), drawn in a panel of its own.
+        gamma: exponent of brightness; below 1 lightens dim voxels.
+        title: text above the figure.
+
+    Returns:
+        The matplotlib figure.
+
+    Raises:
+        ShapeError: for shapes that do not fit each other.
+        UnitError: for depths that do not increase, extents and gammas that are not positive.
+        StorageError: when the figure cannot be written.
     """
     values = _volume(volume)
     gamma = positive("volume_views: gamma", gamma)
@@ -86,7 +99,7 @@ def volume_views(
 
 
 def _light_panel(panel: Any, picture: Tensor, columns: Tensor, rows: Tensor, aspect: str) -> None:
-    """Brightness between edges of columns and rows; those of uneven planes as they are."""
+    """Draw brightness between edges of columns and rows; uneven planes as they are."""
     from matplotlib import colormaps
 
     shown_ = {"cmap": colormaps["gray"].with_extremes(bad=_NO_NUMBER), "vmin": 0, "vmax": 1}
@@ -156,7 +169,7 @@ def _normals(values: Any, size: tuple[int, ...]) -> Tensor:
 
 
 def _scales(size: tuple[int, ...], depths: Any, extent: Any) -> tuple[Tensor, tuple[float, float]]:
-    """Edges of the planes (Z + 1,), float64, and (width, height)."""
+    """Return edges of the planes (Z + 1,), float64, and (width, height)."""
     if depths is None:
         z = torch.arange(size[0] + 1, dtype=torch.float64) - 0.5
     else:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,11 +73,7 @@ class Table:
 
     def _looked_up(self, x: Tensor) -> NDArray[np.uint8]:
         """Codes by the upper bits of each number: a logarithm of each is thirty times slower."""
-        every = (np.arange(2**_BITS, dtype=np.uint32) << (32 - _BITS)).view(np.float32)
-        with np.errstate(all="ignore"):
-            # Whole numbers begin an interval of equal bits, others are taken for its middle.
-            middle = every if self.kind == "whole" else every * np.float32(1 + _SAME_BITS)
-            codes = self._codes(middle)
+        codes = self._codes_of_bits
         numbers = np.ascontiguousarray(x.float().numpy())
         out = np.empty(numbers.shape, np.uint8)
         bits, flat = numbers.reshape(-1).view(np.uint32), out.reshape(-1)
@@ -84,6 +81,13 @@ class Table:
             part = slice(first, first + _ENTRIES_AT_ONCE)
             np.take(codes, bits[part] >> (32 - _BITS), out=flat[part], mode="clip")
         return out
+
+    @cached_property
+    def _codes_of_bits(self) -> NDArray[np.uint8]:
+        every = (np.arange(2**_BITS, dtype=np.uint32) << (32 - _BITS)).view(np.float32)
+        with np.errstate(all="ignore"):
+            # Whole numbers begin an interval of equal bits, others are taken for its middle.
+            return self._codes(every if self.kind == "whole" else every * np.float32(1 + _SAME_BITS))
 
     def _codes(self, x: NDArray[np.float32]) -> NDArray[np.uint8]:
         size = np.abs(x.astype(np.float64))
@@ -102,7 +106,13 @@ class Table:
 
 
 def light_table(name: str, top: float, lowest: float) -> Table:
-    """Return the table of numbers from zero to ``top``, of which ``lowest`` is the smallest above zero."""
+    """Return the table of numbers from zero up, in logarithmic steps.
+
+    Args:
+        name: quantity.
+        top: largest number.
+        lowest: smallest number above zero.
+    """
     top = top if top > 0 else 1.0
     decades = min(MOST_DECADES, max(0.5, math.log10(top / lowest) if lowest > 0 else 1.0))
     values = np.full(256, np.nan, np.float32)
@@ -113,7 +123,12 @@ def light_table(name: str, top: float, lowest: float) -> Table:
 
 
 def signed_table(name: str, top: float) -> Table:
-    """Return the table of numbers between ``-top`` and ``top``."""
+    """Return the table of numbers of both signs, in logarithmic steps.
+
+    Args:
+        name: quantity.
+        top: largest size.
+    """
     top = top if top > 0 else 1.0
     values = np.full(256, np.nan, np.float32)
     values[0] = 0.0
@@ -138,7 +153,12 @@ RATIO = _linear("ratio", "ratio", np.arange(255) / 127 - 1.0, 0.5 / 127)
 
 
 def table_of(name: str, cubes: list[Tensor]) -> Table:
-    """Return the table that fits real numbers of several cubes: whole, light, or of both signs."""
+    """Return the table that fits real numbers of several cubes: whole numbers, light, or numbers of both signs.
+
+    Args:
+        name: quantity.
+        cubes: tensors of any shape.
+    """
     top, bottom, lowest = 0.0, 0.0, math.inf
     for cube in cubes:
         for part in cube.float().reshape(-1).split(_ENTRIES_AT_ONCE):  # type: ignore[no-untyped-call]

@@ -119,7 +119,11 @@ class Content:
 
 
 def time_slider(centers_opl: NDArray[np.float64]) -> Slider:
-    """Return the slider of bins of time around ``centers_opl`` (T,), metres."""
+    """Return the slider of bins of time.
+
+    Args:
+        centers_opl: (T,) centres, metres of optical path.
+    """
     return Slider("optical path length", "m", centers_opl, "time", "ns", _NS_PER_METRE)
 
 
@@ -129,13 +133,23 @@ def bin_slider(bins: int) -> Slider:
 
 
 def gate_slider(count: int, gates: Sequence[Gate] | None) -> Slider:
-    """Return the slider of gates, which count where they are not known."""
+    """Return the slider of gates, which count where they are not known.
+
+    Args:
+        count: number of gates.
+        gates: the gates.
+    """
     labels = tuple(f"{gate.start_opl:.4g} to {gate.end_opl:.4g} m" for gate in gates or ())
     return Slider("gate", "", np.arange(count, dtype=np.float64), labels=labels)
 
 
 def frequency_slider(frequencies_per_metre: Sequence[float] | None, count: int) -> Slider:
-    """Return the slider of ``count`` frequencies, which count where they are not known."""
+    """Return the slider of frequencies, which count where they are not known.
+
+    Args:
+        frequencies_per_metre: cycles per metre.
+        count: number of frequencies.
+    """
     if frequencies_per_metre is None:
         return Slider("frequency", "", np.arange(count, dtype=np.float64))
     return Slider("frequency", "/m", np.array(frequencies_per_metre), "frequency", "GHz", SPEED_OF_LIGHT / 1e9)

@@ -36,7 +36,17 @@ def content_of(
     x: Any, who: str, *, axis: TimeAxis | None = None, rate_axis: RateAxis | None = None,
     frequencies: Any = None, samples: int = _SAMPLES,
 ) -> Content:  # fmt: skip
-    """Return what a page shows of ``x``; see :func:`torchtransient.vis.view`."""
+    """Return the content of a page.
+
+    Args:
+        x: anything that :func:`torchtransient.vis.view` shows.
+        who: beginning of messages.
+        axis, rate_axis, frequencies: axes of tensors.
+        samples: most samples of a sequence.
+
+    Raises:
+        ShapeError, ArgumentError, StorageError: as of ``view``.
+    """
     known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
     if isinstance(x, tuple) and len(x) == 2:
         return _together([_single(part, who, **known) for part in x], ("A", "B"), who)
@@ -164,7 +174,17 @@ def _errors(x: Any) -> Tensor | None:
 
 
 def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
-    """Return the slider of bins of time, which count where there is no axis."""
+    """Return the slider of bins of time, which count without an axis.
+
+    Args:
+        bins: number of bins.
+        axis: time axis.
+        who: beginning of messages.
+
+    Raises:
+        ArgumentError: for another object.
+        ShapeError: for another number of bins.
+    """
     if axis is None:
         return bin_slider(bins)
     if not isinstance(axis, TimeAxis):
@@ -185,7 +205,18 @@ def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
 def light_content(
     cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None, who: str = "view"
 ) -> Content:
-    """Return what a page shows of light (C, T, H, W), or polarized (4, C, T, H, W)."""
+    """Return the content of light over time.
+
+    Args:
+        cube: (C, T, H, W), or polarized (4, C, T, H, W). Other numbers of channels than 1 and 3 are averaged.
+        slider: positions of T.
+        kind: "transient" or "gates".
+        error: standard errors (T, H, W).
+        who: beginning of messages.
+
+    Raises:
+        ShapeError: for other shapes.
+    """
     if cube.ndim == 5 and cube.shape[0] == 4:
         mean = cube.mean(1)
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
@@ -339,8 +370,12 @@ def _volume(volume: Any) -> Content:
 
 
 def binned(content: Content, times: int, pixels: int) -> Content:
-    """Return the content with ``times`` bins and ``pixels`` x ``pixels`` pixels as one, light added up over bins and
-    averaged over pixels; what does not fill one at the ends is left out.
+    """Return a content with fewer bins and pixels; those at the ends that fill none are left out.
+
+    Args:
+        content: the content.
+        times: bins that are added up to one.
+        pixels: rows and columns that are averaged to one.
     """
     t, h, w = (n // k * k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
 

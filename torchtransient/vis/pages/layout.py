@@ -45,7 +45,11 @@ def import_bokeh() -> Any:
 
 
 def modes_of(content: Content) -> dict[str, str]:
-    """Return the modes of a page by their names."""
+    """Return names of the modes of a page by their keys.
+
+    Args:
+        content: content of the page.
+    """
     first = content.planes[0]
     found = ["colour"] if first.light.shape[0] == 3 else []
     found.append("light")
@@ -114,7 +118,14 @@ def described(content: Content, tables: dict[str, Any], modes: dict[str, str], m
 
 
 def html_of(root: Any, title: str, meta: dict[str, Any], chunks: Sequence[str] = ()) -> str:
-    """Return the page of bokeh's models with bokeh, `view.js`, ``meta`` and ``chunks`` of numbers in it."""
+    """Return a page with bokeh, ``view.js`` and its data in it.
+
+    Args:
+        root: root of bokeh's models.
+        title: title of the window.
+        meta: data of :func:`described`.
+        chunks: script elements with numbers.
+    """
     from bokeh.embed import file_html
     from bokeh.resources import INLINE
 

@@ -70,9 +70,9 @@ def view(
 
     Args:
         x: a tensor or array (C, T, H, W), polarized (4, C, T, H, W) or complex (C, F, H, W); a result of a render with
-            `transient`, `phasor`, `gated`, `rates` or `beats`; a Capture; a HiddenVolume; the path of a file of one of
-            them; a tuple of two of a kind, shown as A, B and their difference; or a sequence of samples, of which one
-            is shown at a time.
+            `transient`, `phasor`, `slow_phasor`, `gated`, `rates` or `beats`; a Capture; a HiddenVolume; the path of a
+            file of one of them; a tuple of two of a kind, shown as A, B and their difference; or a sequence of samples,
+            of which one is shown at a time.
         path: file to write the page to.
         axis, rate_axis, frequencies: axes of tensors that do not know their own. Rates (C, R, T, H, W) need
             ``rate_axis``.
@@ -82,7 +82,8 @@ def view(
         samples: number of samples of a sequence that the page holds.
 
     Returns:
-        The page, with its notes about errors of numbers. Light is kept in 256 logarithmic steps.
+        The page, with its notes about errors of numbers. Light is kept in 256 logarithmic steps, whole numbers up to
+        65534 as they are.
 
     Raises:
         ShapeError: for other shapes, and results that do not fit each other.
@@ -119,7 +120,13 @@ class Encoded:
 
 
 def page_of(content: Content, title: str, max_bytes: int) -> Page:
-    """Return the page of a content, binned until it has at most ``max_bytes``."""
+    """Return the page of a content, binned until it fits.
+
+    Args:
+        content: the content.
+        title: heading.
+        max_bytes: most bytes of the page.
+    """
     import_bokeh()
     not_finite = _not_finite_said(content)
     room = max_bytes - 1_800_000
@@ -143,8 +150,8 @@ def _fitted(content: Content, max_bytes: int) -> tuple[Content, Encoded]:
     times = pixels = 1
     while True:
         t, h, w = (n // k for n, k in zip(content.shape, (times, pixels, pixels), strict=True))
-        # Slices and frequencies are no bins of light.
-        adds_up = t > 1 and content.kind not in ("phasors", "gates", "volume")
+        # Slices, frequencies and slow times are no bins of light.
+        adds_up = t > 1 and content.planes[0].phase is None and content.kind not in ("gates", "volume")
         least = t * h * w <= 64 or (min(h, w) == 1 and not adds_up)
         if least or _expected(content, times, pixels) <= 1.1 * max_bytes:
             shown = content if times == pixels == 1 else binned(content, times, pixels)

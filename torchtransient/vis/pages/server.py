@@ -42,7 +42,11 @@ _REQUEST = re.compile(r"/(frame|curve)/0/(c[0-2]|s[1-3]|phase)/(\d+)(?:/(\d+))?"
 
 
 def cube_bytes(path: Path) -> int:
-    """Return the size of the light in an HDF5 result; 0 for files of other kinds."""
+    """Return the bytes of the light in an HDF5 result; 0 for files of other kinds.
+
+    Args:
+        path: the file.
+    """
     if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
         return 0
     with hdf5_package("view").File(path, "r") as file:
