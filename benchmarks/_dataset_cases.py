@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at
+from torchtransient.scenes import look_at
 
 BOXES, COLOURS = ("small-box", "large-box"), ("red", "green", "white")
 VARIANT = "llvm_ad_mono"
@@ -15,21 +15,10 @@ START, LENGTH = 2.0, 10.0
 LETTER = "letter"
 
 
-class NoOne:
-    """Hears of samples, and lets all of them be made."""
-
-    def begin(self, shard: int, index: int) -> None:
-        return None
-
-    def end(self, shard: int, index: int, failed: str | None) -> None:
-        if failed is not None:
-            raise RuntimeError(f"sample {index} failed: {failed}")
-
-    def retry(self, shard: int, index: int, reason: str) -> None:
-        raise RuntimeError(f"sample {index} failed: {reason}")
-
-    def closing(self, shard: int) -> None:
-        pass
+def undisturbed(message: tuple[Any, ...]) -> None:
+    """Take the messages of a worker, and stop at a failure."""
+    if message[0] == "retry" or (message[0] == "end" and message[3] is not None):
+        raise RuntimeError(f"sample {message[2]} failed: {message[3]}")
 
 
 def room(resolution: int, bins: int, spp: int) -> dict[str, Any]:

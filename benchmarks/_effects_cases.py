@@ -47,7 +47,7 @@ def integrator(name: str) -> Callable[[SceneDict], SceneDict]:
 
 def with_fog(scene: SceneDict) -> SceneDict:
     """A thin homogeneous medium in a box that fills the room."""
-    from torchtransient.scenes.transforms import scale
+    from torchtransient.scenes import scale
 
     fog = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}
     box = {"type": "cube", "to_world": scale(0.999), "bsdf": {"type": "null"}, "interior": fog}

@@ -40,7 +40,7 @@ def small_box(integrator: str = "transient_path", *, fog: bool = False) -> Scene
     scene = cornell(16, num_bins=BINS, bin_width_opl=0.225)
     scene["integrator"] |= {"type": integrator}
     if fog:
-        from torchtransient.scenes.transforms import scale
+        from torchtransient.scenes import scale
 
         medium = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}
         scene["fog"] = {"type": "cube", "to_world": scale(0.999), "bsdf": {"type": "null"}, "interior": medium}

@@ -25,7 +25,7 @@ from scipy.optimize import minimize_scalar
 
 import torchtransient as tt
 from tools.diffusion import slab_transmittance
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 from torchtransient.units import SPEED_OF_LIGHT
 
 HERE = Path(__file__).resolve().parent

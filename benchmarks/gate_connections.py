@@ -22,7 +22,7 @@ import torch
 from _runner import arguments, environment
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.scenes import scale, translate
 
 SceneDict = dict[str, Any]
 NARROW = {"early": (4.4, 4.46), "middle": (6.0, 6.06), "late": (8.5, 8.56)}

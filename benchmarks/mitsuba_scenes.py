@@ -21,7 +21,7 @@ import numpy as np
 from _runner import arguments, environment, report
 
 import torchtransient as tt
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 
 # Beside those that say so in their name; all others are shown in colour.
 POLARIZED = ("bsdf_polarizer", "bsdf_pplastic", "bsdf_measured_polarized")

@@ -22,7 +22,7 @@ import torch
 from _runner import arguments, environment, report
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 
 FREQUENCIES, EXPOSURE_S = tt.FrequencyAxis.from_hertz([30e6]), 1.5e-3
 POSES = (2, 3, 8)

@@ -18,7 +18,7 @@ import numpy as np
 from _comparison import OURS, PEER, Comparison, Row, comparison_arguments
 from nlos_rates import ALBEDO, BIN_WIDTH, BINS, START, WALL_ALBEDO, body, letter, plate
 
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 
 KINDS = ("confocal", "single")
 ORIGIN, SPOT = [-0.5, 0.0, 0.25], [-0.3, 0.1, 0.0]

@@ -25,7 +25,7 @@ from _runner import arguments, environment, report
 import torchtransient as tt  # isort: skip
 import mitsuba as mi
 
-from torchtransient.scenes.transforms import look_at, scale, translate
+from torchtransient.scenes import look_at, scale, translate
 
 RATES, AXIS = tt.RateAxis(-10.0, 0.25, 80), tt.TimeAxis(0.0, 0.1, 100)
 LAMP = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1.0}

@@ -49,7 +49,7 @@ def cornell(resolution: int = 64, **settings: Any) -> SceneDict:
 
 def small_lamp() -> SceneDict:
     """The Cornell box with a lamp of 6 cm, as bright in sum as the large one."""
-    from torchtransient.scenes.transforms import rotate, scale, translate
+    from torchtransient.scenes import rotate, scale, translate
 
     scene = cornell()
     scene["light"]["to_world"] = translate([0.0, 0.99, 0.01]) @ rotate([1, 0, 0], 90) @ scale([0.03, 0.03, 0.03])
@@ -67,7 +67,7 @@ def with_box_of(bsdf: SceneDict) -> SceneDict:
 
 def fog() -> SceneDict:
     """The Cornell box full of thin fog, 48 x 48 pixels."""
-    from torchtransient.scenes.transforms import scale
+    from torchtransient.scenes import scale
 
     scene = cornell(48)
     medium = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}

@@ -20,9 +20,8 @@ import numpy as np
 from _comparison import BASELINE, OURS, Row, add_baseline, load, with_tent
 from _runner import Worker, arguments, environment, report
 
-from torchtransient.scenes import cornell_box
+from torchtransient.scenes import cornell_box, look_at, rotate, scale, translate
 from torchtransient.scenes.parts import perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
 GAPS = (1e-1, 1e-2, 1e-3, 1e-4)
 DIFFUSE = {"type": "diffuse", "reflectance": 0.6}

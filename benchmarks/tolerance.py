@@ -36,7 +36,7 @@ AXIS = {"num_bins": 60, "bin_width_opl": 0.1}
 
 def fog() -> SceneDict:
     """The Cornell box full of thin fog."""
-    from torchtransient.scenes.transforms import scale
+    from torchtransient.scenes import scale
 
     scene = tt.scenes.cornell_box(8, **AXIS)
     medium = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}

@@ -15,8 +15,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchtransient as tt
+from torchtransient.scenes import look_at, rotate, scale, translate
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
 PICTURE = Path(__file__).parent / "images" / "boundary_term.png"

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at, scale, translate
+from torchtransient.scenes import look_at, scale, translate
 from torchtransient.vis.files import enlarge, save_image, to_palette
 
 OUT = Path(__file__).parent / "images" / "pictures"

@@ -7,23 +7,18 @@ import copy
 import inspect
 import pickle
 
-import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.checks import arguments_of
 from torchtransient.errors import (
     ArgumentError,
-    SceneError,
-    ShapeError,
     StorageError,
     TorchTransientError,
     UnitError,
-    UnknownKeyError,
 )  # fmt: skip
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 
 AXIS = tt.TimeAxis(0.0, 0.05, 40)
 LIGHT = torch.rand(1, 40, 4, 4, generator=torch.Generator().manual_seed(0))
@@ -70,46 +65,6 @@ def test_functions_that_hand_arguments_on_say_what_was_called(scene, capture):
         tt.nlos.Capture.read("letter.mat", wallsize=0.6)
 
 
-def test_errors_inside_of_a_function_are_left_as_they_are():
-    def inner():
-        raise TypeError("of something else")
-
-    with pytest.raises(TypeError, match=r"^of something else$"), arguments_of("outer", inner):
-        inner()
-
-
-def test_depths_as_an_array(capture):
-    listed = tt.nlos.default_grid(capture, depths=(0.25, 0.5))
-    for depths in (torch.tensor([0.25, 0.5]), np.array([0.25, 0.5])):
-        assert torch.equal(tt.nlos.default_grid(capture, depths=depths).depths, listed.depths)
-
-
-def test_samples_by_place_are_no_values(scene):
-    with pytest.raises(ArgumentError, match=r"expected a mapping from keys to values, got int; write \{key: value\}"):
-        tt.render(scene, 4)
-
-
-def test_one_of_two_arguments():
-    with pytest.raises(ArgumentError, match=r"f_number= or solid_angle_sr=, got none of them; give one of them"):
-        tt.sensing.Optics()
-    with pytest.raises(ArgumentError, match=r"got f_number= and solid_angle_sr=; leave one of them out"):
-        tt.sensing.Optics(f_number=2.0, solid_angle_sr=1.0)
-    with pytest.raises(ArgumentError, match=r"axis= .* or bin_width_s=, got none of them"):
-        tt.sensing.SynchronousSPAD(10, dead_time_s=1e-9)
-
-
-def test_ranges_name_their_unit():
-    with pytest.raises(UnitError, match=r"frequencies_hz in \[1000, 1e\+12\] hertz \(20 MHz are 20e6\), got 20\.0"):
-        tt.sensing.read_itof(torch.rand(1, 4, 4, 4), 20, 4)
-    with pytest.raises(UnitError, match=r"pixel_area_m2 in \(0, 0.0001\] square metres .*, got 100\.0"):
-        tt.sensing.Optics(f_number=2.0, pixel_area_m2=100)
-    with pytest.raises(UnitError, match=r"every quantum_efficiency in \[0, 1\], got 2 to 40\."):
-        tt.sensing.PhotonBudget(
-            tt.sensing.Optics(f_number=2.0), pulse_energy_j=1e-9, wavelength_m=532e-9, repetition_rate_hz=10e6,
-            exposure_s=0.01, axis=AXIS, quantum_efficiency=torch.linspace(2, 40, 16).reshape(4, 4),
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("width", [1e-10, torch.tensor(1e-10)], ids=["number", "tensor"])
 def test_widths_of_bins_in_seconds(width):
     for loss in (tt.losses.wasserstein_loss, tt.losses.cumulative_loss):
@@ -118,24 +73,6 @@ def test_widths_of_bins_in_seconds(width):
     for module in (tt.losses.WassersteinLoss, tt.losses.CumulativeLoss):
         with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
             module(bin_width_opl=width)(LIGHT, LIGHT)
-
-
-def test_one_frequency_needs_no_list():
-    assert tt.FrequencyAxis.from_hertz(20e6) == tt.FrequencyAxis.from_hertz([20e6])
-    with pytest.raises(UnitError, match="a frequency: expected a finite number, got 'x'"):
-        tt.FrequencyAxis.from_hertz("x")
-
-
-
-@pytest.mark.parametrize(
-    ("given", "do"), [("a.h5", "tt.nlos.Capture.read reads files"), (LIGHT, r"a Tensor \(1, 40, 4, 4\)")]
-)
-def test_what_is_no_capture(given, do):
-    for function in (tt.nlos.reconstruct, tt.nlos.fk, tt.nlos.default_grid):
-        with pytest.raises(ShapeError, match=f"expected a tt.nlos.Capture, got .*{do}"):
-            function(given)
-    with pytest.raises(ArgumentError, match=f"expected a tt.nlos.Capture, got .*{do}"):
-        tt.nlos.choose_method(given)
 
 
 def test_files_of_another_kind_say_what_reads_them(scene, capture, tmp_path):
@@ -182,27 +119,6 @@ def test_a_seed_is_no_generator():
                 draw(LIGHT, *given)
         with pytest.raises(ArgumentError, match=r"got 0. Use torch.Generator\(\).manual_seed\("):
             draw(LIGHT, generator=0)
-
-
-def test_sides_of_a_picture():
-    assert tt.scenes.cornell_box(resolution=np.array([5, 4]))["sensor"]["film"]["width"] == 5
-    for wrong in (16.5, (4, 4, 4), "16"):
-        with pytest.raises(SceneError, match=r"^resolution: expected "):
-            tt.scenes.cornell_box(resolution=wrong)
-
-
-def test_keys_are_named_as_they_are_written(scene):
-    renderer = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=1)
-    with pytest.raises(UnknownKeyError, match=r"'red'; there are red\.reflectance\.value\."):
-        tt.parametrize.register(renderer, "red", tt.parametrize.Albedo())
-
-
-def test_recipes_name_what_is_written_in_python(scene):
-    box = tt.scenes.cornell_box(resolution=4, num_bins=20)
-    with pytest.raises(SceneError, match=r"expected a distribution, tt.data.Uniform\(0, 1\)"):
-        tt.data.Recipe(box, {"white.reflectance.value": (0.2, 0.8)}, spp=1)
-    with pytest.raises(ArgumentError, match=r"vary: expected a dictionary \{key: distribution\}, got \["):
-        tt.data.Recipe(box, ["white.reflectance.value"], spp=1)
 
 
 ROOMS = (tt.sensing, tt.stokes, tt.units, tt.losses, tt.metrics, tt.geometry)

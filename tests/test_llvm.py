@@ -144,15 +144,6 @@ def test_no_library_at_all(tmp_path):
 
 
 @pytest.mark.slow
-def test_search_that_finds_nothing_says_what_to_install(tmp_path):
-    code = "import torchtransient\n_llvm = torchtransient._llvm\n_llvm._search()\nprint(_llvm._outcome.problem)"
-    result = run(code, tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "torchtransient found none" in result.stdout
-    assert "pip install" in result.stdout
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("exists", [True, False])
 def test_the_users_own_choice_is_refused_and_left_as_it_was(tmp_path, exists):
     path = tmp_path / "mine" / "libLLVM-16.so.1"
@@ -183,25 +174,6 @@ def test_a_library_that_dr_jit_cannot_load_is_reported(tmp_path):
     result = run(REFUSED, tmp_path)
     assert result.returncode == 0, result.stderr
     assert f"LLVM 19.1 ({fake}) was found but Dr.Jit could not load it" in result.stdout
-
-
-@pytest.mark.slow
-def test_dr_jit_imported_first_with_an_old_library():
-    code = """
-        import drjit
-        drjit.detail.llvm_version = lambda: (15, 0, 6)
-        import torchtransient
-        try:
-            torchtransient._llvm.ensure_llvm()
-        except torchtransient.errors.VariantError as error:
-            print(error)
-    """
-    environment = {k: v for k, v in os.environ.items() if k != _llvm.VARIABLE}
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=120, env=environment
-    )
-    assert "imported before torchtransient and has bound LLVM 15.0.6" in result.stdout, result.stderr
-    assert "set DRJIT_LIBLLVM_PATH=" in result.stdout
 
 
 @pytest.mark.slow

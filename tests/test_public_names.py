@@ -227,8 +227,7 @@ def test_names_are_spelled_in_one_way():
 # What takes more than three arguments by place, and why.
 MANY_BY_PLACE = {
     "losses.surface_distance": "two meshes, each of vertices and faces",
-    "sensing.emg_cdf": "a density's arguments in the order of its formula: x, mean, sigma, tau",
-    "sensing.emg_density": "as emg_cdf",
+    "sensing.emg_cdf": "arguments in the order of its formula: x, mean, sigma, tau",
     "sensing.emg_survival": "as emg_cdf",
 }
 

@@ -10,7 +10,7 @@ import torch
 
 from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.checks import as_number, real_array, shown
+from torchtransient.checks import shown
 from torchtransient.errors import MissingPackageError, ShapeError, TorchTransientError, UnitError, UnknownKeyError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse, transform
@@ -69,13 +69,6 @@ def test_gates_of_numbers_that_are_none(gate):
     with np.errstate(all="raise"):
         found = gate.value([math.nan, -math.inf, math.inf, 1e300, -1e300])
     np.testing.assert_array_equal(found, [math.nan, 0, 0, 0, 0])
-
-
-def test_what_python_takes_for_a_number():
-    assert [as_number(bad) for bad in NONE[:-1]] == [None] * len(NONE[:-1])
-    assert real_array([True, 10**30]) is None and real_array(np.array([DATE])) is None
-    assert real_array(np.ma.array([1.0, 2.0], mask=[False, True])) is None
-    np.testing.assert_array_equal(real_array(np.ma.array([1.0, 2.0])), [1.0, 2.0])
 
 
 def test_messages_are_one_line():

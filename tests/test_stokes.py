@@ -152,23 +152,6 @@ def test_gradcheck_of_elements(element):
     assert element(angle).shape == (2, 4, 4)
 
 
-def test_errors():
-    good = random_light(3, dim=0)
-    for call in (
-        lambda: st.degree_of_polarization(torch.zeros(3, 2), 0),
-        lambda: st.degree_of_polarization(torch.zeros(4, 1, 2, 2), st.TRANSIENT_DIM),
-        lambda: st.degree_of_polarization(torch.zeros(4, dtype=torch.int64), 0),
-        lambda: st.rotate_frame(good, torch.zeros(5, 3), 0),
-        lambda: st.apply_mueller(torch.zeros(3, 3), good, 0),
-    ):
-        with pytest.raises(ShapeError, match="expected"):
-            call()
-    with pytest.raises(UnitError, match="floor"):
-        st.degree_of_polarization(good, 0, floor=-1.0)
-    with pytest.raises(UnitError, match="extinction"):
-        st.linear_polarizer(0.0, 1.5)
-
-
 def test_a_floor_has_to_be_exceeded():
     """A linear part, or an intensity, that is the floor itself has no angle and no degree."""
     s = torch.tensor([0.5, -0.5, 0.0, 0.0])
@@ -186,17 +169,6 @@ def test_an_ideal_polarizer_has_a_derivative_by_its_extinction():
     assert slope.item() == pytest.approx(0.5)
 
 
-def test_an_ideal_polarizer_lets_nothing_through_across():
-    """At 0 and 90 degrees, element by element."""
-    for angle, sign in ((0.0, 1.0), (math.pi / 2, -1.0)):
-        expected = torch.zeros(4, 4)
-        expected[0, 0] = expected[1, 1] = 0.5
-        expected[0, 1] = expected[1, 0] = 0.5 * sign
-        torch.testing.assert_close(st.linear_polarizer(angle), expected, rtol=0, atol=1e-6)
-    half = st.linear_polarizer(math.pi / 4)
-    torch.testing.assert_close(half[2], torch.tensor([0.5, 0.0, 0.5, 0.0]), rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize("floor", [0.0, 0.5])
 def test_light_that_is_no_number_has_no_measure(measure, floor):
@@ -211,17 +183,28 @@ def test_light_that_is_no_number_has_no_measure(measure, floor):
     assert torch.autograd.grad(measure(everything, 0).sum(), everything)[0].isnan().any()
 
 
+def test_precision_of_angles_and_matrices():
+    assert st.rotator(0.1).dtype == st.rotator([1, 2]).dtype == torch.float32
+    assert st.rotator(np.float64(0.1)).dtype == torch.float64
+    horizontal = light(1.0, 1.0, 0.0, 0.0)
+    torch.testing.assert_close(st.rotate_frame(horizontal, 0.1, 0)[1], torch.tensor(math.cos(0.2), dtype=torch.float64))
+    matrix = [[0.1 if i == j else 0.0 for i in range(4)] for j in range(4)]
+    assert torch.equal(st.apply_mueller(matrix, horizontal, 0), 0.1 * horizontal)
+
+
 @pytest.mark.parametrize("measure", MEASURES)
 def test_what_is_no_light(measure):
     ones = torch.ones(4, 2)
-    for given in (np.ones(4), [1, 0, 0, 0], None):
-        with pytest.raises(ShapeError, match="stokes: expected a tensor"):
+    for given in (np.ones(4), None, torch.zeros(3, 2), torch.zeros(4, dtype=torch.int64)):
+        with pytest.raises(ShapeError):
             measure(given, 0)
-    for floor in (None, "x", True, math.nan, -1.0, math.inf, 10**400, torch.ones(2), [1.0]):
-        with pytest.raises(UnitError, match="floor: expected a finite number of at least 0"):
+    with pytest.raises(ShapeError):
+        measure(torch.zeros(4, 1, 2, 2), st.TRANSIENT_DIM)
+    for floor in (None, True, math.nan, -1.0, math.inf, torch.ones(2)):
+        with pytest.raises(UnitError):
             measure(ones, 0, floor)
-    for dim in (None, 1.5, True, "x"):
-        with pytest.raises(ArgumentError, match="dim: expected a whole number"):
+    for dim in (None, 1.5, True):
+        with pytest.raises(ArgumentError):
             measure(ones, dim)
 
 
@@ -234,18 +217,11 @@ def test_what_is_no_angle():
     ]  # fmt: skip
     for call in calls:
         for bad in (None, "x", True, 1j, torch.tensor(1j), torch.tensor(True)):
-            with pytest.raises(UnitError, match="expected"):
+            with pytest.raises(UnitError):
                 call(bad)
-    with pytest.raises(UnitError, match="extinction: expected finite numbers, got nan"):
-        st.linear_polarizer(0.0, math.nan)
-    with pytest.raises(UnitError, match=r"extinction: expected numbers in \[0, 1\], got tensor\(nan\)"):
-        st.linear_polarizer(0.0, torch.tensor(math.nan))
-
-
-def test_precision_of_angles_and_matrices():
-    assert st.rotator(0.1).dtype == st.rotator([1, 2]).dtype == torch.float32
-    assert st.rotator(np.float64(0.1)).dtype == torch.float64
-    horizontal = light(1.0, 1.0, 0.0, 0.0)
-    torch.testing.assert_close(st.rotate_frame(horizontal, 0.1, 0)[1], torch.tensor(math.cos(0.2), dtype=torch.float64))
-    matrix = [[0.1 if i == j else 0.0 for i in range(4)] for j in range(4)]
-    assert torch.equal(st.apply_mueller(matrix, horizontal, 0), 0.1 * horizontal)
+    for extinction in (math.nan, torch.tensor(math.nan), 1.5):
+        with pytest.raises(UnitError):
+            st.linear_polarizer(0.0, extinction)
+    for call in (lambda: st.rotate_frame(ones, torch.zeros(5, 2), 0), lambda: st.apply_mueller(torch.eye(3), ones, 0)):
+        with pytest.raises(ShapeError):
+            call()

@@ -130,7 +130,7 @@ def users_choice() -> str | None:
 
 
 def ensure_llvm() -> LLVMLibrary:
-    """Return the LLVM that Dr.Jit has bound, whoever imported Dr.Jit. Called before an `llvm_*` variant is set.
+    """Return the LLVM that Dr.Jit has bound. Called before an `llvm_*` variant is set.
 
     Raises:
         VariantError: without a usable LLVM, with what to install.

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 from torchtransient.vis.files import figure_type, save_figure
 
 HERTZ, EXPOSURE_S = 60e6, 5e-3

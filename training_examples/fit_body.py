@@ -28,9 +28,9 @@ from tqdm import tqdm
 
 import torchtransient as tt
 from torchtransient.parametrize import AxisAnglePose, axis_angle_from_pose
+from torchtransient.scenes import look_at, rotate, scale, translate
 from torchtransient.scenes.meshes import triangle_mesh
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
 KEY, BINS, RESOLUTION = "body.to_world", 96, 16

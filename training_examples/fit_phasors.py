@@ -29,7 +29,7 @@ from tqdm import tqdm
 import torchtransient as tt
 from torchtransient import sensing
 from torchtransient.parametrize import pose_from_axis_angle
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 from torchtransient.vis.files import figure_type, save_figure
 
 HERTZ = (100e6, 20e6)

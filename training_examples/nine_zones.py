@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 import torchtransient as tt
 from torchtransient import sensing
+from torchtransient.scenes import look_at, scale
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at, scale
 
 BIN_S, ZERO, FIRST, LAST, FINE = 88e-12, 13, 24, 73, 4  # bins behind the cross-talk and before what else is in the room
 AXIS = tt.TimeAxis.from_seconds((FIRST - ZERO) * BIN_S, BIN_S / FINE, (LAST - FIRST) * FINE)

@@ -27,9 +27,9 @@ from tqdm import tqdm
 
 import torchtransient as tt
 from torchtransient import sensing
+from torchtransient.scenes import look_at
 from torchtransient.scenes.meshes import plate
 from torchtransient.scenes.parts import perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at
 from torchtransient.vis.files import figure_type, save_figure
 
 KEY = "relief.vertex_positions"

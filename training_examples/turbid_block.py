@@ -12,8 +12,8 @@ from torch.nn.utils import parametrize
 
 import torchtransient as tt
 from torchtransient import sensing
+from torchtransient.scenes import look_at, scale, translate
 from torchtransient.scenes.parts import perspective, transient_film
-from torchtransient.scenes.transforms import look_at, scale, translate
 
 SIGMA_T, ALBEDO = (f"block.interior_medium.{name}.value.value" for name in ("sigma_t", "albedo"))
 HEIGHT, LIT, PIXEL, PIXELS = 1.0, 0.2, 0.005, 8  # metres; six pixels in the dark, two in the light

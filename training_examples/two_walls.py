@@ -18,8 +18,8 @@ from tqdm import tqdm
 import torchtransient as tt
 from torchtransient import sensing
 from torchtransient.parametrize import Bounded, pose_from_axis_angle
+from torchtransient.scenes import look_at, rotate, scale
 from torchtransient.scenes.parts import diffuse, perspective, transient_film, transient_path
-from torchtransient.scenes.transforms import look_at, rotate, scale
 
 PIXELS, SIZE, CYCLES = 8, 6.0, 20_000
 AXIS = tt.TimeAxis(1.9, 0.08, 64)

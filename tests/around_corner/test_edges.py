@@ -10,6 +10,8 @@ from support.hidden_shapes import ball, join, mesh, wall_grid
 from torchtransient.plugins.around_corner.outline_table import Edges, OutlineTable, hiding_pairs, parts_of
 from torchtransient.plugins.edges.joined import Triangles
 
+VARIANT = "llvm_ad_mono"
+
 
 def edges_of(*meshes):
     triangles = Triangles.from_meshes(list(meshes))

@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import SceneError
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 
 ORIGIN, SPOT, POINTS = (-0.5, 0.0, 0.25), (-0.2, 0.1, 0.0), 4
 LINEAR, ANGULAR, CENTER = (0.8, -0.5, -1.6), (0.6, 1.5, 0.4), (0.1, 0.05, 1.0)

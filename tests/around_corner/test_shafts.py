@@ -15,6 +15,8 @@ from torchtransient.plugins.around_corner.shafts import ScanRegion, clear_elemen
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
+VARIANT = "llvm_ad_mono"
+
 
 def relay_wall(cells=1):
     v, f = plate(2, 2, (0, 0, 0), cells)

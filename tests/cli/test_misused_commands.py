@@ -12,7 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from torchtransient.cli.main import Commands, main
+from torchtransient.cli import main as cli
 
 TESTS = Path(__file__).parents[1]
 
@@ -45,11 +45,11 @@ def test_errors_of_others(monkeypatch, error, status, words):
     def broken():
         raise error
 
-    monkeypatch.setattr(Commands, "get_command", lambda self, ctx, name: broken)
-    found = CliRunner().invoke(main, ["plan"])
+    monkeypatch.setattr(cli.Commands, "get_command", lambda self, ctx, name: broken)
+    found = CliRunner().invoke(cli.main, ["plan"])
     assert found.exit_code == status and words in found.stderr
     assert found.stderr.startswith("error: ") and found.stderr.count("\n") == 1 and len(found.stderr) < 500
-    assert type(CliRunner().invoke(main, ["--debug", "plan"]).exception) is type(error)
+    assert type(CliRunner().invoke(cli.main, ["--debug", "plan"]).exception) is type(error)
 
 
 def test_a_reader_that_has_left_is_no_error_of_ours(monkeypatch):
@@ -57,11 +57,11 @@ def test_a_reader_that_has_left_is_no_error_of_ours(monkeypatch):
     def broken():
         raise BrokenPipeError(32, "Broken pipe")
 
-    monkeypatch.setattr(Commands, "get_command", lambda self, ctx, name: broken)
-    found = CliRunner().invoke(main, ["plan"])
+    monkeypatch.setattr(cli.Commands, "get_command", lambda self, ctx, name: broken)
+    found = CliRunner().invoke(cli.main, ["plan"])
     assert found.exit_code == 1 and not found.stderr
 
 
 def test_a_folder_that_is_no_data_set(tmp_path):
-    found = CliRunner().invoke(main, ["dataset", "verify", str(tmp_path)])
+    found = CliRunner().invoke(cli.main, ["dataset", "verify", str(tmp_path)])
     assert found.exit_code == 2 and "holds no shard" in found.stderr

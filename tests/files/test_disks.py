@@ -20,7 +20,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.capture_files import ENDINGS, grids, holdable, made
+from support.capture_files import ENDINGS, grids, holdable, made, volume
 from support.fake_recipe import FakeRecipe
 from support.killed_writers import output
 from support.stored_samples import sample, write
@@ -80,7 +80,7 @@ def test_pipes_are_not_replaced(tmp_path, name):
     write, ending = WRITERS[name]
     place = tmp_path / f"a{ending}"
     os.mkfifo(place)
-    reading = os.open(place, os.O_RDONLY | os.O_NONBLOCK)  # so that nobody waits who opens it
+    reading = os.open(place, os.O_RDONLY | os.O_NONBLOCK)  # or opening it would wait for a reader
     try:
         with pytest.raises(StorageError):
             write(place)
@@ -146,13 +146,6 @@ def test_includes_that_are_devices(tmp_path):
 
 
 # ------------------------------------------------------------------------------------------------------ files of arrays
-
-
-def volume():
-    eye = torch.eye(3, dtype=torch.float64)
-    axes = dict(zip(("along_x", "along_y", "normal"), eye, strict=True))
-    grid = tt.nlos.VoxelGrid(torch.linspace(0.1, 1, 4), (5, 6), (0.1, 0.2), first=eye[0] * 0, **axes)
-    return tt.nlos.HiddenVolume(torch.arange(120.0).reshape(1, 4, 5, 6), grid, "fk", metadata={"a": 1})
 
 
 def capture():

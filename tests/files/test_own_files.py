@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.capture_files import FREQUENCIES, grids, listed, made
+from support.capture_files import FREQUENCIES, grids, listed, made, volume
 from support.killed_writers import output
 from support.sealed_files import as_first_version
 from support.sweeps import together
@@ -27,13 +27,6 @@ from torchtransient.files import read_result, write_result
 
 SEED = 3
 SCAN = grids()["confocal"]
-
-
-def volume():
-    eye = torch.eye(3, dtype=torch.float64)
-    axes = dict(zip(("along_x", "along_y", "normal"), eye, strict=True))
-    grid = tt.nlos.VoxelGrid(torch.linspace(0.1, 1, 4), (5, 6), (0.1, 0.2), first=eye[0] * 0, **axes)
-    return tt.nlos.HiddenVolume(torch.arange(120.0).reshape(1, 4, 5, 6), grid, "fk", metadata={"a": 1})
 
 
 KINDS = {

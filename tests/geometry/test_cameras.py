@@ -18,7 +18,7 @@ from torchtransient import geometry
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.rendering.cameras import camera_of
 from torchtransient.rendering.labels import scene_labels
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 POSE = look_at([1.0, 2.0, 3.0], [0.2, 0.5, 0.0])
 OFFSET = (0.1, -0.07)

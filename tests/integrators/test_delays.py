@@ -12,7 +12,7 @@ from scipy.stats import gamma
 import torchtransient as tt
 from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
 from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, DelayedBSDFs, _distribution
 from torchtransient.plugins.guards import no_collection

@@ -10,10 +10,10 @@ import torch
 
 import torchtransient as tt
 from support.marks import long, long_pairs, long_rows
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError
 from torchtransient.scene.variant import active_variant
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 VARIANT = "llvm_ad_rgb"
 COLOUR = "red.reflectance.value"

@@ -29,7 +29,7 @@ from support.lights_and_sensors import (
 from support.marks import long, long_rows
 from support.runs import T
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.plugins.guards import no_collection
 
 VARIANT = "llvm_ad_rgb"  # the sky of Mitsuba knows no monochromatic variant

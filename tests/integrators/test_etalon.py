@@ -12,7 +12,7 @@ import torch
 
 from support.dielectric_reference import fresnel_reflectance, rough_dielectric
 from support.marks import long_rows
-from torchtransient.accuracy.statistics import z_test
+from torchtransient.accuracy import z_test
 
 VARIANT = "llvm_ad_mono"
 RUNS = 8

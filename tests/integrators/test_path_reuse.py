@@ -12,10 +12,10 @@ import torch
 import torchtransient as tt
 from support.marks import long
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError
 from torchtransient.scene.variant import active_variant
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 VARIANT = "llvm_ad_rgb"
 PATH, REUSE = "transient_path", "transient_path_reuse"

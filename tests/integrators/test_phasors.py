@@ -8,7 +8,7 @@ import pytest
 
 from support.plain_scenes import camera, load
 from support.runs import T
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.plugins.films import phasor_sums
 
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 10}

@@ -8,7 +8,7 @@ import pytest
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.plugins.guards import no_collection
 
 VARIANT = "llvm_ad_mono_polarized"

@@ -13,7 +13,7 @@ import torch
 from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient import stokes as st
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.testing.closed_forms import fresnel_reflectances
 
 RUNS, BIN, INDEX = 8, 0.02, 1.5

@@ -12,7 +12,7 @@ import pytest
 from support.marks import long, long_rows
 from support.runs import T, runs
 from support.surface_samples import start
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.plugins.sampling.sphere_lights import SphereLights
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0

@@ -221,7 +221,7 @@ def test_a_capture_with_transient_and_phasor_beside_a_phasor():
 def test_renders_of_the_library():
     """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
     from torchtransient.capture import Capture, Scan, Wall
-    from torchtransient.files.result_file import Result
+    from torchtransient.files import Result
     from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
     from torchtransient.sensing import ItofReading
 

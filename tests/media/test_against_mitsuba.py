@@ -8,7 +8,7 @@ import pytest
 from support.marks import long
 from support.media_scenes import block, camera, clouds, homogeneous, load, rgb, volume
 from support.runs import T, runs, steady_runs
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import GradientError, SceneError
 
 VARIANT = "llvm_ad_rgb"

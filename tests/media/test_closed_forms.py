@@ -9,7 +9,7 @@ from support.marks import long
 from support.media_scenes import film, homogeneous, load, rgb
 from support.runs import T, runs
 from support.walks import recorded_paths
-from torchtransient.accuracy.statistics import z_test
+from torchtransient.accuracy import z_test
 
 VARIANT = "llvm_ad_mono"
 

@@ -8,7 +8,7 @@ import pytest
 from support.marks import long_rows
 from support.media_scenes import film, homogeneous, load, volume
 from support.runs import T, runs
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 
 VARIANT = "llvm_ad_mono"
 SIGMA = 0.7

@@ -5,7 +5,7 @@ import pytest
 
 from support.media_scenes import block, camera, film, homogeneous, load, volume
 from support.runs import T, runs
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 
 VARIANT = "llvm_ad_mono"
 

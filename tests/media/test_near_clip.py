@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.accuracy.statistics import z_test
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.accuracy import z_test
+from torchtransient.scenes import scale, translate
 
 VARIANT = "llvm_ad_mono"
 # Metres from the camera: a black shield that is clipped away, the clip plane, a lamp without end.

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.rates import VARIANT, hidden_plate, plate, scene
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 RATES, AXIS = tt.RateAxis(-12.0, 0.5, 48), tt.TimeAxis(0.0, 0.2, 60)
 CHIRPS = tt.Chirps(1e9, 2e-6, 1550e-9)

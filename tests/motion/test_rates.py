@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from support.rates import AXIS, RATES, VARIANT, close, hidden_plate, mean_length, mean_rate, plate, rates_of, scene
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
 SPEED, WAVELENGTH = 1.37, 1550e-9

@@ -10,7 +10,7 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 
 TIMES, FREQUENCIES = (-0.3, 0.0, 0.2), (0.0, 0.4, 1.0)
 SPEED = 1.37

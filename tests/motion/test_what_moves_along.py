@@ -9,7 +9,7 @@ import torch
 import torchtransient as tt
 from support.rates import VARIANT, mean_rate, plate, rates_of, scene
 from torchtransient.errors import SceneError
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.scenes import scale, translate
 
 RATES = tt.RateAxis(-10.0, 0.25, 80)
 

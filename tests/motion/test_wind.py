@@ -11,7 +11,7 @@ import torch
 import torchtransient as tt
 from support.rates import RATES, VARIANT, mean_length, mean_rate, rates_of, scene
 from torchtransient.errors import SceneError
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.scenes import scale, translate
 
 WIND, WHIRL, CENTER = np.array([0.3, 0.2, 1.4]), np.array([0.3, 0.8, 0.2]), np.array([0.7, 0.1, 2.0])
 # The grid's box and the centres of its cells along each axis: a linear field is exact between those.

@@ -26,6 +26,7 @@ from torchtransient.errors import (
 )
 from torchtransient.rendering.renderer import TransientRenderer
 
+VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
 WALL = tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7)
 HIDDEN = tt.scenes.nlos_z()

@@ -10,6 +10,7 @@ import torchtransient as tt
 from torchtransient import scenes
 from torchtransient.errors import TorchTransientError
 
+VARIANT = "llvm_ad_mono"
 VERTICES, FACES = np.array([[0, 0, 1.0], [1, 0, 1], [0, 1, 1]]), [[0, 2, 1]]
 WALL = tt.nlos.Wall.plane()
 POINTS = tt.nlos.Scan.grid(WALL, 2, kind="confocal")
@@ -19,9 +20,7 @@ HIDDEN = scenes.nlos_z()
 
 @pytest.mark.parametrize("values", [None, [1], "x", 3, torch.tensor([1.0]), {1: 2}])
 def test_values_that_are_none(values):
-    renderer = tt.nlos.CaptureRenderer(
-        HIDDEN, POINTS, ["letter.bsdf.reflectance.value"], time_axis=AXIS, spp=2, variant="llvm_ad_mono"
-    )
+    renderer = tt.nlos.CaptureRenderer(HIDDEN, POINTS, ["letter.bsdf.reflectance.value"], time_axis=AXIS, spp=2)
     if values is None:
         assert renderer(values, seed=0).transient.shape == (1, 20, 2, 2)
         return

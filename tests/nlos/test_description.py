@@ -14,7 +14,7 @@ from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
 from torchtransient.nlos.setup_files import _SCAN_ENTRIES as SCAN_ENTRIES
 from torchtransient.nlos.setup_files import ENTRIES, SCENES, read_description
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 from torchtransient.sensing import Device
 from torchtransient.units import SPEED_OF_LIGHT
 

@@ -17,6 +17,7 @@ import torchtransient as tt
 from support.marks import long
 from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning, SceneError
 
+VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
 WALL = tt.nlos.Wall.plane(2.0, 1.6, albedo=0.7)
 VERTICES = "letter.vertex_positions"

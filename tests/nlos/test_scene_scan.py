@@ -14,6 +14,7 @@ from torchtransient.errors import SceneError, TorchTransientWarning
 from torchtransient.nlos import scene_scan
 from torchtransient.nlos.scene_scan import Ends
 
+VARIANT = "llvm_ad_mono"
 UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -10,7 +10,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Wall
 from torchtransient.errors import SceneError, StorageError
 from torchtransient.nlos.tal_yaml import read_tal_yaml
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 GEOMETRY = """

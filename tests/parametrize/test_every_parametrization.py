@@ -14,7 +14,7 @@ from torch.nn.utils import parametrize as torch_parametrize
 from support.marks import long
 from torchtransient import parametrize
 from torchtransient.errors import ShapeError, TorchTransientError
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 BASE = translate([0.3, -0.5, 2.0]) @ rotate([1.0, 2.0, -1.0], 40.0) @ scale([0.2, 1.5, 0.7])
 MOVED = translate([0.1, 0.2, -0.3]) @ rotate([0.0, 1.0, 0.3], 25.0)

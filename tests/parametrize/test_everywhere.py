@@ -10,7 +10,7 @@ import torch
 
 from support.sweeps import together
 from torchtransient import geometry, parametrize
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 
 def numbers(*shape, low=0.1, high=0.9):

@@ -19,7 +19,7 @@ from torchtransient.parametrize import (
     pose_from_twist,
     twist_from_pose,
 )  # fmt: skip
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 AXIS = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
 SHIFT = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
@@ -156,13 +156,9 @@ def test_a_scale_needs_its_base():
         ({"base": np.zeros((4, 4))}, UnitError, "with an inverse"),
         ({"base": np.eye(3)}, ShapeError, r"\(\.\.\., 4, 4\)"),
         ({"base": np.diag([1.0, 1.0, 1.0, 2.0])}, UnitError, "last row 0, 0, 0, 1"),
-        ({"base": np.eye(4) + 0.1 * np.eye(4, k=-3)}, UnitError, "last row 0, 0, 0, 1"),
         ({"base": np.where(np.eye(4, k=3), np.nan, np.eye(4))}, UnitError, "with an inverse"),
         ({"about": [math.nan, 0.0, 0.0]}, UnitError, "finite numbers"),
-        ({"about": torch.tensor([0.0, math.inf, 0.0])}, UnitError, "finite numbers"),
-        ({"base": "there"}, ShapeError, r"\(\.\.\., 4, 4\)"),
         ({"about": "there"}, ArgumentError, "'self', 'world' or a point"),
-        ({"about": [1.0, 2.0]}, ShapeError, "point"),
         ({"frame": "camera"}, ArgumentError, "'world' or 'local'"),
         ({"length_scale": 0.0}, UnitError, "length_scale"),
     ],

@@ -23,7 +23,7 @@ from torchtransient.parametrize import (
     Simplex,
     register,
 )
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 BASE = translate([0.3, -0.5, 2.0]) @ rotate([1.0, 2.0, -1.0], 40.0) @ scale([0.2, 1.5, 0.7])
 OTHER = translate([1.0, 0.0, 0.1]) @ BASE

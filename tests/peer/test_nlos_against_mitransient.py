@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.accuracy import two_sample_z_test
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 pytestmark = pytest.mark.peer
 

@@ -11,7 +11,7 @@ import pytest
 
 from support.marks import long
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError, StorageError
 
 LANES = "torchtransient.plugins.integrators.job.MAX_LANES"

@@ -13,9 +13,9 @@ from support.film_storage import storage
 from support.marks import long
 from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import ArgumentError, GradientError, SceneError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.gates import Gate
 from torchtransient.plugins.films.block import ArrivalWindow, GappedWindow
 from torchtransient.plugins.sampling.lights import LightBox

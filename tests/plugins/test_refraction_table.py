@@ -9,6 +9,8 @@ import pytest
 
 from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs, index_of
 
+VARIANT = "llvm_ad_mono"
+
 DIFFUSE = {"type": "diffuse"}
 GLASS = {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.1}
 OURS = {**GLASS, "type": "diff_rough_dielectric"}

@@ -13,9 +13,9 @@ from scipy.integrate import trapezoid
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test, z_test
+from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.plugins.films.colour import ChannelMatch, SensorResponse, StandardObserver, mean_of
 from torchtransient.plugins.polarized import FrameRotation
 

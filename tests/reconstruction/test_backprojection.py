@@ -92,14 +92,6 @@ def test_a_voxel_gives_its_value_to_every_pair():
     torch.testing.assert_close(mean, lengths.mean(-1))
 
 
-def test_what_is_outside_of_the_record_counts_as_nothing():
-    scan, point = SCANS["confocal"], torch.tensor([[0.0, 0.0, 0.5]], dtype=F64)
-    for axis in (TimeAxis(0.0, 0.02, 20), TimeAxis(2.0, 0.02, 20)):
-        operator = Backprojection(scan, point, time_axis=axis, dtype=F64)
-        assert not operator(torch.ones(1, dtype=F64)).any()
-        assert not operator.adjoint(torch.ones(operator.data_shape, dtype=F64)).any()
-
-
 def test_far_from_the_origin_and_late_single_precision_keeps_its_digits():
     # The same hidden point 300 m away from the origin, with legs of 500 m: 1e9 float32 ulp of a bin otherwise.
     shift = torch.tensor([300.0, -200.0, 100.0], dtype=F64)

@@ -121,6 +121,7 @@ def test_batches_are_items_on_their_own():
     ):
         torch.testing.assert_close(function(volume)[1, 2], function(volume[1, 2]))
         torch.testing.assert_close(torch.vmap(function)(volume), function(volume))
+        assert function(volume[:0]).shape == (0, *function(volume).shape[1:])
 
 
 def test_what_cannot_be_taken():

@@ -187,7 +187,7 @@ def test_an_empty_picture_has_no_error():
 def test_a_result_file_keeps_them(tmp_path):
     with torch.no_grad():
         out = tt.TransientRenderer(room(), spp=8, physics="ignore")(seed=0, errors=True)
-    from torchtransient.files.result_file import read_result, write_result
+    from torchtransient.files import read_result, write_result
 
     again = read_result(write_result(tmp_path / "a.npz", out))
     assert torch.equal(again.standard_error(), out.standard_error())
@@ -277,7 +277,7 @@ def test_histograms_of_several_rows(name, errors):
 
 @pytest.mark.parametrize("name", FILMS_OF_ROWS)
 def test_rows_in_files_and_polarized(name, tmp_path):
-    from torchtransient.files.result_file import read_result, write_result
+    from torchtransient.files import read_result, write_result
 
     scene = room("llvm_ad_mono_polarized", 6).moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0))})
     renderer = tt.TransientRenderer(scene, spp=8, physics="ignore", **FILMS_OF_ROWS[name])

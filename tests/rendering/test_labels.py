@@ -25,7 +25,7 @@ from torchtransient.rendering.labels import (
     scene_labels,
 )  # fmt: skip
 from torchtransient.rendering.recording import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 FLOATS = [name for name in LABELS if name not in NUMBERED]
 DISTANCE, RADIUS = 5.0, 1.25

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Dataset, default_collate
 
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, make_room
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 
 
 @pytest.fixture(scope="module")

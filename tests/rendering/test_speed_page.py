@@ -9,6 +9,8 @@ import torchtransient as tt
 from support.pages import Page
 from torchtransient.rendering import recording
 
+VARIANT = "llvm_ad_rgb"
+
 PAGE = Page("docs/speed.md")
 
 

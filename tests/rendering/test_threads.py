@@ -18,6 +18,8 @@ from torchtransient.plugins import drjit_pool
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
 
+VARIANT = "llvm_ad_rgb"
+
 
 @pytest.fixture(autouse=True)
 def counts_come_back():

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from torchtransient.cli.main import main
-from torchtransient.files.result_file import read_result
+from torchtransient.files import read_result
 
 VARIANT = "llvm_ad_mono"
 SCENE = """<scene version="3.0.0">

@@ -15,7 +15,7 @@ import torch
 import torchtransient as tt
 from support.moving_scenes import LAMP, moving_scene, wall
 from torchtransient.errors import ArgumentError, GradientError, GradientWarning, SceneError, TorchTransientWarning
-from torchtransient.scenes.transforms import look_at
+from torchtransient.scenes import look_at
 
 VARIANT = "llvm_ad_mono"
 SPEED = 1.5

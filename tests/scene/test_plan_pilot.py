@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import torchtransient as tt
 from support import plan_scenes
 from support.marks import long
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 from torchtransient.cli.main import main
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.films import Histogram

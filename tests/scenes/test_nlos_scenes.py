@@ -12,7 +12,7 @@ from torchtransient import scenes
 from torchtransient.capture import Wall
 from torchtransient.capture.wall import first_hits
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 ALL = {
     "nlos_z": scenes.nlos_z,

@@ -222,6 +222,7 @@ REFUSED = {
     "learnt background": (lambda: [budget(**LEARNT), open_response(), spad()], "boundary='zero'"),
     "cycles in a group": (lambda: [budget(), halves(lambda: Compose([spad(399)]))], "one number of cycles"),
     "quantity in a group": (lambda: [budget(), halves(lambda: Compose([jitter()]))], "Put the detector between"),
+    "jitter of rates": (lambda: [budget(), jitter(), spad()], "acts on detections. Take an ImpulseResponse"),
     "skew of counts": (lambda: [spad(), sensing.PixelSkew(5 * PS, AXIS)], "average counts.*DetectionSkew"),
     "lens of counts": (lambda: [spad(), sensing.LensBlur(2.0)], "average counts"),
     "spot of counts": (lambda: [spad(), nn.Sequential(sensing.SpatialPSF(torch.ones(3, 3)))], "average counts"),

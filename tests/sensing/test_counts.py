@@ -168,6 +168,17 @@ def test_a_sum_of_many_draws_has_the_variance_of_a_binomial():
     assert abs(float(x.var()) / (n * p * (1 - p)) - 1) < 5 * (2 / size) ** 0.5
 
 
+def test_many_trials_and_photons():
+    """More trials than tables have, and means past the whole numbers of single precision."""
+    size, g = 40_000, torch.Generator().manual_seed(2)
+    shared = halve(torch.full((size,), 1000.0), torch.full((size,), 0.25), g)
+    photons = moved_counts.poisson(torch.full((size,), 3e7), g)
+    for found, mean, variance in ((shared, 250.0, 187.5), (photons, 3e7, 3e7)):
+        found = found.double() - mean
+        assert abs(float(found.mean())) < 5 * (variance / size) ** 0.5
+        assert abs(float(found.square().mean()) / variance - 1) < 5 * (2 / size) ** 0.5
+
+
 def test_lags_follow_their_distribution():
     """Also where a lag is much rarer than a cell of the table, and where it is impossible."""
     k = torch.arange(3000, dtype=torch.float64)

@@ -182,7 +182,8 @@ def test_first_photons_and_moves_are_drawn_at_once():
     one_by_one, g = many, generator(5)
     for stage in chain.stages:
         one_by_one = stage.sample(one_by_one, g)
-    for y in (at_once, one_by_one, counter("gaussian")(many, generator=generator(2))):
+    surrogates = counter("gaussian")(many, generator=generator(2)), counter().gaussian(many, generator(3))
+    for y in (at_once, one_by_one, *surrogates):
         y = y.flatten(1)
         assert float(((y.mean(0) - mean) / (covariance.diag() / repeats).sqrt()).abs().max()) < 5
         assert float(((y.T.cov() - covariance) / (spread + 1e-3)).abs().max()) < 6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import json
 import sys
@@ -12,20 +11,16 @@ import torch
 from torch import nn
 
 from torchtransient import TimeAxis, sensing
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, MissingPackageError, StorageError, UnitError
 from torchtransient.sensing import (
     DEVICES,
     Compose,
     Device,
-    GaussianResponse,
-    ImpulseResponse,
-    ItofCorrelation,
     PixelElectronics,
     build_stage,
     deepinv_physics,
     device,
     read_itof,
-    sine_code,
 )
 from torchtransient.sensing.devices import KINDS
 
@@ -191,43 +186,6 @@ def test_errors_of_values_keep_their_type():
 def test_json_is_plain():
     data = json.loads(device("vl53l8_like").to_json())
     assert data["stages"][0]["axis"] == "@axis" and data["num_bins"] == 128
-
-
-def test_deepinverse_runs_on_our_sensors():
-    """Where the package is: its own adjointness test, a least-squares solve, a noisy measurement."""
-    axis = TimeAxis(0.0, 0.1, 24)
-    linear = Compose(
-        [
-            ImpulseResponse(GaussianResponse(400e-12), axis),
-            ItofCorrelation(sine_code(4), 60e6, axis, background_e=5.0, electrons_per_unit=50.0),
-            PixelElectronics(read_noise_e=1.0),
-        ],
-        grad="straight_through",
-    )
-    size = (1, 24, 3, 2)
-    if importlib.util.find_spec("deepinv") is None:
-        with pytest.raises(MissingPackageError, match="deepinv"):
-            deepinv_physics(linear, size)
-        return
-    physics = deepinv_physics(linear, size)
-    x = torch.rand(2, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert abs(float(physics.adjointness_test(x))) < 1e-9 * float(physics.A(x).square().sum())
-    y = physics(x, generator=torch.Generator().manual_seed(1))
-    mean = torch.stack([physics(x, generator=torch.Generator().manual_seed(s)) for s in range(200)]).mean(0)
-    assert float((mean - physics.A(x)).abs().max()) < 6 * (60 / 200) ** 0.5 * 2
-    # The pseudo-inverse reproduces the measurement where there are fewer taps than bins.
-    back = physics.A(physics.A_dagger(physics.A(x)))
-    torch.testing.assert_close(back, physics.A(x), rtol=1e-3, atol=1e-2)
-    assert physics.A_adjoint(y).shape == x.shape
-    with pytest.raises(UnitError, match="linear sensor"):
-        deepinv_physics(Compose([PixelElectronics(full_well_e=0.2)]), size)
-    with pytest.raises(ShapeError, match="img_size"):
-        deepinv_physics(linear, (1, 24), check=False)
-    general = deepinv_physics(Compose([PixelElectronics(full_well_e=0.2)]))
-    v = torch.rand_like(x)
-    slope = general.A_vjp(x, v)
-    numeric = (general.A(x + 1e-3 * v) - general.A(x - 1e-3 * v)).mul(v).sum() / 2e-3
-    assert abs(float((slope * v).sum() - numeric)) < 1e-2 * float(numeric.abs())
 
 
 NS = 1e-9

@@ -154,18 +154,6 @@ def test_the_order_of_a_pixel():
     sensing.PixelElectronics(gain_e_per_dn=4.0, bits=4, black_level_dn=15.0)
 
 
-def test_variances_by_hand():
-    x = light(50.0, 20.0)
-    given = {"read_noise_e": 3.0, "ktc_noise_e": 4.0, "dark_e": 6.0}
-    assert flat(sensing.PixelElectronics(**given).variance(x)) == [56 + 25, 26 + 25]
-    assert flat(sensing.PixelElectronics(**given, excess_noise=1.5).variance(x)) == [1.5 * 56 + 25, 1.5 * 26 + 25]
-    drawn = sensing.PixelElectronics(**given, excess_noise=1.5, shot_noise=False)
-    assert flat(drawn.variance(x)) == [0.5 * 56 + 25, 0.5 * 26 + 25]
-    rounded = sensing.PixelElectronics(gain_e_per_dn=6.0, bits=8)
-    assert flat(rounded.variance(x)) == [50 + 3.0, 20 + 3.0]
-    assert flat(sensing.PixelElectronics(**given).expected(x)) == [56.0, 26.0]
-
-
 @pytest.mark.parametrize("policy", ["gaussian", "score"])
 def test_gradients_through_a_converter(policy):
     """One where the code is inside of the range, zero beyond it, whatever the rounding."""

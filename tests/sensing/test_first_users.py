@@ -110,25 +110,6 @@ def test_phase_of_nan_is_nan(code):
         assert int(value.isnan().sum()) == 1
 
 
-@pytest.mark.parametrize(
-    "loss",
-    [
-        losses.poisson_nll,
-        lambda r, n: losses.first_photon_nll(r, n, 100),
-        lambda r, n: losses.free_running_nll(r, n, periods=100, dead_bins=2.5),
-        lambda r, n: losses.read_noise_nll(r, n, 2.0),
-    ],
-    ids=["poisson", "first photon", "free running", "read noise"],
-)
-def test_loss_of_nan_is_nan(loss):
-    good = 0.1 + light(1, 12, 2, 3)
-    assert bool(torch.isfinite(loss(good, good)))
-    bad = good.clone()
-    bad[0, 5, 0, 0] = math.nan
-    assert bool(loss(bad, good).isnan())
-    assert bool(loss(good, bad).isnan())
-
-
 # ------------------------------------------------------------------------------------------------------ extreme light
 
 
@@ -290,57 +271,3 @@ def test_half_precision_leaves_physical_numbers_alone(dtype):
     assert float(model[1].dead_time_s) == pytest.approx(75e-9, rel=1e-12)
     response.float()
     assert response.log_fwhm_s.dtype == torch.float32
-
-
-# -------------------------------------------------------------------------------------------------------------- losses
-
-
-@pytest.mark.parametrize(
-    "loss",
-    [losses.poisson_nll, lambda r, n, **k: losses.first_photon_nll(r, n, 10**6, **k)],
-    ids=["poisson", "first photon"],
-)
-def test_items_of_a_batch_do_not_touch(loss):
-    """A bright item next to a dim one: losses and gradients are those of each alone."""
-    mean = light(2, 1, 12, 2, 2) * torch.tensor([100.0, 1e-3], dtype=torch.float64).view(2, 1, 1, 1, 1)
-    counts = torch.poisson(mean * 10, generator=generator())
-
-    def both(r, n):
-        leaf = r.clone().requires_grad_()
-        value = loss(leaf, n, reduction="none")
-        return value.detach(), torch.autograd.grad(value.sum(), leaf)[0]
-
-    together = both(mean, counts)
-    for i in range(2):
-        for whole, alone in zip(together, both(mean[i : i + 1], counts[i : i + 1]), strict=True):
-            torch.testing.assert_close(whole[i : i + 1], alone, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_loss_of_half_precision_is_single(dtype):
-    """A network under autocast: 1e3 counts have a square that float16 cannot hold. 8 bits of the mean: 2 %."""
-    counts, mean = torch.full((1, 4, 1, 1), 1000.0), torch.full((1, 4, 1, 1), 3.0, dtype=dtype, requires_grad=True)
-    for loss in (losses.poisson_nll, lambda m, n: losses.read_noise_nll(m, n, 2.0)):
-        value = loss(mean, counts)
-        wanted = loss(mean.detach().double(), counts.double())
-        assert value.dtype == torch.float32
-        assert float(value.detach()) == pytest.approx(float(wanted), rel=0.02)
-        assert bool(torch.isfinite(torch.autograd.grad(value, mean)[0]).all())
-
-
-def test_slope_of_an_item_in_the_dark_is_usable():
-    """1e9, whose square single precision holds; with a floor of the model's scale at most 1e4."""
-    mean = torch.stack([torch.ones(1, 4, 2, 2), torch.zeros(1, 4, 2, 2)]).requires_grad_()
-    counts = torch.ones_like(mean)
-    for floor, most in ((None, 1.001e9), (losses.relative_floor(mean, measured=counts), 1e4)):
-        loss = losses.poisson_nll(mean, counts, floor=floor, reduction="sum")
-        (slope,) = torch.autograd.grad(loss, mean)
-        assert bool(torch.isfinite(loss)) and float(slope.abs().max()) < most
-        assert bool(torch.isfinite(slope.square().sum()))
-
-
-def test_counts_below_zero_keep_their_weight():
-    """A normal surrogate goes below 0: the mean loss over +n and -n is that of no counts."""
-    mean = 0.1 + light(1, 6, 1, 1)
-    pair = [losses.poisson_nll(mean, sign * torch.full_like(mean, 0.5)) for sign in (1, -1)]
-    torch.testing.assert_close(sum(pair) / 2, losses.poisson_nll(mean, torch.zeros_like(mean)))

@@ -196,26 +196,6 @@ def test_zones_are_sums_of_their_pixels():
 
 # --- coincidences ---------------------------------------------------------------------------------------------------
 
-CASES = [
-    ("first", 9.5, 20.0, [1] * 8, 2, 3.4),
-    ("several", 9.5, 6.0, [1, 1, 2, 4], 2, 2.0),
-    ("free", 9.5, 30.0, [1] * 8, 3, 4.7),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode, dead, total, weights, k, window", CASES)
-def test_coincidences_are_those_of_events(mode, dead, total, weights, k, window):
-    rate = light(total)
-    sensor = CoincidencePixel(
-        detector(mode, dead), len(weights), coincidence=k, window_s=window * WIDTH, weights=weights, bin_width_s=WIDTH
-    )
-    mean, found = sensor.expected(image(rate)).numpy(), []
-    for seed in range(4):
-        events = zone(np.random.default_rng(seed), mode, dead, rate, weights, 100)
-        found.append(compare(coincidences(events, k, window, in_step=mode != "free"), mean))
-    assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])

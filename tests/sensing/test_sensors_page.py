@@ -64,7 +64,8 @@ def test_names_exist():
     named = set(re.findall(r"`(?:sensing\.)?([A-Za-z]\w+)`", TEXT))
     known = {n for n in named if hasattr(sensing, n)}
     elsewhere = {
-        "Compose", "TransientRenderer", "expected", "forward", "gaussian", "straight_through", "score", "transform",
+        "Compose", "TransientRenderer", "expected", "forward", "gaussian", "log_prob", "straight_through", "score",
+        "transform",
         "LinearPhysics", "Physics", "img_size", *sensing.DEVICES, "depth_std_m", "std_e", "offset_e",
         "electrons_per_unit", "background_e", "dark_e", "read_noise_e", "full_well_e", "black_level_dn",
     }  # fmt: skip

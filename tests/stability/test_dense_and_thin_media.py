@@ -10,7 +10,7 @@ import pytest
 from support.marks import long, long_rows
 from support.media_scenes import block, camera, clouds, film, homogeneous, load, volume
 from support.runs import runs
-from torchtransient.accuracy.statistics import z_test
+from torchtransient.accuracy import z_test
 
 VARIANT = "llvm_ad_mono"
 

@@ -28,7 +28,7 @@ from support.extremes import (
     square,
     tangent,
 )
-from torchtransient.scenes.transforms import look_at, scale, translate
+from torchtransient.scenes import look_at, scale, translate
 
 VARIANT = "llvm_ad_mono"
 # Of edges that move the pages tell: here all are far outside of the view.

@@ -28,7 +28,7 @@ from support.extremes import (
     seen_from,
     tangent,
 )
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.scenes import scale, translate
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::torchtransient.errors.PhysicsWarning")

@@ -10,7 +10,7 @@ import pytest
 from support.gradient_cases.scenes import room
 from support.marks import long
 from support.media_scenes import film, homogeneous, load
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 
 VARIANT = "llvm_ad_mono"
 

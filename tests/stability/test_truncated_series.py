@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchtransient import scenes
-from torchtransient.accuracy.statistics import z_test
+from torchtransient.accuracy import z_test
 
 VARIANT = "llvm_ad_mono"
 REFLECTANCE, RADIANCE = 0.8, 2.0

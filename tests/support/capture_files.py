@@ -11,6 +11,7 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.files.captures.formats import LAYOUTS
 from torchtransient.files.captures.matlab import write_mat as write_mat
+from torchtransient.nlos import HiddenVolume, VoxelGrid
 
 # Endings of files by layout, and the layouts that are written.
 ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
@@ -123,3 +124,11 @@ def read_only():
     }  # fmt: skip
     yield "keyhole", {"direct_before": rng.poisson(3.0, (9, 1)).astype(np.uint32)}
     yield "rect_data", {"meas": rng.poisson(3.0, (9, 4, 4)).astype(np.uint16)}
+
+
+def volume():
+    """A hidden volume of whole numbers, 4 planes of 5 x 6 voxels."""
+    eye = torch.eye(3, dtype=torch.float64)
+    axes = dict(zip(("along_x", "along_y", "normal"), eye, strict=True))
+    grid = VoxelGrid(torch.linspace(0.1, 1, 4), (5, 6), (0.1, 0.2), first=eye[0] * 0, **axes)
+    return HiddenVolume(torch.arange(120.0).reshape(1, 4, 5, 6), grid, "fk", metadata={"a": 1})

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import scale, translate
+from torchtransient.scenes import scale, translate
 
 ROUNDING = 2e-6  # of a product of some ten factors in single precision
 SAMPLES = 4096

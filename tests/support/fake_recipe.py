@@ -13,19 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from torchtransient.array_files import hdf5
+from torchtransient.data import Sample
 from torchtransient.errors import SceneError
 
 TROUBLES = ("raising", "hanging", "crashing", "dying")
-
-
-@dataclass(frozen=True)
-class FakeSample:
-    index: int
-    seed: int
-    arrays: dict
-    values: dict
-    outside: tuple = (0.0, 0.0)
-    structure: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,10 +85,10 @@ class FakeMaker:
                 getattr(self, f"_{kind}")(index)
         drawn = np.random.Generator(np.random.Philox(key=[recipe.seed, index]))
         cube = drawn.random(recipe.shape, dtype=np.float32)
-        return FakeSample(
-            index, int(drawn.integers(2**32)), {"transient": cube, "depth": cube.sum(axis=(0, 1))},
-            {"albedo": drawn.random(3, dtype=np.float32), "name": f"box{index % 3}"},
-            (0.0, 0.5) if index in recipe.late else (0.0, 0.0), f"s{index % 2}",
+        return Sample(
+            index, int(drawn.integers(2**32)), arrays={"transient": cube, "depth": cube.sum(axis=(0, 1))},
+            values={"albedo": drawn.random(3, dtype=np.float32), "name": f"box{index % 3}"},
+            outside=(0.0, 0.5) if index in recipe.late else (0.0, 0.0), structure=f"s{index % 2}",
         )  # fmt: skip
 
     def _was(self, kind, index):

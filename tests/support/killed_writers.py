@@ -35,7 +35,7 @@ def killed_writers(folder: Path, kills: int, seed: int) -> Counter[str]:
 
     In a process that may fork: one thread, nothing of Dr.Jit.
     """
-    from torchtransient.files.result_file import read_result, write_result
+    from torchtransient.files import read_result, write_result
 
     rng, found = random.Random(seed), Counter({"old": 0, "new": 0, "parts": 0})
     outputs = [output(0), output(1)]

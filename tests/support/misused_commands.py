@@ -19,7 +19,7 @@ def files(folder: Path) -> dict[str, Path]:
     from support.capture_files import grids, made
     from support.killed_writers import output
     from support.text_files import RECIPES, SCENE, SETUPS
-    from torchtransient.files.result_file import write_result
+    from torchtransient.files import write_result
 
     folder.joinpath("empty").write_bytes(b"")
     folder.joinpath("folder").mkdir()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 from torchtransient.units import SPEED_OF_LIGHT
 
 MODULATION_HZ, EXPOSURE_S = 30e6, 1.5e-3

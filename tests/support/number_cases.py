@@ -396,5 +396,7 @@ LEFT = {
     r"data\.scene_labels\(.*\)": "rendering/test_labels.py",
     r"data\.ShardWriter\.(put|fail)\(.*\)": "what tt.data.generate gives",
     r"training\.worker_init\(worker\)|vis\.Frames\(make\)": "given by torch; no number",
+    r"accuracy\.(two_sample_)?z_test\(.*\)": "accuracy/test_statistics.py",
+    r"scenes\.(translate|scale|rotate|look_at)\(.*\)": "scenes/test_transforms.py",
     r"sensing\..*": "sensing/test_given.py and the tests of each sensor",
 }

@@ -10,19 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from torchtransient.data import Sample
 from torchtransient.errors import SceneError
 
 SHAPE = (1, 16, 8, 8)
-
-
-@dataclass(frozen=True)
-class FakeSample:
-    index: int
-    seed: int
-    arrays: dict
-    values: dict
-    outside: tuple = (0.0, 0.0)
-    structure: str = ""
 
 
 class UnpicklableError(Exception):
@@ -97,7 +88,7 @@ class FakeMaker:
         shape = (2, *recipe.shape[1:]) if index in recipe.odd else recipe.shape
         values = {"wall.reflectance": np.float32([index, 0.5, 0.25]), "box.filename": f"{index % 3}.ply"}
         outside = (0.25, 0.5) if index in recipe.late else (0.0, 0.0)
-        return FakeSample(index, index, arrays_of(index, shape), values, outside)
+        return Sample(index, index, arrays=arrays_of(index, shape), values=values, outside=outside)
 
     def close(self):
         pass

@@ -7,7 +7,7 @@ import numpy as np
 
 from support.runs import T, steady_runs
 from torchtransient import plugins
-from torchtransient.accuracy.statistics import two_sample_z_test
+from torchtransient.accuracy import two_sample_z_test
 
 
 def camera(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 GREY = {"type": "diffuse", "reflectance": 0.5}
 

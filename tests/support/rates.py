@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at, scale
+from torchtransient.scenes import look_at, scale
 
 RATES = tt.RateAxis(-10.0, 0.25, 80)
 AXIS = tt.TimeAxis(0.0, 0.1, 100)

@@ -35,7 +35,7 @@ def _results(folder: Path) -> list[Path]:
 
     from support.sealed_files import as_first_version
     from torchtransient.axes import FrequencyAxis, TimeAxis
-    from torchtransient.files.result_file import write_result
+    from torchtransient.files import write_result
     from torchtransient.gates import Gate
     from torchtransient.rendering.output import RenderOutput, RenderStats
 
@@ -67,7 +67,7 @@ def _results(folder: Path) -> list[Path]:
 
 
 def _read_result(path: Path) -> str:
-    from torchtransient.files.result_file import read_result
+    from torchtransient.files import read_result
 
     return _content(read_result(path))
 

@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
+from torchtransient.data import Sample, ShardWriter
+
 AXIS = {"start_opl": 3.5, "bin_width_opl": 0.02, "num_bins": 256}
-
-
-@dataclass(frozen=True)
-class Stored:
-    index: int
-    seed: int
-    arrays: dict
-    values: dict = field(default_factory=dict)
-    outside: tuple[float, float] = (0.0, 0.0)
-    structure: str = ""
 
 
 def cube(index, shape=(1, 256, 16, 16)):
@@ -36,7 +26,8 @@ def sample(index, shape=(1, 256, 16, 16), counts=False):
     if counts:
         arrays = {"measurement": rng.poisson(x * 5).astype(np.float32), "depth": arrays["depth"]}
     values = {"red.reflectance.value": rng.random(3, np.float32), "box.filename": f"größe_{index}.ply", "count": index}
-    return Stored(index, index * 7919 % 2**32, arrays, values, (0.01, index * 0.5), f"structure {index % 2}")
+    outside, structure = (0.01, index * 0.5), f"structure {index % 2}"
+    return Sample(index, index * 7919 % 2**32, arrays=arrays, values=values, outside=outside, structure=structure)
 
 
 def header(number=0, n=8, per_shard=4):
@@ -50,8 +41,6 @@ def header(number=0, n=8, per_shard=4):
 
 def write(path, samples, store="exact", compression="blosc2", rows=None, **header_entries):
     """A shard of samples in order; exceptions among them are failures."""
-    from torchtransient.data import ShardWriter
-
     with ShardWriter(path, len(samples), {**header(), **header_entries}, store=store, compression=compression) as shard:
         for row in range(len(samples)) if rows is None else rows:
             if isinstance(samples[row], Exception):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 FILM = {"type": "transient_hdr_film", "width": 6, "height": 5, "temporal_bins": 64, "start_opl": 4.0,
         "bin_width_opl": 0.1, "rfilter": {"type": "box"}}  # fmt: skip

@@ -15,7 +15,7 @@ import torch
 import torchtransient as tt
 from support import view_cases as cases
 from support.browser import SCREEN, Shown, chromium
-from torchtransient.files.result_file import write_result
+from torchtransient.files import write_result
 from torchtransient.vis.pages.server import serving
 
 pytestmark = pytest.mark.browser

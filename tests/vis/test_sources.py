@@ -12,7 +12,7 @@ import torch
 import torchtransient as tt
 from support.cubes import AXIS, sweep
 from torchtransient.errors import ShapeError, StorageError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.vis.sources import images_of, phasor_of, steady_of, stokes_of, transient_of
 
 

@@ -120,7 +120,7 @@ def test_notebooks_show_small_pages():
 
 
 def test_files(tmp_path):
-    from torchtransient.files.volume_file import write_volume
+    from torchtransient.files import write_volume
 
     capture, volume = cases.capture("confocal"), cases.volume()
     capture.write(tmp_path / "capture.h5")

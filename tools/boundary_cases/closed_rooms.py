@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from tools.boundary_cases.moving_edges import Array, Description, MovingEdge, mesh, moved, paint, rectangle
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 
 def one_pixel(bins: int = 343, width: float = 0.1) -> Description:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 Array = NDArray[np.float64]
 Description = dict[str, Any]

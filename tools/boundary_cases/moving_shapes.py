@@ -23,7 +23,7 @@ from tools.boundary_cases.moving_edges import (
     shadow,
     turned,
 )
-from torchtransient.scenes.transforms import rotate, scale, translate
+from torchtransient.scenes import rotate, scale, translate
 
 Parts = dict[str, Description]
 # Where the body is, and half its size, in metres.

@@ -7,3 +7,5 @@ from torchtransient.accuracy.gradient_errors import gradient_errors as gradient_
 from torchtransient.accuracy.report import AccuracyReport as AccuracyReport
 from torchtransient.accuracy.report import Recommendation as Recommendation
 from torchtransient.accuracy.report import SamplesNeeded as SamplesNeeded
+from torchtransient.accuracy.statistics import two_sample_z_test as two_sample_z_test
+from torchtransient.accuracy.statistics import z_test as z_test

@@ -82,13 +82,26 @@ def measure(
 
     Each candidate first warms up (kernels are compiled) at the sample count that follows. Within a repeat, the
     candidates take turns, so that a change of the machine's speed meets all of them. Every candidate is compared with
-    itself: with its own reference of `reference_spp` samples (two independent halves), or, without one, in pairs of
-    independent runs; then `repeats` must be even. Of tasks with `tails`, 96 runs of 16 samples (or of the smallest
-    count) come first: where they show a heavy tail, there is no error.
+    itself: with its own reference (two independent halves), or in pairs of independent runs. Of tasks with `tails`, 96
+    runs of 16 samples (or of the smallest count) come first: where they show a heavy tail, there is no error.
 
-    `finest`: by name of a task, the choice whose reference all choices are compared with as well: what that finds is
-    the total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of `spp`.
-    Raises UnitError for values out of range.
+    Args:
+        candidates: tasks by name, of each choice.
+        spp: different sample counts, at least 1.
+        reference_spp: samples of a candidate's own reference, at least four times the largest of `spp`; None: pairs.
+        repeats: runs at each count; even without a reference.
+        seed: of the first run; no two runs share one.
+        progress: whether a bar counts the samples.
+        settings: kept in the report.
+        finest: by name of a task, the choice whose reference all choices are compared with as well, which gives the
+            total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
+            `spp`.
+
+    Returns:
+        The report.
+
+    Raises:
+        UnitError: for values out of range.
     """
     counts = checked_counts(spp, repeats, reference_spp)
     tail_spp = min(_TAIL_SPP, counts[0])

@@ -187,7 +187,8 @@ class ErrorTally:
         )
 
     def _bias(self) -> _Bias:
-        """What the runs have in common against the reference, and errors of it; entries count as independent.
+        """Return the part of the deviation from the reference that all runs share, and errors of it; entries count as
+        independent.
 
         With the mean d of the deviations, s^2 the variance of a run, and n = (A - B)^2 / 4 that of the reference's
         mean, b^2 = d^2 - s^2 / R - n. The squared error is off by -2 d e + e^2 - n by an error e of the reference's
@@ -250,7 +251,12 @@ NOT_MEASURED = ErrorEstimate(math.nan, math.nan, math.nan, math.nan)
 
 
 def relative(squared: float, power: float) -> float:
-    """Root of a squared error over a power; NaN without power."""
+    """Return the root of a squared error over a power; NaN without power.
+
+    Args:
+        squared: squared error, of which one below zero counts as none.
+        power: mean square of what was estimated.
+    """
     return math.sqrt(max(squared, 0.0) / power) if power > 0 else math.nan
 
 

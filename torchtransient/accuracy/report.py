@@ -1,4 +1,4 @@
-"""What accuracy costs, as a table, a picture and a file."""
+"""Reports of what accuracy costs: a table, a picture, a file."""
 
 from __future__ import annotations
 
@@ -308,16 +308,21 @@ class AccuracyReport:
         return quantity
 
     def spp_for(self, error: float, *, quantity: str | None = None, choice: Choice | None = None) -> SamplesNeeded:
-        """Samples per pixel for a relative error (`CostPoint.relative_error`, 0.05 for 5 %), by the line through the
-        logarithms of the squared relative errors of one curve.
+        """Return the samples per pixel for a relative error, by the line through the logarithms of the squared relative
+        errors of one curve.
 
-        The curve is that of `quantity` and `choice`, None for the first one of the report. Its interval holds the
-        scatter of the points about the line, or their own standard errors where those are larger, and grows with the
-        distance from what was measured. A curve that flattens out, as against a reference with a bias, is not seen
-        beyond its end.
+        Its interval holds the scatter of the points about the line, or their own standard errors where those are
+        larger, and grows with the distance from what was measured. A curve that flattens out, as against a reference
+        with a bias, is not seen beyond its end.
 
-        Raises UnitError for an error that is not positive, ArgumentError for a curve that the report does not have,
-        and for one with less than three points of known error, or whose error does not fall.
+        Args:
+            error: relative error (`CostPoint.relative_error`), 0.05 for 5 %.
+            quantity, choice: of the curve; None: the first one of the report.
+
+        Raises:
+            UnitError: for an error that is not positive.
+            ArgumentError: for a curve that the report does not have, and for one with less than three points of known
+                error, or whose error does not fall.
         """
         wanted = positive("spp_for: error", error)
         quantity = self._quantity("spp_for", quantity)

@@ -67,7 +67,7 @@ def standard_error(runs: ArrayLike) -> Array:
     return np.asarray(data.std(axis=0, ddof=1) / math.sqrt(data.shape[0]), dtype=np.float64)
 
 
-def z_test(runs: ArrayLike, expected: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
+def z_test(runs: ArrayLike, expected: ArrayLike, *, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
     """Test that independent runs (K, ...) have the mean `expected` (...), which is known exactly.
 
     Args:
@@ -87,7 +87,9 @@ def z_test(runs: ArrayLike, expected: ArrayLike, alpha: float = 1e-3, rounding: 
     return _score(data.mean(axis=0) - target, standard_error(data), data.shape[0] - 1.0, alpha, rounding)
 
 
-def two_sample_z_test(runs_a: ArrayLike, runs_b: ArrayLike, alpha: float = 1e-3, rounding: float = 0.0) -> ZTest:
+def two_sample_z_test(
+    runs_a: ArrayLike, runs_b: ArrayLike, *, alpha: float = 1e-3, rounding: float = 0.0
+) -> ZTest:
     """Test that two sets of independent runs have the same mean (Welch's test per entry).
 
     Args:

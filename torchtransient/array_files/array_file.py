@@ -232,9 +232,10 @@ def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
         StorageError: for dtypes that NumPy does not have, and for sparse and meta tensors.
     """
     if tensor.layout != torch.strided or tensor.device.type == "meta":
+        lacking = "on the device meta" if tensor.device.type == "meta" else f"of layout {tensor.layout}"
         raise StorageError(
-            f"{what}: expected a tensor with all its numbers, got one {_lacking(tensor)}. Use tensor.to_dense(), or "
-            "compute it on a device."
+            f"{what}: expected a tensor with all its numbers, got one {lacking}. Use tensor.to_dense(), or compute it "
+            "on a device."
         )
     plain = tensor.detach().resolve_conj().resolve_neg().cpu()
     try:
@@ -242,10 +243,6 @@ def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
     except TypeError as error:
         raise StorageError(f"{what}: {tensor.dtype} cannot be stored; use tensor.float() instead.") from error
     return array
-
-
-def _lacking(tensor: torch.Tensor) -> str:
-    return "on the device meta" if tensor.device.type == "meta" else f"of layout {tensor.layout}"
 
 
 def tensor_in(array: Any) -> torch.Tensor:

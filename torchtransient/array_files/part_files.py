@@ -179,14 +179,14 @@ def _locked(target: Path) -> tuple[Path, int]:
     while True:
         path = target.with_name(f".{target.name[:40]}.{secrets.token_hex(4)}{_SUFFIX}")
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        # Somebody may sweep it before it is locked. Without locks nobody sweeps.
+        # It may be swept before it is locked. Without locks nothing is swept.
         if _lock(descriptor) != "theirs" and path.exists():
             return path, descriptor
         os.close(descriptor)
 
 
 def _lock(descriptor: int) -> str:
-    """Lock an open file and return its owner: "ours", "theirs", or "nobody's" on file systems without locks."""
+    """Lock an open file and return its owner: "ours", "theirs", or "unlocked" on file systems without locks."""
     import fcntl
 
     try:
@@ -195,7 +195,7 @@ def _lock(descriptor: int) -> str:
         return "theirs"
     except OSError as error:
         if error.errno in _NO_LOCKS:
-            return "nobody's"
+            return "unlocked"
         raise
     return "ours"
 

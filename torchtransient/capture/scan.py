@@ -482,15 +482,13 @@ def _check_sides(scan: Scan) -> None:
         heights = ((origin - points) * normals).sum(-1).detach()
         behind = int((heights <= 0).sum())
         if behind:
+            lowest = float(heights.min())
+            place = f"behind them by up to {-lowest:.4g} m" if lowest < 0 else "in the wall itself"
             raise SceneError(
                 f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
-                f"{heights.numel()} points do not see: it is {_behind(float(heights.min()))}. Move "
+                f"{heights.numel()} points do not see: it is {place}. Move "
                 "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
             )
-
-
-def _behind(height: float) -> str:
-    return f"behind them by up to {-height:.4g} m" if height < 0 else "in the wall itself"
 
 
 # ------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ class Commands(click.Group):
             click.echo(f"error: {' '.join(_in_options(error).split())}", err=True)
             sys.exit(2)
         except BrokenPipeError:
-            raise  # whoever reads the output has left, which click knows
+            raise  # the reader of the output has left, which click handles
         except OSError as error:
             if ctx.params.get("debug"):
                 raise

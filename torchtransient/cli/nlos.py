@@ -56,7 +56,8 @@ def command(scene: Path, **options: Any) -> None:
     from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
-    target = check_capture_target(options["output"] or _beside(scene))
+    beside = scene / f"{scene.resolve().name}.h5" if scene.is_dir() else scene.with_suffix(".h5")
+    target = check_capture_target(options["output"] or beside)
     _check_pictures(options)
     part = _part(options, target)
     setup = tt.nlos.read_setup(scene, **assignments(options["params"], "--param"))
@@ -81,10 +82,6 @@ def command(scene: Path, **options: Any) -> None:
         _delete(part)
     click.echo(f"{target}: {_summary(capture)}")
     _write_pictures(capture, setup, options)
-
-
-def _beside(scene: Path) -> Path:
-    return scene / f"{scene.resolve().name}.h5" if scene.is_dir() else scene.with_suffix(".h5")
 
 
 def _part(options: dict[str, Any], target: Path) -> Path | None:

@@ -132,10 +132,14 @@ def command(capture: Path, **options: Any) -> None:
 def _run(capture: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
     from torchtransient.files.volume_file import check_volume_target
+    from torchtransient.nlos.methods import Choice, choose_method
 
     told = {name: options[name] for name in _OPEN if options[name] is not None}
-    measured = tt.nlos.read_capture(capture, options["layout"], **{**told, **_wall_size(told)})
-    choice = _choice(measured, options["method"])
+    if len(told.get("wall_size", ())) == 1:
+        (told["wall_size"],) = told["wall_size"]
+    measured = tt.nlos.read_capture(capture, options["layout"], **told)
+    method = options["method"]
+    choice = choose_method(measured) if method is None else Choice(method, "asked for")
     if not options["quiet"]:
         _tell(measured, choice)
     target = check_volume_target(options["output"] or capture.with_name(f"{capture.stem}_{choice.name}.h5"))
@@ -188,17 +192,6 @@ def _check_together(options: dict[str, Any]) -> None:
         raise click.UsageError("--times is for --camera confocal and --camera transient.")
     if options["slab_snr"] is not None and options["slab"] is None:
         raise click.UsageError("--slab-snr needs --slab.")
-
-
-def _wall_size(told: dict[str, Any]) -> dict[str, Any]:
-    size = told.get("wall_size")
-    return {} if size is None else {"wall_size": size[0] if len(size) == 1 else size}
-
-
-def _choice(capture: Any, method: str | None) -> Any:
-    from torchtransient.nlos.methods import Choice, choose_method
-
-    return choose_method(capture) if method is None else Choice(method, "asked for")
 
 
 def _picture(options: dict[str, Any], target: Path) -> Path | None:

@@ -74,7 +74,8 @@ def command(scene: Path, **options: Any) -> None:
         return
     metadata = {"scene": scene.name, "parameters": options["params"], "set": options["values"]}
     if options["planned"]:
-        plan = _planned(scene, options)
+        chosen = None if options["temporal_filter"] == "auto" else options["temporal_filter"]
+        plan = plan_of_options(scene, options, None, temporal_filter=chosen)
         click.echo(plan)
         check_pictures(options, plan.film_choice)
         described, metadata["plan"] = plan.scene, plan.to_dict()
@@ -104,11 +105,6 @@ def command(scene: Path, **options: Any) -> None:
         _report_energy(output)
     check_pictures(options, film)
     write_pictures(output, film, options, scene.name)
-
-
-def _planned(scene: Path, options: dict[str, Any]) -> Any:
-    given = options["temporal_filter"]
-    return plan_of_options(scene, options, None, temporal_filter=None if given == "auto" else given)
 
 
 def _render(described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]) -> Any:

@@ -128,7 +128,7 @@ class Crew(ABC, Generic[AnyMember]):
             indices: samples to try.
 
         Returns:
-            `Measured` of it.
+            ``Measured`` of it.
 
         Raises:
             TorchTransientError: without a measurement, or as :meth:`receive`.
@@ -217,7 +217,7 @@ class Crew(ABC, Generic[AnyMember]):
 
         Args:
             worker: its sender.
-            kind: first word, see `Messages`, and "ready", "measured", "wrote", "fatal".
+            kind: first word, see ``Messages``, and "ready", "measured", "wrote", "fatal".
             facts: its other entries.
 
         Raises:

@@ -54,7 +54,7 @@ class LocalWorker(Member):
         """Send a task through the pipe.
 
         Args:
-            task: see `Member.assign`.
+            task: see ``Member.assign``.
         """
         with contextlib.suppress(OSError):
             self.link.send(task)
@@ -149,7 +149,7 @@ class InProcessWorker(Member):
         """Keep a task.
 
         Args:
-            task: see `Member.assign`.
+            task: see ``Member.assign``.
         """
         self.task = task
 
@@ -205,7 +205,7 @@ def work(link: Connection, packed: bytes) -> None:
 
     Args:
         link: pipe to the supervisor.
-        packed: pickled `RunSettings`.
+        packed: pickled ``RunSettings``.
     """
     # Ctrl-C reaches the whole group of processes; the supervisor decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

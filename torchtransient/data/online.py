@@ -28,7 +28,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
 from torchtransient.data.processes import WorkerError, interrupts_blocked, registered_plugins
-from torchtransient.data.sample import OutsideLight, checked_transform, outside_tensor
+from torchtransient.data.sample import OutsideLight, checked_transform, measurement, outside_tensor, value_tensors
 from torchtransient.errors import (
     ShapeError,
     StorageError,
@@ -133,10 +133,7 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         """Draw one sample; waits where no sample may be used."""
         sample = self._producers.draw()
         if self.transform is not None:
-            with torch.no_grad():
-                if "transient" not in sample:
-                    raise ShapeError(f"{WHAT}: transform= is for transients, and samples have {', '.join(sample)}.")
-                sample["measurement"] = self.transform(sample["transient"])
+            sample["measurement"] = measurement(WHAT, self.transform, sample)
         return sample
 
     @property
@@ -255,9 +252,7 @@ class Producers:
         """Copy of the sample at a place of the ring."""
         index, values, outside = self._beside[slot]
         sample: dict[str, Any] = {name: array[slot].clone() for name, array in self._ring.items()}
-        sample["values"] = {key: v if isinstance(v, str) else _own_tensor(v) for key, v in values.items()}
-        sample |= {"outside": outside_tensor(outside), "index": index}
-        return sample
+        return {**sample, "values": value_tensors(values), "outside": outside_tensor(outside), "index": index}
 
     def _check(self) -> None:
         if os.getpid() != self._pid:
@@ -538,10 +533,6 @@ class _Worker:
 
 class _EndedError(Exception):
     """A producer has ended without a message."""
-
-
-def _own_tensor(value: Any) -> torch.Tensor:
-    return torch.from_numpy(np.array(value))
 
 
 def _raise(error: BaseException | None, text: str) -> NoReturn:

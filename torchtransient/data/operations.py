@@ -378,7 +378,7 @@ class PixelMap:
             name: of the image, for messages.
 
         Returns:
-            (..., *new_size), as the image.
+            (..., H', W'), as the image.
 
         Raises:
             UnitError: for a type that cannot hold ``fill``, NaN in whole numbers or -1 in unsigned ones; exact maps
@@ -411,7 +411,7 @@ class PixelMap:
             name: of the image, for messages.
 
         Returns:
-            (..., *new_size), as the image.
+            (..., H', W'), as the image.
 
         Raises:
             UnitError: for whole numbers that would have to be interpolated; exact maps take every type.

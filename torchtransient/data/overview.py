@@ -162,7 +162,7 @@ def behind_time(about: Mapping[str, Any]) -> int:
     """Dimensions of a transient behind its bins: rows and columns, or those of a scan.
 
     Args:
-        about: entry `about` of a header.
+        about: entry ``about`` of a header.
 
     Returns:
         Number.

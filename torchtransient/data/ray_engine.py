@@ -137,10 +137,10 @@ class RayWorker(Member):
         self.awaited: Any = actor.begin.remote()
 
     def send(self, task: tuple[Any, ...]) -> None:
-        """Call the actor; the result is awaited by `RayCrew.poll`.
+        """Call the actor; the result is awaited by ``RayCrew.poll``.
 
         Args:
-            task: see `Member.assign`.
+            task: see ``Member.assign``.
         """
         self.awaited = self.actor.do.remote(task)
 
@@ -177,7 +177,7 @@ class ShardActor:
         """Execute a task.
 
         Args:
-            task: see `Member.assign`.
+            task: see ``Member.assign``.
 
         Returns:
             Its last message.

@@ -14,13 +14,14 @@ from torchtransient.data.sample import (
     Epochs,
     checked_seed,
     checked_transform,
+    measurement,
     outside_tensor,
     sample_generator,
     sample_number,
     takes_generator,
-    transformed,
+    value_tensors,
 )
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, UnitError
 
 _WHAT = "RecipeDataset"
 
@@ -100,13 +101,9 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         made = self._maker.sample(index)
         found: dict[str, Any] = {name: torch.from_numpy(np.array(array)) for name, array in made.arrays.items()}
         if self.transform is not None:
-            if "transient" not in found:
-                raise ShapeError(f"{_WHAT}: transform= is for transients, and samples have {', '.join(found)}.")
-            found["measurement"] = transformed(self.transform, found["transient"], generator)
-        values = made.values.items()
-        found["values"] = {key: v if isinstance(v, str) else torch.from_numpy(np.array(v)) for key, v in values}
-        found |= {"outside": outside_tensor(made.outside), "index": made.index}
-        return found
+            found["measurement"] = measurement(_WHAT, self.transform, found, generator)
+        values, outside = value_tensors(made.values), outside_tensor(made.outside)
+        return {**found, "values": values, "outside": outside, "index": made.index}
 
     def close(self) -> None:
         """Free the scenes, which are built again when a sample is read."""

@@ -1,4 +1,4 @@
-"""RunSettings of a run, the files of a data set, and ``recipe.json``, with which a later run is compared."""
+"""Settings of a run, the files of a data set, and ``recipe.json``, with which a later run is compared."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ DECIDING = ("format", "key", "n", "per_shard", "store", "compression")
 
 @dataclass(frozen=True)
 class RunSettings:
-    """RunSettings of a run, for every process. Pickles when the recipe does.
+    """Settings of a run, for every process. Pickles when the recipe does.
 
     Args:
         recipe: that is generated.
         folder: of the data set.
         n: samples.
-        store: see `ShardWriter`.
-        compression: see `ShardWriter`.
+        store: see ``ShardWriter``.
+        compression: see ``ShardWriter``.
         retries: attempts at a sample after the first.
         plugins: plugin modules of others, which every process has to add.
     """
@@ -150,7 +150,7 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
     Args:
         settings: of the run.
         per_shard: samples in a file.
-        about: `Maker.about`.
+        about: ``Maker.about``.
         standard_error: of a sample.
 
     Returns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Self
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.checks import count, function, shown
-from torchtransient.errors import PhysicsWarning, TorchTransientWarning, UnitError, level_of_user
+from torchtransient.errors import PhysicsWarning, ShapeError, TorchTransientWarning, UnitError, level_of_user
 
 # Least size of arrays that are copied in blocks, and pixels of a block.
 _LARGE, _BLOCK = 2**15, 64
@@ -302,16 +302,38 @@ def takes_generator(transform: Any) -> bool:
         return False
 
 
-def transformed(transform: Callable[..., Any], transient: Tensor, generator: torch.Generator | None) -> Any:
-    """Transform a transient without gradients.
+def value_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Drawn values as tensors of the caller's own; texts stay texts.
 
     Args:
+        values: of a sample, by key.
+
+    Returns:
+        Tensors and texts by key.
+    """
+    return {key: v if isinstance(v, str) else torch.from_numpy(np.array(v)) for key, v in values.items()}
+
+
+def measurement(
+    what: str, transform: Callable[..., Any], sample: Mapping[str, Any], generator: torch.Generator | None = None
+) -> Any:
+    """Transform the transient of a sample, without gradients.
+
+    Args:
+        what: caller for messages.
         transform: function or module.
-        transient: tensor.
+        sample: tensors by name.
         generator: None for torch's own.
 
     Returns:
-        Its result.
+        Result of the transform.
+
+    Raises:
+        ShapeError: for a sample without a transient.
     """
+    if "transient" not in sample:
+        raise ShapeError(f"{what}: transform= is for transients, and samples have {', '.join(sample)}.")
     with torch.no_grad():
-        return transform(transient) if generator is None else transform(transient, generator=generator)
+        if generator is None:
+            return transform(sample["transient"])
+        return transform(sample["transient"], generator=generator)

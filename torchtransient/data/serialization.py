@@ -35,7 +35,7 @@ from torchtransient.scene.description import Plain, XmlDescription
 _MOST_LISTED = 64
 Record = TypeVar("Record", Pulse, Gate)
 # Keys of mappings for values that JSON does not have.
-_PIXELS, _VOXELS, _SCAN, _DISTRIBUTION = "__pixels__", "__voxels__", "__scan__", "__distribution__"
+_PIXELS, _VOXELS, _SCAN = "__pixels__", "__voxels__", "__scan__"
 
 
 def written(value: Any) -> Any:
@@ -175,7 +175,7 @@ def read_record(kind: type[Record], data: Any) -> Record | None:
     """Restore a record from its fields.
 
     Args:
-        kind: `Pulse` or `Gate`.
+        kind: ``Pulse`` or ``Gate``.
         data: fields by name, a record, or None.
 
     Returns:

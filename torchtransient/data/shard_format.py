@@ -38,7 +38,7 @@ def measured_names(about: Any) -> tuple[str, ...]:
     image.
 
     Args:
-        about: entry `about` of a header.
+        about: entry ``about`` of a header.
 
     Returns:
         Names.

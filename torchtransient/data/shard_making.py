@@ -211,7 +211,7 @@ class Measured:
 
     Args:
         sample_bytes: before compression.
-        about: `Maker.about`.
+        about: ``Maker.about``.
         standard_error: of the sample, or None.
         warned: messages and classes of this library's warnings in the recipe's check, for the caller of ``generate``.
     """

@@ -598,7 +598,7 @@ def stored_checksum(path: Path) -> str:
 
 
 def _read_into(array: NDArray[Any], dataset: Any, corner: tuple[int, ...]) -> None:
-    """Read a block of one row into an array, as `dataset.read_direct` does, which takes longer to find the block than
+    """Read a block of one row into an array, as ``dataset.read_direct`` does, which takes longer to find the block than
     to read a small image.
     """
     import h5py

@@ -52,7 +52,7 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_a
 
 
 class SpatialFilter(nn.Module):
-    """`spatial_filter` as a module, for ``transform=`` or a chain: ``SpatialFilter(MedianBlur((3, 3)))``.
+    """``spatial_filter`` as a module, for ``transform=`` or a chain: ``SpatialFilter(MedianBlur((3, 3)))``.
 
     Args:
         function: of images (N, 1, H, W).

@@ -165,7 +165,7 @@ class Scenes:
             structure: of the recipe.
 
         Returns:
-            Scene as `tt.load` takes it (hidden shapes for a capture), and its scan.
+            Scene as ``tt.load`` takes it (hidden shapes for a capture), and its scan.
         """
         description, scan = self.descriptions[structure.name], self.scan
         # Nodes before their entries.

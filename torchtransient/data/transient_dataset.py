@@ -25,11 +25,11 @@ from torchtransient.data.sample import (
     Epochs,
     checked_seed,
     checked_transform,
+    measurement,
     outside_tensor,
     sample_generator,
     sample_number,
     takes_generator,
-    transformed,
 )
 from torchtransient.data.shard_format import measured_names
 from torchtransient.data.shards import Shard
@@ -156,11 +156,11 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         found: dict[str, Any] = {name: self._read(shard, name, row) for name in self._fields if name != _VALUES}
         index = int(self._table.index[number])
         if self.transform is not None:
-            given = found[_TRANSIENT] if _TRANSIENT in found else self._read(shard, _TRANSIENT, row)
+            given = found if _TRANSIENT in found else {_TRANSIENT: self._read(shard, _TRANSIENT, row)}
             # Samples of several folders may have one number in their recipes.
             repeat = int(self._table.repeat[number])
             generator = sample_generator(WHAT, self.seed, index, epoch, repeat)
-            found[_MEASURED] = transformed(self.transform, given, generator)
+            found[_MEASURED] = measurement(WHAT, self.transform, given, generator)
         if _VALUES in self._fields:
             values = shard.values(row)
             found[_VALUES] = {k: v if isinstance(v, str) else tensor_in(v) for k, v in values.items()}
@@ -282,7 +282,7 @@ def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
     """Time axis of a render.
 
     Args:
-        about: entry `about` of a header.
+        about: entry ``about`` of a header.
 
     Returns:
         Axis, None for films without one.

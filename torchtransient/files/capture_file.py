@@ -105,13 +105,10 @@ def read_capture(path: str | Path) -> Capture:
     Raises:
         StorageError: for a file that is missing, damaged or no capture.
     """
-    values = read_arrays(path, FORMATS, _WHAT, _is_known)
+    known = {*_MEASURED, *_POINTS, *_ENTRIES}
+    values = read_arrays(path, FORMATS, _WHAT, lambda name: name in known or name.startswith("wall_"))
     with damage_said(Path(path), _WHAT):
         return _capture(values)
-
-
-def _is_known(name: str) -> bool:
-    return name in (*_MEASURED, *_POINTS, *_ENTRIES) or name.startswith("wall_")
 
 
 def _capture(values: Mapping[str, Any]) -> Capture:

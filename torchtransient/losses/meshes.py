@@ -250,16 +250,11 @@ def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
     edges = triangles[:, 1:] - triangles[:, :1]
     longest = edges.detach().abs().amax()
     edges = edges / torch.where(longest > 0, longest, torch.ones_like(longest))
-    area = _length(torch.linalg.cross(edges[:, 0], edges[:, 1]))
+    area = _root(torch.linalg.cross(edges[:, 0], edges[:, 1]).square().sum(-1))
     if not is_true((area.sum() > 0) | area.isnan().any()):
         raise ShapeError("surface_distance: expected meshes with an area, got one of whose triangles none has any.")
     mean: Tensor = (distance.mean(1) * area).sum() / area.sum()
     return mean
-
-
-def _length(x: Tensor) -> Tensor:
-    """Length of vectors (..., 3)."""
-    return _root(x.square().sum(-1))
 
 
 def _root(square: Tensor) -> Tensor:

@@ -252,7 +252,7 @@ def _description(source: str | Path) -> CaptureDescription:
     if frequencies is not None and "time_axis" in section:
         raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
     return CaptureDescription(
-        name=section.text("name", _name(source)),
+        name=section.text("name", "capture" if isinstance(source, str) and "\n" in source else Path(source).stem),
         hidden=hidden,
         scan=scan,
         axis=None if frequencies is not None else _axis(section.get("time_axis", {}), scan, hidden),
@@ -264,10 +264,6 @@ def _description(source: str | Path) -> CaptureDescription:
         variant=section.text("variant", None),
         entries=data,
     )
-
-
-def _name(source: str | Path) -> str:
-    return "capture" if isinstance(source, str) and "\n" in source else Path(source).stem
 
 
 def wall_of(data: Any, folder: Path) -> Wall:

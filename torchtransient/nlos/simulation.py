@@ -256,8 +256,9 @@ def simulate(
         whole = kept is None and work.count == 1
         capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
         say_black("simulate", capture)
-        if chain is not None:
-            capture = replace(capture, transient=_through(capture.transient, capture.scan, chain, generator))
+        if chain is not None and capture.transient is not None:
+            light = measured(in_film_shape(capture.transient, capture.scan), capture.scan, chain, generator)
+            capture = replace(capture, transient=in_scan_shape(light, capture.scan))
         if kept is not None and not keep_part:
             kept.remove()
     return replace(capture, metadata=_metadata(work, forecast, seed, seconds))
@@ -459,10 +460,6 @@ def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.
     # Counts as they are drawn: nothing of a simulation has gradients.
     return checked_module(sensor, axis, "straight_through")
 
-
-def _through(transient: Any, scan: Scan, sensor: torch.nn.Module, generator: torch.Generator | None) -> torch.Tensor:
-    """Apply a sensor to a capture's transient."""
-    return in_scan_shape(measured(in_film_shape(transient, scan), scan, sensor, generator), scan)
 
 
 def _metadata(work: Work, forecast: Forecast, seed: int, seconds: float) -> dict[str, Any]:

@@ -308,7 +308,11 @@ def _placed(part: Section) -> Any:
 def _scan(section: Section, wall: Wall) -> Scan:
     kind = section.choice("scan_type", GRID_KINDS, "single")
     size = section.whole("sensor_width", 256), section.whole("sensor_height", 256)
-    origins: dict[str, Any] = {f"{who}_origin": _origin(section, who) for who in ("sensor", "laser")}
+    places = (("x", -0.5), ("y", 0.0), ("z", 0.25))
+    origins: dict[str, Any] = {
+        f"{who}_origin": [section.number(f"{who}_{axis}", default) for axis, default in places]
+        for who in ("sensor", "laser")
+    }
     legs = section.flag("account_first_and_last_bounces", False)
     if kind == "single":
         laser = _looked_at(section, "x", size[0]), _looked_at(section, "y", size[1])
@@ -328,10 +332,6 @@ def _scan(section: Section, wall: Wall) -> Scan:
         torch.from_numpy(sensor_points), kind=kind, laser_points=torch.from_numpy(laser_points), wall=wall,
         first_and_last_leg=legs, **origins,
     )  # fmt: skip
-
-
-def _origin(section: Section, who: str) -> list[float]:
-    return [section.number(f"{who}_{axis}", default) for axis, default in (("x", -0.5), ("y", 0.0), ("z", 0.25))]
 
 
 def _looked_at(section: Section, axis: str, pixels: int) -> float:

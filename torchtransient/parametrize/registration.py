@@ -79,7 +79,9 @@ def _append(owner: nn.Module, name: str, key: str, parametrization: nn.Module) -
                 f"{type(one).__name__} has no right_inverse. {cure}"
             )
     value = getattr(owner, name).detach().clone()
-    numbers = [(one, one.detach().clone()) for one in _behind(chain)]
+    # The tensors of which a chain makes its value: parameters, or buffers.
+    behind = [*chain.parameters(recurse=False), *chain.buffers(recurse=False)]
+    numbers = [(one, one.detach().clone()) for one in behind]
     # Torch's own call leaves the numbers behind as they were, of which the two make another value.
     chain.append(parametrization.train(owner.training))
     try:
@@ -98,11 +100,6 @@ def _append(owner: nn.Module, name: str, key: str, parametrization: nn.Module) -
             f"register: {key!r} has {', '.join(before)} already, and with {kind.__name__} after it cannot keep its "
             f"value: {error} {cure}"
         ) from error
-
-
-def _behind(chain: Any) -> list[Tensor]:
-    """The tensors of which a chain makes its value: parameters, or buffers."""
-    return [*chain.parameters(recurse=False), *chain.buffers(recurse=False)]
 
 
 def original(module: nn.Module, key: str) -> nn.Parameter:
@@ -124,9 +121,19 @@ def original(module: nn.Module, key: str) -> nn.Parameter:
 
 
 def remove(module: nn.Module, key: str) -> nn.Module:
-    """Take the parametrizations of a key away. Its value stays as it is, in a new `nn.Parameter` (of a buffer, a
-    buffer): make optimisers afterwards. Returns the module. Raises UnknownKeyError, and SceneError for a key without a
-    parametrization.
+    """Take the parametrizations of a key away.
+
+    Its value stays as it is, in a new `nn.Parameter` (of a buffer, a buffer): make optimisers afterwards.
+
+    Args:
+        module, key: as of `register`.
+
+    Returns:
+        The module.
+
+    Raises:
+        UnknownKeyError: for a key that is not there.
+        SceneError: for a key without a parametrization.
     """
     owner, name = _parametrized(module, key)
     chain = _chain(owner, name)

@@ -15,6 +15,11 @@ from torchtransient.scenes.nlos import nlos_plates as nlos_plates
 from torchtransient.scenes.nlos import nlos_room as nlos_room
 from torchtransient.scenes.nlos import nlos_z as nlos_z
 from torchtransient.scenes.nlos import relay_wall as relay_wall
+from torchtransient.scenes.transforms import identity as identity
+from torchtransient.scenes.transforms import look_at as look_at
+from torchtransient.scenes.transforms import rotate as rotate
+from torchtransient.scenes.transforms import scale as scale
+from torchtransient.scenes.transforms import translate as translate
 from torchtransient.scenes.walls import etalon_slab as etalon_slab
 from torchtransient.scenes.walls import glass_slab_before_wall as glass_slab_before_wall
 from torchtransient.scenes.walls import light_over_plane as light_over_plane

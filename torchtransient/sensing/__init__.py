@@ -35,7 +35,6 @@ from torchtransient.sensing.cramer_rao import return_rates as return_rates
 from torchtransient.sensing.crosstalk import Crosstalk as Crosstalk
 from torchtransient.sensing.crosstalk import add_crosstalk as add_crosstalk
 from torchtransient.sensing.depth import Returns as Returns
-from torchtransient.sensing.depth import background_per_bin as background_per_bin
 from torchtransient.sensing.depth import center_of_mass as center_of_mass
 from torchtransient.sensing.depth import distance_of_position as distance_of_position
 from torchtransient.sensing.depth import distance_to_points as distance_to_points
@@ -117,7 +116,6 @@ from torchtransient.sensing.responses import Response as Response
 from torchtransient.sensing.responses import TailedResponse as TailedResponse
 from torchtransient.sensing.responses import UniformResponse as UniformResponse
 from torchtransient.sensing.responses import emg_cdf as emg_cdf
-from torchtransient.sensing.responses import emg_density as emg_density
 from torchtransient.sensing.responses import emg_response as emg_response
 from torchtransient.sensing.responses import emg_survival as emg_survival
 from torchtransient.sensing.responses import resample_counts as resample_counts

@@ -97,11 +97,6 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     return table / lengths
 
 
-def _coded_sums(x: Tensor, matrix: Tensor) -> Tensor:
-    sums = product(matrix, x.flatten(-2))
-    return sums.reshape(*sums.shape[:-1], *x.shape[-2:])
-
-
 class CodedHistogram(Sensor):
     """Coded sums (..., C, K, H, W) of a histogram (..., C, T, H, W): y = codes h, built up on the fly in a pixel.
 
@@ -136,7 +131,8 @@ class CodedHistogram(Sensor):
         check_transient(x, f"CodedHistogram.{name}")
         if x.shape[TIME] != matrix.shape[1]:
             raise ShapeError(f"CodedHistogram.{name}: expected dimension -3 of {matrix.shape[1]}, got {x.shape[TIME]}.")
-        return _coded_sums(x, matrix.to(x.dtype))
+        sums = product(matrix.to(x.dtype), x.flatten(-2))
+        return sums.reshape(*sums.shape[:-1], *x.shape[-2:])
 
     def expected(self, x: Tensor) -> Tensor:
         return self._apply_matrix(self.codes, x, "expected")

@@ -138,8 +138,8 @@ def center_of_mass(
 
     Args:
         histogram: (..., C, T, H, W).
-        background: counts per bin, a number or (..., C, H, W) (`background_per_bin`), subtracted before; a background
-            left in pulls the result to the middle of the window.
+        background: counts per bin, a number or (..., C, H, W), subtracted before; a background left in pulls the
+            result to the middle of the window. Where most bins hold nothing else, it is their median.
         half_width_bins: only bins within that distance of the largest one count; None for all.
 
     Returns:
@@ -282,18 +282,6 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     strength = scores.gather(TIME, index)
     position, strength = torch.where(valid, position, 0.0), torch.where(valid, strength, 0.0)
     return Returns(torch.where(unknown, math.nan, position), torch.where(unknown, math.nan, strength), valid & ~unknown)
-
-
-def background_per_bin(histogram: Tensor) -> Tensor:
-    """Median over the bins, without gradient: the level where most bins hold background only.
-
-    Args:
-        histogram: (..., C, T, H, W).
-
-    Returns:
-        (..., C, H, W).
-    """
-    return check_bins(histogram, "background_per_bin").detach().median(TIME).values
 
 
 @in_single

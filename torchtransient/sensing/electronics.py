@@ -85,8 +85,6 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
         variance: of a shape that broadcasts.
         high: upper limit.
     """
-    if not math.isfinite(high):
-        return variance
     variance = variance.clamp_min(0)
     # Beyond 12 standard deviations the answer is the variance or nothing, and the squares below would cancel.
     t = ((high - mean) / (variance + VARIANCE_FLOOR).sqrt()).clamp(-12, 12)

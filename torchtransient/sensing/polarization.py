@@ -253,8 +253,8 @@ class PolarizationMosaic(Sensor):
 
     def expected(self, x: Tensor) -> Tensor:
         _check_stokes(x, "PolarizationMosaic")
-        weights = self.weights(*x.shape[-2:]).to(x)
-        raw = _behind_mosaic(x, weights)
+        # No product of matrices, which autocast would round.
+        raw = (self.weights(*x.shape[-2:]).to(x)[:, None, None] * x).sum(TRANSIENT_DIM)
         slack = -_ROUNDING * x.select(TRANSIENT_DIM, 0)
         return torch.where((raw < 0) & (raw >= slack), 0.0, raw)
 
@@ -279,11 +279,6 @@ class PolarizationMosaic(Sensor):
             (..., 4, C, T, H, W).
         """
         return stokes_from(self.demosaic(raw), self.rows.flatten(0, 1))
-
-
-def _behind_mosaic(stokes: Tensor, weights: Tensor) -> Tensor:
-    # No product of matrices, which autocast would round.
-    return (weights[:, None, None] * stokes).sum(TRANSIENT_DIM)
 
 
 def mosaic_rows(

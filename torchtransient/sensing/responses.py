@@ -62,31 +62,11 @@ def _tail_term(u: Tensor, ratio: Tensor) -> Tensor:
     return torch.where(scaled, by_erfcx, plain)
 
 
-def emg_density(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
-    """Density of a normal delay plus an exponential one: the exponentially modified Gaussian.
+def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
+    """Share of an exponentially modified Gaussian, a normal delay plus an exponential one, before each time.
 
     Stable for every ratio of the two. Source: Grushka, Anal. Chem. 44 (1972); erfcx form as in Kalambet et al., J.
     Chemometrics 25 (2011).
-
-    Args:
-        time_s: times in seconds; all arguments broadcast.
-        mean_s: mean of the normal part, in seconds.
-        sigma_s: standard deviation of the normal part, in seconds.
-        tau_s: mean of the exponential part, in seconds.
-
-    Returns:
-        Density in 1/s.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
-    """
-    given = going_together("emg_density", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
-    time_s, mean_s, sigma_s, tau_s = given
-    return _tail_term((time_s - mean_s) / sigma_s, sigma_s / tau_s) / tau_s
-
-
-def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> Tensor:
-    """Share of an exponentially modified Gaussian before each time.
 
     Args:
         time_s: times in seconds; all arguments broadcast.

@@ -53,7 +53,7 @@ class Derivative:
         Raises:
             ShapeError: if the shapes of one run differ, or M < 2.
         """
-        return two_sample_z_test(gradients, self.per_seed, alpha, rounding)
+        return two_sample_z_test(gradients, self.per_seed, alpha=alpha, rounding=rounding)
 
 
 def central_difference(

@@ -145,7 +145,8 @@ def _found(device: str) -> Ranks:
         raise UnitError(f"ranks: {', '.join(given)} are set and {missing} not; start the script with torchrun.")
     least = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
     rank, size, local, local_size = (
-        count(f"ranks: {name}", _whole(given[name]), least[name], UnitError) for name in _TORCHRUN
+        count(f"ranks: {name}", int(text) if (text := given[name]).isdecimal() else text, least[name], UnitError)
+        for name in _TORCHRUN
     )
     if rank >= size or local >= local_size:
         raise UnitError(
@@ -153,10 +154,6 @@ def _found(device: str) -> Ranks:
             f"{local} of {local_size}; start the script with torchrun."
         )
     return Ranks(rank, size, local=local, local_size=local_size, device=torch.device(device))
-
-
-def _whole(text: str) -> int | str:
-    return int(text) if text.isdecimal() else text
 
 
 def _cores() -> int:

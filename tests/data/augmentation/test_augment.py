@@ -17,7 +17,7 @@ from torchtransient.data.augment import KINDS
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.rendering.cameras import camera_of
 from torchtransient.rendering.labels import LABELS, NUMBERED, first_return, scene_labels
-from torchtransient.scenes.transforms import look_at, rotate, scale, translate
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 VARIANT = "llvm_ad_mono_polarized"
 POSE = look_at([0.6, 0.4, 3.0], [0.1, 0.0, 0.0], [0.1, 1.0, 0.0])

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import damage, data_files, leftovers
 from torchtransient.data import Shard, generate, verify
-from torchtransient.data import overview as summaries
-from torchtransient.data.crew import RunLog
 from torchtransient.data.overview import drawn_sheet, summary
 from torchtransient.errors import SceneError, StorageError
 
@@ -113,19 +109,6 @@ def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
     assert shown[1] == [7, 0, 7, *({"failed": k, "restarts": 0} for k in (1, 2)), "closed"]
 
 
-def test_a_log_that_cannot_be_written(tmp_path):
-    log = RunLog(tmp_path / "nowhere")
-    log("event")
-    log.close()
-    log = RunLog(tmp_path)
-    log("event", number=np.int64(3), path=tmp_path)
-    log.close()
-    log.close()
-    log("not any more")
-    (line,) = events(tmp_path)
-    assert (line["event"], line["run"], line["path"]) == ("event", os.getpid(), str(tmp_path))
-
-
 # ---------------------------------------------------------------------------------------------- what does not fit
 
 
@@ -218,47 +201,22 @@ def test_shards_that_are_somewhere_else(tmp_path, monkeypatch):
     assert events(tmp_path, "stopped") and not events(tmp_path, "end")
 
 
-def test_what_a_summary_says(whole, tmp_path):
-    """Of all shards, line by line; where the folder has no description, the shards have."""
+def test_summaries_of_folders(whole, tmp_path):
+    """From the description, and without it from the shards."""
     size = sum(path.stat().st_size for path in whole.glob("*.h5")) / 1e6
     lines = summary(whole).splitlines()
-    assert lines == [
-        f"{whole}: 7 of 7 samples in 4 shards, 0 failed, {size:.4g} MB", "  depth: 2 x 3 float32",
-        "  transient: 1 x 4 x 2 x 3 float32", "  values: albedo, name", "  stored: exact, none",
-        "  1 samples per pixel, standard error 0.25", "  fake", "  made with fake 1",
-    ]  # fmt: skip
+    assert lines[0] == f"{whole}: 7 of 7 samples in 4 shards, 0 failed, {size:.4g} MB"
+    assert {"  depth: 2 x 3 float32", "  transient: 1 x 4 x 2 x 3 float32", "  values: albedo, name"} <= set(lines)
     alone = copied(whole, tmp_path / "set", 3)
-    assert summary(alone).splitlines()[1:] == lines[1:] and "1 of 7 samples in 1 shards" in summary(alone)
+    assert summary(alone).splitlines()[1:] == lines[1:]
     described = json.loads((whole / "recipe.json").read_text())
-    about = described["about"] | {
-        "plan": {"a": ["one"], "b": ["two", "three"]}, "spp": 8, "versions": {"x": "1", "y": "2"},
-        "axis": {"start_opl": 1.5, "bin_width_opl": 0.25, "num_bins": 6}, "frequencies": {"per_metre": [2.0, 0.5, 3]},
-    }  # fmt: skip
-    (alone / "recipe.json").write_text(json.dumps(described | {"about": about, "standard_error": None}))
-    assert summary(alone).splitlines()[5:] == [
-        "  6 bins of 0.25 m of optical path, from 1.5 to 3 m",
-        "  light outside of the window: more than 1% in 0 of 1 samples, 0.00% on average, 0.00% at most",
-        "  3 frequencies, 0.5 to 3 cycles per metre",
-        "  8 samples per pixel", "  a: one", "  b: two", "  b: three", "  made with x 1, y 2",
-    ]  # fmt: skip
-
-
-def test_samples_that_are_drawn_for_a_sheet(whole, tmp_path, monkeypatch):
-    """Each once, in order, with all that is stored of them."""
-    sheets = []
-    monkeypatch.setattr(summaries, "sheet_of", lambda samples, *given: sheets.append((list(samples), *given)))
-    chosen = drawn_sheet(whole, "sheet.png", 4, 2)
-    assert len(set(chosen)) == 4 and chosen == sorted(chosen) and chosen == drawn_sheet(whole, "sheet.png", 4, 2)
-    assert drawn_sheet(whole, "sheet.png", 99, 0) == list(range(7))
-    samples, path, axis, title, behind = sheets[0]
-    assert (path, axis, title, behind) == ("sheet.png", None, str(whole), 2)
-    maker = RECIPE.maker()
-    for index, one in zip(chosen, samples, strict=True):
-        made = maker.sample(index)
-        assert (one.index, one.seed, one.outside) == (index, made.seed, made.outside)
-        assert np.array_equal(one.arrays["transient"], made.arrays["transient"]) and one.values["name"] == (
-            made.values["name"]
-        )
+    axis = {"start_opl": 1.5, "bin_width_opl": 0.25, "num_bins": 6}
+    described["about"] |= {"axis": axis, "frequencies": {"per_metre": [2.0, 0.5, 3]}}
+    (alone / "recipe.json").write_text(json.dumps(described))
+    text = summary(alone)
+    assert "6 bins of 0.25 m of optical path, from 1.5 to 3 m" in text and "3 frequencies, 0.5 to 3 cycles" in text
+    chosen = drawn_sheet(whole, tmp_path / "sheet.png", 2, 2)
+    assert len(set(chosen)) == 2 and set(chosen) <= set(range(7)) and (tmp_path / "sheet.png").exists()
 
 
 def test_folders_without_samples(tmp_path):

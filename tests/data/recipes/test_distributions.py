@@ -28,25 +28,6 @@ def many(distribution, place=NUMBER, count=DRAWS):
     return np.array([distribution.draw(Stream(1, index, "x"), place) for index in range(count)])
 
 
-@pytest.mark.parametrize(
-    "distribution, mean, std",
-    [
-        (D.Uniform(2, 5), 3.5, 3 / np.sqrt(12)),
-        (D.LogUniform(1, np.e), np.e - 1, np.sqrt((np.e**2 - 1) / 2 - (np.e - 1) ** 2)),
-        (D.Normal(1, 2), 1, 2),
-        # Half of a normal distribution.
-        (D.Normal(0, 1, low=0), np.sqrt(2 / np.pi), np.sqrt(1 - 2 / np.pi)),
-        (D.Choice([1, 2, 6], weights=[1, 1, 2]), 3.75, np.sqrt((1 + 4 + 2 * 36) / 4 - 3.75**2)),
-    ],
-    ids=["uniform", "log", "normal", "half normal", "choice"],
-)
-def test_mean_and_deviation(distribution, mean, std):
-    drawn = many(distribution)
-    # 4 standard errors; of a deviation some 1 / sqrt(2 n) of itself for these.
-    assert abs(drawn.mean() - mean) < 4 * std / np.sqrt(DRAWS)
-    assert abs(drawn.std() - std) < 4 * std / np.sqrt(DRAWS)
-
-
 def test_ends_are_reached_and_not_left():
     for distribution, low, high in (
         (D.Uniform(-1, 3), -1, 3), (D.LogUniform(0.1, 10), 0.1, 10), (D.Normal(0, 5, low=-1, high=2), -1, 2),

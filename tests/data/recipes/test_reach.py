@@ -7,7 +7,7 @@ import pytest
 
 import torchtransient as tt
 from torchtransient.errors import SceneError, TorchTransientWarning
-from torchtransient.scenes.transforms import look_at, translate
+from torchtransient.scenes import look_at, translate
 
 D = tt.data
 # A ball of radius one that moves to (0, 0, 11), seen from (0, 0, -4): its box spans (-1, -1, 10) to (1, 1, 12).

@@ -8,7 +8,6 @@ from PIL import Image
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.data.maker import Maker
 from torchtransient.errors import SceneError
 
 D = tt.data
@@ -43,22 +42,6 @@ def test_cost(recipe):
 
 
 @pytest.mark.slow
-def test_cost_is_that_of_workers(recipe, monkeypatch):
-    """Which compute with one thread each."""
-    used = set()
-    sample = Maker.sample
-
-    def watched(maker, index):
-        used.add((tt.threads().torch, tt.threads().drjit))
-        return sample(maker, index)
-
-    monkeypatch.setattr(Maker, "sample", watched)
-    with tt.threads(2) as before:
-        recipe.cost(1)
-        assert used == {(1, 1)} and tt.threads() == before
-
-
-@pytest.mark.slow
 def test_preview_is_a_picture(recipe, tmp_path):
     recipe.preview(4, tmp_path / "sheet.png")
     picture = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
@@ -67,16 +50,6 @@ def test_preview_is_a_picture(recipe, tmp_path):
     assert np.asarray(Image.open(tmp_path / "one.png")).size < picture.size
     with pytest.raises(SceneError, match="whole number"):
         recipe.preview(0)
-
-
-@pytest.mark.slow
-def test_cost_counts_what_is_built():
-    """Every sample is a scene of its own: the forecast is that of making them, within what timing is good for."""
-    ball = {"type": "sphere", "center": [0, -0.6, 0.2], "radius": 0.1, "bsdf": {"type": "ref", "id": "white"}}
-    scene = tt.scenes.cornell_box(resolution=8, num_bins=60, bin_width_opl=0.2, start_opl=2.0) | {"ball": ball}
-    recipe = D.Recipe(scene, {"ball.radius": D.Uniform(0.05, 0.3)}, variant="llvm_ad_mono", spp=4)
-    cost = recipe.cost(1)
-    assert cost.seen == 64 and cost.sample_s >= np.mean([one.first_s for one in cost.structures[1:]])
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from torchtransient.data import (
 from torchtransient.data.exports import decode_web_sample
 from torchtransient.data.serialization import written_frequencies
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError
-from torchtransient.files.plain_data import scan_data, scan_from_data
+from torchtransient.files.plain_data import scan_data
 from torchtransient.tensor_record import same
 
 
@@ -238,16 +238,6 @@ def test_each_capture_has_its_own_scan(tmp_path):
     write(tmp_path / "shard-000000.h5", samples, about=about)
     with pytest.raises(StorageError, match="sample 0: expected the value 'scan' as one of #0 to #1, got '#2'"):
         export_tal(tmp_path, tmp_path / "out", progress=False)
-
-
-def test_scans_as_plain_data():
-    wall = tt.nlos.Wall.of({"type": "rectangle"})
-    for kind in ("single", "confocal", "exhaustive"):
-        scan = tt.nlos.Scan.grid(wall, (3, 2), kind=kind)
-        assert scan_from_data(json.loads(json.dumps(scan_data(scan)))) == scan
-    for data in ({"kind": "confocal"}, {"what": 3}, {**scan_data(scan), "kind": "other"}):
-        with pytest.raises(StorageError):
-            scan_from_data(data)
 
 
 def test_what_is_no_capture(data, tmp_path):

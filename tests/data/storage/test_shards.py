@@ -237,12 +237,9 @@ def test_windows_and_pixels(tmp_path):
         found = shard.read("transient", 0, window=slice(100, 164), pixels=(slice(2, 4), slice(5, None)))
         assert np.array_equal(found, x[:, 100:164, 2:4, 5:])
         assert np.array_equal(shard.read("depth", 0, pixels=(slice(3, 5), slice(None))), sample(0).arrays["depth"][3:5])
-        for arguments, message in (
-            ({"window": slice(5, 5)}, "some of 256"), ({"window": slice(0, 9, 2)}, "without steps"),
-            ({"window": 3}, "as slices"), ({"pixels": (slice(16, 17), slice(None))}, "some of 16"),
-            ({"window": slice("a", 2)}, "whole numbers"),
-        ):  # fmt: skip
-            with pytest.raises(StorageError, match=message):
+        outside = (slice(16, 17), slice(None))
+        for arguments in ({"window": slice(5, 5)}, {"window": slice(0, 9, 2)}, {"pixels": outside}):
+            with pytest.raises(StorageError, match="some of"):
                 shard.read("transient", 0, **arguments)
         with pytest.raises(StorageError, match="no time axis"):
             shard.read("depth", 0, window=slice(0, 1))

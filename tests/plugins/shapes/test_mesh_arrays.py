@@ -12,8 +12,8 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.scene.variant import active_variant
+from torchtransient.scenes import rotate, scale, translate
 from torchtransient.scenes.bottle import write_ply
-from torchtransient.scenes.transforms import rotate, scale, translate
 
 VARIANT = "llvm_ad_mono"
 POSE = translate([0.1, 0.0, 0.0]) @ rotate([1, 2, 0], 20) @ scale([0.8, 1.1, 0.9])

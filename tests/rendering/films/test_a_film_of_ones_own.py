@@ -16,7 +16,7 @@ import torchtransient as tt
 from tools.small_room import WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.plugins import _registry
 from torchtransient.rendering.films import FILMS, FilmLayout
 

@@ -16,7 +16,7 @@ import torch
 import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError
-from torchtransient.files.result_file import read_result, write_result
+from torchtransient.files import read_result, write_result
 from torchtransient.rendering import film_layout, films
 from torchtransient.rendering.film_layout import measured
 from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors

@@ -129,7 +129,6 @@ CALLS = {
     "distance_of_position": ({"position": 10 * rand(2, 3)}, TIMED),
     "detections_with_dead_time": ({"rate": LIGHT, "dead_bins": number(2.5)}, {}),
     "emg_cdf": (DELAYS, {}),
-    "emg_density": (DELAYS, {}),
     "emg_survival": (DELAYS, {}),
     "emg_response": ({"fwhm_s": number(1e-10), "tau_s": number(1e-10), "delay_s": number(1e-10)}, {}),
     "equi_depth_edges": ({"counts": COUNTS}, {"depth": 2}),
@@ -220,7 +219,7 @@ OTHERS = {
     # its pulses are arguments of any number
     "apply_pulse",
     # draws and medians have no derivative, and say so
-    "background_per_bin", "poisson", "sample_detections",
+    "poisson", "sample_detections",
 }  # fmt: skip
 
 # Arguments that decide and do not flow: thresholds, orders, whole numbers, positions of what is found.

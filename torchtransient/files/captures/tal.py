@@ -137,7 +137,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     left = sorted(set(contents.shapes) - _KNOWN)
     if own is not None:
         return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
-    kept |= {"scene_info_text": text, "volume_format": _volume(contents, gaps)}
+    volume = None if contents.array("volume_format") is None else _whole(contents, "volume_format", gaps)
+    kept |= {"scene_info_text": text, "volume_format": volume}
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
@@ -280,10 +281,6 @@ def _whole(contents: Contents, name: str, gaps: Gaps, missing: int | None = None
     if array is None or array.size != 1 or array.dtype.kind not in "iu":
         raise gaps.error(f"expected one whole number as {name}, got {None if array is None else array.dtype}.")
     return int(array.reshape(-1)[0])
-
-
-def _volume(contents: Contents, gaps: Gaps) -> int | None:
-    return None if contents.array("volume_format") is None else _whole(contents, "volume_format", gaps)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing

@@ -39,7 +39,7 @@ _VOLUME = ("hiddenVolumePosition", "hiddenVolumeRotation", "hiddenVolumeSize")
 # What y-tal tells the axes of pairs by. The first is empty in all files: light of the second is off hidden things.
 _BOUNCES, _OURS = 6, 1
 _CONFOCAL, _PAIRS = 4, 6
-# Files have six; each takes a look, also those that nobody stored.
+# Files have six; each is read by itself, also bounces that are not stored.
 _MOST_BOUNCES = 1000
 _INT64 = 2**63
 

@@ -88,17 +88,6 @@ def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
     return ((str(number), stage) for number, stage in enumerate(stages))
 
 
-def parts_of(chain: nn.Module) -> Iterator[tuple[str, Sensor]]:
-    """Yield every sensor in a chain with its place, parts of other sensors too.
-
-    Args:
-        chain: a chain, which is left out itself.
-    """
-    for name, part in chain.named_modules(remove_duplicate=False):
-        if part is not chain and isinstance(part, Sensor):
-            yield name.replace("stages.", ""), part
-
-
 def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
     """Return stages to call one after another.
 
@@ -271,16 +260,6 @@ class _Light:
     number: Stage | None = None  # of bins
 
 
-def stages_of(chain: nn.Module) -> Iterator[Stage | None]:
-    """Yield the sensors of a chain in their order, those of nested chains too; None for modules of another kind.
-
-    Args:
-        chain: a chain.
-    """
-    for name, stage in in_order(named(getattr(chain, "stages", chain))):
-        yield Stage(name, stage) if isinstance(stage, Sensor) else None
-
-
 def check_stages(chain: nn.Module) -> bool:
     """Check that each stage takes what the stages before it give.
 
@@ -296,33 +275,35 @@ def check_stages(chain: nn.Module) -> bool:
     Raises:
         UnitError: for stages that do not go together.
     """
-    _through(stages_of(chain), _Light())
+    _through(in_order(named(getattr(chain, "stages", chain))), _Light())
     parts = _parts_of(chain)
     _check_cycles(parts)
     check_dead_times(chain)
     check_window(chain, None)
-    return has_period(chain) and any((_bins(part) or (0.0, 1))[1] is None for part in parts)
+    periods = [getattr(part.sensor, n, None) for part in parts for n in ("repetition_rate_hz", "period_s")]
+    return any(isinstance(p, float) for p in periods) and any(_bins(part)[1] is None for part in parts)
 
 
-def _through(stages: Iterable[Stage | None], light: _Light) -> _Light:
+def _through(row: Iterable[tuple[str, nn.Module]], light: _Light) -> _Light:
     """Compare each stage in a row with its light, every branch with the same, and return the light behind."""
-    for stage in stages:
-        if stage is None:
+    for place, module in row:
+        if not isinstance(module, Sensor):
             light = _Light()
             continue
+        stage = Stage(place, module)
         _check_quantity(light, stage)
         before = _same_bins(light, stage)
-        for name, sensor in branches_of(stage.sensor):
-            row = in_order([(f"{stage.name}.{name}", sensor)])
-            end = _through((Stage(n, s) if isinstance(s, Sensor) else None for n, s in row), light)
+        for name, sensor in branches_of(module):
+            end = _through(in_order([(f"{place}.{name}", sensor)]), light)
             before = replace(before, width=end.width, number=end.number)
         light = _after(stage, before)
     return light
 
 
 def _parts_of(chain: nn.Module) -> list[Stage]:
-    """Return every sensor of a chain, parts of other sensors too."""
-    return [Stage(name, part) for name, part in parts_of(chain)]
+    """Return every sensor of a chain with its place, parts of other sensors too."""
+    found = chain.named_modules(remove_duplicate=False)
+    return [Stage(n.replace("stages.", ""), s) for n, s in found if s is not chain and isinstance(s, Sensor)]
 
 
 # ------------------------------------------------------------------------------------------------------------- bins
@@ -481,16 +462,6 @@ def check_window(chain: nn.Module, num_bins: int | None) -> None:
                 _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
             if not budgets and isinstance(own, float):
                 _check_armed(stage, own, stage, num_bins)
-
-
-def has_period(chain: nn.Module) -> bool:
-    """Return True if a laser period is known in a chain.
-
-    Args:
-        chain: a chain.
-    """
-    names = ("repetition_rate_hz", "period_s")
-    return any(isinstance(getattr(part.sensor, name, None), float) for part in _parts_of(chain) for name in names)
 
 
 def _dead_time(stage: Stage) -> float | None:

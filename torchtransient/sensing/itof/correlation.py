@@ -182,16 +182,6 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
 _LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 
-def rounding_of(weights: Tensor) -> float:
-    """Largest rounding error of weights in their dtype.
-
-    Args:
-        weights: tensor.
-    """
-    most = float(weights.abs().max()) if weights.numel() else 1.0
-    return max(float(torch.finfo(weights.dtype).eps), 1e-9) * max(most, 1.0)
-
-
 def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis, within_bin: str) -> Tensor:
     """Cosine and sine of every harmonic of every frequency, over the bins.
 
@@ -608,8 +598,10 @@ class ItofCorrelation(Sensor):
                     f"{tuple(phases.shape)}. Make the camera with the frequencies of the state."
                 )
             own = self._weights_for(phases.double().cpu()).to(weights)
-            # as much as rounding to half precision leaves
-            near = own.shape == weights.shape and torch.allclose(own, weights, rtol=0, atol=4 * rounding_of(weights))
+            # as much as rounding to their dtype leaves, at least 1e-9 of one
+            largest = max(float(weights.abs().max()) if weights.numel() else 1.0, 1.0)
+            slack = 4 * max(float(torch.finfo(weights.dtype).eps), 1e-9) * largest
+            near = own.shape == weights.shape and torch.allclose(own, weights, rtol=0, atol=slack)
             if not near:
                 raise UnitError(
                     "ItofCorrelation.load_state_dict: expected the state of a camera with the code, frequencies, axis, "
