@@ -6,15 +6,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient.plugins.around_corner.late_light as late_light
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.late_light_runs import agree, chains, density_of, rendered, scan_scene
 from support.marks import long, long_rows
 from support.third_bounce_runs import film_of, table_of, wall_of
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import SceneError
 
 VARIANT = "llvm_ad_mono"
-UP = (0.0, 0.0, 1.0)
+
+
 PATHS, CHAINS = 1 << 14, 1 << 10
 
 
@@ -163,18 +163,6 @@ def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(corner):
     assert runs[1][0].sum() == pytest.approx(runs[0][1].sum(), rel=1e-6) and runs[0][0].sum() > 1.1 * runs[0][1].sum()
 
 
-@pytest.mark.parametrize("busy", [1, 64])
-def test_groups_at_a_time_do_not_matter(corner, monkeypatch, busy):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    usual = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
-    for table in (late_light._BUSY,):
-        for backend in list(table):
-            monkeypatch.setitem(table, backend, busy)
-    again = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
-    assert np.allclose(usual, again, rtol=1e-4, atol=1e-6 * usual.max())
-
-
 @pytest.mark.parametrize("choices", [{"size": 1}, {"side": 2}])
 def test_groups_and_tiles_have_one_mean(corner, choices):
     scene, elements, points, normals = corner
@@ -200,38 +188,6 @@ def test_few_chains_and_no_light():
         steady, cube = chains(scene, elements, histogram(2), sensors, sensors, "confocal", count)
         assert steady.sum() == 0
         assert cube.sum() == 0
-
-
-@pytest.mark.slow
-def test_chains_name_their_material_points(corner):
-    """Shape, primitive and barycentrics of every vertex give its place again."""
-    import drjit as dr
-
-    from torchtransient.plugins.around_corner.late_light import ChainPlan, trace_chains
-
-    scene, elements, points, _ = corner
-    center, seed = mi.Point3f(*np.mean(points, 0).tolist()), dr.opaque(mi.UInt32, 5)
-    _, tails = trace_chains(scene, ChainPlan(elements, center, 32, 4, 3, seed), dr.arange(mi.UInt32, 128))
-    v = np.array(elements.shapes[0].vertex_positions_buffer()).reshape(-1, 3)
-    f = np.array(elements.shapes[0].faces_buffer()).reshape(-1, 3)
-    for vertex in tails:
-        alive = np.array(vertex.alive & (vertex.shape == mi.ShapePtr(elements.shapes[0])))
-        corners = v[f[np.array(vertex.primitive)[alive]]]
-        b = np.array(vertex.uv).T[alive]
-        place = corners[:, 0] + b[:, :1] * (corners[:, 1] - corners[:, 0]) + b[:, 1:] * (corners[:, 2] - corners[:, 0])
-        assert alive.any()
-        assert np.abs(place - np.array(vertex.p).T[alive]).max() < 1e-4
-
-
-def test_arguments_are_checked(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    run = lambda **more: chains(scene, elements, histogram(2), sensors, sensors, "confocal", 8, **more)  # noqa: E731
-    for bounces in ((3, 5), (4, late_light.MOST + 1), (6, 5)):
-        with pytest.raises(SceneError, match="expected bounces"):
-            run(bounces=bounces)
-    with pytest.raises(UnitError, match="power of two"):
-        run(size=12)
 
 
 def test_the_choice_says_why_not():

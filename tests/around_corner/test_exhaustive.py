@@ -8,7 +8,7 @@ import pytest
 import torchtransient.plugins.around_corner.exhaustive as exhaustive
 from support.hidden_shapes import ball, folded_plates, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
-from torchtransient.errors import SceneError, ShapeError
+from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
@@ -129,22 +129,6 @@ def test_interpolated_normals_are_not_reciprocal():
         runs.exhaustive(reciprocal=True)
 
 
-def test_blocks_of_samples_add_up(monkeypatch):
-    runs = Runs(SCENES["body"]())
-    _, cube = runs.exhaustive()
-    monkeypatch.setattr(exhaustive, "MOST_BYTES", 8 * GRID**2 * 50)
-    told = []
-    _, parts = captured(
-        runs.pairs,
-        lambda: exhaustive.add_exhaustive(
-            ThirdBounce(runs.scene, runs.pairs, runs.samples, runs.sensors, 2.5, progress=told.append), runs.sensors
-        ),
-    )
-    parts, bands = parts.reshape(cube.shape), len(runs.pairs.band_layout())
-    assert told == pytest.approx([(k + 1) / (3 * bands) for k in range(3 * bands)])
-    assert parts == pytest.approx(cube, rel=1e-5, abs=1e-7 * cube.max())
-
-
 @pytest.mark.parametrize(("name", "window"), [("body", (1.0, 60)), ("body", (2.2, 3)), ("sheet across", (1.0, 60))])
 def test_bins_and_what_is_outside_are_the_steady_image(name, window):
     """Also of a sheet that some pairs see from either side, which brings no light of these."""
@@ -207,30 +191,3 @@ def test_colours_of_the_other_side():
     away = np.cross(*(v[f[0][1:]] - v[f[0][0]]))[2] > 0
     expected = colours[::-1] if away else colours
     np.testing.assert_allclose([c / c[1] for c in found], [np.divide(c, c[1]) for c in expected], rtol=1e-4)
-
-
-def test_films_and_spots_are_checked():
-    runs = Runs(SCENES["body"]())
-    with pytest.raises(SceneError, match="exhaustive_scan"):
-        captured(runs.one, lambda: exhaustive.add_exhaustive(runs.job(runs.one), runs.sensors))
-    points, normals = wall_grid(2)
-    with pytest.raises(ShapeError, match="9 and 4"):
-        runs.exhaustive(wall_of(points, normals))
-    with pytest.raises(SceneError, match="exhaustive"):
-        captured(runs.pairs, lambda: runs.job(runs.pairs).add_confocal())
-
-
-def test_light_is_added_to_what_the_film_holds():
-    runs = Runs(SCENES["V and plate"]())
-
-    def twice():
-        for _ in range(2):
-            exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors)
-
-    steady, cube = runs.exhaustive()
-    both_steady, both = captured(runs.pairs, twice)
-    np.testing.assert_allclose(both_steady, 2 * steady, rtol=1e-5)
-    np.testing.assert_allclose(both.reshape(cube.shape), 2 * cube, rtol=1e-5, atol=1e-7 * cube.max())
-    with pytest.raises(SceneError, match="without light in it"):
-        captured(runs.pairs, lambda: [exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors, True), twice(),
-                                      exhaustive.add_exhaustive(runs.job(runs.pairs), runs.sensors, True)])  # fmt: skip

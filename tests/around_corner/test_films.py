@@ -4,12 +4,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient.plugins.around_corner.launches as launches
 from support.hidden_shapes import mannequin, mesh, scene_of, wall_grid
 from support.marks import long
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
-from torchtransient.errors import SceneError, ShapeError, VariantError
-from torchtransient.plugins.around_corner.geometry import WallPoints
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -74,33 +71,12 @@ def test_phasors_are_the_transform_of_fine_bins(run, spot):
     assert steady[..., 0] == pytest.approx(phasors[:, :, 0, 0], rel=1e-5)
 
 
-def test_phasors_in_several_launches(run, monkeypatch):
-    film = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0.7, 2.5")
-    _, whole = run(film)
-    for most in (24, 1):
-        monkeypatch.setattr(type(film), "lanes_at_most", lambda self, events, most=most: most)
-        assert len(launches.launches_of(film, COUNT)) > 4
-        _, parts = run(film)
-        assert parts == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
-
-
 def test_gates_are_sums_of_bins(run):
     _, cube = run(histogram())
     film = film_of(GRID, GRID, type="gated_hdr_film", gates="rectangular 1.2 2.2; rectangular 2.2 3.2")
     _, gated = run(film)
     expected = cube.reshape(GRID, GRID, 2, 20, 1).sum(3)
     assert gated == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize("busy", [1, 13, 4096])
-def test_lanes_of_a_pixel_add_up(run, monkeypatch, busy):
-    _, expected = run(histogram())
-    monkeypatch.setattr(launches, "_BUSY", dict.fromkeys(launches._BUSY, busy))
-    monkeypatch.setattr(launches, "_CONNECTIONS", 700)
-    fractions = []
-    _, cube = run(histogram(), progress=fractions.append)
-    assert cube == pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
-    assert fractions == pytest.approx([k / 3 for k in (1, 2, 3)])
 
 
 def test_legs_are_path_length(body):
@@ -133,23 +109,3 @@ def test_colours(vertex_normals):
     for channel, (albedo, energy) in enumerate(((0.2, 1.0), (0.5, 2.0), (0.8, 3.0))):
         for found, expected in zip(rgb, captures(albedo, energy, "llvm_ad_mono"), strict=True):
             assert found[..., channel] == pytest.approx(expected[..., 0], rel=1e-5, abs=1e-7 * expected.max())
-
-
-def test_arguments_are_checked(body):
-    points, normals = wall_grid(GRID, 0.4)
-    sensors = wall_of(points, normals)
-    film = histogram()
-    with pytest.raises(SceneError, match="start_render"):
-        ThirdBounce(*(body[0], film, body[1], sensors))
-    film.start_render()
-    with pytest.raises(ShapeError, match="2 x 2 pixels and 9"):
-        ThirdBounce(body[0], film, body[1], wall_of(*wall_grid(3)))
-    job = ThirdBounce(body[0], film, body[1], sensors)
-    with pytest.raises(ShapeError, match="one laser spot, got 4"):
-        job.add_single(sensors)
-    with pytest.raises(ShapeError, match="9 spots"):
-        job.add_confocal(wall_of(*wall_grid(3)))
-    with pytest.raises(ShapeError, match="leg"):
-        WallPoints(sensors.p, sensors.n, 0.3, mi.Float64([1, 2]))
-    with mi.variant_context("llvm_ad_spectral"), pytest.raises(VariantError, match="spectral"):
-        ThirdBounce(None, film, None, None)

@@ -106,7 +106,7 @@ def compare(ours, theirs, ctx, power_alone=False):
     weight = expected[5]
     lit = weight.reshape(-1, weight.shape[-1]).max(0) > 0
     # Mitsuba computes Mueller matrices of refraction from the refracted cosine, which loses up to a quarter at grazing
-    # incidence (the matrix's first entry must be 1 / eta^2 here; see test_grazing_mueller_matrix).
+    # incidence (the matrix's first entry must be 1 / eta^2 here).
     steep = np.abs(inputs(weight.shape[-1])[0][:, 2]) > 0.05
     for k, (a, b) in enumerate(zip(got, expected, strict=True)):
         assert np.isfinite(a).all()
@@ -155,28 +155,6 @@ def test_density_of_all_normals_is_mitsubas(roughness):
     expected, found = (bsdf.pdf(mi.BSDFContext(), si, wo).numpy() for bsdf in (theirs, ours))
     assert (expected > 1e-3).sum() > 200
     assert np.max(np.abs(found - expected) / (expected + 2e-3)) < 1e-3
-
-
-@pytest.mark.parametrize("number", [0.0, 0.5, 1 - 2.0**-24])
-def test_what_does_not_reflect_transmits_whatever_is_drawn(number):
-    """Between equal indices; and where all light is reflected, nothing is transmitted."""
-    activate("llvm_ad_mono")
-    ctx, glass = mi.BSDFContext(), mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    nothing = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.25, "ext_ior": 1.25})
-    for bsdf, wi, component in ((nothing, [0, 0.6, 0.8], 1), (glass, [0, 0.8, -0.6], 0)):
-        bs, weight = bsdf.sample(ctx, interaction(mi.Vector3f(wi)), mi.Float(number), mi.Point2f(0.5))
-        found = [*bs.sampled_component, *bs.pdf, *weight[0]]
-        assert found == pytest.approx([component, 1, 1])
-
-
-def test_grazing_mueller_matrix():
-    activate("llvm_ad_mono_polarized")
-    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    z = np.float32([1e-3, 1e-2, 0.1, 0.5, 1])
-    wi = mi.Vector3f(np.stack([np.sqrt(1 - z * z), 0 * z, z]))
-    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(0.9999999), mi.Point2f(0.5))
-    assert dr.all(bs.sampled_component == 1)
-    np.testing.assert_allclose(np.array(weight)[0, 0].ravel(), 1 / 2.25, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("roughness", "sample_visible"), [(ROUGHNESSES[2], True), (ROUGHNESSES[3], False)])
@@ -356,23 +334,6 @@ def test_detached_estimator_of_a_rough_lobe(side):
         samples = dr.forward_to(estimate).numpy()
         mean, error = samples.mean(), samples.std() / np.sqrt(count)
         assert abs(mean - slope.item()) < 4 * error + 2e-3 * abs(slope.item()), key
-
-
-def test_gradient_passes_through_a_call_by_pointer():
-    """The plugins are reached through arrays of pointers in a loop: the index must collect its derivative there too."""
-    activate("llvm_ad_rgb")
-    for kind in ("diff_dielectric", "diff_rough_dielectric"):
-        scene = mi.load_dict(
-            {"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}}
-        )
-        params = mi.traverse(scene)
-        dr.enable_grad(params["a.bsdf.eta"])
-        params.update()
-        rays = mi.Ray3f(mi.Point3f(0.1, 0.2, 2), dr.normalize(mi.Vector3f(mi.Float([0.3, -0.2, 0.1]), 0.1, -1)))
-        si = scene.ray_intersect(rays)
-        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
-        dr.backward(dr.sum(bs.eta + bs.pdf * 0))
-        assert dr.grad(params["a.bsdf.eta"])[0] == pytest.approx(3, rel=1e-5)
 
 
 # ----------------------------------------------------------------------------------------------------- parameters

@@ -26,7 +26,6 @@ FILMS = {
     },
     "slow_phasor_hdr_film": {"frequencies": "0 1", "slow_times": "0 0.5"},
 }
-PULSED = {"type": "transient_hdr_film", "temporal_bins": 40, "pulse": "gaussian", "pulse_fwhm_opl": 0.05}
 
 
 @pytest.fixture(autouse=True)
@@ -83,15 +82,6 @@ def test_a_film_without_a_member_is_refused():
 # ------------------------------------------------------------------------------------------ temporal filters
 
 
-def test_a_filter_that_cannot_be_used_changes_nothing():
-    film = mi.load_dict({**PULSED, "bin_width_opl": 0.02})
-    with pytest.raises(SceneError, match="4096"):
-        film.take_filter("gaussian", 1e4)
-    with pytest.raises(SceneError, match="expected one of"):
-        film.take_filter("triangle", 2.0)
-    assert (film.temporal_filter, film.gaussian_stddev, film.filter.name) == ("box", 0.5, "box")
-
-
 def test_films_without_a_temporal_filter():
     for kind in ("phasor_hdr_film", "gated_hdr_film"):
         film = make(kind)
@@ -99,31 +89,6 @@ def test_films_without_a_temporal_filter():
         assert film.temporal_filter == ""
         with pytest.raises(AttributeError):
             film.temporal_filter = "tent"
-
-
-# ------------------------------------------------------------------------------------------------- arrays of others
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["transient_hdr_film", "phasor_hdr_film"])
-def test_films_add_to_an_array_that_was_lent(kind):
-    """From its first entry on, where nothing else is touched."""
-    film = make(kind)
-    wall, lamp = {"type": "rectangle"}, {"type": "point", "position": [0.3, 0.2, 0.8]}
-    sensor = {"type": "perspective", "film": film}
-    sensor["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, 0], [0, 1, 0])
-    node = {"type": "transient_path", "max_depth": 2}
-    scene = mi.load_dict({"type": "scene", "integrator": node, "sensor": sensor, "wall": wall, "lamp": lamp})
-    film = scene.sensors()[0].film()
-    expected = np.array(scene.integrator().render(scene, seed=2, spp=8)[1]).ravel()
-    film.lend((dr.zeros(mi.Float, 7 + expected.size + 4), 7))
-    scene.integrator().render(scene, seed=2, spp=8, develop=False)
-    found = np.array(film.release_storage()[-1])
-    film.lend(None)
-    assert np.abs(expected).sum() > 0
-    np.testing.assert_allclose(found[7:-4], expected, rtol=1e-5, atol=1e-6)
-    assert not found[:7].any() and not found[-4:].any()
-    assert film.release_storage() == [None, None]
 
 
 # -------------------------------------------------------------------------------------------------------- pictures

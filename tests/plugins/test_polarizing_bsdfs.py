@@ -9,8 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient as tt
-from support.gradient_cases.scenes import mirror_room
 from support.marks import long
 from support.surface_samples import activate, directions, interaction
 from torchtransient.plugins import mitsuba_compat as compat
@@ -224,17 +222,3 @@ def reflectance(slot, value, other, cosine):
     p = np.conj(np.sqrt(np.conj(n * n) - (1 - cosine**2)))
     s, r = (cosine - p) / (cosine + p), (n * n * cosine - p) / (n * n * cosine + p)
     return float(abs(s) ** 2 + abs(r) ** 2) / 2
-
-
-@pytest.mark.slow
-def test_a_described_metal_of_index_zero_is_built_anew():
-    metal = {"type": "conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}
-    scene = tt.load(mirror_room(metal), variant="llvm_ad_mono")
-    info = scene.parameters()["wall.bsdf.eta.value"]
-    assert info.differentiable and not info.biased and "diff_conductor" in info.reason
-    renderer = tt.TransientRenderer(scene, parameters=["wall.bsdf.eta.value"], spp=64)
-    image = renderer(seed=0).steady.sum()
-    image.backward()
-    # Mirrored light falls by 4 / (1 + k^2) for each unit, near normal incidence.
-    slope = renderer.values["wall.bsdf.eta.value"].grad / image.detach()
-    assert float(slope) == pytest.approx(-4 / 5, rel=0.1)

@@ -84,20 +84,6 @@ def test_hundred_million_cycles(dtype):
     assert float(totals.std()) / (1e8 * p * (1 - p)) ** 0.5 == pytest.approx(1, abs=0.06)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_half_precision_is_drawn_in_single(dtype):
-    rate = torch.full((1, 8, 16, 16), 0.1, dtype=dtype)
-    g = torch.Generator().manual_seed(0)
-    for module in (
-        sensing.ShotNoise(grad="straight_through"),
-        sensing.SynchronousSPAD(100, grad="straight_through"),
-        sensing.BinaryFrames(100, grad="straight_through"),
-    ):
-        y = module(rate, generator=g)
-        assert y.dtype == torch.float32
-        assert bool(torch.isfinite(y).all()) and float(y.sum()) > 0
-
-
 # --- pile-up -----------------------------------------------------------------------------------------------------
 
 

@@ -75,12 +75,6 @@ def test_depth_of_an_event_is_that_of_the_render_that_has_it(kind):
     assert shares[-1] > shares[1] > 0
 
 
-def test_every_event_has_a_place_in_the_list():
-    """A list that is too short says so, and keeps what there was room for."""
-    _, kept = traced(scene_of("plain"), lambda *_: EventListSink(5 * 5 * SPP, 1, dr.mean))
-    assert int(np.array(kept["used"]).max()) > 1
-
-
 def test_a_sink_of_one_s_own():
     """Sinks are told of every event, whatever strategy found it, and of every vertex."""
 

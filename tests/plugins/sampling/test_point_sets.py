@@ -36,20 +36,6 @@ def test_every_point_is_uniform_and_means_are_unbiased(count):
     assert abs(np.mean(values) - (2 / 3 / 4 + 0.7 * 0.7)) < 4 * error
 
 
-def test_other_seeds_are_other_points():
-    a, b = points(64, 1), points(64, 2)
-    # The strata stay where they are; what is random is where in them, and the order of the second coordinate.
-    assert not np.array_equal(a[0], b[0]) and not np.array_equal(a[1].argsort(), b[1].argsort())
-
-
-def test_several_sets_are_each_a_net_of_its_own():
-    x, y = (np.array(a) for a in plane_points(64, dr.opaque(mi.UInt32, 3), 3))
-    assert sorted(np.floor(x * 64)) == sorted(list(range(64)) * 3)
-    for k in range(3):
-        assert sorted(np.floor(y[64 * k : 64 * (k + 1)] * 64)) == list(range(64))
-    assert not np.array_equal(y[:64], y[64:128])
-
-
 @pytest.mark.slow
 def test_seeds_that_follow_each_other_are_independent():
     """Kolmogorov's test of both coordinates of one point, over consecutive seeds: 1 % of all exceed 1.63."""

@@ -63,14 +63,6 @@ def test_light_is_that_of_the_same_mesh_in_a_file(tmp_path):
     assert float(turned.sum()) == 0.0
 
 
-def test_two_meshes_keep_their_own_vertices_when_shapes_are_merged():
-    near, far = diffuse(), diffuse(to_world=translate([0, 0, -1.5]) @ POSE)
-    both = render(scene_with(near, far))
-    swapped = render(scene_with(far, near))
-    torch.testing.assert_close(both.steady, swapped.steady, rtol=1e-4, atol=1e-5)
-    assert both.steady.sum() > 1.05 * render(scene_with(far)).steady.sum()
-
-
 def test_parameters_are_those_of_meshes():
     scene = tt.load(scene_with(diffuse()), variant=VARIANT)
     table = scene.parameters()
@@ -149,33 +141,7 @@ def test_what_is_no_mesh(changes, message):
         tt.load(scene_with(diffuse(**changes)), variant=VARIANT).parameters()
 
 
-ARRAYS = {"vertices": OCTAHEDRON, "faces": FACES}
 NAN, INF = math.nan, math.inf
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"vertices": OCTAHEDRON * NAN}, "expected finite vertices"),
-        ({"vertices": np.where(OCTAHEDRON == 1, INF, 0)}, "expected finite vertices"),
-        ({"faces": FACES + 1}, "from 0 to 5, one less than the vertices, got numbers from 1 to 6"),
-        ({"faces": FACES - 1}, "from 0 to 5, one less than the vertices, got numbers from -1 to 4"),
-        ({"faces": FACES + 0.25 * (FACES == 2)}, "expected faces of whole numbers"),
-        ({"normals": OCTAHEDRON[:5]}, r"expected normals .* each of the 6 vertices, got 5 rows\.$"),
-        ({"normals": OCTAHEDRON * NAN}, "expected normals .* got 6 rows with NaN or infinity"),
-        ({"texcoords": OCTAHEDRON}, r"expected texcoords .* each of the 6 vertices, got 9 rows\."),
-        ({"texcoords": np.zeros((1, 3))}, "expected texcoords as rows of two numbers, got 3 numbers"),
-        ({"vertices": np.zeros((2, 2))}, "expected vertices as rows of three numbers, got 4 numbers"),
-        ({"vertices": np.zeros((0, 3))}, "expected vertices as rows of three numbers, got 0 numbers"),
-        ({"faces": None}, "expected faces .*, got nothing"),
-    ],
-)
-def test_mitsuba_itself_is_refused_what_is_no_mesh(changes, message):
-    with active_variant(VARIANT):
-        given = {"type": "mesh_arrays", **ARRAYS, **changes}
-        arrays = {key: mi.TensorXf(np.float32(x)) if isinstance(x, np.ndarray) else x for key, x in given.items()}
-        with pytest.raises(SceneError, match=message), plugins.plugin_errors():
-            mi.load_dict({key: x for key, x in arrays.items() if x is not None})
 
 
 def test_scene_files_name_a_mesh_file():
