@@ -1,4 +1,4 @@
-"""Late light from shared chains: the same as that of paths, in every kind of capture, film and colour."""
+"""Late light from shared chains: the same as that of paths, in every kind of capture and colour."""
 
 import itertools
 
@@ -111,58 +111,6 @@ def histogram(points, **arguments):
     return film_of(points, points, 1.2, 48, 0.05, **arguments)
 
 
-@pytest.mark.slow
-def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(corner):
-    """The same chains: to the last digits."""
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals, leg=[0.1, 0.2, 0.0, 0.3])
-    exhaustive = {"exhaustive_scan": True, "laser_scan_width": 2, "laser_scan_height": 2}
-    run = lambda film, lasers, kind: chains(scene, elements, film, sensors, lasers, kind, 200)[1]  # noqa: E731
-    every = run(histogram(2, **exhaustive), sensors, "exhaustive").reshape(4, 4, -1)
-    confocal = run(histogram(2), sensors, "confocal").reshape(4, -1)
-    spot = wall_of(points[2:3], normals[2:3], leg=0.0)
-    single = run(histogram(2), spot, "single").reshape(4, -1)
-    most = every.max()
-    assert np.abs(every[range(4), range(4)] - confocal).max() < 1e-5 * most
-    assert np.abs(every[:, 2] - single).max() < 1e-5 * most
-
-
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_phasors_are_the_transform_of_fine_bins(corner, kind):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
-    frequencies = [0.0, 0.5, 1.5]
-    film = film_of(2, 2, type="phasor_hdr_film", frequencies="0.0, 0.5, 1.5", start_opl=1.0)
-    phasors = chains(scene, elements, film, sensors, lasers, kind, 150)[1].reshape(2, 2, 3, 2)
-    fine = chains(scene, elements, film_of(2, 2, 1.0, 8000, 0.001), sensors, lasers, kind, 150)[1][..., 0]
-    middle = (np.arange(8000) + 0.5) * 0.001
-    for i, frequency in enumerate(frequencies):
-        expected = (fine * np.exp(-2j * np.pi * frequency * middle)).sum(-1)
-        found = phasors[:, :, i, 0] + 1j * phasors[:, :, i, 1]
-        # Half a bin is at most 2 pi 1.5 0.0005 of a turn's angle.
-        assert np.abs(found - expected).max() < 6e-3 * np.abs(fine.sum(-1)).max()
-
-
-def test_bins_and_what_is_outside_are_the_steady_image(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    film = film_of(2, 2, 3.2, 2, 0.1)
-    steady, cube = chains(scene, elements, film, sensors, sensors, "confocal", 300)
-    assert cube.sum() + film.energy_before + film.energy_after == pytest.approx(steady.sum(), rel=1e-5)
-    assert min(film.energy_before, film.energy_after) > 0.05 * steady.sum()
-
-
-@pytest.mark.slow
-def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    runs = [chains(scene, elements, film_of(2, 2, 3.2, 9, 0.1, **more), sensors, sensors, "confocal", 100)
-            for more in ({}, {"steady": False})]  # fmt: skip
-    assert runs[1][1] == pytest.approx(runs[0][1], rel=1e-6)
-    assert runs[1][0].sum() == pytest.approx(runs[0][1].sum(), rel=1e-6) and runs[0][0].sum() > 1.1 * runs[0][1].sum()
-
-
 @pytest.mark.parametrize("choices", [{"size": 1}, {"side": 2}])
 def test_groups_and_tiles_have_one_mean(corner, choices):
     scene, elements, points, normals = corner
@@ -214,29 +162,6 @@ def test_progress_goes_up_to_one():
 
 
 # ------------------------------------------------------------------------------------------------ colours
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
-def test_chains_are_the_same_in_every_colour(corner, kind):
-    """Light of two hidden bounces goes by the square of their albedo, also where another colour is not scattered."""
-    given = corner[2:]
-    grey = by_chains(mesh("a", folded_plates(), 0.5, two_sided=True), *given, kind)
-    albedos = [0.0, 0.8, 0.3]
-    shape = {"type": "rgb", "value": albedos}
-    with mi.variant_context("llvm_ad_rgb"):
-        colours = by_chains(mesh("a", folded_plates(), shape, two_sided=True), *given, kind)
-    assert not colours[..., 0].any()
-    for channel in (1, 2):
-        expected = grey[..., 0] * (albedos[channel] / 0.5) ** 2
-        np.testing.assert_allclose(colours[..., channel], expected, rtol=1e-3, atol=1e-4 * grey.max())
-
-
-def by_chains(shape, points, normals, kind):
-    scene, sensors = scene_of(shape), wall_of(points, normals)
-    elements = density_of(scene, table_of([shape]), points, normals)
-    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
-    return chains(scene, elements, histogram(2), sensors, lasers, kind, 64, bounces=(4, 4))[1]
 
 
 @pytest.mark.slow

@@ -81,22 +81,6 @@ def test_visible_sky_arrives_from_the_sphere_around_the_scene(sky, z):
     assert arrival == pytest.approx(np.sqrt(2.0) - (z + 1.0), abs=6e-4)
 
 
-def test_clock_of_distant_light_does_not_depend_on_merged_shapes():
-    """Mitsuba merges rectangles into a mesh without bounds when it loads a scene; the sphere must hold them all the
-    same.
-    """
-    objects = {"wall": wall(z=0.25), "far": wall(z=-2.0), "sky": {"type": "constant"}}
-    description = {"type": "scene", "integrator": {"type": "transient_path"}, "sensor": narrow(), **objects}
-    spheres = []
-    for optimize in (False, True):
-        scene = mi.load_dict(description, optimize=optimize)
-        spheres.append(scene.integrator().reference(scene))
-    np.testing.assert_allclose(
-        [*spheres[0].center, spheres[0].radius], [*spheres[1].center, spheres[1].radius], rtol=1e-6
-    )
-    assert spheres[0].radius == pytest.approx(np.sqrt(9 + 9 + 1.125**2), rel=1e-6)
-
-
 def test_clock_of_a_second_scene_is_its_own():
     """One integrator for many scenes: a scene that is gone must not lend its sphere to another at its address."""
     integrator = mi.load_dict({"type": "transient_path"})

@@ -295,59 +295,7 @@ def test_rough_eval_and_pdf_are_attached(ggx, alphas):
     assert checked == 10
 
 
-@pytest.mark.parametrize("side", long([1, -1], [-1]))
-def test_detached_estimator_of_a_rough_lobe(side):
-    """What the integrator does: mean of ``weight * relative_grad(pdf) * g(wo)`` over detached samples.
-
-    Its derivative in eta and alpha must be that of the integral over the sphere of directions.
-    """
-    activate("llvm_ad_mono")
-    plugin = {"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.4, "distribution": "ggx"}
-    wi = mi.Vector3f(dr.normalize(mi.Vector3f(0.4, 0.2, 0.9 * side)))
-    weigh = mi.Vector3f(0.3, -0.5, 0.7)
-
-    # Midpoint rule over the sphere, in double precision.
-    z = (np.arange(400) + 0.5) / 200 - 1
-    phi = (np.arange(400) + 0.5) * (2 * np.pi / 400)
-    Z, P = (torch.tensor(x.ravel()) for x in np.meshgrid(z, phi))
-    R = torch.sqrt(1 - Z * Z)
-    wo = torch.stack([R * torch.cos(P), R * torch.sin(P), Z], -1)
-    w = torch.tensor(wi.numpy()[:, 0], dtype=torch.float64).expand_as(wo)
-    eta = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
-    alpha = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    value, _ = rough_dielectric(w, wo, eta.expand(len(wo)), alpha.expand(len(wo)), alpha.expand(len(wo)), True)
-    integrand = value * (1 + wo @ torch.tensor(weigh.numpy()[:, 0], dtype=torch.float64))
-    slopes = torch.autograd.grad(integrand.sum() * (4 * np.pi / len(wo)), (eta, alpha))
-
-    count = 200000
-    rng = np.random.default_rng(3)
-    u1, u2 = mi.Float(rng.random(count)), mi.Point2f(rng.random((2, count)))
-    for key, slope in zip(("eta", "alpha.value"), slopes, strict=True):
-        bsdf = mi.load_dict(plugin)
-        params = mi.traverse(bsdf)
-        dr.enable_grad(params[key])
-        params.update()
-        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), u1, u2)
-        estimate = weight[0] * dr.relative_grad(bs.pdf) * (1 + dr.dot(bs.wo, weigh))
-        estimate = dr.select(weight[0] > 0, estimate, 0)
-        dr.set_grad(params[key], 1)
-        samples = dr.forward_to(estimate).numpy()
-        mean, error = samples.mean(), samples.std() / np.sqrt(count)
-        assert abs(mean - slope.item()) < 4 * error + 2e-3 * abs(slope.item()), key
-
-
 # ----------------------------------------------------------------------------------------------------- parameters
-
-
-def test_parameters():
-    activate("llvm_ad_mono")
-    smooth = mi.traverse(mi.load_dict({"type": "diff_dielectric", "int_ior": "bk7", "ext_ior": "air"}))
-    assert smooth["eta"][0] == pytest.approx(1.5046 / 1.000277, rel=1e-6)
-    assert smooth.flags("eta") & mi.ParamFlags.Discontinuous
-    textured = {"type": "diff_rough_dielectric", "alpha_u": 0.2, "alpha_v": 0.3, "specular_reflectance": 0.5}
-    assert set(mi.traverse(mi.load_dict(textured)).keys()) == {
-        "eta", "alpha_u.value", "alpha_v.value", "specular_reflectance.value",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,6 @@ layout.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -139,23 +137,6 @@ def test_slope_is_the_derivative_of_what_is_read(name, stddev):
         np.testing.assert_allclose(slope[c], (4 * near[c] - far[c]) / 3, atol=2e-3 * np.abs(slope[c]).max())
 
 
-def test_exhaustive_layout():
-    film = make_film(width=3, height=2, exhaustive_scan=True, laser_scan_width=4, laser_scan_height=5)
-    assert film.cube_shape() == (2, 3, 5, 4, BINS, 3)
-    film.start_render()
-    row, column, laser_row, laser_column, k = 1, 2, 3, 1, 17
-    base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
-    value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
-    film.put(
-        0, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
-    )
-    steady, transient = film.develop()
-    assert steady.shape == (2, 3, 3)
-    cube = np.array(transient)
-    np.testing.assert_array_equal(cube[row, column, laser_row, laser_column, k], [1, 2, 3])
-    assert cube.sum() == 6
-
-
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -183,40 +164,3 @@ def test_four_channels_a_colour_in_polarized_variants():
             assert make_film().channel_count() == channels
 
 
-@pytest.mark.parametrize("name, stddev", [("tent", 0.5)])
-def test_lengths_from_an_origin_are_lengths(name, stddev):
-    """Events whose lengths are counted from an origin of their sample, before, in and behind the window, go where those
-    of the whole length do: bins and what is lost.
-    """
-    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
-    n, per_pixel = 10, film.entries_per_pixel()
-    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, 4.775, -2e12])
-    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 0.05, 5.0])
-    value, active = [mi.Float(np.arange(2.0, 12.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 9 + [False])
-    job, base = SimpleNamespace(band=0), dr.arange(mi.UInt32, n) * per_pixel
-    found, ways = [], set()
-    for start, lengths in ((mi.Float64(origin), opl), (None, origin + opl)):
-        cube = storage(film, n * per_pixel)
-        match = SimpleNamespace(to_channels=lambda spectrum: spectrum)
-        block = film.create_event_block(job, base, match, 1, origin=start)
-        ways.add(type(block))
-        lost = block.put(block.begin(), mi.Float64(lengths), value, active)
-        found.append([np.array(cube, dtype=float), *(np.array(part) for part in lost)])
-    assert all(np.abs(part).sum() > 0 for part in found[1]) and len(ways) == 2
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
-
-
-# ----------------------------------------------------------------------------------------- pieces of the histogram
-
-
-def test_bins_far_behind_the_first_are_told_apart():
-    """An event a short way behind its origin, in the middle of a million bins."""
-    film = make_film(temporal_bins=2**20, bin_width_opl=1.0)
-    cube = storage(film, film.entries_per_pixel())
-    match = SimpleNamespace(to_channels=lambda spectrum: spectrum)
-    origin = mi.Float64([1000000.998, 700000.5])
-    block = film.create_event_block(SimpleNamespace(band=0), mi.UInt32(0), match, 1, origin=origin)
-    lost = block.put({}, mi.Float64([0.001, 0.499]), [mi.Float(1)] * 3, mi.Bool(True))
-    assert np.flatnonzero(np.array(cube)).tolist() == [2100000, 2100001, 2100002, 3000000, 3000001, 3000002]
-    assert not np.any(np.array(lost))

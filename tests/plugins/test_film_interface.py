@@ -4,7 +4,6 @@ is still one of ours.
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -110,42 +109,3 @@ def test_the_picture_of_a_steady_image():
     assert film.base_channels_count() == 1
     with mi.variant_context("llvm_ad_rgb"):
         assert make("transient_hdr_film").base_channels_count() == 3
-
-
-def test_sums_in_double_precision_are_handed_over_in_single():
-    """Ones that are lost beside 2^24 in single precision."""
-    film = make("transient_hdr_film")
-    for samples, expected in ((2**16, 2**24), (2**16 + 1, 2**24 + 2)):
-        film.start_render(samples)
-        film.add_steady(mi.UInt32(3), [mi.Float(2**24)])
-        for _ in range(2):
-            film.add_steady(mi.UInt32(3), [mi.Float(1)])
-            dr.eval(film.steady)
-        film.finish_render()
-        assert dr.type_v(film.steady) == dr.type_v(mi.Float)
-        assert np.array(film.develop()[0]).ravel().tolist() == [0, 0, 0, expected]
-
-
-def test_films_without_a_steady_image_sum_up_their_bins():
-    film = mi.load_dict({"type": "transient_hdr_film", "width": 3, "height": 2, "steady": False, "temporal_bins": 5})
-    film.start_render()
-    assert film.outside is None and film.energies_outside() == (0, 0)
-    values = np.arange(1.0, 31.0).reshape(2, 3, 5, 1) ** 2
-    film.bands = [(0, 2, mi.Float(values.ravel()))]
-    film.finish_render()
-    np.testing.assert_array_equal(np.array(film.develop()[0]), values.sum(2))
-
-
-@pytest.mark.parametrize(("variant", "pixels"), [("llvm_ad_mono", "Y"), ("llvm_ad_rgb", "RGB")])
-def test_the_image_of_integrators_that_know_nothing_of_time(variant, pixels):
-    """As large as the film, with its crop and its filter."""
-    mi.set_variant(variant)
-    size = {"width": 7, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 2, "crop_offset_y": 1}
-    node = {"type": "transient_hdr_film", "sample_border": True, "rfilter": {"type": "tent", "radius": 1.5}}
-    from torchtransient.plugins.films.base import plain_image
-
-    image = plain_image(mi.load_dict(node | size))
-    assert [list(part) for part in (image.size(), image.crop_size(), image.crop_offset())] == [[7, 6], [4, 3], [2, 1]]
-    assert image.rfilter().radius() == 1.5 and image.sample_border()
-    image.prepare([])
-    assert (image.bitmap(raw=False).pixel_format().name, image.bitmap().component_format().name) == (pixels, "Float32")

@@ -285,15 +285,3 @@ def test_derivatives_of_mitsubas_own_are_refused(key, description):
 def test_what_is_refused(settings, words):
     with pytest.raises(SceneError, match=words), plugins.plugin_errors():
         mi.load_dict({"type": "diff_hair", **settings})
-
-
-def test_a_roughness_below_the_least_one_keeps_its_slope():
-    from torchtransient.plugins.bsdfs.hair import LEAST_ROUGHNESS, _at_least  # of a variant
-
-    for given, value in ((0.0, LEAST_ROUGHNESS), (0.5 * LEAST_ROUGHNESS, LEAST_ROUGHNESS), (0.4, 0.4)):
-        roughness = mi.Float(given)
-        dr.enable_grad(roughness)
-        used = _at_least(roughness)
-        assert used[0] == pytest.approx(value, rel=1e-6)
-        dr.backward(used)
-        assert dr.grad(roughness)[0] == 1

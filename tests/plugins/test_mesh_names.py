@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.plugins import mitsuba_compat as compat
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchtransient.errors.VersionWarning")
 
 
-POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
-NORMALS = np.tile(np.float32([0, 0, 1]), (4, 1))
-TEXCOORDS = POSITIONS[:, :2]
-FACES = np.array([[0, 1, 2], [2, 1, 3]], np.uint32)
 # Names in Mitsuba 3.9, those in Mitsuba 3.10, and columns.
 NAMES = {
     "vertex_positions": ("positions", 3),
@@ -149,34 +143,3 @@ def test_renders_and_gradients_are_the_same(request, key, face_normals):
     assert image.abs().sum() > 0 and grad.abs().sum() > 0
     torch.testing.assert_close(new_image, image)
     torch.testing.assert_close(new_grad, grad, rtol=1e-4, atol=1e-5)
-
-
-def mesh_of_arrays():
-    return mi.load_dict(
-        {
-            "type": "mesh_arrays",
-            "vertices": mi.TensorXf(POSITIONS),
-            "faces": mi.TensorXf(FACES.astype(np.float32)),
-            "normals": mi.TensorXf(NORMALS),
-            "texcoords": mi.TensorXf(TEXCOORDS),
-        }
-    )
-
-
-READERS = {
-    compat.mesh_positions: POSITIONS,
-    compat.mesh_normals: NORMALS,
-    compat.mesh_texcoords: TEXCOORDS,
-    compat.mesh_faces: FACES,
-}
-
-
-@pytest.mark.parametrize("name", ["3.9", "3.10"])
-def test_arrays(request, name):
-    mesh = mesh_of_arrays()
-    if name == "3.10":
-        request.getfixturevalue("new_meshes")
-    for read, array in READERS.items():
-        found = read(mesh)
-        assert isinstance(found, mi.UInt32 if array is FACES else mi.Float)
-        np.testing.assert_array_equal(np.array(found), array.ravel())

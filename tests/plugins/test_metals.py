@@ -166,27 +166,6 @@ def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
         params.update()
 
 
-def test_ranges_of_textures():
-    """The partner's numbers count wherever they are: in bitmaps, and in spectra over wavelength."""
-    activate(MONO)
-    from torchtransient.plugins.parameters import ParameterTracker
-
-    grid = mi.TensorXf(np.array([[0.3, 2.0], [1.0, 3.0]], dtype=np.float32)[..., None])
-    dark = mi.TensorXf(np.array([[0.3, 2.0], [0.0, 3.0]], dtype=np.float32)[..., None])
-    for data, needed in ((grid, False), (dark, True)):
-        k = {"type": "bitmap", "data": data, "raw": True}
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "wall": {"type": "sphere", "bsdf": {"type": "roughconductor", "eta": number(0.5), "k": k}},
-            }
-        )
-        tracker = ParameterTracker(scene)
-        _, _, node, flags = next(v for key, v in mi.traverse(scene).properties.items() if key.endswith("k.data"))
-        assert tracker.effect_of(node, "data", flags).stand_in == "diff_rough_conductor"
-        assert tracker.effect_of(node, "data", flags).stand_in_needed == needed
-
-
 def test_a_metal_of_no_colour_has_a_derivative_by_it():
     """That of any other colour: light is proportional to it."""
     mi.set_variant(MONO)

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.gradient_cases.cases_curves import file_of
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.scene.edits import BuildOptions
@@ -150,9 +149,6 @@ def test_fields_of_view_of_lasers(fov):
         simulate(described)
 
 
-SHEET = "v 0 0 1\nv 2 0 1\nv 2 3 1.5\nv 0 3 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
-
-
 @pytest.fixture
 def meter():
     """A meter on a wall of 2 m by 4 m around (1, 2, 0), with nothing around it."""
@@ -174,45 +170,11 @@ def meter():
     return make
 
 
-def points_of(name, **given):
-    """Of the properties in a scene file, which are texts."""
-    from torchtransient.plugins.sensors.nlos_capture_meter import _points_of
-
-    return _points_of(given, name)
-
-
 def test_points_that_are_given(meter):
     given = np.arange(18.0).reshape(6, 3)
     sensor = meter(points=mi.TensorXf(given.astype(np.float32)), laser_points=mi.TensorXf(np.float32([[7, 8, 9]])))
     np.testing.assert_allclose(np.array(sensor.scanned()), given.T)
     np.testing.assert_allclose(np.array(sensor.spots()).ravel(), [7, 8, 9])
-    np.testing.assert_allclose(np.array(points_of("points", points="0 1 2, 3 4,5")), [[0, 3], [1, 4], [2, 5]])
-    assert points_of("points") is None and meter().spots() is None
+    assert meter().spots() is None
     for place, spot in (((3.0, 2.0, 0.0), (2, 4, 0)), ((0.0, 0.0, 0.0), (0, 0, 0)), ((1.5, 0.5, 0.0), (1, 1, 0))):
         np.testing.assert_allclose(np.array(meter(laser_lookat_pixel=place).spots()).ravel(), spot, atol=1e-6)
-
-
-def test_places_of_a_texture_on_a_mesh():
-    """Of the triangles that have their coordinates, as their vertices are now."""
-    from torchtransient.plugins.sensors.nlos_capture_meter import PlacesOnMesh  # of a variant
-
-    node = {"type": "obj", "filename": file_of("places.obj", SHEET), "id": "sheet", "flip_tex_coords": False}
-    mesh = mi.load_dict(node)
-    places = np.array([[0.5, 0.25], [0.25, 0.75], [0.9, 0.2]])
-    found = PlacesOnMesh(mesh, places)
-    vertices = np.array([line.split()[1:] for line in SHEET.splitlines() if line.startswith("v ")], dtype=float)
-    lower = [True, False, True]
-    for motion in (np.zeros((4, 3)), np.random.default_rng(1).normal(size=(4, 3))):
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = mi.Float((vertices + motion).ravel())
-        params.update()
-        a, b, c, d = vertices + motion
-        # u runs along the lower edge; the upper triangle has the corner at (0, 1) in place of that at (1, 0).
-        expected = [
-            a + (b - a) * (u - v) + (c - a) * v if below else a + (c - a) * u + (d - a) * (v - u)
-            for (u, v), below in zip(places, lower, strict=True)
-        ]
-        np.testing.assert_allclose(np.array(found.points(mesh, mi.UInt32([0, 1, 2]))).T, expected, rtol=1e-5, atol=1e-5)
-    assert np.array(found.points(mesh, mi.UInt32(2))).shape == (3, 1)
-    with pytest.raises(SceneError, match=r"mesh 'sheet' that fill the square .* got none at 2 of 3 places"):
-        PlacesOnMesh(mesh, np.array([[0.5, 0.5], [1.5, 0.5], [0.5, -0.1]]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from pathlib import Path
 
 import drjit as dr
@@ -221,27 +219,3 @@ def test_a_plugin_enters_by_its_own_file(own_rows):
         assert lineage(node)[:2] == ("Veil", "Curtain")
 
 
-# -------------------------------------------------------------------------------------------------------- the tracker
-
-
-def room():
-    return {
-        "type": "scene",
-        "group": {"type": "shapegroup", "part": {"type": "sphere", "bsdf": {"type": "diff_dielectric"}}},
-        "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
-        "box": {"type": "cube"},
-        "light": {"type": "point"},
-        "sensor": {"type": "perspective", "film": {"type": "transient_hdr_film"}},
-        "integrator": {"type": "transient_path"},
-    }
-
-
-def test_an_integrator_may_keep_it():
-    scene = mi.load_dict(room())
-    film = weakref.ref(scene.sensors()[0].film())
-    integrator = scene.integrator()
-    integrator.tracker = ParameterTracker(scene)
-    gone = weakref.ref(integrator)
-    del scene, integrator
-    gc.collect()
-    assert gone() is None and film() is None

@@ -169,12 +169,6 @@ def test_plastic_of_a_high_index(nonlinear):
         assert float(keyed) == pytest.approx(float(plain), rel=1e-5)
 
 
-def test_the_index_of_a_described_plastic():
-    scene = scene_with("plastic")
-    info = scene.parameters()["wall.bsdf.eta"]
-    assert info.differentiable and not info.biased and not info.moves_path_length and "diff_plastic" in info.reason
-
-
 @pytest.mark.slow
 def test_a_textured_plastic_is_built_anew_wherever_it_is():
     image = {"type": "bitmap", "raw": True, "data": np.zeros((3, 2, 1), dtype=np.float32), "filter_type": "nearest"}

@@ -113,30 +113,6 @@ def test_stored_and_lost_make_one(kernel, name):
     np.testing.assert_allclose(after[late], 1, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kernel", "layout"), [("short gaussian", "film"), ("measured", "channels first"), ("box, late", "film")]
-)
-def test_read_is_the_transpose_of_put(kernel, layout):
-    film = make_film(**KERNELS[kernel][0])
-    rng = np.random.default_rng(1)
-    n, pixels = 500, 5
-    x, pixel = rng.uniform(-8, BINS + 8, n), rng.integers(0, pixels, n)
-    value, g = rng.normal(size=(3, n)), rng.normal(size=(pixels, BINS, 3))
-    active = mi.Bool(rng.random(n) > 0.1)
-    opl = mi.Float64(x * WIDTH)
-    cube = storage(film, pixels * BINS * 3)
-    film.put(0, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
-    if layout == "film":
-        adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (BINS * 3)
-    else:
-        adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, BINS * pixels), mi.UInt32(pixel)
-    A, _ = film.read(adjoint, base, opl, active)
-    dr.eval(cube, A)
-    stored = np.array(cube, dtype=float).reshape(g.shape)
-    read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
-    assert abs((stored * g).sum() - read) < 2e-6 * np.abs(stored * g).sum()
-
-
 @pytest.mark.parametrize("kernel", long([k for k in KERNELS if k != "far shorter than a bin"], ["box, late", "both"]))
 def test_slope_is_the_derivative_of_what_is_read(kernel):
     film = make_film(**KERNELS[kernel][0])
@@ -172,5 +148,3 @@ def test_slope_is_the_derivative_of_what_is_read(kernel):
 def test_errors(arguments, message):
     with pytest.raises(SceneError, match=message):
         make_film(**arguments)
-
-

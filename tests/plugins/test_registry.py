@@ -200,28 +200,6 @@ def test_a_plugin_that_refuses_its_parameters_takes_part_in_no_later_kernel():
 # ------------------------------------------------------------------------------------------- first use, several threads
 
 
-def test_a_class_is_imported_in_one_thread_while_another_uses_it():
-    assert run(
-        """
-        import importlib, threading
-        import torchtransient
-        import mitsuba as mi
-        mi.set_variant("llvm_ad_rgb")
-        names = ("integrators.path", "films.histogram", "bsdfs.plastic")
-        threads = [
-            threading.Thread(target=importlib.import_module, args=(f"torchtransient.plugins.{name}",)) for name in names
-        ]
-        for thread in threads:
-            thread.start()
-        for plugin in ("transient_volpath", "transient_path", "transient_hdr_film", "diff_hair", "diff_plastic"):
-            mi.load_dict({"type": plugin})
-        for thread in threads:
-            thread.join()
-        print("ok")
-        """
-    ) == ["ok"]
-
-
 def test_a_module_loads_a_scene_of_other_plugins_while_it_is_executed(tmp_path):
     """Mitsuba builds the parts of a scene in threads of its own."""
     (tmp_path / "loads_a_scene.py").write_text(
@@ -253,26 +231,6 @@ def test_a_module_loads_a_scene_of_other_plugins_while_it_is_executed(tmp_path):
     ) == ["Mine"]
 
 
-@pytest.mark.parametrize(
-    "take", ["plugins.register('bsdf', 'diff_plastic', Mine)", "mi.register_bsdf('diff_plastic', Mine)"]
-)
-def test_the_last_one_to_take_a_name_has_it(take):
-    """Hair imports plastic, which does not take its name back."""
-    assert run(
-        f"""
-        from torchtransient import plugins
-        import mitsuba as mi
-        mi.set_variant("llvm_ad_rgb")
-        class Mine(mi.BSDF):
-            def __init__(self, props):
-                mi.BSDF.__init__(self, props)
-        {take}
-        mi.load_dict({{"type": "diff_hair"}})
-        print(type(mi.load_dict({{"type": "diff_plastic"}})).__name__)
-        """
-    ) == ["Mine"]
-
-
 def test_a_scene_may_be_freed_before_its_render_is_read():
     """Spheres are met through their addresses: what is rendered must not wait for the scene to be gone."""
     assert run(
@@ -291,23 +249,3 @@ def test_a_scene_may_be_freed_before_its_render_is_read():
             print(np.isfinite(np.array(steady)).all())
         """
     ) == ["True"] * 6
-
-
-def test_a_scene_that_was_refused_takes_part_in_no_later_kernel():
-    """Its integrator is refused when its lights are made already; the error is kept."""
-    assert run(
-        """
-        import torchtransient as tt
-        kept = []
-        for _ in range(3):
-            scene = tt.scenes.cornell_box(resolution=4, num_bins=20)
-            scene["integrator"] |= {"rr_depth": 0}
-            try:
-                tt.TransientRenderer(scene)
-            except tt.errors.SceneError as error:
-                kept.append(error)
-            scene["integrator"] |= {"rr_depth": 5}
-            tt.render(scene, spp=1, seed=0)
-        print(len(kept))
-        """
-    ) == ["3"]

@@ -13,7 +13,6 @@ from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
 from torchtransient.files import read_result, write_result
-from torchtransient.plugins.films.colour import SensorResponse, StandardObserver
 
 VARIANT = "llvm_ad_spectral"
 BANDS = {
@@ -103,21 +102,6 @@ def test_channels_are_integrals_over_wavelength():
     assert result.passed, str(result)
 
 
-def test_wavelengths_are_drawn_where_the_curves_are():
-    response = mi.load_dict(film()).curves
-    assert isinstance(response, SensorResponse) and response.names == ("red", "blue", "ragged")
-    u = mi.Float((np.arange(4096) + 0.5) / 4096)
-    wavelengths, weight = response.sample(u)
-    drawn = np.array(wavelengths, dtype=float)
-    assert drawn.min() >= 400 and drawn.max() <= 800
-    # in proportion to the sum of the curves, each scaled to one
-    counts, _ = np.histogram(drawn, bins=np.arange(400, 801, 20))
-    share = counts / counts.sum()
-    assert share[2] > 3 * share[0]
-    # the reciprocal density averages to the length of the range
-    assert np.array(weight, dtype=float).mean() == pytest.approx(400, rel=1e-2)
-
-
 @pytest.mark.slow
 def test_less_noise_than_wavelengths_drawn_for_the_eye():
     far_red = {"far": {"type": "regular", "wavelength_min": 760, "wavelength_max": 800, "values": "0, 1, 0"}}
@@ -185,19 +169,3 @@ def numbers(value):
     """A sample as an array (components, wavelengths, lanes)."""
     parts = [value[i] for i in range(4)] if mi.is_polarized else [value]
     return np.array([[np.broadcast_to(np.array(part[k], dtype=float), 3) for k in range(len(part))] for part in parts])
-
-
-def test_the_observer_is_mitsuba_s():
-    """At wavelengths between its nodes, at both ends, and none beyond them."""
-    mi.set_variant("llvm_ad_spectral")
-    at = np.array([360.0, 361.3, 447.0, 555.5, 700.1, 829.9, 830.0, 359.9, 830.1])
-    wavelengths = mi.UnpolarizedSpectrum(*(mi.Float(np.roll(at, k)) for k in range(4)))
-    rows = StandardObserver().matrix(wavelengths)
-    for k in range(4):
-        unit = mi.UnpolarizedSpectrum(0)
-        unit[k] = 1
-        # Mitsuba takes the mean over the wavelengths, a row the share of one.
-        expected = np.array(mi.spectrum_to_srgb(unit, wavelengths))
-        outside = (np.roll(at, k) < 360) | (np.roll(at, k) > 830)
-        np.testing.assert_allclose(np.array(rows[k])[:, ~outside], expected[:, ~outside], rtol=1e-3, atol=1e-6)
-        assert not np.array(rows[k])[:, outside].any()

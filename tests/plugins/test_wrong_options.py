@@ -145,14 +145,6 @@ def test_references_count_as_nesting(kind, words):
             tt.plan(room)
 
 
-def test_two_sided_surfaces_reach_their_inside_twice():
-    room = make_room()
-    for _ in range(12):
-        room["box"]["bsdf"] = {"type": "twosided", "nested": room["box"]["bsdf"]}
-    with pytest.raises(SceneError, match="at most 256 nodes"):
-        render(room)
-
-
 @pytest.mark.parametrize("depth", [100, 200_000])
 def test_elements_of_xml_files(tmp_path, depth):
     path = tmp_path / "deep.xml"
