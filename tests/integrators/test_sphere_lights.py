@@ -13,7 +13,6 @@ from support.marks import long, long_rows
 from support.runs import T, runs
 from support.surface_samples import start
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.plugins.sampling.sphere_lights import SphereLights
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
 RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
@@ -185,31 +184,6 @@ def densities(table, scene, p, u):
     ref.p = p
     ds, weight = table.sample(scene, ref, u, mi.Bool(True))
     return ds, weight, table.pdf(scene, ref, ds, mi.Bool(True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
-def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
-    scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
-    table = SphereLights.from_scene(scene).read(scene)
-    n = 1 << 18
-    x = (dr.arange(mi.Float, n) + 0.5) / n
-    turns = 0.61803 * mi.Float(dr.arange(mi.UInt32, n) % 4096)
-    ds, weight, pdf = densities(table, scene, mi.Point3f(0.1, 0, 0), mi.Point2f(0.5 * x, turns - dr.floor(turns)))
-    lit = dr.dot(ds.d, ds.n) < 0
-    assert bool(dr.all(lit)) == ((ratio > 1) == flipped)
-    if not dr.any(lit)[0]:
-        assert dr.all(pdf == 0)
-        return
-    np.testing.assert_allclose(np.array(pdf), np.array(ds.pdf), rtol=2e-4 if ratio < 1 else 1e-2)
-    away = ratio * DISTANCE / np.hypot(DISTANCE, 0.1)
-    expected = 4 * np.pi if ratio > 1 else 2 * np.pi * away**2 / (1 + np.sqrt(max(1 - away**2, 0)))
-    # One of two lights is chosen: half of the samples bring twice their light.
-    assert float(dr.mean(weight.x)[0]) / 2 == pytest.approx(RADIANCE * expected, rel=2e-3)
-    # Points lie on the sphere, in the direction and at the distance that is said.
-    p = mi.Point3f(0.1, 0, 0) + ds.d * ds.dist
-    off = dr.norm(p - mi.Point3f(0, 0, DISTANCE)) - ratio * DISTANCE
-    assert float(dr.max(dr.abs(off))[0]) < 3e-6 * max(1, ratio) * DISTANCE
 
 
 @pytest.mark.parametrize(

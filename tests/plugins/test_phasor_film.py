@@ -8,7 +8,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.film_storage import storage
 from torchtransient import plugins
 from torchtransient.errors import SceneError, TorchTransientWarning
 
@@ -92,31 +91,6 @@ def test_bad_parameters(arguments, message):
 # --------------------------------------------------------------------------------------------------- adjoint
 
 
-def put_directly(film, pixel, opl, value, active):
-    cube = storage(film, (int(pixel.max()) + 1) * film.entries_per_pixel())
-    base = mi.UInt32(pixel) * film.entries_per_pixel()
-    film.put(0, base, mi.Float64(opl), [mi.Float(v) for v in value], mi.Bool(active))
-    return np.array(cube, dtype=np.float64)
-
-
-@pytest.mark.parametrize("layout", ["film", "channels first"])
-def test_read_is_the_transpose_of_put(layout):
-    film, rng = make_film(**LIST), np.random.default_rng(3)
-    n, pixels, F = 500, 4, film.frequency_count()
-    pixel, opl = rng.integers(0, pixels, n), rng.uniform(0, 30, n)
-    pixel[0] = pixels - 1
-    value, active = rng.normal(size=(3, n)), rng.random(n) > 0.1
-    g = rng.normal(size=(pixels, F, 6)).astype(np.float32)
-    stored = g if layout == "film" else np.ascontiguousarray(g.transpose(2, 1, 0))
-    flat = mi.Float(stored.ravel())
-    strides, base = ((6, 1), pixel * 6 * F) if layout == "film" else ((pixels, F * pixels), pixel)
-    A, _ = film.read((flat, *strides), mi.UInt32(base), mi.Float64(opl), mi.Bool(active))
-    left = (put_directly(film, pixel, opl, value, active) * g.ravel()).sum()
-    right = sum((np.array(a, dtype=np.float64) * v).sum() for a, v in zip(A, value, strict=True))
-    assert left == pytest.approx(right, abs=2e-5 * np.sqrt(n * F))
-    assert all(np.all(np.array(a)[~active] == 0) for a in A)
-
-
 def test_slope_of_the_adjoint():
     """The derivative of A in the path length, against the formula in double precision."""
     film, rng = make_film(**LIST), np.random.default_rng(4)
@@ -137,5 +111,3 @@ def test_defaults_that_nobody_asked_for_are_said():
         warnings.simplefilter("error")
         mi.load_dict({"type": "phasor_hdr_film", "wl_mean": 100.0})
         mi.load_dict({"type": "phasor_hdr_film", "frequencies": "0.5"})
-
-

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from torchtransient import losses, sensing
-from torchtransient.sensing.time_convolution import sum_before
 
 PS = 1e-12
 
@@ -90,7 +89,6 @@ def test_hundred_million_cycles(dtype):
 def test_sums_over_ten_thousand_bins_keep_their_digits():
     rate = torch.full((1, 10_000, 1, 1), 1e-4)
     exact = torch.arange(10_000, dtype=torch.float64) * float(rate[0, 0, 0, 0].double())
-    assert float((sum_before(rate).flatten() - exact).abs().max()) < 1e-12
     p, none = sensing.first_photon_probabilities(rate)
     assert float(p.double().sum() + none.double().sum()) == pytest.approx(1, abs=1e-7)
     single = np.cumsum(rate.flatten().numpy(), dtype=np.float32)

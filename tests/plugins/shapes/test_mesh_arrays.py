@@ -11,7 +11,6 @@ import torch
 import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.scene.variant import active_variant
 from torchtransient.scenes import rotate, scale, translate
 from torchtransient.scenes.bottle import write_ply
 
@@ -137,7 +136,7 @@ def test_a_mesh_can_shine():
     ],
 )
 def test_what_is_no_mesh(changes, message):
-    with pytest.raises(SceneError, match=message), active_variant(VARIANT):
+    with pytest.raises(SceneError, match=message), mi.variant_context(VARIANT):
         tt.load(scene_with(diffuse(**changes)), variant=VARIANT).parameters()
 
 
@@ -147,7 +146,7 @@ NAN, INF = math.nan, math.inf
 def test_scene_files_name_a_mesh_file():
     file = '<scene version="3.0.0"><shape type="mesh_arrays"><string name="vertices" value="0 1 2"/></shape></scene>'
     words = r"vertices as an array \(N, 3\) in a scene dictionary, got str\. .*'ply'"
-    with active_variant(VARIANT), pytest.raises(SceneError, match=words), plugins.plugin_errors():
+    with mi.variant_context(VARIANT), pytest.raises(SceneError, match=words), plugins.plugin_errors():
         mi.load_string(file)
 
 
@@ -155,7 +154,7 @@ def test_normals_and_vertices_under_a_transform():
     """Normals stay across the surface where it is stretched, of length one."""
     normals = np.array([[1.0, 2.0, -2.0], [0.0, 3.0, 4.0], [2.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0, 0, 5.0], [0, -1, 0]])
     matrix = translate([1.0, -2.0, 0.5]) @ rotate([1, 2, 0], 20) @ scale([0.5, 2.0, 3.0])
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         given = {"vertices": OCTAHEDRON, "faces": FACES, "normals": normals, "texcoords": OCTAHEDRON[:, :2] * [0.5, 2]}
         arrays = {key: mi.TensorXf(np.float32(x)) for key, x in given.items()}
         shape = mi.load_dict({"type": "mesh_arrays", **arrays, "to_world": mi.ScalarTransform4f(matrix)})
