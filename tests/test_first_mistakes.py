@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import inspect
 import pickle
 
 import pytest
 import torch
 
 import torchtransient as tt
-from support.sweeps import together
 from torchtransient.errors import (
-    ArgumentError,
     StorageError,
-    TorchTransientError,
     UnitError,
 )  # fmt: skip
 from torchtransient.files import read_result, write_result
 
 AXIS = tt.TimeAxis(0.0, 0.05, 40)
 LIGHT = torch.rand(1, 40, 4, 4, generator=torch.Generator().manual_seed(0))
-SPAD = tt.sensing.SynchronousSPAD(10)
 
 
 @pytest.fixture(scope="module")
@@ -34,22 +28,6 @@ def scene():
 def capture():
     scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), 4, kind="confocal")
     return tt.nlos.Capture(LIGHT.clone(), AXIS, scan)
-
-
-def public_classes():
-    for room in ("data", "losses", "metrics", "nlos", "parametrize", "sensing", "training"):
-        for name, value in vars(getattr(tt, room)).items():
-            own = inspect.isclass(value) and value.__module__.startswith("torchtransient.")
-            if own and not inspect.isabstract(value) and not getattr(value, "_is_protocol", False):
-                yield f"{room}.{name}", value
-
-
-@together("name, kind", public_classes(), lambda row: row[0])
-def test_an_unknown_argument_is_said_of_the_class_that_was_called(name, kind):
-    """Or of the base class whose ``__init__`` it has."""
-    names = "|".join(base.__name__ for base in kind.__mro__ if base is not object)
-    with pytest.raises(TypeError, match=rf"^({names})\."):
-        kind(no_such_argument=1)
 
 
 def test_functions_that_hand_arguments_on_say_what_was_called(scene, capture):
@@ -110,46 +88,3 @@ def test_a_record_that_is_taken_for_a_tensor(scene, capture):
         out.transients  # noqa: B018
     assert told.value.name == "transients" and told.value.obj is out  # of which Python makes its suggestion
     assert copy.deepcopy(out) == out and pickle.loads(pickle.dumps(out)) == out
-
-
-def test_a_seed_is_no_generator():
-    for draw in (SPAD.sample, SPAD, SPAD.gaussian, tt.sensing.ShotNoise().sample):
-        for given in ((0,), (torch.manual_seed,)):
-            with pytest.raises(ArgumentError, match=r"expected generator to be a torch.Generator, got "):
-                draw(LIGHT, *given)
-        with pytest.raises(ArgumentError, match=r"got 0. Use torch.Generator\(\).manual_seed\("):
-            draw(LIGHT, generator=0)
-
-
-ROOMS = (tt.sensing, tt.stokes, tt.units, tt.losses, tt.metrics, tt.geometry)
-NOT_NUMBERS = (None, "a", object(), [[1.0, 2.0], [3.0]], {"a": 1})
-
-
-def _functions():
-    for room in ROOMS:
-        for name, value in vars(room).items():
-            ours = inspect.isfunction(value) and value.__module__.startswith(room.__name__)
-            if ours and not name.startswith("_"):
-                yield f"{room.__name__.rpartition('.')[2]}.{name}", value
-
-
-@together("name, function", _functions(), lambda row: row[0])
-def test_what_is_no_number_is_a_typed_error_of_every_function(name, function):
-    every = inspect.signature(function).parameters.values()
-    needed = [p for p in every if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    for given in NOT_NUMBERS:
-        by_place = [given for p in needed if p.kind != p.KEYWORD_ONLY]
-        by_name = {p.name: given for p in needed if p.kind == p.KEYWORD_ONLY}
-        with contextlib.suppress(TorchTransientError):  # and what is taken, as a name is, is no mistake
-            function(*by_place, **by_name)
-
-
-def test_what_is_no_record_function_or_mapping_is_a_typed_error(scene, tmp_path):
-    one = torch.ones((), requires_grad=True)
-    for call in (
-        lambda: tt.RenderOutput.stack(5), lambda: tt.RenderOutput.cat([5]), lambda: tt.TransientRenderer(scene, 5),
-        lambda: tt.training.accumulate(5, range(2)), lambda: scene.save(tmp_path / "a.xml", 5),
-        lambda: tt.training.accumulate(lambda part: one, range(2), scaler=5), lambda: tt.sensing.device(["a"]),
-    ):  # fmt: skip
-        with pytest.raises(ArgumentError, match="expected"):
-            call()

@@ -7,8 +7,6 @@ import pickle
 import numpy as np
 import pytest
 
-from support.sweeps import together
-from torchtransient.errors import ShapeError, UnitError
 from torchtransient.gates import Gate, gates_from_text, gates_to_text
 from torchtransient.pulses import Pulse
 from torchtransient.units import SPEED_OF_LIGHT
@@ -78,16 +76,3 @@ def test_spread_by_a_pulse(gate, pulse):
     shares, middle = np.diff(pulse.cumulative(delays)), 0.5 * (delays[1:] + delays[:-1])
     expected = [gate.value(t + middle) @ shares for t in x]
     np.testing.assert_allclose(seen.value(x), expected, atol=2e-3)
-
-
-@together("make, error", [
-    (lambda: Gate.rectangular(2, 1), UnitError), (lambda: Gate.gaussian(1, 0), UnitError),
-    (lambda: Gate.tabulated([1, 2], [0, 0]), UnitError),
-    (lambda: Gate.tabulated([1, 2, 3], [0, -0.1, 1]), UnitError),
-    (lambda: Gate.tabulated([1, 2, 3], [0, 0]), ShapeError), (lambda: Gate.tabulated([2, 1], [0, 1]), UnitError),
-    (lambda: gates_from_text("rectangular 1"), UnitError), (lambda: gates_from_text("open 1 2"), UnitError),
-    (lambda: gates_from_text("tabulated 1 2"), UnitError), (lambda: gates_from_text(" ; "), UnitError),
-])  # fmt: skip
-def test_errors(make, error):
-    with pytest.raises(error):
-        make()

@@ -68,36 +68,6 @@ def test_version_from_the_name_of_the_file(tmp_path, name, version):
     assert _llvm.library_version(str(path)) == _llvm.library_version(str(tmp_path / "link.so")) == version
 
 
-def test_version_of_the_real_library_agrees_with_what_dr_jit_reports():
-    library = _llvm.ensure_llvm()
-    read = _llvm.library_version(library.path)
-    assert library.version[0] >= _llvm.MIN_MAJOR
-    assert read == library.version[: len(read)]
-
-
-def test_a_library_that_names_no_version_is_asked_in_another_process(monkeypatch):
-    expected = _llvm.ensure_llvm().version
-    monkeypatch.setattr(_llvm, "_version_in_name", lambda name: ())
-    assert _llvm.library_version(good_library()) == expected
-
-
-@pytest.mark.parametrize("content", [b"", b"\x7fELF", b"not a library" * 20, b"\x7fELF\x02\x01" + b"\xff" * 200])
-def test_a_file_that_is_no_library_has_no_version(tmp_path, content):
-    path = tmp_path / "libLLVM.so"
-    path.write_bytes(content)
-    assert _llvm.library_version(str(path)) == ()
-
-
-def test_the_newest_of_a_folder_comes_first_and_every_file_once(tmp_path, monkeypatch):
-    for name in ("libLLVM-9.so.1", "libLLVM-18.so.1", "libLLVM.so.20.1"):
-        write_library(tmp_path / name)
-    write_library(tmp_path / "libLLVMCore.so.19")  # one component, not the library
-    (tmp_path / "libLLVM.so").symlink_to("libLLVM.so.20.1")
-    monkeypatch.setattr(_llvm, "_folders", lambda: iter([str(tmp_path), str(tmp_path)]))
-    found = [os.path.basename(os.path.realpath(p)) for p in _llvm.candidates()]
-    assert found == ["libLLVM.so.20.1", "libLLVM-18.so.1", "libLLVM-9.so.1"]
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="folders of Debian")
 def test_a_library_for_another_processor_is_passed_over(tmp_path):
     other = "powerpc64le" if os.uname().machine != "powerpc64le" else "x86_64"
@@ -161,14 +131,6 @@ def test_the_users_own_choice_is_refused_and_left_as_it_was(tmp_path, exists):
 
 
 @pytest.mark.slow
-def test_the_users_own_good_choice_is_taken(tmp_path):
-    result = run(
-        "import torchtransient as t\nprint(t._llvm.ensure_llvm().path)", tmp_path, DRJIT_LIBLLVM_PATH=good_library()
-    )
-    assert result.stdout.strip() == good_library(), result.stderr
-
-
-@pytest.mark.slow
 def test_a_library_that_dr_jit_cannot_load_is_reported(tmp_path):
     fake = write_library(tmp_path / "usr/lib/llvm-19/lib/libLLVM.so.19.1")
     result = run(REFUSED, tmp_path)
@@ -196,18 +158,3 @@ def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tm
     assert first_line == "1 VariantWarning <string>"
     assert "imported before torchtransient and has bound LLVM 16.0.6" in message
     assert "import torchtransient before drjit and mitsuba" in message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("version", [(17, 0, 6), (0, 0, 0)])
-def test_a_library_that_works_or_none_is_not_warned_of(tmp_path, version):
-    code = f"""
-        import warnings
-        warnings.simplefilter("error")
-        import drjit
-        drjit.detail.llvm_version = lambda: {version}
-        import torchtransient
-        print("silent")
-    """
-    result = run(code, tmp_path)
-    assert result.stdout.strip() == "silent", result.stderr

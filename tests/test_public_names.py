@@ -145,12 +145,6 @@ def test_rows_of_numbers_are_typed_as_they_are_taken():
     assert lists_alone == set()
 
 
-def test_what_a_renderer_gives_by_key_can_be_assigned():
-    """`renderer.values[key] = value`, as the pages say, for type checkers too."""
-    values = typing.get_type_hints(tt.TransientRenderer.values.fget)["return"]
-    assert {"__getitem__", "__setitem__"} <= set(dir(values))
-
-
 @pytest.mark.slow
 def test_a_type_checker_knows_every_name(tmp_path):
     """`mypy --strict` on a script that uses every public name."""

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from support.sweeps import together
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse, cumulative_of_sum, transform
 from torchtransient.units import SPEED_OF_LIGHT
@@ -64,11 +61,6 @@ def test_every_time_is_turned_into_a_length():
     assert Gate.gaussian_s(3e-9, 1e-10) == Gate.gaussian(3e-9 * c, 1e-10 * c)
 
 
-def test_pulses_are_values():
-    again = pickle.loads(pickle.dumps(MEASURED))
-    assert again == MEASURED and hash(again) == hash(MEASURED) and again != MEASURED.shifted(0.1)
-
-
 @pytest.mark.parametrize("first", [Pulse.gaussian(0.2), Pulse.rectangular(0.25), MEASURED], ids=lambda p: p.kind)
 def test_one_pulse_alone_is_exact(first):
     start, values = cumulative_of_sum([first], 1e-3)
@@ -113,18 +105,6 @@ def test_transform():
     tooth = 2 / u**2 * (np.exp(-1j * u) * (1 + 1j * u) - 1) * np.exp(0.5j * u)
     np.testing.assert_allclose(transform(saw, u / (2 * np.pi)), tooth, rtol=5e-3)
     assert transform(MEASURED, 0.0) == pytest.approx(1) and transform(MEASURED, 40.0).shape == (1,)
-
-
-@together("make, error", [
-    (lambda: Pulse.gaussian(0.0), UnitError), (lambda: Pulse.gaussian(float("nan")), UnitError),
-    (lambda: Pulse.rectangular("wide"), UnitError), (lambda: Pulse.tabulated([0, 1], [1, -1]), UnitError),
-    (lambda: Pulse.tabulated([0, 1], [0, 0]), UnitError), (lambda: Pulse.tabulated([0, 0], [1, 1]), UnitError),
-    (lambda: Pulse.tabulated([0, 1, 2], [1, 1]), ShapeError), (lambda: Pulse("sech", 1.0), ArgumentError),
-    (lambda: cumulative_of_sum([], 0.1), UnitError),
-])  # fmt: skip
-def test_errors(make, error):
-    with pytest.raises(error):
-        make()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 import torchtransient as tt
-from support.sweeps import together
 from tools.small_room import VARIANT, make_room
 from torchtransient.parametrize import Bounded, register
 
@@ -50,12 +49,6 @@ def load_several(make):
         with pytest.raises((RuntimeError, tt.errors.TorchTransientError), match=name.rpartition(".")[2]):
             module.load_state_dict(state)
     return len(singles)
-
-
-@pytest.mark.slow
-@together("name", MODULES)
-def test_several_numbers_are_not_loaded_as_one(name):
-    assert load_several(MODULES[name]) > 0
 
 
 def test_where_torch_takes_the_first(monkeypatch):

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from torchtransient import stokes as st
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 MEASURES = [
     st.degree_of_polarization,
@@ -75,12 +74,6 @@ def test_gradcheck(function):
     assert torch.autograd.gradcheck(lambda x: function(x, 0), (s,))
 
 
-@pytest.mark.parametrize("function", MEASURES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_keeps_the_dtype(function, dtype):
-    assert function(random_light(3, dim=0).to(dtype), 0).dtype == dtype
-
-
 def test_dark_below_the_floor():
     s = torch.stack([light(1e-3, 1e-3, 0, 0), light(1.0, 1.0, 0, 0)], dim=1)
     assert st.degree_of_polarization(s, 0, floor=0.01).tolist() == [0, 1]
@@ -127,14 +120,6 @@ def test_elements_do_what_their_names_say():
     torch.testing.assert_close(st.apply_mueller(st.depolarizer(), quarter, 0), light(1, 0, 0, 0))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_angle_of_a_linear_part_above_the_floor_of_components_below_it(dtype):
-    floor = 0.5
-    s = torch.tensor([1.0, 0.9 * floor, 0.9 * floor, 0.0], dtype=dtype)  # a linear part of 1.27 floor
-    assert st.angle_of_linear_polarization(s, 0, floor).item() == pytest.approx(math.pi / 8, abs=1e-6)
-    assert st.angle_of_linear_polarization(s, 0, 1.3 * floor).item() == 0
-
-
 def test_no_element_polarises_beyond_one():
     s = random_light(200, dim=0)
     for element in (st.linear_polarizer(0.3, 0.01), st.linear_retarder(0.1, 2.0), st.circular_polarizer()):
@@ -150,14 +135,6 @@ def test_gradcheck_of_elements(element):
     angle = torch.tensor([0.3, 0.9], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(element, (angle,))
     assert element(angle).shape == (2, 4, 4)
-
-
-def test_a_floor_has_to_be_exceeded():
-    """A linear part, or an intensity, that is the floor itself has no angle and no degree."""
-    s = torch.tensor([0.5, -0.5, 0.0, 0.0])
-    assert st.angle_of_linear_polarization(s, 0, 0.5).item() == 0
-    assert st.angle_of_linear_polarization(s, 0, 0.49).item() == pytest.approx(math.pi / 2)
-    assert st.degree_of_polarization(s, 0, 0.5).item() == 0 and st.degree_of_polarization(s, 0, 0.49).item() == 1
 
 
 def test_an_ideal_polarizer_has_a_derivative_by_its_extinction():
@@ -190,38 +167,3 @@ def test_precision_of_angles_and_matrices():
     torch.testing.assert_close(st.rotate_frame(horizontal, 0.1, 0)[1], torch.tensor(math.cos(0.2), dtype=torch.float64))
     matrix = [[0.1 if i == j else 0.0 for i in range(4)] for j in range(4)]
     assert torch.equal(st.apply_mueller(matrix, horizontal, 0), 0.1 * horizontal)
-
-
-@pytest.mark.parametrize("measure", MEASURES)
-def test_what_is_no_light(measure):
-    ones = torch.ones(4, 2)
-    for given in (np.ones(4), None, torch.zeros(3, 2), torch.zeros(4, dtype=torch.int64)):
-        with pytest.raises(ShapeError):
-            measure(given, 0)
-    with pytest.raises(ShapeError):
-        measure(torch.zeros(4, 1, 2, 2), st.TRANSIENT_DIM)
-    for floor in (None, True, math.nan, -1.0, math.inf, torch.ones(2)):
-        with pytest.raises(UnitError):
-            measure(ones, 0, floor)
-    for dim in (None, 1.5, True):
-        with pytest.raises(ArgumentError):
-            measure(ones, dim)
-
-
-def test_what_is_no_angle():
-    ones = torch.ones(4, 2)
-    calls = [
-        st.rotator, st.linear_polarizer, lambda x: st.linear_polarizer(0.0, x), lambda x: st.linear_retarder(x, 0.0),
-        lambda x: st.linear_retarder(0.0, x), lambda x: st.rotate_frame(ones, x, 0),
-        lambda x: st.apply_mueller(x, ones, 0),
-    ]  # fmt: skip
-    for call in calls:
-        for bad in (None, "x", True, 1j, torch.tensor(1j), torch.tensor(True)):
-            with pytest.raises(UnitError):
-                call(bad)
-    for extinction in (math.nan, torch.tensor(math.nan), 1.5):
-        with pytest.raises(UnitError):
-            st.linear_polarizer(0.0, extinction)
-    for call in (lambda: st.rotate_frame(ones, torch.zeros(5, 2), 0), lambda: st.apply_mueller(torch.eye(3), ones, 0)):
-        with pytest.raises(ShapeError):
-            call()

@@ -2,34 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import click
 import pytest
 from click.testing import CliRunner
 
 from torchtransient.cli import main as cli
-
-TESTS = Path(__file__).parents[1]
-
-
-def misused(folder, part, parts):
-    """Each of the commands of `support/misused_commands.py` whose turn it is, in a process of its own."""
-    arguments = [sys.executable, "-m", "support.misused_commands", str(folder), str(part), str(parts)]
-    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    child = subprocess.run(arguments, capture_output=True, text=True, env=environment, cwd=folder)
-    assert child.returncode == 0, (child.returncode, child.stderr[-2000:])
-    return json.loads(child.stdout.splitlines()[-1])
-
-
-@pytest.mark.slow
-def test_every_command(tmp_path):
-    found = misused(tmp_path, 0, 1)
-    assert found["count"] > 400 and found["faults"] == {}
 
 
 @pytest.mark.parametrize(

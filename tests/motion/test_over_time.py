@@ -185,17 +185,6 @@ def test_vertices_move_as_poses_do():
     assert (by_pose[1] - by_pose[0]).abs().max() > 0.1 * by_pose.abs().max()
 
 
-def test_shapes_of_a_merge_have_poses_of_their_own():
-    room = make_room()
-    room["both"] = {"type": "merge", "wall": room.pop("wall"), "box": room.pop("box")}
-    renderer = renderer_of(room, "box.to_world", spp=4)
-    moving = {"box": tt.Motion(linear=(0, 0, 10.0))}
-    shutter = tt.over_time(renderer, moving, tt.RollingShutter(1e-3), seed=0)
-    assert not torch.equal(shutter.transient, renderer(seed=0).transient)
-    with pytest.raises(UnknownKeyError, match="this renderer has no parameter 'both'"):
-        tt.over_time(renderer, {"both": moving["box"]}, tt.RollingShutter(1e-3), seed=0)
-
-
 def test_a_camera_of_ones_own_and_times_with_gradients(facing):
     """The difference of two instants, and its slope by when the second is."""
 
@@ -215,17 +204,6 @@ def test_a_camera_of_ones_own_and_times_with_gradients(facing):
     assert relative(out.steady, np.full((3, 1, 1), 0.5 / np.pi * (1 / z**2 - 1 / 4))) < 1e-4
     (slope,) = torch.autograd.grad(out.steady[0, 0, 0], later)
     assert float(slope) == pytest.approx(0.5 / np.pi * 2 * 10 / z**3, rel=1e-3)
-
-
-def test_sensors_and_seeds(facing):
-    """Several sensors keep their dimension; a seed that is drawn is one for all poses."""
-    room = make_room()
-    room["other"] = room["sensor"]
-    renderer = renderer_of(room, "box.to_world", spp=4, sensors="all")
-    out = tt.over_time(renderer, {"box": TOWARDS}, tt.RollingShutter(1e-4), seed=0)
-    assert out.transient.shape == (2, 3, 24, 3, 4)
-    torch.manual_seed(0)
-    assert len(set(tt.over_time(facing, {"wall": TOWARDS}, HETERODYNE).stats.seeds)) == 1
 
 
 WALL = "wall.to_world"
@@ -252,17 +230,6 @@ WALL = "wall.to_world"
 def test_what_is_refused(facing, call, error, said):
     with pytest.raises(error, match=said):
         call(facing)
-
-
-def test_films_and_renderers_that_are_refused():
-    histogram = renderer_of(make_room(), "box.to_world", "light.intensity.value", spp=1)
-    with pytest.raises(ArgumentError, match=r"seen by a phasor film, got one that measures transient"):
-        tt.over_time(histogram, {"box": TOWARDS}, HETERODYNE)
-    with pytest.raises(ArgumentError, match=r"moves to_world, position, .*, got 'light\.intensity\.value'"):
-        tt.over_time(histogram, {"light.intensity.value": TOWARDS}, tt.Frames([0.0]))
-    numbered = renderer_of(make_room(), "box.to_world", spp=1, grad_seed=7)
-    with pytest.raises(ArgumentError, match="grad_seed=None or 'same'"):
-        tt.over_time(numbered, {"box": TOWARDS}, tt.Frames([0.0]))
 
 
 TOO_FAR = {

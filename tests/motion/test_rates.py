@@ -83,11 +83,6 @@ def test_described_velocities_are_those_of_motions(tmp_path):
     assert rate_of(tt.load(path, variant=VARIANT)) == pytest.approx(-2 * SPEED, abs=1e-4)
 
 
-def test_what_stands_still_has_no_rate():
-    light = rates_of(scene(wall=plate((0, 0, 2), (0, 0, 0))))
-    assert float(mean_rate(light)) == pytest.approx(0.0, abs=1e-5)
-
-
 def test_films_without_rates_do_not_feel_velocities():
     """The light of the same samples is the same, bit by bit."""
     loaded = tt.load(corner_of_three(), variant=VARIANT)
@@ -324,27 +319,6 @@ def test_fog_that_blows():
     light = rates_of(walled, {"mist": tt.Motion(linear=wind, angular=whirl, center=center)}, spp=4096)
     assert float(mean_rate(light[:, 88:92])) == pytest.approx(0.0, abs=1e-4)
     assert float(mean_rate(light[:, :80])) == pytest.approx(expected, abs=1e-4)
-
-
-def test_fog_inside_of_glass():
-    """Its velocity of zero changes nothing: the light of all paths stays."""
-    nodes = {
-        "box": {
-            "type": "cube", "to_world": translate([0, 0, 2]) @ scale(0.5), "bsdf": {"type": "thindielectric"},
-            "interior": {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.9, "id": "mist"},
-        },
-        "lamp": {
-            "type": "rectangle", "to_world": look_at([0, 0, 4], [0, 0, 0]) @ scale(2.0), "emitter": {"type": "area"},
-        },
-    }  # fmt: skip
-    described = scene(1, 20, **nodes)
-    described["integrator"] = {"type": "transient_prbvolpath", "max_depth": 6}
-    for body in ("lamp", "mist"):
-        out = tt.render(tt.load(described, variant=VARIANT).moving({body: tt.Motion()}), rates=RATES,
-                        time_axis=tt.TimeAxis(0.0, 0.2, 100), spp=64, seed=0)  # fmt: skip
-        light = float(out.steady.sum())
-        assert light > 0 and float(out.rates.sum()) == pytest.approx(light, rel=1e-5)
-
 
 
 # ------------------------------------------------------------------------------------------------------ around a corner

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError
+from torchtransient.errors import PhysicsWarning
 from torchtransient.scenes import look_at, scale
 
 TIMES, FREQUENCIES = (-0.3, 0.0, 0.2), (0.0, 0.4, 1.0)
@@ -73,10 +73,3 @@ def test_motions_that_count_twice():
     found = frames[:, 0, :, 1].mean((-2, -1))
     expected = torch.polar(torch.ones_like(lengths), -2 * math.pi * FREQUENCIES[1] * lengths)
     torch.testing.assert_close(found / found.abs(), expected, rtol=0, atol=1e-3)
-
-
-def test_what_it_asks_for():
-    with pytest.raises(ArgumentError, match="expected frequencies beside them"):
-        tt.render(scene(), slow_times=TIMES, spp=4, seed=0)
-    with pytest.raises(SceneError, match="slow_times: expected finite numbers with commas"):
-        tt.render(scene(type="slow_phasor_hdr_film", frequencies="0 1", slow_times="now"), spp=4, seed=0)

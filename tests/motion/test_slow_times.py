@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
 
 DURATION_S = 1.5e-3
 
@@ -51,12 +51,6 @@ def test_the_beat_is_the_light_over_the_sensor(beat_hz):
         sensor = np.cos(2 * np.pi * (frequency - beat_hz) * t + phase)
         tap = (light * sensor).mean()
         assert tap == pytest.approx(0.5 * (phasor * np.exp(-1j * phase)).real, abs=3e-4)
-
-
-def test_without_a_beat_it_is_the_mean():
-    exposure = tt.Exposure(DURATION_S, poses=1)
-    assert exposure.poses_s().tolist() == [0.0] and exposure.combine(torch.full((1, 2), 3.0)).tolist() == [3.0, 3.0]
-    assert tt.Exposure(DURATION_S).combine(torch.ones(3, 4)).tolist() == pytest.approx([1.0] * 4, abs=1e-7)
 
 
 def test_the_steady_image_has_no_beat():
@@ -114,34 +108,6 @@ def test_autocast_leaves_the_weights_as_they_are():
     assert torch.equal(moved, tt.Motion(angular=(0.1, 0.2, 0.3)).matrices(torch.tensor([0.7])))
 
 
-def test_times_of_frames_keep_their_gradient():
-    t = torch.tensor([0.0, 1.0], requires_grad=True)
-    assert tt.Frames(t).poses_s().requires_grad and tt.Frames([0.0, 0.5]).poses_s().tolist() == [0.0, 0.5]
-
-
-@together(
-    "make, error, said",
-    [
-        (lambda: tt.Exposure(0.0), UnitError, "Exposure: duration_s: expected a finite number greater than zero"),
-        (lambda: tt.Exposure(1e-3, beat_hz=float("nan")), UnitError, "Exposure: beat_hz: expected a finite number"),
-        (lambda: tt.Exposure(1e-3, beat_hz=1e3, poses=1), UnitError, "at least two poses for a beat"),
-        (lambda: tt.Exposure(1e-3, poses=2.5), UnitError, "poses: expected a whole number"),
-        (lambda: tt.RollingShutter("fast"), UnitError, "row_s: expected a finite number"),
-        (lambda: tt.PhaseSteps(0, 1e-3), UnitError, "number: expected a whole number of at least 1"),
-        (lambda: tt.Frames([]), ShapeError, r"Frames: expected times in seconds, \(K,\), got shape \(0,\)"),
-        (lambda: tt.Frames(0.5), ShapeError, r"got shape \(\)"),
-        (lambda: tt.Frames([0.0, float("inf")]), UnitError, "Frames: expected finite times"),
-        (lambda: tt.Frames("now"), ShapeError, "Frames: expected times in seconds"),
-        (lambda: tt.Motion(linear=(1.0, 2.0)), ShapeError, r"expected linear as three numbers, got shape \(2,\)"),
-        (lambda: tt.Motion(angular=(0, 0, float("nan"))), UnitError, "expected finite numbers as angular"),
-        (lambda: tt.Motion(center="here"), ShapeError, "expected a torch tensor, an array, a list of numbers"),
-    ],
-)
-def test_wrong_numbers(make, error, said):
-    with pytest.raises(error, match=said):
-        make()
-
-
 # ------------------------------------------------------------------------------------------------------------ motions
 
 
@@ -177,9 +143,3 @@ def test_gradients_of_a_motion():
                 # Central differences of a turn by 0.025 rad: 1e-3 of it.
                 expected = (sides[0] - sides[1]) / 0.1
                 torch.testing.assert_close(jacobian[..., axis], expected, atol=1e-3, rtol=0)
-
-
-def test_velocities_of_several_tensors_keep_their_gradients():
-    x = torch.tensor(2.0, requires_grad=True)
-    tt.Motion(linear=[x, 0.0, 0.0]).matrices(torch.tensor([0.0, 3.0]))[1, 0, 3].backward()
-    assert x.grad == 3.0

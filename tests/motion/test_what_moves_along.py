@@ -8,8 +8,7 @@ import torch
 
 import torchtransient as tt
 from support.rates import VARIANT, mean_rate, plate, rates_of, scene
-from torchtransient.errors import SceneError
-from torchtransient.scenes import scale, translate
+from torchtransient.scenes import translate
 
 RATES = tt.RateAxis(-10.0, 0.25, 80)
 
@@ -61,13 +60,3 @@ def test_fog_moves_with_the_glass_around_it():
     # Its own motion comes first.
     own = float(mean_rate(rates_of(still, {"cube": comes, "smoke": tt.Motion()})))
     assert own == pytest.approx(0.0, abs=1e-5)
-
-
-def test_parts_of_shapes_move_with_them_alone():
-    glow = {"type": "area", "id": "glow"}
-    lamp = {"type": "rectangle", "to_world": translate([0, 0, -1]) @ scale(0.2), "emitter": glow}
-    moving = tt.load(scene(wall=plate((0, 0, 2), (0, 0, 0)), lamp=lamp), variant=VARIANT).moving(
-        {"glow": tt.Motion(linear=(0, 0, 1))}
-    )
-    with pytest.raises(SceneError, match="'glow': expected the motion of 'lamp'"):
-        tt.render(moving, rates=RATES, spp=4, seed=0)

@@ -10,7 +10,6 @@ import torch
 
 import torchtransient as tt
 from support.rates import RATES, VARIANT, mean_length, mean_rate, rates_of, scene
-from torchtransient.errors import SceneError
 from torchtransient.scenes import scale, translate
 
 WIND, WHIRL, CENTER = np.array([0.3, 0.2, 1.4]), np.array([0.3, 0.8, 0.2]), np.array([0.7, 0.1, 2.0])
@@ -64,14 +63,3 @@ def test_files_copies_and_calls_keep_a_wind(tmp_path):
     still = renderer.values["mist.velocity.data"].detach()
     found = [float(mean_rate(renderer({"mist.velocity.data": x * still}, seed=0).rates[0])) for x in (1.0, 0.5, -1.0)]
     assert found == pytest.approx([found[0], found[0] / 2, -found[0]], abs=1e-4)
-
-
-def test_volumes_of_other_bodies_and_numbers_are_refused():
-    with pytest.raises(SceneError, match="three channels"):
-        tt.render(blown(lambda p: p[..., :1]), rates=RATES, spp=4, seed=0)
-    wall = {"type": "rectangle", "velocity": {"type": "gridvolume", "data": np.zeros((2, 2, 2, 3), np.float32)}}
-    with pytest.raises(SceneError, match="'wall'"):
-        tt.render(tt.load(scene(wall=wall), variant=VARIANT), rates=RATES, spp=4, seed=0)
-    # A rigid motion takes the place of a volume.
-    comes = blown(rigid).moving({"mist": tt.Motion(linear=(0, 0, -1.0))})
-    assert float(mean_rate(rates_of(comes))) == pytest.approx(-2.0, abs=0.05)

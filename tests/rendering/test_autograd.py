@@ -8,7 +8,6 @@ import threading
 
 import pytest
 import torch
-from torch import nn
 from torch.autograd import forward_ad
 
 import torchtransient as tt
@@ -56,15 +55,6 @@ def test_second_backward_follows_its_own_cotangent(renderer, weights):
     torch.testing.assert_close(twice, 2 * once)
 
 
-def test_many_renders_before_one_backward(renderer, weights):
-    starts = [START, START * 0.5, START.flip(0)]
-    xs = [s.clone().requires_grad_() for s in starts]
-    outs = [renderer({COLOUR: x}, seed=n).transient for n, x in enumerate(xs)]
-    sum((n + 1) * (out * weights).sum() for n, out in enumerate(outs)).backward()
-    for n, (x, start) in enumerate(zip(xs, starts, strict=True)):
-        torch.testing.assert_close(x.grad, (n + 1) * gradient(renderer, start, weights, seed=n))
-
-
 def test_gradients_accumulate(renderer, weights):
     values = renderer.values[COLOUR]
     for seed in (0, 1):
@@ -106,26 +96,6 @@ def test_in_place_edit_between_render_and_backward_is_detected(renderer, weights
         loss.backward()
 
 
-def test_nn_parameter(renderer, weights):
-    x = nn.Parameter(START.clone())
-    (renderer({COLOUR: x}, seed=0).transient * weights).sum().backward()
-    same_gradient(x.grad, gradient(renderer, START, weights))
-
-
-@pytest.mark.slow
-def test_optimizer_step_moves_the_image(renderer):
-    target = renderer({COLOUR: torch.tensor([0.3, 0.6, 0.4])}, seed=9).steady.detach()
-    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)
-    losses = []
-    for _ in range(40):
-        optimizer.zero_grad()
-        loss = (renderer(seed=9).steady - target).square().sum()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.05 * losses[0]
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
 def test_other_float_dtypes(renderer, weights, dtype):
     x = START.to(dtype).requires_grad_()
@@ -135,13 +105,6 @@ def test_other_float_dtypes(renderer, weights, dtype):
     assert x.grad.dtype == dtype
     expected = gradient(renderer, START.to(dtype).float(), weights)
     torch.testing.assert_close(x.grad, expected.to(dtype))
-
-
-def test_non_contiguous_input(renderer, weights):
-    storage = torch.stack([START, torch.zeros(3)], dim=1)
-    x = storage.requires_grad_()[:, 0]
-    (renderer({COLOUR: x}, seed=0).transient * weights).sum().backward()
-    same_gradient(storage.grad[:, 0], gradient(renderer, START, weights))
 
 
 @pytest.mark.slow
@@ -309,14 +272,6 @@ def test_functional_call(room_scene, weights):
         return (torch.func.functional_call(renderer, {name: x}, (), {"seed": 0}).transient * weights).sum()
 
     torch.testing.assert_close(torch.func.grad(loss)(START * 0.5), gradient(renderer, START * 0.5, weights))
-
-
-def test_no_gradient_is_computed_for_frozen_values(room_scene, weights):
-    renderer = make_renderer(room_scene, (COLOUR, GREY))
-    renderer.values[GREY].requires_grad_(False)
-    (renderer(seed=0).transient * weights).sum().backward()
-    assert renderer.values[GREY].grad is None
-    assert renderer.values[COLOUR].grad.abs().max() > 0
 
 
 def test_manual_seed_governs_default_seeds(renderer):

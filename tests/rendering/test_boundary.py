@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import copy
-import gc
 import pickle
 import warnings
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -16,8 +13,7 @@ import torch
 import torchtransient as tt
 from support.marks import long
 from tools.small_room import pose
-from torchtransient.errors import ArgumentError, GradientError, GradientWarning
-from torchtransient.scene.variant import active_variant
+from torchtransient.errors import GradientError, GradientWarning
 
 VARIANT = "llvm_ad_mono"
 BODY, PAINT = "body.to_world", "body.bsdf.reflectance.value"
@@ -171,59 +167,6 @@ def test_left_out_it_is_said_once():
         assert twin.boundary is False and twin.spp_boundary is None
 
 
-def test_left_out_by_the_scene_it_is_no_error_either():
-    integrator = {"type": "transient_path", "max_depth": 3, "boundary": False}
-    renderer = tt.TransientRenderer(plate(integrator=integrator), [BODY], spp=4, physics="error")
-    _, messages = said(lambda: reverse(renderer))
-    assert len(messages) == 1 and "integrator" in messages[0]
-
-
-@pytest.mark.parametrize("settings", [{"boundary": "no"}, {"boundary": None}, {"boundary": False, "spp_boundary": 8}])
-def test_settings_that_are_none(settings):
-    with pytest.raises(ArgumentError, match=next(reversed(settings))):
-        tt.TransientRenderer(plate(), [BODY], **settings)
-
-
-def test_a_plan_says_which_derivatives_have_the_term():
-    def said_of(key, **parts):
-        reasons = tt.plan(plate(**parts), parameters=[key]).reasons
-        return [reason for reason in reasons if "boundary" in reason or "edges" in reason]
-
-    off = {"integrator": {"type": "transient_path", "max_depth": 3, "boundary": False}}
-    pane = {"pane": MIRROR | {"bsdf": {"type": "dielectric"}}}
-    (on,), (lost,) = said_of(BODY), said_of(BODY, **off)
-    assert BODY in on and "on" in on and "boundary is false" in lost
-    assert said_of(PAINT) == []
-    (bent,) = said_of("pane.bsdf.eta", **pane)
-    assert bent.startswith("approximation")
-
-
-def test_nothing_is_said_without_derivatives():
-    renderer = tt.TransientRenderer(plate(mirror=MIRROR), [BODY], spp=4)
-    with torch.no_grad():
-        assert said(lambda: renderer(seed=0))[1] == []
-    fixed = tt.TransientRenderer(plate(mirror=MIRROR), [PAINT], spp=4)
-    assert said(lambda: weighed(fixed(seed=0)).backward())[1] == []
-    complete = tt.TransientRenderer(plate(), [BODY], spp=4, physics="error")
-    assert said(lambda: reverse(complete))[1] == []
-
-
-def test_the_integrator_alone_says_it_too():
-    """For users of ``mi.render``: once a scene, too, and nothing of it inside of the layer's calls."""
-    mi.set_variant(VARIANT)
-    scene = mi.load_dict(described(mirror=MIRROR, integrator={"type": "transient_path", "temporal_filter": "tent"}))
-    params = mi.traverse(scene)
-
-    def derivative():
-        params["light.position"] = mi.Point3f(0.7, 0.4, 3.8)
-        dr.enable_grad(params["light.position"])
-        params.update()
-        scene.integrator().render_backward(scene, params, (mi.TensorXf(np.ones((8, 8, 1), np.float32)), None), spp=1)
-
-    messages = said(derivative)[1] + said(derivative)[1]
-    assert len(messages) == 1 and "'light.position'" in messages[0]
-
-
 UPRIGHT = np.eye(4)
 # A rotation by 60 degrees about an axis that lies in no plane of two axes.
 OBLIQUE = np.array([[7, -4, 4, 0], [1, 8, 4, 0], [-8, -4, 1, 0], [0, 0, 0, 9]]) / 9
@@ -358,75 +301,3 @@ def test_bodies_that_run_into_each_other(parts, names):
         assert names in words
     for moved in (BODY, "light.position"):
         assert crossing(moved, **parts) == []
-
-
-@pytest.mark.parametrize("parts", [
-    {"a": box(0.4)},
-    {"wall": wall(OBLIQUE), "a": box(0.4, OBLIQUE)},
-    {"a": ball(0.5), "b": tube(1.0, 1.3)},
-    {"a": ball(2.0), "dome": ball(2.0, 50.0)},
-    {"a": box(2.0), "room": ball(2.0, 0.9)},
-    several(pose(0, 0, 0.4), NEAR),
-    {"cloud": box(0.1) | {"bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.5}}},
-])  # fmt: skip
-def test_bodies_that_touch_do_not_run_into_each_other(parts):
-    assert crossing("sensor.to_world", **parts) == []
-
-
-def test_bricks_side_by_side():
-    """The edges of the upper one run along the faces in which the lower ones touch."""
-    bricks = {name: {"type": "cube", "to_world": OBLIQUE @ pose(x, 0, z) @ np.diag([0.4, 0.4, 0.4, 1])}
-              for name, x, z in (("a", 2.6, 2.0), ("b", 3.4, 2.0), ("c", 3.1, 2.8))}  # fmt: skip
-    bricks["wall"] = {"type": "rectangle", "to_world": pose(0, 0, -9)}
-    assert crossing("sensor.to_world", **bricks) == []
-    bricks["c"]["to_world"] = OBLIQUE @ pose(3.1, 0, 2.7) @ np.diag([0.4, 0.4, 0.4, 1])
-    (words,) = crossing("sensor.to_world", **bricks)
-    assert "'c'" in words
-
-
-def test_one_mesh_of_plates_that_cross():
-    """Joined without an edge where they meet."""
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    mesh = {"type": "mesh_arrays", "vertices": np.concatenate([corners, corners[:, [0, 2, 1]]]) * 0.3 + [0, 0, 2],
-            "faces": np.concatenate([faces, faces + 4])}  # fmt: skip
-    (words,) = crossing("sensor.to_world", mesh=mesh)
-    assert "parts of 'mesh'" in words
-
-
-def test_the_plan_says_so():
-    assert any("boundary term: on" in reason and BODY in reason for reason in planned(plate(), BODY))
-    assert any("mirrors" in reason for reason in planned(plate(mirror=MIRROR), BODY))
-    assert not any("boundary" in reason for reason in planned(plate(), PAINT))
-
-
-def planned(scene, key):
-    return tt.plan(scene, parameters=[key], pilot=False).reasons
-
-
-def test_samples_are_those_asked_for():
-    few, many = (tt.TransientRenderer(plate(), [BODY], spp=16, spp_boundary=n) for n in (1, 64))
-    assert reverse(few) != reverse(many)
-
-
-def kernels(renderer, key):
-    """Hashes of the kernels that a derivative launches, in order. They depend on the plugins that are alive."""
-    gc.collect()
-    weighed(renderer(seed=0)).backward()
-    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        weighed(renderer(seed=1)).backward()
-        return [entry["hash"] for entry in dr.kernel_history((dr.KernelType.JIT,))]
-
-
-def test_derivatives_that_move_no_edge_run_the_same_kernels():
-    """Of a brightness, of texture coordinates that show no steps: as if there were no boundary term."""
-    for key in (PAINT, "light.intensity.value"):
-        # Twice: scenes of other tests may still be alive at first.
-        *_, with_term, without = (
-            kernels(tt.TransientRenderer(plate(), [key], spp=4, boundary=on, freeze=False), key)
-            for on in (True, False) * 2
-        )
-        assert with_term == without and with_term
-    moving = kernels(tt.TransientRenderer(plate(), [BODY], spp=4, freeze=False), BODY)
-    assert len(moving) > len(with_term)

@@ -13,8 +13,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from tools.small_room import COLOUR, GREY, WALL_POSE
-from torchtransient.scene.variant import active_variant
+from tools.small_room import COLOUR
 
 START = torch.tensor([0.8, 0.5, 0.2])
 NAN, INF = math.nan, math.inf
@@ -38,20 +37,6 @@ def test_adjoint_that_is_not_finite_makes_all_gradients_nan(renderer, number, ev
     assert torch.autograd.grad(out, x, adjoint)[0].isnan().all()
 
 
-def test_scalar_that_is_not_a_number_reaches_parameters_through_expanded_adjoints(renderer):
-    renderer.zero_grad()
-    out = renderer(seed=0)
-    (out.transient.sum() * NAN + out.steady.sum()).backward()
-    assert renderer.values[COLOUR].grad.isnan().all()
-
-
-def test_adjoint_of_the_steady_image_counts_as_well(renderer):
-    x = START.clone().requires_grad_()
-    out = renderer({COLOUR: x}, seed=0)
-    (out.transient.sum() + (out.steady - out.steady.detach()).sqrt().sum()).backward()  # a slope of infinity
-    assert x.grad.isnan().all()
-
-
 def test_entries_of_a_batch_are_told_apart(renderer):
     x = START.expand(3, 3).clone().requires_grad_()
     out = render(renderer, x)
@@ -63,34 +48,11 @@ def test_entries_of_a_batch_are_told_apart(renderer):
     torch.testing.assert_close(found[[0, 2]], expected[[0, 2]])
 
 
-def test_value_for_all_entries_is_touched_by_each(room_scene):
-    renderer = tt.TransientRenderer(room_scene, [COLOUR, GREY], spp=4)
-    x, grey = START.expand(2, 3).clone().requires_grad_(), torch.tensor(0.5, requires_grad=True)
-    out = renderer({COLOUR: x, GREY: grey}, seed=0).transient
-    adjoint = torch.ones_like(out)
-    adjoint[1] = NAN
-    of_x, of_grey = torch.autograd.grad(out, (x, grey), adjoint)
-    assert of_x[0].isfinite().all() and of_x[1].isnan().all() and of_grey.isnan().all()
-
-
 @pytest.mark.parametrize("number", [NAN, INF])
 def test_tangent_that_is_not_finite_makes_the_film_nan(renderer, number):
     tangent = torch.tensor([0.0, number, 0.0])
     found = torch.func.jvp(lambda x: renderer({COLOUR: x}, seed=0).transient, (START,), (tangent,))[1]
     assert found.isnan().all()
-
-
-def test_functions_of_torch_func(renderer):
-    x, weights = START.expand(2, 3), torch.tensor([1.0, NAN])
-
-    def loss(x, weight):
-        return (render(renderer, x) * weight).sum()
-
-    found = torch.func.vmap(torch.func.grad(loss))(x, weights)
-    assert found[0].isfinite().all() and found[1].isnan().all()
-    tangents = torch.tensor([[1.0, 1.0, 1.0], [NAN, 1.0, 1.0]])
-    found = torch.func.vmap(lambda x, t: torch.func.jvp(lambda x: render(renderer, x), (x,), (t,))[1])(x, tangents)
-    assert found[0].isfinite().all() and found[1].isnan().all()
 
 
 def test_recorded_derivatives_do_the_same(renderer):
@@ -102,24 +64,6 @@ def test_recorded_derivatives_do_the_same(renderer):
     found = torch.autograd.grad((out_again := render(renderer, x)), x, torch.full_like(out_again, NAN))[0]
     assert found.isnan().all()
     assert torch.autograd.grad(render(renderer, x).sum(), x)[0].isfinite().all()  # nothing of it stays behind
-
-
-@pytest.mark.slow
-def test_sensors_and_path_lengths(room):
-    room["second"] = dict(room["sensor"])
-    renderer = tt.TransientRenderer(room, [COLOUR, WALL_POSE], spp=4, sensors="all", temporal_filter="tent")
-    out = renderer(seed=0).transient
-    adjoint = torch.ones_like(out)
-    adjoint[1, 0, 0, 0, 0] = NAN
-    out.backward(adjoint)
-    assert all(value.grad.isnan().all() for value in renderer.values.values())
-
-
-def test_anomaly_detection_raises(renderer):
-    x = START.clone().requires_grad_()
-    out = render(renderer, x)
-    with torch.autograd.set_detect_anomaly(True), pytest.raises(RuntimeError, match=r"RunBackward.*nan"):
-        torch.autograd.grad(out, x, torch.full_like(out, INF))
 
 
 def test_grad_scaler_skips_the_step(renderer):
@@ -145,19 +89,3 @@ def test_wrapped_function_is_nan_where_the_adjoint_touches_it(gathered):
     x = torch.arange(1.0, 5.0).requires_grad_()
     found = torch.autograd.grad(gathered(x), x, torch.tensor([NAN, 1.0, 1.0, INF]))[0]
     assert found[[0, 2]].isnan().all() and found[[1, 3]].tolist() == [2, 0]
-
-
-def test_tangents_of_wrapped_functions(gathered):
-    found = torch.func.jvp(gathered, (torch.arange(1.0, 5.0),), (torch.tensor([0.0, NAN, 1.0, 0.0]),))[1]
-    assert found[1:3].isnan().all() and found[[0, 3]].tolist() == [0, 1]
-
-
-@pytest.mark.slow
-def test_wrapped_render(room):
-    with active_variant("llvm_ad_rgb"):
-        scene = mi.load_dict(room)
-        params = mi.traverse(scene)
-    wrapped = tt.wrap(lambda params, seed: mi.render(scene, params, spp=4, seed=seed)[1], params)
-    x = START.clone().requires_grad_()
-    out = wrapped({COLOUR: x}, seed=0)
-    assert torch.autograd.grad(out, x, torch.full_like(out, NAN))[0].isnan().all()

@@ -10,7 +10,6 @@ import torchtransient as tt
 from tools.small_room import VARIANT, make_room, pose
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.cameras import camera_of
-from torchtransient.scene.variant import active_variant
 
 POSE = pose(0.3, -0.2, 2.5, 1.0)
 KEYS = ["eye.x_fov", "eye.principal_point_offset_x", "eye.principal_point_offset_y", "eye.to_world"]
@@ -30,8 +29,7 @@ def renderer():
                     "film": FILM}  # fmt: skip
     scene = tt.load(room, variant=VARIANT)
     made = tt.TransientRenderer(scene, parameters=KEYS, sensors=[1, 0], temporal_filter="tent")
-    with active_variant(VARIANT):
-        names = [sensor.id() for sensor in scene.built(made._options).scene.sensors()]
+    names = [sensor.id() for sensor in scene.built(made._options).scene.sensors()]
     return made, {name: names.index(name) for name in ("flat", "eye", "lens")}
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import inspect
 import subprocess
 import sys
-import weakref
 
 import pytest
 import torch
@@ -17,7 +15,6 @@ from support.marks import long
 from support.sensing.all_entries import ENTRIES
 from tools.small_room import COLOUR
 from tools.small_room import VARIANT as VARIANT
-from torchtransient.scene.opaque import opaque
 
 START = torch.tensor([0.8, 0.5, 0.2])
 
@@ -78,33 +75,6 @@ def test_a_renderer(room_scene, backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_module_around_a_renderer(room_scene, backend):
-    pipeline = Pipeline(tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4))
-    compiled = torch.compile(pipeline, backend=backend)
-    same(results(compiled, START, pipeline.code), results(pipeline, START, pipeline.code))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_function(room_scene, backend):
-    def loss(x):
-        return (tt.render(room_scene, {COLOUR: 2 * x}, spp=4, seed=0).steady * 3).square().sum()
-
-    same(results(torch.compile(loss, backend=backend), START / 2), results(loss, START / 2))
-
-
-@pytest.mark.slow
-def test_scenes_made_and_read_inside(room):
-    def loss(x):
-        scene = tt.load(room, variant=VARIANT)
-        renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4)
-        return renderer({COLOUR: x}, seed=0).steady.sum() * len(scene.parameters())
-
-    same(results(torch.compile(loss, backend="eager"), START), results(loss, START))
-
-
-@pytest.mark.slow
 def test_what_a_whole_graph_would_need(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     # The compiler of torch 2.6 takes no reason: it names the function that it was told to leave alone.
@@ -128,28 +98,3 @@ def test_a_render_does_not_import_the_compiler():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-2:] == ["False", "False"]
-
-
-def test_what_an_opaque_function_holds_goes_with_it():
-    """Beside the compiler, which everything that makes an optimizer imports."""
-    assert "torch._dynamo" in sys.modules
-
-    class Held:
-        pass
-
-    def made():
-        held = Held()
-        function = opaque(lambda x: x + bool(held))
-        return function, weakref.ref(held)
-
-    function, held = made()
-    assert function(1) == function(1) == 2 and held() is not None
-    del function
-    gc.collect()
-    assert held() is None
-    wrapped = tt.wrap(lambda x: x * 2)
-    inner = weakref.ref(wrapped.__wrapped__)
-    torch.testing.assert_close(wrapped(torch.ones(2)), torch.full((2,), 2.0))
-    del wrapped
-    gc.collect()
-    assert inner() is None

@@ -53,10 +53,6 @@ def identity():
     return dr.wrap(source="torch", target="drjit")(lambda x: x)
 
 
-def test_one_backward_is_right(render, slope):
-    assert slope[0].min() > 0 and not torch.allclose(slope[0], slope[1])
-
-
 def test_second_backward_returns_the_first_gradient(render, slope):
     x = START.clone().requires_grad_()
     loss = render(x)
@@ -112,17 +108,6 @@ def test_dtypes_that_are_refused(dtype):
 )
 def test_dtypes_that_pass(dtype):
     assert identity()(torch.ones(3, dtype=dtype)).dtype == dtype
-
-
-def test_inputs_that_are_not_contiguous_pass(render, slope):
-    storage = torch.stack([START, torch.zeros(3)], dim=1).requires_grad_()
-    render(storage[:, 0]).backward()
-    torch.testing.assert_close(storage.grad[:, 0], slope[0])
-
-
-def test_no_grad_records_nothing_in_torch(render):
-    with torch.no_grad():
-        assert not render(START.clone().requires_grad_()).requires_grad
 
 
 def test_the_scene_is_left_with_the_values_of_the_last_call_and_a_graph():

@@ -8,7 +8,7 @@ import torch
 
 import torchtransient as tt
 from support.marks import long, long_pairs
-from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.errors import ShapeError
 
 BINS = 40
 
@@ -143,86 +143,6 @@ def test_pixels_that_share_light():
     assert 0.2 < float(sums.var() / estimates.mean()) < 2.5
 
 
-def test_batches_gradients_and_records():
-    scene = room()
-    renderer = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=8, physics="ignore")
-    value = renderer.values["red.reflectance.value"].detach()
-    out = renderer({"red.reflectance.value": torch.stack([value, 0.5 * value])}, seed=0, errors=True)
-    assert out.standard_error().shape == (2,) and out.transient.shape[0] == 2
-    one = renderer(seed=0, errors=True)
-    torch.testing.assert_close(one.standard_error(), out.standard_error()[0], rtol=1e-4, atol=0)
-    (one.transient.sum()).backward()
-    plain = tt.TransientRenderer(scene, ["red.reflectance.value"], spp=8, physics="ignore")
-    plain(seed=0).transient.sum().backward()
-    torch.testing.assert_close(
-        renderer.values["red.reflectance.value"].grad, plain.values["red.reflectance.value"].grad, rtol=1e-4, atol=1e-6
-    )
-    both = tt.RenderOutput.stack([one.detach(), one.detach()])
-    assert both.standard_error().shape == (2,)
-
-
-def test_wrong_requests():
-    renderer = tt.TransientRenderer(room(), ["red.reflectance.value"], spp=4, physics="ignore")
-    with pytest.raises(ArgumentError, match="errors: expected True, False or 'bins'"):
-        renderer(seed=0, errors="lean")
-    with pytest.raises(ArgumentError, match="at least 2 samples"):
-        renderer(seed=0, spp=1, errors=True)
-    with pytest.raises(ArgumentError, match="errors=True"):
-        renderer(seed=0).standard_error()
-    with pytest.raises(ShapeError, match="broadcast"):
-        renderer(seed=0, errors=True).standard_error(torch.ones(3, 8, 8))
-    values = renderer.values["red.reflectance.value"].detach()[None].repeat(2, *[1] * 1)
-    with pytest.raises(ArgumentError, match="vmap"):
-        torch.func.vmap(lambda v: renderer({"red.reflectance.value": v}, seed=0, errors=True).steady)(values)
-
-
-def test_an_empty_picture_has_no_error():
-    dark = tt.TransientRenderer(room(), ["light.emitter.radiance.value"], spp=8, physics="ignore")
-    with torch.no_grad():
-        dark.values["light.emitter.radiance.value"].zero_()
-        out = dark(seed=0, errors=True)
-    assert float(out.standard_error()) == 0 and not out.error_map().any()
-
-
-def test_a_result_file_keeps_them(tmp_path):
-    with torch.no_grad():
-        out = tt.TransientRenderer(room(), spp=8, physics="ignore")(seed=0, errors=True)
-    from torchtransient.files import read_result, write_result
-
-    again = read_result(write_result(tmp_path / "a.npz", out))
-    assert torch.equal(again.standard_error(), out.standard_error())
-    assert torch.equal(again.error_map(), out.error_map()) and again.relative_error() == out.relative_error()
-    assert f"sum known to {out.relative_error():.2%}" in repr(out)
-
-
-def test_a_picture_shows_them(tmp_path):
-    with torch.no_grad():
-        out = tt.TransientRenderer(room(), spp=8, physics="ignore")(seed=0, errors=True)
-    settings = {"axis": out.axis, "pixel": (3, 3)}
-    tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "with.png", errors=out.error_map())
-    tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "without.png")
-    assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()
-    with pytest.raises(ShapeError, match="errors"):
-        tt.vis.plot_overview(out.transient, out.steady, **settings, path=tmp_path / "x.png", errors=torch.ones(3, 8, 8))
-
-
-@pytest.mark.parametrize("size, bins", [(1, 40), (1, 1), (3, 5), (5, 9)])
-@pytest.mark.parametrize("errors", [True, "bins"])
-def test_small_films(size, bins, errors):
-    scene = tt.load(tt.scenes.cornell_box(resolution=size, num_bins=bins, bin_width_opl=9 / bins))
-    with torch.no_grad():
-        out = tt.TransientRenderer(scene, spp=16, physics="ignore")(seed=0, errors=errors)
-    assert out.error_map().shape == (bins, size, size) and float(out.standard_error()) > 0
-
-
-def test_a_capture_of_few_bins():
-    scan = tt.nlos.Scan.grid(tt.nlos.Wall.plane(2.0, 2.0, albedo=0.7), 2, kind="confocal")
-    capture = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan, time_axis=tt.TimeAxis(1.5, 0.3, 7), spp=16)
-    with torch.no_grad():
-        out = capture.renderer(seed=0, errors=True)
-    assert out.error_map().shape == (7, 2, 2) and float(out.standard_error()) > 0
-
-
 @pytest.mark.parametrize("power", [-24, 18])
 def test_light_that_is_far_from_one(power):
     """Sums scale with the radiance; squares of it have no room in single precision."""
@@ -273,30 +193,3 @@ def test_histograms_of_several_rows(name, errors):
     assert 0 < out.relative_error() < 0.2
     with pytest.raises(ShapeError, match="weights that broadcast"):
         out.standard_error(torch.ones(rows + 1, BINS, 8, 8))
-
-
-@pytest.mark.parametrize("name", FILMS_OF_ROWS)
-def test_rows_in_files_and_polarized(name, tmp_path):
-    from torchtransient.files import read_result, write_result
-
-    scene = room("llvm_ad_mono_polarized", 6).moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0))})
-    renderer = tt.TransientRenderer(scene, spp=8, physics="ignore", **FILMS_OF_ROWS[name])
-    with torch.no_grad():
-        out = renderer(seed=0, errors=True)
-    back = read_result(write_result(tmp_path / "a.h5", out))
-    assert out.standard_error().shape == (4,)
-    torch.testing.assert_close(back.standard_error(), out.standard_error())
-    assert back.error_map().shape == (4, *renderer.film.shape, 6, 6)
-
-
-@pytest.mark.parametrize("name", FILMS_OF_ROWS)
-def test_rows_to_a_tolerance_and_in_other_bins(name):
-    scene = room("llvm_ad_mono").moving({"small-box": tt.Motion(linear=(0.0, 0.0, 2.0))})
-    renderer = tt.TransientRenderer(scene, spp=16, physics="ignore", **FILMS_OF_ROWS[name])
-    found = renderer.to_tolerance(rtol=0.5, seed=0, max_spp=2048, progress=False)
-    assert getattr(found.output, name).shape[1:] == (*renderer.film.shape, 8, 8)
-    assert found.standard_error.shape == (*renderer.film.shape, 8, 8)
-    wider = renderer.variation(time_axis=tt.TimeAxis(0.0, 0.9, 10))
-    assert wider.film.shape == (renderer.film.shape[0], 10) and wider.film.settings == renderer.film.settings
-    report = tt.cost_of_accuracy(renderer, spp=(2, 4), repeats=2, bin_widths=[0.225, 0.9], progress=False)
-    assert name in str(report)

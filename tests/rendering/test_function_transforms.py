@@ -129,11 +129,6 @@ def test_second_derivatives_are_refused(groups, way):
 # ---------------------------------------------------------------------------------------------------- seeds of vmap
 
 
-def test_a_seed_that_is_not_given_under_vmap(groups):
-    with pytest.raises(tt.errors.UnitError, match=r"Pass seed=.*randomness='same'.*'different'"):
-        torch.func.vmap(lambda x: groups(x, seed=None))(XS)
-
-
 def test_same_randomness_is_one_seed(groups):
     twice = torch.stack([START, START])
     out = torch.func.vmap(lambda x: groups(x, seed=None), randomness="same")(twice)
@@ -163,18 +158,3 @@ def test_seeds_may_be_what_is_mapped(groups):
     close(out, torch.stack([groups(x, seed=int(seed)) for x, seed in zip(XS, seeds, strict=True)]))
     slopes = torch.func.vmap(torch.func.jacrev(groups))(XS, seeds)
     close(slopes[1], torch.func.jacrev(groups)(XS[1], 8))
-
-
-def test_statistics_under_vmap_are_those_of_all_entries(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], time_axis=tt.TimeAxis(8.0, 0.25, 2), spp=4)
-    found = []
-
-    def f(x, seed):
-        out = renderer({COLOUR: x}, seed=seed)
-        found.append(out.stats)
-        return out.steady
-
-    torch.func.vmap(f)(XS, torch.tensor([3, 8]))
-    single = renderer({COLOUR: XS[1]}, seed=8).stats
-    assert found[0].seeds == (3, 8)
-    assert len(found[0].energy_after) == 2 and found[0].energy_after[1] == pytest.approx(single.energy_after[0])

@@ -1,8 +1,13 @@
-"""Interrupts, signals and the garbage collector around calls."""
+"""Interrupts below Mitsuba and Dr.Jit arrive as `KeyboardInterrupt`, and what comes after them is right."""
+
+from __future__ import annotations
 
 import gc
+import random
 import signal
+import time
 
+import drjit as dr
 import mitsuba as mi
 import pytest
 import torch
@@ -11,9 +16,126 @@ import torchtransient as tt
 from support.walks import before_each_turn
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.plugins.drjit_pool import engine_lock
-from torchtransient.plugins.guards import ensure_restored, interrupts_wait, no_collection
 from torchtransient.scene.variant import active_variant
+
+
+def interrupt(*args, **kwargs):
+    raise KeyboardInterrupt
+
+
+@pytest.fixture
+def level():
+    """Mitsuba's level of messages, which every test has to leave as it was."""
+    mi.set_variant(VARIANT)
+    before = mi.logger().log_level()
+    yield before
+    assert mi.logger().log_level() == before
+
+
+@pytest.fixture(scope="module")
+def renderer(room_scene):
+    return tt.TransientRenderer(room_scene, [COLOUR], spp=2, freeze=False)
+
+
+def forward(renderer):
+    x = torch.ones(3)
+    return torch.func.jvp(lambda x: renderer({COLOUR: x}, seed=0).transient, (x,), (x,))
+
+
+CALLS = {
+    "render": lambda renderer: renderer(seed=0),
+    "forward": forward,
+    "plan": lambda renderer: tt.plan(make_room()),
+    "cost": lambda renderer: tt.cost_of_accuracy(renderer, spp=(2,)),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_in_a_loop_that_is_traced(renderer, monkeypatch, level, call):
+    expected = renderer(seed=0).transient
+    with monkeypatch.context() as patched:
+        before_each_turn(patched, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            CALLS[call](renderer)
+    assert mi.variant() == VARIANT
+    torch.testing.assert_close(renderer(seed=0).transient, expected)
+
+
+def test_in_wrapped_functions(level):
+    """Dr.Jit's own loops, and its own derivatives."""
+    on = {"at": "nowhere"}
+
+    @tt.wrap
+    def doubled(x):
+        count, found = mi.UInt32(0), mi.Float(x.array)
+
+        def body(count, found):
+            if on["at"] == "loop":
+                raise KeyboardInterrupt
+            return count + 1, found + mi.Float(x.array)
+
+        if on["at"] == "function":
+            raise KeyboardInterrupt
+        return dr.while_loop((count, found), lambda count, found: count < 1, body, max_iterations=2)[1]
+
+    x = torch.ones(2, requires_grad=True)
+    for where in ("loop", "function"):
+        on["at"] = where
+        with pytest.raises(KeyboardInterrupt):
+            doubled(x)
+        on["at"] = "nowhere"
+        y = doubled(x)
+        assert y.tolist() == [2, 2]
+        on["at"] = where
+        with pytest.raises(KeyboardInterrupt):
+            y.sum().backward(retain_graph=True)
+        on["at"] = "nowhere"
+        assert torch.autograd.grad(y.sum(), x)[0].tolist() == [2, 2]
+
+
+@pytest.mark.slow
+def test_at_random_moments(level):
+    """A timer in place of a user who presses control and C."""
+    renderer = tt.TransientRenderer(make_room(), [COLOUR, WALL_POSE], spp=2, temporal_filter="tent")
+    scene = mi.load_dict(make_room())
+    params = mi.traverse(scene)
+    image = tt.wrap(lambda params, seed: mi.render(scene, params, spp=2, seed=seed)[0], params)
+
+    def backward():
+        renderer(seed=0).transient.mean().backward()
+
+    def traced():
+        twin = tt.TransientRenderer(make_room(), [COLOUR, WALL_POSE], spp=2, temporal_filter="tent", freeze=False)
+        twin(seed=0).transient.mean().backward()
+
+    def wrapped():
+        image({COLOUR: torch.full((3,), 0.5, requires_grad=True)}, seed=0).mean().backward()
+
+    jobs = [backward, traced, wrapped, lambda: forward(renderer), lambda: tt.plan(make_room())]
+    took = []
+    for job in jobs:
+        job()
+        started = time.perf_counter()
+        job()
+        took.append(time.perf_counter() - started)
+    expected, moments, interrupted = renderer(seed=0).transient.detach(), random.Random(0), 0
+    previous = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        for _ in range(100):
+            n = moments.randrange(len(jobs))
+            try:
+                try:
+                    signal.setitimer(signal.ITIMER_REAL, max(1e-4, moments.random() * took[n]))
+                    jobs[n]()
+                finally:
+                    signal.setitimer(signal.ITIMER_REAL, 0)
+            except KeyboardInterrupt:
+                interrupted += 1
+            assert mi.logger().log_level() == level and mi.variant() == VARIANT
+            torch.testing.assert_close(renderer(seed=0).transient.detach(), expected)
+    finally:
+        signal.signal(signal.SIGALRM, previous)
+    assert interrupted > 50
 
 
 def step(renderer, kind):
@@ -50,36 +172,11 @@ def test_an_interrupted_call_leaves_nothing_behind(kind, place, monkeypatch):
             patched.setattr(integrator, place, interrupt)
             with pytest.raises(KeyboardInterrupt):
                 step(renderer, kind)
-    assert mi.variant() == "llvm_ad_mono" and gc.isenabled() and not engine_lock._is_owned()
+    assert mi.variant() == "llvm_ad_mono" and gc.isenabled()
     assert torch.equal(step(renderer, kind), expected)
     with active_variant(VARIANT):
         now = mi.traverse(renderer.scene.built(renderer._options).scene)
         assert {key: str(now[key]) for key in before} == before
-
-
-def test_settings_are_put_back_when_an_interrupt_cuts_that_off():
-    done, interrupts = [], [KeyboardInterrupt()]
-
-    def put_back():
-        if interrupts:
-            raise interrupts.pop()
-        done.append(1)
-
-    with pytest.raises(KeyboardInterrupt):
-        ensure_restored(put_back)
-    assert done == [1]
-
-
-def test_the_collector_waits_in_every_block():
-    """A progress report of Mitsuba's own render that renders with the library: a call inside of a trace."""
-    seen = []
-    with no_collection():
-        tt.render(make_room(), spp=1, seed=0)
-        seen.append(gc.isenabled())
-    assert seen == [False] and gc.isenabled()
-
-
-# ---------------------------------------------------------------------------------- calls in somebody's except block
 
 
 @pytest.mark.parametrize(
@@ -96,71 +193,3 @@ def test_calls_in_an_except_block_raise_their_own_errors(room_scene, monkeypatch
     except (KeyboardInterrupt, ValueError):
         with pytest.raises(SceneError, match="a plain mistake"):
             renderer(seed=0)
-
-
-@pytest.mark.parametrize("handled", [KeyboardInterrupt(), ShapeError("of another call")])
-def test_scenes_that_are_loaded_in_an_except_block(handled):
-    try:
-        raise handled
-    except (KeyboardInterrupt, ValueError):
-        room = make_room()
-        room["wall"] = {"type": "no_such_plugin"}
-        with pytest.raises(RuntimeError, match="no_such_plugin"):
-            mi.load_dict(room)
-        with pytest.raises(SceneError, match="no_such_plugin"):
-            tt.render(room, spp=1)
-
-
-# --------------------------------------------------------------------------------------------------- signals that wait
-
-KINDS = (signal.SIGTERM, signal.SIGALRM, signal.SIGUSR1)
-
-
-@pytest.fixture
-def handlers():
-    """Signals that raise; what they were is put back."""
-    before = {number: signal.getsignal(number) for number in KINDS}
-    heard = []
-
-    def hear(number, frame):
-        heard.append(number)
-        raise KeyboardInterrupt(number)
-
-    for number in KINDS:
-        signal.signal(number, hear)
-    yield heard, hear
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-def test_every_signal_that_waits_is_handled(handlers):
-    heard, hear = handlers
-    block = interrupts_wait()
-    block.__enter__()
-    for number in (*KINDS, signal.SIGALRM):
-        signal.raise_signal(number)
-    assert not heard
-    with pytest.raises(KeyboardInterrupt):
-        block.__exit__(None, None, None)
-    assert sorted(heard) == sorted(KINDS)
-    assert all(signal.getsignal(number) is hear for number in KINDS)
-
-
-def test_signals_while_handlers_are_put_back(handlers, monkeypatch):
-    """Each of them is put back, and heard, also where one has raised in between."""
-    heard, hear = handlers
-    own, put_back = signal.signal, []
-
-    def interrupted(number, handler):
-        found = own(number, handler)
-        if handler is hear and number not in put_back:
-            put_back.append(number)
-            signal.raise_signal(number)
-        return found
-
-    monkeypatch.setattr(signal, "signal", interrupted)
-    with pytest.raises(KeyboardInterrupt), interrupts_wait():
-        pass
-    monkeypatch.undo()
-    assert set(put_back) == set(KINDS) <= set(heard)
-    assert all(signal.getsignal(number) is hear for number in KINDS)

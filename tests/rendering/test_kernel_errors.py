@@ -11,7 +11,6 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import room
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.scene.variant import _reason, named_errors
 
 
 @pytest.fixture(autouse=True)
@@ -81,38 +80,3 @@ def test_forward_mode_beside_a_scene_with_attached_values():
     params["side.bsdf.reflectance.value"] = dr.detach(params["side.bsdf.reflectance.value"])
     params.update()
     assert slope() == pytest.approx(expected)
-
-
-@named_errors()
-def traced(reason):
-    """What Dr.Jit makes of an exception inside a loop."""
-    try:
-        raise reason
-    except type(reason) as error:
-        raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from error
-
-
-def test_the_first_reason_is_named():
-    with pytest.raises(SceneError, match=r"ValueError.*: no such lobe"):
-        traced(ValueError("no such lobe"))
-
-
-def test_the_deepest_cause_that_says_more():
-    """Of those that only say that something happened above, the deepest."""
-    above = [RuntimeError(f"{n} (see above)") for n in range(3)]
-    assert _reason(above) is above[2]
-    said = RuntimeError("no such lobe")
-    for chain in ([above[0], said, above[1]], [said], [above[0], RuntimeError("less deep"), said]):
-        assert _reason(chain) is said
-
-
-def test_errors_of_this_library_are_raised_as_they_are():
-    reason = GradientError("not this one")
-    with pytest.raises(GradientError) as found:
-        traced(reason)
-    assert found.value is reason
-
-
-def test_other_errors_are_left_alone():
-    with pytest.raises(RuntimeError, match=r"^elsewhere$"), named_errors():
-        raise RuntimeError("elsewhere")

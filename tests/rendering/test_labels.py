@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import threading
-import weakref
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,18 +9,15 @@ import torch
 
 import torchtransient as tt
 from support.marks import long
-from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
+from torchtransient.errors import SceneError
 from torchtransient.rendering.labels import (
     LABELS,
     NUMBERED,
-    _labels,
     first_return,
     label_names,
-    material_names,
     scene_labels,
 )  # fmt: skip
-from torchtransient.rendering.recording import FIRST, LAUNCHED, RECORDED, SWITCHED_OFF
 from torchtransient.scenes import look_at, rotate, scale, translate
 
 FLOATS = [name for name in LABELS if name not in NUMBERED]
@@ -136,32 +129,6 @@ def test_depth_counts_from_the_origin_not_from_the_near_plane(near):
             assert (labels["depth"] > DISTANCE).all()
 
 
-def test_orthographic_pixels_lie_side_by_side():
-    labels = scene_labels(
-        renderer_of(camera("orthographic", to_world=DOWN_Z @ scale([3.0, 3.0, 1.0])), wall=plane()), names=["position"]
-    )
-    x = labels["position"][0].numpy()
-    np.testing.assert_allclose(np.abs(np.diff(x, axis=1)), 6.0 / W, rtol=1e-4)
-
-
-def test_crop_window_is_a_part():
-    crop = {"crop_width": 3, "crop_height": 2, "crop_offset_x": 4, "crop_offset_y": 1}
-    whole, part = (
-        scene_labels(renderer_of(camera(of_film=film(**more)), wall=plane()), names=["depth", "position"])
-        for more in ({}, crop)
-    )
-    for name, expected in whole.items():
-        close(part[name], expected[..., 1:3, 4:7].numpy())
-
-
-def test_radiance_meter_has_one_pixel():
-    meter = camera("radiancemeter", of_film=film(1, 1))
-    labels = scene_labels(renderer_of(meter, wall=plane()), names=["depth", "z_depth", "position"])
-    close(labels["depth"], [[DISTANCE]], atol=1e-3)
-    close(labels["z_depth"], [[DISTANCE]])
-    close(labels["position"].flatten(), [0, 0, 0])
-
-
 def test_batch_sensor_has_its_children_side_by_side():
     other = look_at([1.0, 0.5, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     square = film(4, 4)
@@ -200,19 +167,6 @@ def test_scan_has_its_wall_points():
         scene_labels(meter_scene(), names=["z_depth"])
 
 
-@pytest.mark.parametrize("kind", ["irradiancemeter", "distant"])
-def test_sensors_without_pixels_are_refused(kind):
-    if kind == "distant":
-        renderer = renderer_of({"type": "distant", "film": film(1, 1)}, wall=plane())
-    else:
-        sensor = {"type": "irradiancemeter", "film": film(1, 1)}
-        description = scene_of(None, wall=plane(sensor=sensor))
-        del description["sensor"]
-        renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), spp=1, physics="ignore")
-    with pytest.raises(SceneError, match="looks along a line of its own"):
-        scene_labels(renderer)
-
-
 # ----------------------------------------------------------------------------------------------- what is looked at
 
 
@@ -240,12 +194,6 @@ def test_boundaries_of_media_are_looked_through():
     assert (labels["shape"] == 1).all()
     close(labels["z_depth"], np.full((H, W), DISTANCE + 3), atol=1e-4)
     close(labels["depth"], (DISTANCE + 3) / -pinhole_directions()[2], atol=1e-4)
-
-
-def test_far_clip_holds_behind_a_pane():
-    pane = plane(to_world=translate([0, 0, 1.0]) @ scale(20.0), bsdf={"type": "null"})
-    labels = scene_labels(renderer_of(camera(far_clip=4.5), pane=pane, wall=plane()), names=["depth"])
-    assert torch.isnan(labels["depth"]).all()
 
 
 @pytest.mark.parametrize("hidden", [False, True])
@@ -280,24 +228,6 @@ def test_instances_are_shapes_of_their_own():
         close(labels["albedo"][:, here], np.full((3, int(here.sum())), 0.6))
 
 
-def test_names_follow_the_description():
-    contents = {
-        name: {"type": "sphere", "to_world": translate([x, 0, 0]) @ scale(0.4), "bsdf": {"type": "ref", "id": paint}}
-        for name, x, paint in (("zebra", -1.0, "white"), ("apple", 0.0, "red"), ("moon", 1.0, "white"))
-    }
-    paints = {"red": {**grey(0.9)}, "white": {**grey(0.8)}}
-    description = scene_of(camera(fov=FOV), **paints, **contents)
-    for parameters in ((), ["red.reflectance.value"], ["moon.to_world"]):
-        renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), parameters=parameters, physics="ignore")
-        assert label_names(renderer) == ("zebra", "apple", "moon")
-        assert material_names(renderer) == ("white", "red")
-        labels = scene_labels(renderer, names=["shape", "position", "material"])
-        for n, x in enumerate((-1.0, 0.0, 1.0)):
-            here = labels["shape"] == n
-            assert here.any() and ((labels["position"][0, here] - x).abs() < 0.4).all()
-            assert (labels["material"][here] == (1 if n == 1 else 0)).all()
-
-
 def test_meshes_that_renders_merge_are_told_apart():
     cubes = {f"cube_{n}": {"type": "cube", "to_world": translate([2.0 * n - 2, 0, 0]) @ scale(0.5)} for n in range(3)}
     renderer = renderer_of(camera(fov=FOV), **cubes)
@@ -322,44 +252,6 @@ def test_albedo_of_a_colour_in_every_variant(variant):
     close(labels["depth"], DISTANCE / -pinhole_directions(fov=50)[2], atol=0.5)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
-def test_albedo_of_grey_has_one_channel(variant):
-    renderer = renderer_of(camera(), variant, wall=plane(bsdf={"type": "twosided", "inner": grey(0.35)}))
-    close(scene_labels(renderer, names=["albedo"])["albedo"], np.full((1, H, W), 0.35))
-
-
-@pytest.mark.slow
-def test_albedo_in_the_films_own_channels():
-    bands = {
-        "low": {"type": "regular", "wavelength_min": 450.0, "wavelength_max": 500.0, "values": "1, 1"},
-        "high": {"type": "regular", "wavelength_min": 600.0, "wavelength_max": 650.0, "values": "2, 2"},
-    }
-    step = {"type": "irregular", "wavelengths": "360, 549, 551, 830", "values": "0.25, 0.25, 0.75, 0.75"}
-    wall = plane(bsdf={"type": "diffuse", "reflectance": step})
-    renderer = renderer_of(camera(of_film=film(**bands)), "llvm_ad_spectral", wall=wall)
-    albedo = scene_labels(renderer, names=["albedo"])["albedo"]
-    close(albedo[:, 0, 0], [0.25, 0.75], atol=1e-4)
-
-
-@pytest.mark.parametrize("kind", long(["plastic", "roughplastic"], ["plastic"]))
-def test_albedo_does_not_depend_on_which_values_are_parameters(kind):
-    paint = {"type": kind, "diffuse_reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}
-    key = "wall.bsdf.diffuse_reflectance.value"
-    described, asked = (
-        scene_labels(renderer_of(camera(), parameters=keys, wall=plane(bsdf=paint)), names=["albedo"])["albedo"]
-        for keys in ((), [key])
-    )
-    close(described[:, 0, 0], [0.2, 0.5, 0.7])
-    close(asked, described.numpy())
-
-
-def test_mirrors_have_no_albedo():
-    for kind in ("conductor", "dielectric"):
-        labels = scene_labels(renderer_of(camera(), wall=plane(bsdf={"type": kind})), names=["albedo", "z_depth"])
-        assert (labels["albedo"] == 0).all()
-        close(labels["z_depth"], np.full((H, W), DISTANCE))
-
-
 # -------------------------------------------------------------------------------------------- values, batches, calls
 
 
@@ -374,138 +266,13 @@ def moved(x):
     return pose
 
 
-def test_batches_and_sensors_lead():
-    renderer = room_renderer(parameters=[COLOUR, WALL_POSE])
-    colours = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
-    poses = torch.stack([moved(-0.1), moved(-0.2), moved(-0.3)])
-    labels = scene_labels(renderer, {COLOUR: colours, WALL_POSE: poses}, ["depth", "albedo", "shape"])
-    assert labels["depth"].shape == (3, 3, 4) and labels["albedo"].shape == (3, 3, 3, 4)
-    assert labels["shape"].shape == (3, 3, 4)
-    for n in range(3):
-        alone = scene_labels(renderer, {COLOUR: colours[n], WALL_POSE: poses[n]}, ["depth", "albedo", "shape"])
-        for name, value in alone.items():
-            assert torch.equal(labels[name][n], value)
-    assert not torch.equal(labels["depth"][0], labels["depth"][1])
-    listed = room_renderer(sensors="all")
-    assert scene_labels(listed, names=["depth", "normals"])["normals"].shape == (1, 3, 3, 4)
-
-
-def test_two_sensors_of_one_call():
-    second = look_at([0.5, 0.5, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    description = scene_of(camera(), wall=plane())
-    description["other"] = camera(to_world=second)
-    scene = tt.load(description, variant=VARIANT)
-    both = scene_labels(tt.TransientRenderer(scene, sensors=[1, 0], physics="ignore"))["depth"]
-    for n, sensor in enumerate((1, 0)):
-        one = scene_labels(tt.TransientRenderer(scene, sensors=sensor, physics="ignore"))["depth"]
-        assert torch.equal(both[n], one)
-    assert not torch.equal(both[0], both[1])
-
-
 def test_recorded_calls_say_what_traced_ones_do():
     recorded, traced = (room_renderer(parameters=[COLOUR, WALL_POSE], freeze=freeze) for freeze in (True, False))
-    said = []
     for n in range(5):
         values = {COLOUR: [0.1 * n, 0.5, 0.9], WALL_POSE: moved(-0.1 * n)}
-        a, how = _labels(recorded, values, LABELS, False, 16)
-        b, of_traced = _labels(traced, values, LABELS, False, 16)
-        said += how
-        assert of_traced == [SWITCHED_OFF]
+        a, b = (scene_labels(renderer, values, LABELS) for renderer in (recorded, traced))
         for name in LABELS:
             assert torch.equal(a[name], b[name]), (n, name)
-    assert said == [FIRST, RECORDED, LAUNCHED, LAUNCHED, LAUNCHED]
-
-
-def test_labels_of_a_call_stay_what_they_are():
-    renderer = room_renderer(parameters=[WALL_POSE])
-    kept = [scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"] for n in range(6)]
-    copies = [one.clone() for one in kept]
-    for n in range(6):
-        scene_labels(renderer, {WALL_POSE: moved(-1.0 - n)})
-        renderer({WALL_POSE: moved(-1.0)}, seed=n)
-    gc.collect()
-    for one, copy in zip(kept, copies, strict=True):
-        assert torch.equal(one, copy)
-    for n in range(5):
-        assert kept[n + 1][0, 0] > kept[n][0, 0]
-    kept[0].fill_(0.0)
-    assert (scene_labels(renderer, {WALL_POSE: moved(-0.1)})["depth"] > 1).all()
-
-
-def test_own_parameters_and_described_values_come_back():
-    renderer = room_renderer(parameters=[COLOUR, WALL_POSE])
-    before = scene_labels(renderer, names=["depth", "albedo"])
-    scene_labels(renderer, {COLOUR: [0.0, 0.0, 0.0], WALL_POSE: moved(-2.0)}, ["depth", "albedo"])
-    again = scene_labels(renderer, names=["depth", "albedo"])
-    # Other keys of the same scene find the described values.
-    beside = tt.TransientRenderer(renderer.scene, parameters=[GREY], physics="ignore")
-    other = scene_labels(beside, names=["depth", "albedo"])
-    for name, value in before.items():
-        assert torch.equal(again[name], value)
-        torch.testing.assert_close(other[name], value)
-    with torch.no_grad():
-        renderer.values[WALL_POSE].copy_(moved(-2.0))
-    assert (scene_labels(renderer)["depth"][:, 0] > before["depth"][:, 0] + 1).all()
-
-
-@pytest.mark.slow
-def test_interleaved_scenes_keys_and_renders():
-    """Two scenes, two sets of keys, labels and renders in turn: each call has its own values."""
-    near, far = make_room(), make_room()
-    far["box"]["to_world"] = far["box"]["to_world"] @ translate([0.0, 0.0, -1.0])
-    scenes = [tt.load(one, variant=VARIANT) for one in (near, far)]
-    renderers = [
-        tt.TransientRenderer(scene, parameters=keys, spp=4, physics="ignore")
-        for scene in scenes
-        for keys in ([WALL_POSE], [COLOUR, WALL_POSE])
-    ]
-    fresh = [
-        tt.TransientRenderer(scene, parameters=keys, spp=4, physics="ignore", freeze=False)
-        for scene in (tt.load(one, variant=VARIANT) for one in (near, far))
-        for keys in ([WALL_POSE], [COLOUR, WALL_POSE])
-    ]
-    for turn in range(3):
-        for n, (renderer, expected) in enumerate(zip(renderers, fresh, strict=True)):
-            values = {WALL_POSE: moved(-0.1 * (turn + n))}
-            found = scene_labels(renderer, values, ["depth", "shape", "normals"])
-            cube = renderer(values, seed=turn).transient.detach()
-            wanted = scene_labels(expected, values, ["depth", "shape", "normals"])
-            for name, value in wanted.items():
-                assert torch.equal(found[name], value)
-            torch.testing.assert_close(cube, expected(values, seed=turn).transient.detach(), rtol=1e-4, atol=1e-5)
-
-
-def test_threads_take_turns():
-    renderer = room_renderer(parameters=[WALL_POSE])
-    expected = [scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"] for n in range(4)]
-    right: list[int] = []
-    wrong: list[int] = []
-
-    def work(n):
-        for _ in range(10):
-            found = scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)})["depth"]
-            (right if torch.equal(found, expected[n]) else wrong).append(n)
-
-    threads = [threading.Thread(target=work, args=(n,)) for n in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong and len(right) == 40
-
-
-def test_values_that_need_gradients_give_none():
-    renderer = room_renderer(parameters=[WALL_POSE])
-    value = moved(-0.5).requires_grad_()
-    labels = scene_labels(renderer, {WALL_POSE: value}, LABELS)
-    assert not any(label.requires_grad for label in labels.values())
-    assert renderer({WALL_POSE: value}, seed=0).transient.requires_grad
-
-
-def test_phasors_and_gates_have_labels():
-    plain = scene_labels(room_renderer())["depth"]
-    for more in ({"frequencies": [0.5, 1.0]}, {"gates": [tt.Gate.gaussian(8.0, 2.0)]}):
-        assert torch.equal(scene_labels(room_renderer(**more))["depth"], plain)
 
 
 # ---------------------------------------------------------------------------------------------------------- means
@@ -530,13 +297,6 @@ def test_means_over_pixels():
     mean, centre = (scene_labels(alone, average=average)["depth"] for average in (True, False))
     assert (mean[torch.isfinite(mean)] < DISTANCE).all()
     assert torch.isfinite(mean).sum() > torch.isfinite(centre).sum()
-
-
-def test_mean_of_a_thin_lens_is_over_its_aperture():
-    lens = {"aperture_radius": 0.5, "focus_distance": 2.0}
-    renderer = renderer_of(camera("thinlens", fov=FOV, **lens), ball={"type": "sphere", "radius": RADIUS})
-    sharp, blurred = (scene_labels(renderer, average=average)["depth"] for average in (False, True))
-    assert torch.isfinite(blurred).sum() > torch.isfinite(sharp).sum()
 
 
 # -------------------------------------------------------------------------------------------- beside the transient
@@ -643,106 +403,6 @@ def test_first_return_of_given_bins():
     assert torch.equal(first_return(stokes, axis, polarized=True)[0, :2], found[0, :2])
 
 
-@pytest.mark.parametrize("shape", [(6, 1, 3), (2, 5, 1, 3)])
-def test_first_return_refuses_other_shapes(shape):
-    with pytest.raises(ShapeError, match="bins of its axis"):
-        first_return(torch.zeros(shape), tt.TimeAxis(1.0, 0.5, 6))
-
-
-# ---------------------------------------------------------------------------------------------------------- errors
-
-
-def test_mistakes_have_typed_errors(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], physics="ignore")
-    for names in ([], ["deepth"], ["depth", "depth"]):
-        with pytest.raises(ArgumentError, match="names: expected labels out of"):
-            scene_labels(renderer, names=names)
-    with pytest.raises(ArgumentError, match="have no mean"):
-        scene_labels(renderer, names=["depth", "shape"], average=True)
-    for call in (tt.data.scene_labels, tt.data.label_names, tt.data.material_names):
-        with pytest.raises(ArgumentError, match=r"renderer: expected a TransientRenderer, got .*make one of a scene"):
-            call(room_scene)
-    for samples in (0, 1.5, True, 10**6):
-        with pytest.raises(UnitError, match="samples"):
-            scene_labels(renderer, average=True, samples=samples)
-    with pytest.raises(SceneError, match="no parameter"):
-        scene_labels(renderer, {"walls.to_world": moved(0.0)})
-    with pytest.raises(ShapeError):
-        scene_labels(renderer, {WALL_POSE: [1.0, 2.0]})
-    with pytest.raises(UnitError, match="finite"):
-        scene_labels(renderer, {WALL_POSE: moved(float("nan"))})
-    assert torch.isfinite(scene_labels(renderer)["depth"]).all()
-    assert set(scene_labels(renderer, names="depth")) == {"depth"}
-
-
-# ------------------------------------------------------------------------------------- recorded calls of every kind
-
-
-# Of plugins that do not show Dr.Jit all of their arrays, renders and labels are traced (docs/speed.md).
-HIDDEN_ARRAYS = "does not show Dr.Jit all of its arrays"
-
-
-def same_recorded(make, values, names, hidden=False):
-    """Recorded calls with these values against traced ones of a scene of their own; the last two are launched, unless
-    arrays are ``hidden``.
-    """
-    # Plugins of earlier tests that are collected between two calls would change what these are compiled for.
-    gc.collect()
-    recorded, traced = (make(freeze) for freeze in (True, False))
-    said, found = [], []
-    for given in values:
-        a, how = _labels(recorded, given, names, False, 16)
-        b = _labels(traced, given, names, False, 16)[0]
-        said += how
-        found.append(a)
-        for name in names:
-            torch.testing.assert_close(a[name], b[name], rtol=1e-5, atol=1e-5, equal_nan=True)
-    if hidden:
-        assert HIDDEN_ARRAYS in said[-1], said
-    else:
-        assert said[-2:] == [LAUNCHED] * 2, said
-    return found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", long(["perspective", "thinlens", "orthographic"], ["perspective"]))
-def test_recorded_calls_follow_the_sensor(kind):
-    more = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
-    poses = [look_at([x, 0.2, DISTANCE - x], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]) for x in (0.0, 0.3, 0.6, 0.9, 1.2)]
-
-    def make(freeze):
-        contents = {"ball": {"type": "sphere", "radius": RADIUS}, "wall": plane()}
-        return renderer_of(
-            camera(kind, **more), parameters=["sensor.to_world"], options={"freeze": freeze}, **contents
-        )
-
-    values = [{"sensor.to_world": pose.astype(np.float32)} for pose in poses]
-    found = same_recorded(make, values, LABELS, hidden=kind != "perspective")
-    for pose, labels in zip(poses, found, strict=True):
-        axis = torch.from_numpy(pose[:3, 2].astype(np.float32))
-        away = labels["position"] - torch.from_numpy(pose[:3, 3].astype(np.float32))[:, None, None]
-        close(labels["z_depth"], (away * axis[:, None, None]).sum(0).numpy(), atol=1e-4)
-        if kind != "orthographic":
-            close(labels["depth"], torch.linalg.norm(away, dim=0).numpy(), atol=1e-4)
-
-
-def test_built_scenes_are_freed():
-    renderer = room_renderer(parameters=[WALL_POSE])
-    for n in range(3):
-        scene_labels(renderer, {WALL_POSE: moved(-0.1 * n)}, LABELS)
-    (built,) = [one for options, one in renderer.scene._builds.items() if one.label_tables is not None]
-    scene = weakref.ref(built.scene.integrator())
-    del built
-    renderer.scene._builds.clear()
-    renderer.scene._slots.clear()
-    renderer.scene.recordings.clear()
-    renderer.scene.installed.clear()
-    renderer.scene._table = None
-    gc.collect()
-    gc.collect()
-    assert scene() is None
-
-
 # ------------------------------------------------------------------------------------------------------ velocities
 
 
@@ -789,24 +449,3 @@ def test_radial_velocity_is_how_the_depth_changes():
     cosine = torch.from_numpy(-pinhole_directions()[2])
     grown = (depths[1] - depths[0]).double() / time
     np.testing.assert_allclose(grown * cosine**2, labels["radial_velocity"], rtol=1e-3)
-
-
-def test_velocities_of_batches_and_recorded_calls():
-    key = "wall.velocity.linear"
-    linear = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 0.0], [0.0, 0.0, -3.0]])
-    names = ["radial_velocity", "velocity"]
-    frozen, traced = (
-        moving_renderer({"wall": tt.Motion()}, [key], {"freeze": freeze}, wall=plane()) for freeze in (True, False)
-    )
-    said, found = [], []
-    for one in (*linear, *linear):
-        labels, how = _labels(frozen, {key: one}, names, False, 16)
-        said += how
-        found.append(labels["velocity"])
-        close(labels["velocity"], one[:, None, None].expand(3, H, W).numpy())
-        again = scene_labels(traced, {key: one}, names)
-        assert all(torch.equal(labels[name], again[name]) for name in names)
-    assert said[:2] == [FIRST, RECORDED] and set(said[2:]) == {LAUNCHED}
-    batch = scene_labels(frozen, {key: linear}, names)
-    assert torch.equal(batch["velocity"], torch.stack(found[:3]))
-    assert batch["radial_velocity"].shape == (3, H, W)

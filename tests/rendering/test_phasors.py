@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
-
 import pytest
 import torch
 
 import torchtransient as tt
 from support.marks import long
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 AXIS = tt.FrequencyAxis.uniform(0.0, 0.15, 5)
 LIST = (0.3, 1.7, -0.4)
@@ -89,36 +85,6 @@ def test_the_origin_of_the_phase(histogram_scene):
     assert b.frequencies == late
     turned = a.phasor * torch.exp(2j * torch.pi * late.per_metre * 1.25)[:, None, None]
     torch.testing.assert_close(b.phasor, turned.to(torch.complex64), rtol=1e-5, atol=1e-6)
-
-
-def test_bad_settings(scene, histogram_scene):
-    with pytest.raises(ArgumentError, match="one of them"):
-        tt.render(histogram_scene, frequencies=LIST, time_axis=tt.TimeAxis(0.0, 0.1, 10))
-    with pytest.raises(ArgumentError, match="phasor film has none"):
-        tt.render(scene, temporal_filter="tent")
-    with pytest.raises(UnitError, match="finite"):
-        tt.render(scene, frequencies=[float("nan")])
-    with pytest.raises(ShapeError, match="at least one"):
-        tt.render(scene, frequencies=[])
-    with pytest.raises(UnitError, match="a finite number"):
-        tt.render(scene, frequencies=["fast"])
-
-
-def test_batch_and_sensors_come_first():
-    room = phasor_room()
-    room["sensor_2"] = copy.deepcopy(room["sensor"])
-    renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[COLOUR], spp=4, sensors="all")
-    values = torch.rand(5, 3, generator=torch.Generator().manual_seed(1))
-    out = renderer({COLOUR: values}, seed=0)
-    assert out.phasor.shape == (5, 2, 3, 3, 3, 4) and out.steady.shape == (5, 2, 3, 3, 4)
-    first = tt.TransientRenderer(tt.load(room, variant=VARIANT), parameters=[COLOUR], spp=4)
-    torch.testing.assert_close(first({COLOUR: values[0]}, seed=0).phasor, out.phasor[0, 0])
-
-
-def test_it_is_the_films_own_memory(scene):
-    out = tt.render(scene, seed=0)
-    storage = torch.view_as_real(out.phasor)
-    assert storage.permute(2, 3, 1, 0, 4).is_contiguous() and not out.phasor.is_contiguous()
 
 
 # ----------------------------------------------------------------------------------------------- derivatives
@@ -202,15 +168,6 @@ def test_vmap_and_jacobians(scene):
 
     forward, reverse = torch.func.jacfwd(power)(values[0]), torch.func.jacrev(power)(values[0])
     torch.testing.assert_close(forward, reverse, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_copies_and_pickles_keep_the_frequencies(histogram_scene):
-    renderer = tt.TransientRenderer(histogram_scene, parameters=[COLOUR], frequencies=AXIS)
-    expected = renderer(seed=1).phasor
-    for twin in (copy.deepcopy(renderer), pickle.loads(pickle.dumps(renderer))):
-        torch.testing.assert_close(twin(seed=1).phasor, expected)
-    assert "frequencies=FrequencyAxis(5" in repr(renderer)
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from support.mitsuba_room import FILM, as_mitsuba
 from tools.small_room import VARIANT as VARIANT
 from tools.small_room import make_room
 from torchtransient import plugins
-from torchtransient.errors import SceneError
 from torchtransient.plugins import _registry
 
 MODULE = "support.plugins_of_ones_own"
@@ -81,15 +80,3 @@ def test_files_name_the_kind_of_every_plugin(tmp_path):
         assert tag in text
     assert '<bsdf type="bare"' in text and '<emitter type="bare_light"' in text
     assert again.parameters()[KEYS[0]].value == 2.5 and again.parameters().keys() == scene.parameters().keys()
-
-
-def test_integrators_of_images_are_refused_by_the_layer_and_taken_by_mitsuba():
-    with pytest.raises(SceneError, match="the integrator Flat renders images"):
-        tt.TransientRenderer(tt.load(room("flat"), variant=VARIANT))(seed=0)
-    assert np.all(np.array(mi.render(mi.load_dict(as_mitsuba(room("flat"))), spp=1)) == 1)
-
-
-def test_an_integrator_that_nobody_has_told_of():
-    mi.register_integrator("stranger", lambda props: mi.load_dict({"type": "transient_path"}))
-    with pytest.raises(SceneError, match=r"neither knows.*plugins\.register_module"):
-        tt.TransientRenderer(tt.load(room("stranger"), variant=VARIANT))(seed=0)

@@ -3,32 +3,93 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
-from support import foreign_paint
 from support.marks import long_rows
 from tools.small_room import GREY, VARIANT, WALL_POSE, make_room
 from torchtransient.rendering.recording import LAUNCHED, OWN_ENTRY
-from torchtransient.scene.variant import active_variant
 
 KEY = "wall.bsdf.value"
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    with active_variant(VARIANT):
-        yield
+class Slotted:
+    __slots__ = ("gain",)
+
+    def __init__(self, gain: float) -> None:
+        self.gain = gain
 
 
-def painted(kept, says=True, lazy=False):
+# A number as a plugin may keep it: (made of it, read again).
+KEPT = {
+    "float": (float, float),
+    "list": (lambda x: [x], lambda c: c[0]),
+    "slots": (Slotted, lambda c: c.gain),
+    "function": (lambda x: lambda: x, lambda c: c()),
+    "NumPy": (lambda x: np.full(5000, x), lambda c: float(c[0])),
+    "torch": (lambda x: torch.full((5000,), x), lambda c: float(c[2500])),
+    "generator": (lambda x: (x for _ in range(10**6)), next),
+    "array of Dr.Jit in a plain object": (lambda x: SimpleNamespace(gain=dr.opaque(mi.Float, x)), lambda c: c.gain),
+}
+
+
+def registered(kept, says):
+    """Name of a diffuse BSDF in Python with one way of keeping, which says whether it can be recorded."""
+    make, read = KEPT[kept]
+
+    class Paint(mi.BSDF):
+        can_be_recorded = says
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.value = mi.Float(0.5)
+            self.m_flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [self.m_flags]
+            self.parameters_changed()
+
+        def traverse(self, cb):
+            cb.put("value", self.value, +mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys=()):
+            self.cache = make(float(np.array(mi.Float(dr.detach(self.value)))[0]))
+
+        def gain(self):
+            return mi.Float(read(self.cache))
+
+        def sample(self, ctx, si, u, v, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.warp.square_to_cosine_hemisphere(v)
+            bs.pdf, bs.eta = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo), mi.Float(1)
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            return bs, mi.Spectrum(self.gain()) & active
+
+        def eval(self, ctx, si, wo, active=True):
+            return mi.Spectrum(self.gain() * self.pdf(ctx, si, wo, active))
+
+        def pdf(self, ctx, si, wo, active=True):
+            return dr.select((si.wi.z > 0) & (wo.z > 0), mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self):
+            return "Paint[]"
+
+    name = f"paint_{abs(hash((kept, says)))}"
+    mi.register_bsdf(name, Paint)
+    return name
+
+
+def painted(kept, says):
     """The same room with a wall in the paint, traced and recorded."""
     room = make_room()
-    room["wall"]["bsdf"] = {"type": foreign_paint.register(kept, says, lazy)}
+    room["wall"]["bsdf"] = {"type": registered(kept, says)}
     scene = tt.load(room, variant=VARIANT)
     return [tt.TransientRenderer(scene, parameters=[KEY], spp=2, physics="ignore", freeze=f) for f in (False, True)]
 
@@ -45,7 +106,7 @@ SAYS = [(kept, True) for kept in (
 )] + [("float", False)]  # fmt: skip
 
 
-@pytest.mark.parametrize(("kept", "says"), long_rows(itertools.product(foreign_paint.KEPT, [False, True]), SAYS))
+@pytest.mark.parametrize(("kept", "says"), long_rows(itertools.product(KEPT, [False, True]), SAYS))
 def test_whatever_a_plugin_keeps(kept, says):
     traced, recorded = painted(kept, says)
     said = []
@@ -62,42 +123,6 @@ def test_whatever_a_plugin_keeps(kept, says):
         # Of the same number the kernels are launched; arrays that are handed over need not even be that.
         assert said[2] == LAUNCHED
         assert (said[3] == LAUNCHED) == (kept == "array of Dr.Jit in a plain object")
-
-
-def test_an_attribute_that_changes_its_type_is_an_error():
-    traced, recorded = painted("float", lazy=True)
-
-    def fail():
-        for value in (0.5, 0.5, 0.5, 0.9):
-            steady(recorded, value)
-
-    with pytest.raises(tt.errors.SceneError, match="changed the type of an attribute"):
-        fail()
-    # Nothing of it is left in the scene.
-    fresh = painted("float", lazy=True)[0]
-    assert steady(traced, 0.9)[0] == pytest.approx(steady(fresh, 0.9)[0], rel=1e-6)
-
-
-def test_a_film_with_storage_of_its_own_is_not_lent_another():
-    import drjit as dr
-    import mitsuba as mi
-
-    from torchtransient.plugins.films.histogram import TransientHDRFilm
-
-    class OwnStorage(TransientHDRFilm):
-        def prepare(self, aovs=(), samples=0):
-            height, width = self.cube_shape()[:2]
-            self.bands = [(0, height, dr.zeros(mi.Float, height * width * self.entries_per_pixel()))]
-            self.steady, self.outside = dr.zeros(mi.Float, height * width * 3), dr.zeros(mi.Float, height * width * 2)
-            return 3
-
-    built = tt.load(make_room(), variant=VARIANT)
-    renderer = tt.TransientRenderer(built, parameters=[GREY], spp=2)
-    film = renderer.scene.built(renderer._options).scene.sensors()[0].film()
-    assert film.can_borrow(2)
-    film.__class__ = OwnStorage
-    assert not film.can_borrow(2)
-    assert "OwnStorage does not say" in renderer(seed=0).stats.recorded[0]
 
 
 def test_a_render_of_an_integrators_own_is_called():
@@ -122,59 +147,6 @@ def test_a_render_of_an_integrators_own_is_called():
 
 
 # -------------------------------------------------------------------------------------------- what is told apart
-
-
-LOOSE = {
-    "diffuse": {},
-    "dielectric": {},
-    "mask": {"opacity": {"type": "uniform", "value": 0.3}, "inner": {"type": "diffuse"}},
-    "principled": {},
-    "retroreflector": {},
-    "uniform": {"value": 0.3},
-    "bitmap": {"data": np.full((4, 4, 1), 0.5, np.float32), "raw": True},
-    "constant": {},
-    "area": {},
-    "homogeneous": {},
-    "hg": {},
-    "perspective": {},
-    "sphere": {"bsdf": {"type": "diffuse"}},
-    "constvolume": {"value": 0.5},
-    "transient_hdr_film": {},
-}
-
-
-ALONE = [pytest.param([kind], id=kind, marks=pytest.mark.slow) for kind in LOOSE]
-
-
-@pytest.mark.parametrize("kinds", [pytest.param(list(LOOSE), id="all", marks=pytest.mark.slow), *ALONE])
-def test_plugins_of_no_scene(kinds):
-    """A method call is compiled for every plugin of a kind that is alive, of a scene or not."""
-    import mitsuba as mi
-
-    def made():
-        return [mi.load_dict({"type": kind, **LOOSE[kind]}) for kind in kinds]
-
-    before = made()
-    traced, recorded = (
-        tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[GREY], spp=2, freeze=freeze)
-        for freeze in (False, True)
-    )
-    after = made()
-    for seed in range(6):
-        out, expected = recorded(seed=seed), traced(seed=seed)
-        torch.testing.assert_close(out.transient, expected.transient, rtol=1e-5, atol=0)
-        (found,) = torch.autograd.grad(out.transient.sum(), recorded.values[GREY])
-        (wanted,) = torch.autograd.grad(expected.transient.sum(), traced.values[GREY])
-        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=0)
-    assert out.stats.recorded == (LAUNCHED,)
-    # They may go, and others come, between two calls.
-    del before
-    again = made() + made()
-    del after
-    for seed in range(6):
-        out = recorded(seed=seed)
-        torch.testing.assert_close(out.transient, traced(seed=seed).transient, rtol=1e-5, atol=0)
-    assert out.stats.recorded == (LAUNCHED,) and again
 
 
 def test_gradients_that_an_integrator_leaves_at_parameters_arrive():

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 
-import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from tools.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
 from torchtransient.errors import TorchTransientWarning
-from torchtransient.rendering import memory
 from torchtransient.rendering.job import mix_seed
-from torchtransient.scene.variant import active_variant
 
 START = torch.tensor([0.8, 0.5, 0.2])
 
@@ -89,16 +86,6 @@ def test_function_takes_a_dictionary_and_no_values():
     assert out.steady.min() > 0 and not out.steady.requires_grad
 
 
-def test_start_values_may_be_given(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: [0.1, 0.2, 0.3], GREY: None}, spp=4)
-    torch.testing.assert_close(renderer.values[COLOUR].detach(), torch.tensor([0.1, 0.2, 0.3]))
-    assert float(renderer.values[GREY].detach()) == 0.5
-    assert [name for name, _ in renderer.named_parameters()] == [
-        "box/bsdf/reflectance/value",
-        "wall/bsdf/reflectance/value",
-    ]
-
-
 # ------------------------------------------------------------------------------------------------- seeds, batches
 
 
@@ -122,12 +109,6 @@ def test_entries_of_a_batch_have_their_own_noise(room_scene):
     assert not torch.equal(out.transient[0], out.transient[1])
     for seed, entry in zip(out.stats.seeds, out.transient, strict=True):
         assert torch.equal(entry, renderer({COLOUR: x}, seed=seed).transient)
-
-
-def test_batch_of_one_keeps_its_dimension(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, GREY], spp=4)
-    assert renderer({GREY: torch.tensor([0.4])}, seed=0).transient.shape == (1, 3, 24, 3, 4)
-    assert renderer({GREY: torch.tensor(0.4)}, seed=0).transient.shape == (3, 24, 3, 4)
 
 
 @pytest.mark.parametrize(("key", "shape"), [(GREY, ()), (COLOUR, (3,)), (WALL_POSE, (4, 4)), ("light.position", (3,))])
@@ -177,19 +158,6 @@ def test_gradients_of_several_sensors_add_up():
     torch.testing.assert_close(gradient("all", 2, weight), expected)
 
 
-def test_sensors_of_different_size_are_refused():
-    scene = tt.load(two_sensor_room(second_width=5), variant=VARIANT)
-    assert tt.TransientRenderer(scene, sensors=1, spp=4)(seed=0).steady.shape == (3, 3, 5)
-    with pytest.raises(tt.errors.SceneError, match=r"one shape.*one TransientRenderer per sensor"):
-        tt.TransientRenderer(scene, sensors="all")
-
-
-@pytest.mark.parametrize("sensors", [1, -1, [0, 7]])
-def test_unknown_sensor(room_scene, sensors):
-    with pytest.raises(tt.errors.ArgumentError, match="the scene has 1"):
-        tt.TransientRenderer(room_scene, sensors=sensors)
-
-
 # ------------------------------------------------------------------------------------------------ temporal filter
 
 
@@ -201,13 +169,6 @@ def test_automatic_filter(room_scene):
     for key in (WALL_POSE, "light.position", "box.vertex_positions", "box.to_world", "sensor.to_world"):
         assert chosen([COLOUR, key]) == "tent"
     assert chosen([WALL_POSE], temporal_filter="gaussian") == "gaussian"
-
-
-def test_automatic_filter_keeps_a_smooth_one_of_the_scene(room):
-    room["sensor"]["film"]["temporal_filter"] = "gaussian"
-    scene = tt.load(room, variant=VARIANT)
-    assert tt.TransientRenderer(scene, parameters=[WALL_POSE]).effective_filter == "gaussian"
-    assert tt.TransientRenderer(scene).effective_filter == "gaussian"
 
 
 def test_filter_of_one_renderer_does_not_reach_another(room_scene):
@@ -229,18 +190,6 @@ def test_gradient_of_a_length_through_a_box_is_refused(room_scene):
     renderer.values[WALL_POSE].requires_grad_(False)
     renderer(seed=0).transient.sum().backward()
     assert renderer.values[COLOUR].grad.abs().min() > 0
-
-
-def test_derivative_of_a_length_through_a_box_is_refused_in_functional_transforms(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[WALL_POSE], spp=4, temporal_filter="box")
-    x = renderer.values[WALL_POSE].detach()
-
-    def total(value):
-        return renderer({WALL_POSE: value}, seed=0).steady.sum()
-
-    for derivative in (torch.func.grad(total), torch.func.jacfwd(total)):
-        with pytest.raises(tt.errors.GradientError, match="has no slope"):
-            derivative(x)
 
 
 # -------------------------------------------------------------------------------------------------------- errors
@@ -268,42 +217,10 @@ def test_wrong_shapes(room_scene):
         tt.TransientRenderer(room_scene, parameters={COLOUR: torch.rand(2, 3)})
 
 
-@pytest.mark.parametrize(
-    "value",
-    [[0.25, 0.5, 0.75], (0.25, 0.5, 0.75), np.array([0.25, 0.5, 0.75], np.float16), [torch.tensor(0.25), 0.5, 0.75]],
-)
-def test_values_that_are_no_tensors(room_scene, value):
-    renderer = tt.TransientRenderer(room_scene, parameters={COLOUR: value, GREY: 0.125}, spp=4)
-    expected = renderer({COLOUR: torch.tensor([0.25, 0.5, 0.75]), GREY: torch.tensor(0.125)}, seed=0)
-    assert torch.equal(renderer(seed=0).transient, expected.transient)
-    assert torch.equal(renderer({COLOUR: value, GREY: np.float64(0.125)}, seed=0).transient, expected.transient)
-    assert torch.equal(tt.render(room_scene, {COLOUR: value, GREY: 0.125}, spp=4, seed=0).steady, expected.steady)
-    batch = renderer({COLOUR: [[0.25, 0.5, 0.75], [0, 1, 0]], GREY: [0.125, 1]}, seed=0)
-    assert torch.equal(batch.transient[0], expected.transient)
-
-
 def test_gradients_reach_numbers_inside_lists(room_scene):
     red = torch.tensor(0.25, requires_grad=True)
     tt.render(room_scene, {COLOUR: [red, 0.5, 0.75]}, spp=4, seed=0).steady.sum().backward()
     assert red.grad > 0
-
-
-@pytest.mark.parametrize(
-    "value",
-    [torch.zeros(3, dtype=torch.complex64), torch.zeros(3).bool(), [True, False], [[1, 2], [3]], "red", object()],
-)
-def test_values_that_are_no_real_numbers(room_scene, value):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
-    with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
-        renderer({COLOUR: value}, seed=0)
-    with pytest.raises(tt.errors.ShapeError, match=COLOUR.replace(".", r"\.")):
-        tt.TransientRenderer(room_scene, parameters={COLOUR: value})
-
-
-def test_none_is_no_value(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
-    with pytest.raises(tt.errors.ShapeError, match="got None"):
-        renderer({COLOUR: None}, seed=0)
 
 
 def test_parameters_are_set_by_their_keys(room_scene):
@@ -318,12 +235,6 @@ def test_parameters_are_set_by_their_keys(room_scene):
     assert "box.colour" not in renderer.values and renderer.values.get("box.colour") is None
 
 
-def test_wrong_device(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
-    with pytest.raises(tt.errors.DeviceError, match=r"expected a tensor on 'cpu'.*got 'meta'"):
-        renderer({COLOUR: torch.zeros(3, device="meta")}, seed=0)
-
-
 def test_values_that_are_not_finite(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     with pytest.raises(tt.errors.UnitError, match="1 of 3 that are NaN or infinite"):
@@ -336,47 +247,11 @@ def test_undeclared_value(room_scene):
         renderer({GREY: torch.tensor(0.1)}, seed=0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "error", "message"),
-    [
-        ({"effects": "polarization"}, tt.errors.ArgumentError, "'auto' or a plan"),
-        ({"temporal_filter": "hat"}, tt.errors.ArgumentError, "box, tent, gaussian"),
-        ({"parameters": COLOUR}, tt.errors.ArgumentError, "expected a list of keys"),
-        ({"parameters": [COLOUR, COLOUR]}, tt.errors.SceneError, "both set"),
-        ({"spp": 0}, tt.errors.UnitError, "spp: expected a positive integer"),
-        ({"spp_grad": 2.5}, tt.errors.UnitError, "spp_grad: expected a positive integer"),
-        ({"grad_seed": "other"}, tt.errors.ArgumentError, "None, 'same' or an integer"),
-        ({"sensors": "some"}, tt.errors.ArgumentError, "an index, a list of indices or 'all'"),
-        ({"sensors": []}, tt.errors.ArgumentError, "an index, a list of indices or 'all'"),
-        ({"max_depth": -3}, tt.errors.ArgumentError, "max_depth"),
-        ({"time_axis": (6.0, 0.1, 8)}, tt.errors.ArgumentError, "expected a tt.TimeAxis, got tuple"),
-    ],
-)
-def test_bad_settings(room_scene, settings, error, message):
-    with pytest.raises(error, match=message):
-        tt.TransientRenderer(room_scene, **settings)
-
-
 def test_cube_that_does_not_fit_is_refused_before_it_is_allocated(room):
     room["sensor"]["film"].update(width=4096, height=4096, temporal_bins=60000)
     renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=1)
     with pytest.raises(tt.errors.StorageError, match=r"10\.99 TiB \(H x W x T x C = 4096 x 4096 x 60000 x 3"):
         renderer(seed=0)
-
-
-def test_batch_that_does_not_fit_counts_all_its_films(monkeypatch):
-    cube = 3 * 4 * 24 * 3 * 4
-    monkeypatch.setattr(memory, "available_bytes", lambda variant: 3 * cube)
-    monkeypatch.setattr(memory, "_SMALL", 0)
-    memory.check_fits((3, 4, 24, 3), 1, VARIANT)
-    memory.check_fits((3, 4, 24, 3), 2, VARIANT)
-    with pytest.raises(tt.errors.StorageError, match="4 of them for 3 renders"):
-        memory.check_fits((3, 4, 24, 3), 3, VARIANT)
-
-
-def test_available_memory_is_known_here():
-    available = memory.available_bytes(VARIANT)
-    assert available is not None and 2**20 < available < 2**50
 
 
 def small_bands(monkeypatch):
@@ -398,64 +273,14 @@ def small_launches(monkeypatch):
 def test_jobs_of_several_passes(room_scene, monkeypatch, split):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=512, grad_seed="same")
     x = renderer.values[COLOUR]
-    with active_variant(VARIANT):
-        whole = renderer(seed=0).transient
-        whole_slope = torch.autograd.grad(whole.sum(), x)[0]
-        split(monkeypatch)
-        several = renderer(seed=0).transient
-        slope = torch.autograd.grad(several.sum(), x)[0]
-        pushed = torch.func.jvp(lambda y: renderer({COLOUR: y}, seed=0).transient.sum(), (START,), (torch.ones(3),))[1]
+    whole = renderer(seed=0).transient
+    whole_slope = torch.autograd.grad(whole.sum(), x)[0]
+    split(monkeypatch)
+    several = renderer(seed=0).transient
+    slope = torch.autograd.grad(several.sum(), x)[0]
+    pushed = torch.func.jvp(lambda y: renderer({COLOUR: y}, seed=0).transient.sum(), (START,), (torch.ones(3),))[1]
     assert several.shape == whole.shape and not torch.equal(several, whole)
     # Every pass has its own samples: amounts can be compared, row by row.
     torch.testing.assert_close(several.sum((0, 1, 3)), whole.sum((0, 1, 3)), rtol=0.05, atol=0)
     torch.testing.assert_close(slope, whole_slope, rtol=0.05, atol=0)
     torch.testing.assert_close(pushed, slope.sum(), rtol=1e-4, atol=0)
-
-
-def test_statistics_tell_the_samples_that_are_drawn(room):
-    room["sensor"]["sampler"] = {"type": "stratified", "sample_count": 16}
-    stats = tt.TransientRenderer(tt.load(room, variant=VARIANT), spp=10)(seed=0).stats
-    assert stats.spp == 16
-
-
-def test_outputs_inside_of_vmap_are_shown(room_scene):
-    """Their tensors have no numbers; the share of light outside of a short window is that of all entries."""
-    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.25, num_bins=2)
-    renderer = tt.TransientRenderer(room_scene, [GREY], time_axis=axis, spp=4, physics="ignore")
-    shown = []
-
-    def render(value):
-        out = renderer({GREY: value}, seed=0)
-        shown.append(repr(out))
-        return out.steady
-
-    values = torch.tensor([0.2, 0.4])
-    torch.func.vmap(render)(values)
-    share = sum(renderer({GREY: values}, seed=[0, 0]).outside)
-    assert "4 spp" in shown[0] and f"{share:.2%} of the light outside" in shown[0]
-
-
-def test_progress_bar(room_scene, capsys):
-    tt.TransientRenderer(room_scene, spp=4)(seed=0, progress=True)
-    assert "100%" in capsys.readouterr().err
-    tt.TransientRenderer(room_scene, spp=4)(seed=0)
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("seed", [np.int64(5), np.uint32(5), torch.tensor(5), 5 + 2**32, 5 - 2**32])
-def test_whole_numbers_of_any_type_are_seeds(room_scene, seed):
-    renderer = tt.TransientRenderer(room_scene, parameters=[], spp=2)
-    torch.testing.assert_close(renderer(seed=seed).transient, renderer(seed=5).transient)
-
-
-@pytest.mark.parametrize("seed", [1.5, "5", torch.tensor(1.5)])
-def test_other_seeds_are_refused(room_scene, seed):
-    with pytest.raises(ValueError, match="seed: expected a whole number"):
-        tt.TransientRenderer(room_scene, parameters=[], spp=2)(seed=seed)
-
-
-@pytest.mark.parametrize("values", [0, 1, False, [], (), [0.1, 0.2, 0.3], torch.ones(3), "seed"], ids=repr)
-def test_values_that_are_no_mapping(room_scene, values):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
-    with pytest.raises(tt.errors.ArgumentError, match="expected a mapping from keys to values"):
-        renderer(values)

@@ -10,7 +10,6 @@ import torch
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.rendering import engine
-from torchtransient.scene.variant import active_variant
 
 
 def resident_bytes(field: str = "VmRSS") -> int:
@@ -54,10 +53,9 @@ def test_peak_of_render_and_backward_is_one_cube_each():
     scene = tt.load(big_room(4096), variant=VARIANT)
     renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=4, freeze=False)
     renderer(seed=0).transient.square().sum().backward()
-    with active_variant(VARIANT):
-        import drjit as dr
+    import drjit as dr
 
-        dr.flush_malloc_cache()
+    dr.flush_malloc_cache()
     gc.collect()
     before = resident_bytes()
     reset_peak()
@@ -94,32 +92,29 @@ def test_memory_is_flat_over_200_steps(training):
         training(seed)
     gc.collect()
     before = resident_bytes()
-    with active_variant(VARIANT):
-        import drjit as dr
+    import drjit as dr
 
-        variables = len(dr.whos(as_string=True).splitlines())
+    variables = len(dr.whos(as_string=True).splitlines())
     for seed in range(20, 220):
         training(seed)
     gc.collect()
     growth = resident_bytes() - before
     assert growth < 4 * 2**20, f"{growth / 2**20:.1f} MiB in 200 steps"
-    with active_variant(VARIANT):
-        assert len(dr.whos(as_string=True).splitlines()) <= variables
-        assert "scatter" not in dr.whos_ad(as_string=True)
+    assert len(dr.whos(as_string=True).splitlines()) <= variables
+    assert "scatter" not in dr.whos_ad(as_string=True)
 
 
 def test_nothing_is_compiled_after_three_steps(training):
     """They are traced, recorded and launched; small kernels beside a recording differ where it is launched."""
-    with active_variant(VARIANT):
-        import drjit as dr
+    import drjit as dr
 
-        for seed in range(10, 13):
+    for seed in range(10, 13):
+        training(seed)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for seed in range(2, 8):
             training(seed)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            for seed in range(2, 8):
-                training(seed)
-            history = dr.kernel_history()
+        history = dr.kernel_history()
     kernels = [entry for entry in history if entry["type"] == dr.KernelType.JIT]
     assert len(kernels) >= 12
     missed = [entry for entry in kernels if not entry["cache_hit"]]
@@ -128,10 +123,9 @@ def test_nothing_is_compiled_after_three_steps(training):
 
 def test_no_graph_is_left_behind(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, WALL_POSE], spp=4)
-    with active_variant(VARIANT):
-        import drjit as dr
+    import drjit as dr
 
-        empty = len(dr.whos_ad(as_string=True).splitlines())
-        for seed in range(3):
-            renderer(seed=seed).transient.square().sum().backward()
-        assert len(dr.whos_ad(as_string=True).splitlines()) == empty
+    empty = len(dr.whos_ad(as_string=True).splitlines())
+    for seed in range(3):
+        renderer(seed=seed).transient.square().sum().backward()
+    assert len(dr.whos_ad(as_string=True).splitlines()) == empty

@@ -13,12 +13,10 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import UnitError
-from torchtransient.plugins import drjit_pool
 from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
 
-VARIANT = "llvm_ad_rgb"
+VARIANT = 'llvm_ad_rgb'
 
 
 @pytest.fixture(autouse=True)
@@ -64,66 +62,6 @@ def test_a_context_puts_back_what_was():
     with tt.threads():
         tt.threads(1)
     assert tt.threads() == module.Threads(torch=2, drjit=3)
-
-
-@pytest.mark.parametrize("n", [0, -1, True, False, 1.0, 1.5, "2", 1025, 2**40, torch.tensor(2.0)])
-def test_what_is_no_number_of_threads(n):
-    before = tt.threads()
-    with pytest.raises(UnitError, match="whole number from 1 to 1024"):
-        tt.threads(n)
-    assert tt.threads() == before
-
-
-class Asleep:
-    """A nanothread whose thread falls asleep while it is told to end: it ends when a task wakes it."""
-
-    def __init__(self, takes):
-        self.woken, self.takes, self.released = threading.Event(), takes, []
-
-    def pool_set_size(self, pool, size, start_parked):
-        assert self.woken.wait(20), "nobody wakes the thread that is waited for"
-        if self.takes:
-            dr.set_thread_count(size)
-
-    def task_submit_dep(self, *arguments):
-        self.woken.set()
-        return 5
-
-    def task_release(self, task):
-        self.released.append(task)
-
-
-@pytest.mark.parametrize("takes", [True, False])
-def test_a_thread_that_falls_asleep_while_it_is_told_to_end_is_woken(monkeypatch, takes):
-    """Dr.Jit waited for it for ever, once in a hundred thousand times."""
-    before, asleep = tt.threads(3), Asleep(takes)
-    with before, monkeypatch.context() as patch:
-        patch.setattr(drjit_pool, "_nanothread", lambda: asleep)
-        patch.setattr(drjit_pool, "WAKE_S", 0.01)
-        assert tt.threads(2).drjit == 2 and asleep.released
-        assert not [t for t in threading.enumerate() if "wakes" in t.name]
-
-
-@pytest.mark.slow
-def test_threads_are_woken_by_a_task():
-    """Of the pool itself: tasks that do nothing, submitted all the time, leave it as it is."""
-    assert drjit_pool._nanothread() is not None
-    ended = threading.Lock()
-    ended.acquire()
-    helper = threading.Thread(target=drjit_pool._wake, args=(drjit_pool._nanothread(), ended))
-    with tt.threads(2), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drjit_pool, "WAKE_S", 1e-4)
-        patch.setattr(drjit_pool, "MOST_WAKES", 10**9)
-        helper.start()
-        try:
-            for count in (1, 3, 2) * 20:
-                assert tt.threads(count).drjit == count
-                x = dr.arange(dr.llvm.Float, 200_000) + count
-                assert dr.sum(x)[0] == pytest.approx(200_000 * (199_999 / 2 + count), rel=1e-5)
-        finally:
-            assert helper.is_alive()
-            ended.release()
-            helper.join()
 
 
 def test_renders_of_other_threads_end_first():
@@ -267,45 +205,3 @@ def test_pictures_of_scenes_are_read_by_one_thread(tmp_path):
         print(tt.plan(scene, time_axis=tt.TimeAxis(0.0, 1.0, 4)).variant, tt.threads().drjit)
     """
     assert run(script) == ["0.25", "1", "llvm_ad_mono", "1"]
-
-
-@pytest.mark.slow
-def test_films_write_pictures_by_one_thread(tmp_path):
-    script = f"""
-        import torchtransient as tt
-        import mitsuba as mi
-        mi.set_variant("llvm_ad_rgb")
-        scene = mi.load_dict(tt.scenes.cornell_box())
-        tt.threads(1)
-        mi.render(scene, spp=1)
-        scene.sensors()[0].film().write({str(tmp_path / "steady.exr")!r})
-        print(tt.threads().drjit)
-    """
-    assert run(script) == ["1"]
-    assert (tmp_path / "steady.exr").stat().st_size > 1000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("parent", "child", "said"),
-    # A parent that has only asked has no threads to leave behind.
-    [("3", "1", "True"), ("", "3", "3")],
-)
-def test_a_forked_child_of_a_process_with_a_pool_is_told(parent, child, said):
-    if not hasattr(os, "fork"):
-        pytest.skip("needs fork")
-    script = """
-        import os, warnings
-        warnings.simplefilter("ignore")
-        import torchtransient as tt
-        tt.threads({parent})
-        child = os.fork()
-        if child == 0:
-            try:
-                print(tt.threads({child}).drjit, flush=True)
-            except tt.errors.VariantError as error:
-                print("spawn" in str(error), flush=True)
-            os._exit(0)
-        print("ended", os.waitpid(child, 0)[1])
-    """
-    assert run(script.format(parent=parent, child=child)) == [said, "ended", "0"]

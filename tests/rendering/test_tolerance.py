@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError
 
 VARIANT = "llvm_ad_rgb"
 KEY = "red.reflectance.value"
@@ -87,12 +87,6 @@ def test_the_error_is_the_formula(result, passes):
     assert str(result.passes) in result.reason
 
 
-def test_same_seed_same_passes(renderer, result):
-    assert same_mean(to_tolerance(renderer, seed=3), result)
-    other = to_tolerance(renderer, seed=4)
-    assert not set(other.output.stats.seeds) & set(result.output.stats.seeds)
-
-
 @pytest.mark.parametrize("spp", [1, 5, 9, 20])
 def test_resuming_is_one_go(renderer, result, spp):
     """Cut anywhere, the passes and the looks are those of one go."""
@@ -104,18 +98,6 @@ def test_resuming_is_one_go(renderer, result, spp):
     assert again.output.stats.seeds == result.output.stats.seeds
     assert again.error == pytest.approx(result.error, rel=1e-4)
     assert part.passes == spp  # as it was
-
-
-def test_more_accurate_afterwards(renderer, result):
-    finer = to_tolerance(renderer, seed=3, rtol=0.4, resume=result)
-    assert finer.reached and finer.passes > result.passes and finer.seconds > result.seconds
-    assert finer.output.stats.seeds[: result.passes] == result.output.stats.seeds
-    assert to_tolerance(renderer, seed=3, resume=finer).passes == finer.passes
-
-
-def test_numbers_of_other_libraries(renderer):
-    numbers = {"rtol": torch.tensor(0.5), "max_spp": np.int64(SPP * 3), "batch_spp": torch.tensor(SPP)}
-    assert to_tolerance(renderer, quantile=np.float32(0.9), max_seconds=np.array(60), **numbers).passes == 3
 
 
 def test_time_ends_it(renderer):
@@ -198,14 +180,6 @@ def test_phasors(scene):
     assert not result.standard_error.is_complex() and result.standard_error.shape == (3, 8, 8)
 
 
-def test_gates(scene):
-    gates = [tt.Gate.gaussian(5.5, 0.2), tt.Gate.gaussian(7.0, 0.2)]
-    result = to_tolerance(tt.TransientRenderer(scene, gates=gates, physics="ignore"), rtol=0.3)
-    assert result.reached and result.output.gated.shape == (3, 2, 8, 8) and result.standard_error.shape == (2, 8, 8)
-    # A gate is no neighbour of the next one in the list: each keeps its own error.
-    assert result.output.gates == tuple(gates)
-
-
 def test_batches(renderer):
     """Each entry counts its own bins with light, a dim one like a bright one."""
     values = {KEY: torch.tensor([[0.6, 0.1, 0.1], [0.0, 0.0, 0.0]])}
@@ -216,28 +190,12 @@ def test_batches(renderer):
         to_tolerance(renderer, {KEY: torch.zeros(2, 3)}, resume=result)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
-def test_other_variants(variant):
-    scene = tt.load(tt.scenes.moving_wall(resolution=4, start_opl=7.5, num_bins=20, bin_width_opl=0.1), variant=variant)
-    result = to_tolerance(tt.TransientRenderer(scene), rtol=0.1)
-    assert result.reached and result.standard_error.shape == (20, 4, 4)
-    assert result.output.polarized == variant.endswith("polarized")
-
-
 def test_values_and_gradients(renderer):
     """Passes have no gradient, and values of the call replace the module's."""
     dark = to_tolerance(renderer, {KEY: torch.zeros(3, requires_grad=True)}, max_spp=SPP * 8)
     lit = to_tolerance(renderer, max_spp=SPP * 8)
     assert not dark.output.transient.requires_grad
     assert dark.output.transient.sum() < lit.output.transient.sum()
-
-
-def test_a_pass_of_a_small_film_is_large(renderer):
-    result = renderer.to_tolerance(rtol=0.5, progress=False)
-    assert result.spp / result.passes == 256
-    assert tt.TransientRenderer(renderer.scene, sampler="independent", physics="ignore").to_tolerance(
-        rtol=0.5, progress=False
-    ).spp == result.spp
 
 
 def fireflies():
@@ -284,63 +242,6 @@ def test_going_on_for_other_bins(renderer, result):
     of_loss = to_tolerance(renderer, seed=3, on=energy, max_spp=SPP * result.passes, rtol=0.001)
     assert of_loss.passes == result.passes
     assert to_tolerance(renderer, seed=3, resume=of_loss).error == pytest.approx(result.error, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("settings", "error", "message"),
-    [
-        ({"rtol": 0}, UnitError, "rtol: expected a relative error between 0 and 1"),
-        ({"rtol": 5}, UnitError, "rtol"),
-        ({"rtol": "5 %"}, UnitError, "rtol"),
-        ({"quantile": 0}, UnitError, "quantile: expected a share"),
-        ({"quantile": 90}, UnitError, "quantile"),
-        ({"max_seconds": -1}, UnitError, "max_seconds"),
-        ({"max_spp": 0}, UnitError, "max_spp"),
-        ({"max_spp": 8}, UnitError, "16 samples per pixel of one pass"),
-        ({"batch_spp": 0}, UnitError, "batch_spp"),
-        ({"seed": [1, 2]}, UnitError, "seed: expected one whole number"),
-        ({"seed": 1.5}, UnitError, "seed"),
-        ({"on": torch.ones(60, 8, 8)}, ArgumentError, "on: expected a mask of truth values"),
-        ({"on": torch.zeros(8, 8, dtype=torch.bool)}, ArgumentError, "false everywhere"),
-        ({"on": torch.ones(7, 8, 8, dtype=torch.bool)}, ShapeError, "broadcasts to"),
-        ({"on": "late"}, ArgumentError, "on: expected a mask"),
-        ({"on": lambda out: out.transient}, ShapeError, "returns one number"),
-        ({"on": lambda out: math.nan}, UnitError, "finite for every pass"),
-        ({"resume": 5}, ArgumentError, "resume: expected a ToleranceResult"),
-    ],
-)
-def test_arguments(renderer, settings, error, message):
-    with pytest.raises(error, match=message):
-        to_tolerance(renderer, **settings)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"seed": 4}, "the seed of this call, 4"),
-        ({"batch_spp": 32}, "the batch_spp of this call"),
-        ({"on": energy}, "same loss"),
-    ],
-)
-def test_results_of_other_renders_do_not_go_on(renderer, result, settings, message):
-    with pytest.raises(ArgumentError, match=message):
-        to_tolerance(renderer, **{"seed": 3, "resume": result, **settings})
-
-
-def test_results_of_other_renderers_do_not_go_on(renderer, result):
-    other = renderer.variation(sampler="independent")
-    with pytest.raises(ArgumentError, match="the sampler of this call"):
-        to_tolerance(other, seed=3, resume=result)
-    with pytest.raises(ArgumentError, match="same values"):
-        to_tolerance(renderer, {KEY: [0.1, 0.1, 0.1]}, seed=3, resume=result)
-
-
-def test_the_bar_shows_error_and_target(renderer, capsys):
-    to_tolerance(renderer, progress=True)
-    shown = capsys.readouterr().err
-    assert "target 0.5" in shown and "error 0." in shown and "left" in shown
-    to_tolerance(renderer)
-    assert capsys.readouterr().err == ""
 
 
 def calibrated(scene, truth, seeds, rtol):

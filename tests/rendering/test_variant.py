@@ -10,11 +10,9 @@ import pytest
 import torch
 
 import torchtransient as tt  # isort: skip
-import drjit as dr
-import mitsuba as mi
 
 from tools.small_room import COLOUR, VARIANT, make_room
-from torchtransient.scene.variant import active_variant, is_differentiable, resolve_variant
+from torchtransient.scene.variant import active_variant
 
 
 def run(script: str) -> str:
@@ -46,47 +44,6 @@ def test_import_scenes_and_load_need_no_variant():
     """)
     # With no variant active there is none to go back to: the scene's stays.
     assert printed == "True llvm_ad_rgb llvm_ad_rgb"
-
-
-def test_a_change_of_the_variant_transforms_no_source_again(monkeypatch):
-    """Renderers of two variants in one loop: at each change Mitsuba executes its integrators anew."""
-    syntax, transformed = dr.syntax, []
-
-    def counted(f=None, **options):
-        if f is None:
-            return lambda g: counted(g, **options)
-        transformed.append(f)
-        return syntax(f, **options)
-
-    mi.set_variant(VARIANT)
-    monkeypatch.setattr(dr, "syntax", counted)
-    other = "llvm_ad_mono" if VARIANT != "llvm_ad_mono" else "llvm_ad_rgb"
-    for _ in range(2):
-        del transformed[:]
-        for name in (other, VARIANT, other):
-            with active_variant(name):
-                assert mi.variant() == name
-    assert transformed == [] and dr.syntax is counted and mi.variant() == VARIANT
-    # Mitsuba's own integrators are whole.
-    with active_variant(other):
-        image = mi.render(mi.load_dict(mi.cornell_box() | {"integrator": {"type": "prb", "max_depth": 2}}), spp=1)
-        assert float(dr.mean(image, axis=None).array[0]) > 0
-
-
-@pytest.mark.slow
-def test_differentiable_active_variant_is_taken_and_scalar_one_is_not():
-    printed = run("""
-        import mitsuba as mi
-        mi.set_variant("llvm_ad_mono")
-        import torchtransient as tt
-        from tools.small_room import make_room
-        first = tt.TransientRenderer(make_room(), spp=4)
-        mi.set_variant("scalar_rgb")
-        second = tt.TransientRenderer(make_room(), spp=4)
-        shapes = tuple(first(seed=0).steady.shape), tuple(second(seed=0).steady.shape)
-        print(*shapes, first.scene.variant, second.scene.variant, mi.variant())
-    """)
-    assert printed == "(1, 3, 4) (3, 3, 4) llvm_ad_mono llvm_ad_rgb scalar_rgb"
 
 
 def test_other_active_variant_is_restored_and_does_not_matter(room_scene):
@@ -133,14 +90,6 @@ def test_scenes_of_several_variants_side_by_side(variant, room_scene):
         assert renderer.values["light.position"].grad.abs().max() > 0
 
 
-def test_unusable_variants():
-    with pytest.raises(tt.errors.VariantError, match=r"not part of this Mitsuba.*llvm_ad_rgb"):
-        tt.load(make_room(), variant="llvm_ad_rbg")
-    with pytest.raises(tt.errors.VariantError, match=r"scalar_rgb.*differentiates"):
-        tt.load(make_room(), variant="scalar_rgb")
-    assert is_differentiable(resolve_variant(None))
-
-
 @pytest.mark.slow
 def test_fork_before_rendering_is_fine_and_after_it_is_refused():
     printed = run("""
@@ -163,24 +112,3 @@ def test_fork_before_rendering_is_fine_and_after_it_is_refused():
         print(before, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     """)
     assert printed == "0 7"
-
-
-@pytest.mark.slow
-def test_many_switches_are_mentioned_once(monkeypatch):
-    import mitsuba as mi
-
-    from torchtransient.scene import variant
-
-    monkeypatch.setattr(variant, "MANY_SWITCHES", 2)
-    monkeypatch.setitem(variant._switches, "count", 0)
-    mi.set_variant("llvm_ad_mono")
-
-    def switch(times):
-        for _ in range(times):
-            with active_variant(VARIANT):
-                pass
-
-    with pytest.warns(UserWarning, match="mitsuba.set_variant") as caught:
-        switch(4)
-    assert sum("mitsuba.set_variant" in str(warning.message) for warning in caught) == 1
-    assert mi.variant() == "llvm_ad_mono"

@@ -184,39 +184,6 @@ def test_dtypes(dtype, size):
         torch.testing.assert_close(x.grad, 2 * x.detach())
 
 
-def test_shapes_without_entries_and_without_dimensions():
-    for shape in ((), (0,), (2, 0, 3), (1,), (2, 1, 3)):
-        x = torch.ones(shape, requires_grad=True)
-        out = moments(x)[0]
-        assert out.shape == shape
-        out.sum().backward()
-        assert torch.equal(x.grad, torch.full(shape, 2.0))
-
-
-def test_inputs_and_cotangents_that_are_not_contiguous(render, slope):
-    storage = torch.stack([START, torch.zeros(3)], dim=1).requires_grad_()
-    render(storage[:, 0]).backward()
-    torch.testing.assert_close(storage.grad[:, 0], slope[0], rtol=1e-4, atol=1e-6)
-    x = torch.rand(40, 30).t().requires_grad_()
-    for cotangent in (torch.rand(40, 30).t(), torch.ones(()).expand(30, 40)):
-        found = torch.autograd.grad(moments(x)[0], x, cotangent)[0]
-        torch.testing.assert_close(found, 2 * x.detach() * cotangent)
-
-
-def test_no_grad_records_nothing(render):
-    with torch.no_grad():
-        assert not render(START.clone().requires_grad_()).requires_grad
-
-
-def test_autocast(render, slope):
-    x = START.clone().requires_grad_()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        loss = render(x)
-        assert loss.dtype == torch.float32
-    loss.backward()
-    torch.testing.assert_close(x.grad, slope[0], rtol=1e-4, atol=1e-6)
-
-
 def test_the_scene_is_as_it_was_and_no_graph_is_left(room):
     params, render = room
     before = mi.Color3f(params[COLOUR])

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import gc
 import random
-import subprocess
-import sys
-import textwrap
 from collections import namedtuple
 
 import drjit as dr
@@ -19,17 +15,15 @@ import torch
 
 import torchtransient as tt
 from support.mitsuba_room import load_room
-from tools.small_room import CAMERA, COLOUR, GREY
+from tools.small_room import COLOUR, GREY
 from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import (
     ArgumentError,
-    DeviceError,
     GradientError,
     SceneError,
     ShapeError,
     UnitError,
     UnknownKeyError,
-    VariantError,
 )
 
 START = torch.tensor([0.8, 0.5, 0.2])
@@ -66,14 +60,6 @@ def test_values_by_key(texture):
     several = torch.rand(3, 2, 2, 3)
     each = torch.func.vmap(lambda data: wrapped({"data": data}, torch.tensor([0.25, 0.25])))(several)
     torch.testing.assert_close(each.squeeze(), several[:, 0, 0])
-
-
-def test_values_by_the_name_of_the_first_argument(texture):
-    params, look_up = texture
-    data, uv = torch.rand(2, 2, 3), torch.tensor([0.25, 0.25])
-    torch.testing.assert_close(tt.wrap(look_up, params)(params={"data": data}, uv=uv).squeeze(), data[0, 0])
-    with pytest.raises(ArgumentError, match="as the first argument, got no argument"):
-        tt.wrap(look_up, params)(values={"data": data}, uv=uv)
 
 
 def test_every_kind_of_value():
@@ -142,26 +128,6 @@ def test_values_that_do_not_fit(texture, values, error, words):
     with pytest.raises(error, match=words):
         tt.wrap(look_up, params)(values, torch.tensor([0.25, 0.25]))
     assert np.all(np.array(params["data"]) == 0.5)
-
-
-def test_other_values_of_the_scene_are_those_of_the_call(texture):
-    """A scene that is changed between a call and its derivative."""
-    params, look_up = texture
-    first = mi.TensorXf(np.array(params["data"]))
-
-    @tt.wrap
-    def product(x):
-        return x * look_up(params, mi.TensorXf([0.25, 0.25], (2,))).array[0]
-
-    x = torch.ones(1, requires_grad=True)
-    out = product(x)
-    params["data"] = first * 3
-    params.update()
-    out.backward()
-    held = np.array(params["data"])
-    params["data"] = first
-    params.update()
-    assert float(x.grad) == 0.5 and np.all(held == 1.5)
 
 
 def test_a_scene_that_raises_is_put_back(texture):
@@ -341,21 +307,6 @@ def test_a_function_that_changes_its_arguments(kind):
 # ---------------------------------------------------------------------------------------------- functions of all kinds
 
 
-def test_decorators_methods_and_partial_functions():
-    class Scaled:
-        factor = 3.0
-
-        @tt.wrap(source="torch", target="drjit")
-        def times(self, x):
-            """Scale a tensor."""
-            return x * self.factor
-
-    x = torch.ones(2, requires_grad=True)
-    assert torch.equal(Scaled().times(x), torch.full((2,), 3.0)) and Scaled.times.__doc__ == "Scale a tensor."
-    assert torch.equal(tt.wrap(functools.partial(Scaled.times.__wrapped__, Scaled()))(x), torch.full((2,), 3.0))
-    assert torch.equal(tt.wrap(Scaled().times.__wrapped__, source=torch, target=dr)(Scaled(), x), torch.full((2,), 3.0))
-
-
 def test_loops_and_branches_of_drjit():
     @tt.wrap
     @dr.syntax
@@ -380,24 +331,6 @@ def test_a_part_in_torch_inside():
     x = torch.tensor([0.1, 0.2], requires_grad=True)
     outer(x).sum().backward()
     torch.testing.assert_close(x.grad, 2 * torch.cos(2 * x.detach()))
-
-
-@pytest.mark.slow
-def test_an_integrator_of_ones_own_and_aovs():
-    scene, params = load_room()
-    aov = mi.load_dict({"type": "aov", "aovs": "depth:depth,albedo:albedo", "inner": {"type": "direct"}})
-    film = mi.load_dict({"type": "hdrfilm", "width": 4, "height": 3, "rfilter": {"type": "box"}})
-    pose = mi.ScalarTransform4f(CAMERA)
-    sensor = mi.load_dict({"type": "perspective", "fov": 20.0, "to_world": pose, "film": film})
-
-    def render(params, seed):
-        return mi.render(scene, params, sensor=sensor, integrator=aov, spp=4, seed=seed)
-
-    x = START.clone().requires_grad_()
-    image = tt.wrap(render, params)({COLOUR: x}, 0)
-    assert image.shape[:2] == (3, 4) and image.shape[2] > 4
-    image.sum().backward()
-    assert float(x.grad.min()) > 0
 
 
 # --------------------------------------------------------------------------------------------------- what is refused
@@ -452,61 +385,6 @@ def test_frozen_functions_are_differentiated(where):
     assert dr.flag(dr.JitFlag.KernelFreezing)
 
 
-def test_functions_that_do_something_else_when_they_are_replayed():
-    calls = []
-
-    def f(x):
-        calls.append(1)
-        return x if len(calls) == 1 else (x, x)
-
-    with pytest.raises(GradientError, match="returned another structure when it was replayed"):
-        tt.wrap(f)(torch.ones(2, requires_grad=True)).sum().backward()
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "words"),
-    [
-        (lambda: tt.wrap("torch", "drjit"), ArgumentError, "expected a function, got 'torch'"),
-        (lambda: tt.wrap(source="drjit", target="torch"), ArgumentError, "those of drjit.wrap"),
-        (lambda: tt.wrap(len, ["red"]), ArgumentError, "parameters: expected the mitsuba.SceneParameters"),
-        (lambda: tt.wrap(len, state={}), ArgumentError, "state: expected the mitsuba.SceneParameters"),
-        (lambda: tt.wrap(dr.sum)(torch.ones(2, dtype=torch.complex64)), ShapeError, "view_as_real"),
-        (lambda: tt.wrap(dr.sum)(torch.eye(2).to_sparse()), ShapeError, "dense tensor"),
-        (lambda: tt.wrap(dr.sum)(torch.ones(2, device="meta")), DeviceError, "a tensor on 'cpu' or 'cuda', got 'meta'"),
-        (lambda: tt.wrap(dr.sum)(torch.ones(2, dtype=torch.float8_e5m2)), ShapeError, "whole numbers or truth values"),
-        (lambda: tt.wrap(lambda x: x.torch())(torch.ones(2)), GradientError, "got a torch tensor from the function"),
-        (lambda: tt.wrap(lambda x: dr.zeros(mi.SurfaceInteraction3f))(torch.ones(2)), ShapeError, "whose fields"),
-        (lambda: tt.wrap(lambda x: dr.zeros(mi.Ray3f))(torch.ones(2)), ShapeError, "a Ray3f, whose fields"),
-    ],
-)  # fmt: skip
-def test_what_is_refused(make, error, words):
-    with pytest.raises(error, match=words):
-        make()
-
-
-@pytest.mark.slow
-def test_a_fork_is_refused():
-    script = """
-        import os
-        import torchtransient as tt
-        import torch
-        double = tt.wrap(lambda x: x * 2)
-        double(torch.ones(2))
-        if (child := os.fork()) == 0:
-            try:
-                double(torch.ones(2))
-            except tt.errors.VariantError as error:
-                os._exit(7 if "does not survive a fork" in str(error) else 1)
-            os._exit(0)
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=240, check=False
-    )
-    assert done.stdout.split() == ["7"], done.stderr[-2000:]
-    assert issubclass(VariantError, RuntimeError)
-
-
 @pytest.mark.slow
 def test_memory_and_kernels_stay_what_they_are():
     scene, params = load_room()
@@ -528,12 +406,3 @@ def test_memory_and_kernels_stay_what_they_are():
         launched = dr.kernel_history((dr.KernelType.JIT,))
     assert launched and all(kernel["cache_hit"] for kernel in launched)
     assert dr.whos(as_string=True).count("\n") == before
-
-
-@pytest.mark.slow
-def test_the_compiler_leaves_a_call_as_it_is():
-    squares = tt.wrap(lambda x: x * x)
-    compiled = torch.compile(lambda x: squares(2 * x).sum() + x.sum(), backend="eager")
-    x = torch.rand(3, requires_grad=True)
-    compiled(x).backward()
-    torch.testing.assert_close(x.grad, 8 * x.detach() + 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from support.marks import long_rows
-from torchtransient.errors import GradientError
 
 VARIANT = "llvm_ad_mono"
 ZERO = {"type": "uniform", "value": 0.0}
@@ -116,27 +114,3 @@ def test_black_that_weighs_elsewhere():
     scene = {"nothing": ZERO | {"id": "nothing"}, **room(bsdf=wall, light=area_light())}
     scene["side"] = scene["side"] | {"bsdf": side}
     compare(tt.load(scene, variant=VARIANT), "nothing.value", 2048)
-
-
-REFUSED = {
-    "normal map": (lambda: described("normalmap", NESTED["diffuse"][1]), "wall.bsdf.nested_bsdf.reflectance.value"),
-    "bump map": (lambda: described("bumpmap", NESTED["mirror"][1]), "wall.bsdf.nested_bsdf.specular_reflectance.value"),
-    "light": (
-        lambda: room(light=area_light() | {"emitter": {"type": "area", "radiance": ZERO}}),
-        "light.emitter.radiance.value",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_scene_of_mitsuba_is_refused(name):
-    make, key = REFUSED[name]
-    scene = mi.load_dict(make(), optimize=False)
-    params = mi.traverse(scene)
-    value = type(params[key])(0.0)
-    dr.enable_grad(value)
-    params[key] = value
-    params.update()
-    adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
-    with pytest.raises(GradientError, match="1e-30"):
-        scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)

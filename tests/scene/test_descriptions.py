@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -12,12 +11,9 @@ import torch
 import torchtransient as tt
 from tools.small_room import GREY, make_room
 from torchtransient.errors import SceneError
-from torchtransient.scene.checks import MOST_LEVELS
 from torchtransient.scene.description import (
     describe_dict,
-    describe_xml,
 )
-from torchtransient.scene.objects import transient_dictionary
 
 VARIANT = "llvm_ad_rgb"
 
@@ -50,38 +46,7 @@ def test_tensors_of_three_rows_are_no_colours_or_points(capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_matrices_that_are_no_transforms():
-    """And arrays of Mitsuba whose numbers cannot be read."""
-    odd = type("OddTransform", (), {"matrix": np.zeros((3, 4))})()
-    with pytest.raises(SceneError, match=r"expected one transform at x, got matrices of shape \(3, 4\)"):
-        plain(odd)
-
-    def unreadable(self, dtype=None, copy=None):
-        raise TypeError("no numbers")
-
-    strange = type("Strange", (), {"__module__": "mitsuba.strange", "__array__": unreadable})()
-    with pytest.raises(SceneError, match="the Strange at x cannot be described as an array"):
-        plain(strange)
-
-
-def nested(levels):
-    tree = {"type": "scene"}
-    for _ in range(levels - 1):
-        tree = {"type": "scene", "inside": tree}
-    return tree
-
-
-def test_dictionaries_as_deep_as_they_may_be():
-    describe_dict(nested(MOST_LEVELS))
-    with pytest.raises(SceneError, match=rf"at most {MOST_LEVELS} deep, got more at .*inside.*Does one hold itself"):
-        describe_dict(nested(MOST_LEVELS + 1))
-    with pytest.raises(SceneError, match="expected a dictionary with 'type': 'scene', got 'type': 'cube'"):
-        describe_dict({"type": "cube"})
-
-
 # --------------------------------------------------------------------------------------------------------------- XML
-
-
 
 
 def test_files_in_files_count_their_levels(tmp_path):
@@ -94,61 +59,6 @@ def test_files_in_files_count_their_levels(tmp_path):
                 tt.load(tmp_path / "c.xml")
         else:
             tt.load(tmp_path / "c.xml")
-
-
-def test_files_that_are_no_scenes(tmp_path):
-    file = tmp_path / "scene.xml"
-    with pytest.raises(SceneError, match=r"no such file seen from"):
-        describe_xml(file, {})
-    with pytest.raises(SceneError, match=r"a folder seen from"):
-        describe_xml(tmp_path, {})
-    file.write_text("<scene>\n  <a/>\n </b></scene>", encoding="utf-8")
-    with pytest.raises(SceneError, match="not well-formed XML at line 3, column 4: mismatched tag"):
-        describe_xml(file, {})
-    file.write_bytes(b"<scene>\xff</scene>")
-    with pytest.raises(SceneError, match="cannot be read as text"):
-        describe_xml(file, {})
-
-
-def test_elements_as_deep_as_they_may_be(tmp_path):
-    """A node of the last level may hold a transform of several parts. Those that have ended count no more."""
-    file, most = tmp_path / "scene.xml", 2 * MOST_LEVELS
-    file.write_text("<a>" + "<b/>" * most + "<b>" * (most - 1) + "</b>" * (most - 1) + "</a>", encoding="utf-8")
-    found = describe_xml(file, {"b": 2, "a": 1.5})
-    assert found.parameters == (("a", "1.5"), ("b", "2")) and found.path == str(file.resolve())
-    file.write_text("<a>" * most + "<c/>" + "</a>" * most, encoding="utf-8")
-    with pytest.raises(SceneError, match=rf"at most {most} levels deep, got more at <c>"):
-        describe_xml(file, {})
-
-
-
-
-# ------------------------------------------------------------------------------------------------- ready for pictures
-
-
-def test_cameras_and_integrators_of_ready_scenes():
-    """By what they show of themselves."""
-    room = make_room() | {"integrator": {"type": "volpath", "max_depth": -1, "rr_depth": 7, "hide_emitters": True}}
-    pose = room["sensor"]["to_world"]
-    film = {"type": "hdrfilm", "width": 6, "height": 4, "crop_width": 3, "crop_height": 2, "crop_offset_x": 2,
-            "crop_offset_y": 1, "pixel_format": "rgba", "rfilter": {"type": "gaussian", "stddev": 0.4}}  # fmt: skip
-    room["sensor"] = {
-        "type": "thinlens", "to_world": pose, "fov": 30.0, "aperture_radius": 0.25, "focus_distance": 3.0,
-        "near_clip": 0.5, "far_clip": 50.0, "shutter_open": 1.5, "shutter_close": 4.0, "film": film,
-        "sampler": {"type": "stratified", "sample_count": 9, "jitter": False},
-    }  # fmt: skip
-    tree = transient_dictionary(mi.load_dict(room, optimize=False))
-    (integrator,) = (entry for entry in tree.values() if isinstance(entry, dict) and entry["type"] == "volpath")
-    assert (integrator["max_depth"], integrator["rr_depth"], integrator["hide_emitters"]) == (-1, 7, True)
-    (camera,) = (entry for entry in tree.values() if isinstance(entry, dict) and entry["type"] == "thinlens")
-    numbers = {"near_clip": 0.5, "far_clip": 50, "shutter_open": 1.5, "shutter_close": 4, "aperture_radius": 0.25,
-               "focus_distance": 3}  # fmt: skip
-    assert {name: camera[name] for name in numbers} == pytest.approx(numbers)
-    assert camera["fov_axis"] == "x" and camera["fov"] == pytest.approx(30.0, rel=1e-5)
-    np.testing.assert_allclose(camera["to_world"], pose, atol=1e-6)
-    assert camera["sampler"] == {"type": "stratified", "sample_count": 9, "jitter": False}
-    assert camera["film"].pop("rfilter") == {"type": "gaussian", "stddev": pytest.approx(0.4, rel=1e-6)}
-    assert camera["film"] == {**{key: value for key, value in film.items() if key != "rfilter"}, "sample_border": False}
 
 
 # --------------------------------------------------------------------------------------------------------- of a call

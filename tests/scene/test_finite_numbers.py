@@ -7,12 +7,11 @@ import struct
 import mitsuba as mi
 import numpy as np
 import pytest
-import torch
 
 import torchtransient as tt
 from support.sweeps import together
 from torchtransient import plugins
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import SceneError
 
 VARIANT = "llvm_ad_rgb"
 NAN, INF = float("nan"), float("inf")
@@ -102,13 +101,6 @@ def test_number_of_a_description(place, x):
         tt.TransientRenderer(broken)
 
 
-@pytest.mark.parametrize("ask", ["parameters", "plan"])
-def test_found_by_whatever_builds(ask):
-    broken = tt.load(with_number("lamp.intensity", NAN), variant=VARIANT)
-    with pytest.raises(SceneError, match=r"'lamp.intensity' \(1 of 3\)"):
-        broken.parameters() if ask == "parameters" else tt.plan(broken)
-
-
 def mesh_file(path, vertices):
     """A binary file of two triangles over the first four vertices, rows of x, y, z, u, v."""
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
@@ -128,20 +120,6 @@ def test_vertices_of_a_file(tmp_path, x):
     broken["wall"] = mesh_file(tmp_path / "wall.ply", [[-1, -1, x, 0, 0], *SQUARE[1:]])
     with pytest.raises(SceneError, match=r"wall\.ply.*invalid vertex position"):  # found by Mitsuba
         tt.TransientRenderer(tt.load(broken, variant=VARIANT))
-
-
-@pytest.mark.parametrize("x", [NAN, INF], ids=str)
-def test_texture_coordinates_of_a_file(tmp_path, x):
-    broken = scene()
-    broken["wall"] = mesh_file(tmp_path / "wall.ply", [[-1, -1, 0, x, 0], *SQUARE[1:]])
-    with pytest.raises(SceneError, match=r"vertex_texcoords' \(1 of 8\)"):
-        tt.TransientRenderer(tt.load(broken, variant=VARIANT))
-
-
-def test_vertices_that_no_face_has_do_not_count(tmp_path):
-    kept = scene()
-    kept["wall"] = mesh_file(tmp_path / "wall.ply", [*SQUARE, [0, 0, 0, NAN, 0]])
-    assert tt.load(kept, variant=VARIANT).parameters()
 
 
 @pytest.mark.parametrize("x", [NAN, INF], ids=str)
@@ -166,19 +144,6 @@ def test_grid_in_a_file(tmp_path):
         tt.TransientRenderer(tt.load(broken, variant=VARIANT))
 
 
-def test_number_of_an_xml_file(tmp_path):
-    path = tmp_path / "scene.xml"
-    path.write_text("""<scene version="3.0.0">
-    <integrator type="transient_path"/>
-    <sensor type="perspective" id="eye"><film type="transient_hdr_film"><integer name="width" value="2"/>
-        <integer name="height" value="2"/></film></sensor>
-    <shape type="sphere" id="ball"><float name="radius" value="$radius"/></shape>
-</scene>""")
-    tt.TransientRenderer(tt.load(path, variant=VARIANT, radius=1.0))
-    with pytest.raises(SceneError, match="radius"):
-        tt.TransientRenderer(tt.load(path, variant=VARIANT, radius=NAN))
-
-
 @pytest.mark.parametrize("own", [True, False], ids=["its own integrator", "another integrator"])
 def test_first_sight_of_a_scene_of_mitsuba(own):
     mi.set_variant(VARIANT)
@@ -196,9 +161,3 @@ def test_first_sight_of_a_scene_of_mitsuba(own):
     for _ in range(2):
         with pytest.raises(SceneError, match=r"finite numbers, got NaN or infinity in .*reflectance.data' \(1 of 48\)"):
             used.render(loaded, spp=1)
-
-
-def test_values_of_torch():
-    renderer = tt.TransientRenderer(tt.load(scene(), variant=VARIANT), parameters=["lamp.intensity.value"])
-    with pytest.raises(UnitError, match=r"value of 'lamp.intensity.value': expected finite"):
-        renderer({"lamp.intensity.value": torch.tensor([1.0, NAN, 1.0])}, seed=0, spp=1)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from click.testing import CliRunner
 
 import torchtransient as tt
-from torchtransient.cli.main import main
-from torchtransient.files import read_result
 
-VARIANT = "llvm_ad_mono"
+VARIANT = 'llvm_ad_mono'
+
 SCENE = """<scene version="3.0.0">
     <integrator type="transient_path"><integer name="max_depth" value="3"/></integrator>
     <sensor type="perspective">
@@ -84,13 +82,3 @@ def test_delays(write):
     # the axis ends 10 lifetimes after the first light
     assert mean_opl(delayed) == pytest.approx(mean_opl(plain) + 0.299792, rel=2e-3)
     assert float(delayed.steady.sum()) == pytest.approx(0.5 * float(plain.steady.sum()), rel=1e-3)
-
-
-def test_gates_on_the_command_line(write, tmp_path):
-    path = write("gated_hdr_film", '<string name="gates" value="rectangular 8.0 8.1; gaussian 8.05 0.05"/>')
-    target = tmp_path / "out.h5"
-    arguments = ["render", str(path), "-o", str(target), "--variant", "llvm_ad_mono", "--seed", "0", "--quiet"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.output
-    assert read_result(target).gates == (tt.Gate.rectangular(8.0, 8.1), tt.Gate.gaussian(8.05, 0.05))
-    assert "1 x 2 x 2 x 2 (C x G x H x W) gates" in result.output

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -13,9 +12,7 @@ import torch
 import torchtransient as tt
 from support.sweeps import together
 from support.text_files import SCENE
-from tools.small_room import CAMERA, COLOUR, VARIANT, make_room, pose
-from torchtransient.errors import ArgumentError, SceneError
-from torchtransient.scene.variant import active_variant
+from tools.small_room import COLOUR, VARIANT, make_room, pose
 
 
 @pytest.fixture
@@ -51,16 +48,6 @@ def test_nameless_xml_children_have_stable_names(xml):
     assert not any(key.startswith("object_") for key in first)
 
 
-def test_xml_text_of_loading_time_counts(xml):
-    scene = tt.load(xml, variant=VARIANT)
-    expected = show(tt.load(xml, variant=VARIANT))
-    stored = pickle.dumps(scene)
-    xml.write_text(SCENE.replace("10, 10, 10", "1, 1, 1"))
-    assert torch.equal(show(scene), expected)
-    xml.unlink()
-    assert torch.equal(show(pickle.loads(stored)), expected)
-
-
 def test_files_beside_the_xml_are_found(xml, tmp_path, monkeypatch):
     (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     shape = '<shape type="obj" id="tri"><string name="filename" value="tri.obj"/></shape></scene>'
@@ -89,23 +76,21 @@ def test_relative_files_of_a_dictionary(tmp_path, monkeypatch):
 )
 def test_forms_of_a_transform(write, room_scene):
     room = make_room()
-    with active_variant(VARIANT):
-        import mitsuba as mi
+    import mitsuba as mi
 
-        room["wall"]["to_world"] = write(mi)
+    room["wall"]["to_world"] = write(mi)
     assert torch.equal(show(tt.load(room, variant=VARIANT)), show(room_scene))
 
 
 def test_forms_of_vectors_and_colours(room_scene):
     expected = show(room_scene)
     room = make_room()
-    with active_variant(VARIANT):
-        import mitsuba as mi
+    import mitsuba as mi
 
-        room["light"]["position"] = mi.Point3f(-0.5, 0.25, 4.0)
-        room["box"]["bsdf"]["reflectance"]["value"] = mi.Color3f(0.8, 0.5, 0.2)
-        room["wall"]["bsdf"]["reflectance"] = np.float64(0.5)
-        scene = tt.load(room, variant=VARIANT)
+    room["light"]["position"] = mi.Point3f(-0.5, 0.25, 4.0)
+    room["box"]["bsdf"]["reflectance"]["value"] = mi.Color3f(0.8, 0.5, 0.2)
+    room["wall"]["bsdf"]["reflectance"] = np.float64(0.5)
+    scene = tt.load(room, variant=VARIANT)
     assert torch.equal(show(scene), expected)
 
 
@@ -117,10 +102,9 @@ def test_pixels_given_as_bitmap_array_and_tensor():
         room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "raw": True, **entry}
         return show(tt.load(room, variant=VARIANT))
 
-    with active_variant(VARIANT):
-        import mitsuba as mi
+    import mitsuba as mi
 
-        bitmap, tensor = mi.Bitmap(pixels), mi.TensorXf(pixels)
+    bitmap, tensor = mi.Bitmap(pixels), mi.TensorXf(pixels)
     expected = with_texture(data=pixels)
     assert torch.equal(with_texture(bitmap=bitmap), expected)
     assert torch.equal(with_texture(data=tensor), expected)
@@ -130,10 +114,9 @@ def test_pixels_given_as_bitmap_array_and_tensor():
 def test_eight_bit_texture_is_decoded_and_differentiable():
     encoded = np.full((2, 2, 3), 128, dtype=np.uint8)
     room = make_room()
-    with active_variant(VARIANT):
-        import mitsuba as mi
+    import mitsuba as mi
 
-        room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "bitmap": mi.Bitmap(encoded)}
+    room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "bitmap": mi.Bitmap(encoded)}
     scene = tt.load(room, variant=VARIANT)
     key = "wall.bsdf.reflectance.data"
     assert scene.parameters()[key].differentiable
@@ -156,12 +139,6 @@ def test_pickle_and_copies(room_scene):
     assert copy.deepcopy(room_scene) is room_scene and copy.copy(room_scene) is room_scene
 
 
-def test_load_of_a_scene(room_scene):
-    assert tt.load(room_scene) is room_scene
-    mono = tt.load(room_scene, variant="llvm_ad_mono")
-    assert mono.variant == "llvm_ad_mono" and show(mono).shape[0] == 1
-
-
 # ------------------------------------------------------------------------------------------------ overrides
 
 
@@ -179,11 +156,6 @@ def test_steady_film_and_integrator_are_taken_with_a_time_axis(room_scene):
     out = renderer(seed=0)
     assert out.stats.integrator == "transient_path" and out.axis == axis
     assert torch.equal(out.transient, show(room_scene))
-
-
-def test_steady_film_without_a_time_axis_is_refused():
-    with pytest.raises(tt.errors.SceneError, match="time_axis"):
-        tt.TransientRenderer(tt.load(steady_room(), variant=VARIANT))
 
 
 def test_scene_without_film_or_integrator():
@@ -217,17 +189,6 @@ def test_foreign_integrator_is_refused():
 # --------------------------------------------------------------------------------------------------- errors
 
 
-def test_missing_file():
-    with pytest.raises(tt.errors.SceneError, match=r"no/such\.xml.*no such file"):
-        tt.load("no/such.xml")
-
-
-def test_malformed_xml_names_line(xml):
-    xml.write_text(SCENE.replace("</integrator>", "</integrater>"))
-    with pytest.raises(tt.errors.SceneError, match=r"peer\.xml is not well-formed XML at line 8"):
-        tt.load(xml)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -246,18 +207,6 @@ def test_faults_in_xml_name_file_and_line(xml, old, new, message):
         tt.TransientRenderer(tt.load(xml, variant=VARIANT))
 
 
-def test_unused_xml_parameter(xml):
-    with pytest.raises(tt.errors.SceneError, match=r"(?s)unused.*resolution"):
-        tt.TransientRenderer(tt.load(xml, variant=VARIANT, resolution=5))
-
-
-def test_faults_in_a_dictionary_name_the_entry():
-    room = make_room()
-    room["wall"]["colour"] = 0.5
-    with pytest.raises(tt.errors.SceneError, match=r"(?s)wall.*colour"):
-        tt.TransientRenderer(tt.load(room, variant=VARIANT))
-
-
 def test_properties_that_nothing_reads_are_said_with_what_to_do():
     room = make_room()
     room["integrator"] |= {"nlos_hidden_geometry_sampling_max_depth": 3, "nlos_laser_sampling": True, "max_dept": 4}
@@ -267,51 +216,6 @@ def test_properties_that_nothing_reads_are_said_with_what_to_do():
     assert "parser.cpp" not in text and "'max_dept' = 4" in text and "Misspelt" in text
     assert "Leave 'nlos_hidden_geometry_sampling_max_depth' out: hidden geometry is sampled at all depths" in text
     assert "'nlos_laser_sampling': transient_nlos_path reads such" in text
-
-
-def test_objects_of_python_are_refused():
-    room = make_room()
-    room["wall"]["bsdf"] = object()
-    with pytest.raises(tt.errors.SceneError, match=r"wall\.bsdf.*cannot be described"):
-        tt.load(room)
-
-
-@pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        ({"type": "diffuse"}, "'type': 'scene'"),
-        ({"type": "scene", "a": {"type": "cube", "to_world": [[1, 2], [3]]}}, r"a\.to_world"),
-        ({"type": "scene", 3: {}}, "keys must be strings"),
-    ],
-)
-def test_bad_arguments(scene, message):
-    with pytest.raises(tt.errors.SceneError, match=message):
-        tt.load(scene)
-
-
-def test_other_types():
-    with pytest.raises(tt.errors.ArgumentError, match=r"expected a path, a dictionary, .* or a mi\.Scene, got int"):
-        tt.load(42)
-
-
-def test_xml_parameters_need_xml():
-    with pytest.raises(tt.errors.ArgumentError, match=r"XML files \(spp\) are for these alone, got dict"):
-        tt.load(make_room(), spp=4)
-    for given, words in (
-        ({"max_depth": 3}, r" Options of a render belong to .* tt\.render, max_depth to the scene's integrator too\.$"),
-        ({"spp": 4, "a": 1, "freeze": True}, r"\(a, freeze, spp\) .* belong to TransientRenderer and"),
-        ({"a": 1}, r"for these alone, got dict\. Options"),
-    ):
-        with pytest.raises(tt.errors.ArgumentError, match=words):
-            tt.load(make_room(), **given)
-
-
-def test_camera_of_the_room_is_mitsubas_look_at():
-    with active_variant(VARIANT):
-        import mitsuba as mi
-
-        look_at = mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0])
-        np.testing.assert_allclose(np.array(look_at.matrix), CAMERA, atol=1e-6)
 
 
 # ----------------------------------------------------------------------------- lists of numbers of our own plugins
@@ -350,18 +254,6 @@ def test_pulses_and_decays_as_lists():
     assert torch.equal(a, b) and a.sum() > 0
 
 
-@pytest.mark.parametrize("wrong", [[[0.5, 1.0], [1.0, 2.0]], np.ones((2, 2)), np.array([1j]), np.array([True])])
-def test_lists_that_are_no_row_of_numbers(wrong):
-    with pytest.raises(tt.errors.SceneError, match=r"list of numbers at sensor\.film\.frequencies.*commas"):
-        tt.load(phasor_room(wrong))
-
-
-def test_lists_of_other_plugins_stay_lists():
-    node = {"type": "someone_elses_film", "frequencies": [1.0, 2.0, 3.0]}
-    text = node | {"frequencies": "1.0, 2.0, 3.0"}
-    assert not tt.load({"type": "scene", "film": node}).same_description(tt.load({"type": "scene", "film": text}))
-
-
 def test_meshes_that_cannot_be_merged():
     """Mitsuba merges meshes of one surface, and stops where their normals point to different sides."""
     shape = {"type": "cube", "bsdf": {"type": "ref", "id": "paint"}, "to_world": pose(0.0, 0.0, 1.0, 0.1)}
@@ -378,40 +270,3 @@ def test_an_unknown_plugin_is_not_replaced(key):
     (scene if key == "integrator" else scene["sensor"])[key] = {"type": "transientpath"}
     with pytest.raises(tt.errors.SceneError, match=f"'{key}': expected .* got 'transientpath'"):
         tt.render(tt.load(scene, variant=VARIANT), spp=1)
-
-
-@pytest.mark.parametrize("given", [3, [1], None, {"type": "scene"}.items()])
-def test_objects_that_are_no_scene(given):
-    with pytest.raises(ArgumentError, match=r"a tt\.Scene or a mi\.Scene, got"):
-        tt.load(given)
-
-
-def test_parameters_of_files_are_for_files_alone(room_scene):
-    for given in ({"type": "scene"}, room_scene):
-        with pytest.raises(ArgumentError, match=r"\$parameters of XML files \(a, b\) are for these alone, got"):
-            tt.load(given, b=1, a=2)
-    with active_variant(VARIANT):
-        params = mi.traverse(mi.load_dict({"type": "scene"}))
-    with pytest.raises(ArgumentError, match="got the SceneParameters of one"):
-        tt.load(params)
-
-
-def test_many_settings_of_one_scene():
-    """More than the built scenes that are kept; the first one is built anew."""
-    scene = tt.load(make_room(), variant=VARIANT)
-    first = tt.TransientRenderer(scene, spp=1, max_depth=2)
-    expected = first(seed=0).steady
-    for depth in range(3, 12):
-        tt.TransientRenderer(scene, spp=1, max_depth=depth)
-    torch.testing.assert_close(first(seed=0).steady, expected, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("name", ["to_world", "to_uv"])
-def test_transforms_that_are_numbers(name):
-    room = make_room()
-    if name == "to_world":
-        room["box"]["to_world"] = 2.0
-    else:
-        room["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": 2.0}}
-    with pytest.raises(SceneError, match=name):
-        tt.load(room, variant=VARIANT).parameters()

@@ -152,14 +152,6 @@ def test_described_objects_travel(make):
         assert tt.plan(taken, pilot=False).variant
 
 
-def test_flags_of_a_described_mesh(tmp_path):
-    room = make_room()
-    flags = {"face_normals": True, "flip_normals": True, "silhouette_sampling_weight": 0.25}
-    room["box"] = mi.load_dict(room["box"] | flags)
-    saved = tt.load(room).save(tmp_path / "room.xml").read_text()
-    assert all(name in saved for name in flags)
-
-
 @each(KEPT, scene)
 def test_objects_that_are_taken_as_they_are_stay(make):
     given, _ = make()
@@ -213,25 +205,6 @@ def test_what_would_change_a_ready_scene_is_refused():
         tt.TransientRenderer(tt.load(mi.load_dict(steady)), time_axis=axis)
 
 
-def test_what_would_change_a_film_that_was_taken_is_refused():
-    axis = tt.TimeAxis(start_opl=6.0, bin_width_opl=0.5, num_bins=24)
-    room, _ = film()
-    with pytest.raises(tt.errors.SceneError, match="time_axis would change"):
-        tt.TransientRenderer(tt.load(room), time_axis=axis)
-    room["sensor"]["film"] = mi.load_dict(STEADY_FILM)
-    with pytest.raises(tt.errors.SceneError, match="no time axis"):
-        tt.TransientRenderer(tt.load(room), time_axis=axis)
-
-
-def test_another_sampler_takes_the_number_of_one_that_was_taken():
-    room = make_room()
-    room["sensor"]["sampler"] = mi.load_dict({"type": "independent", "sample_count": 9})
-    assert tt.TransientRenderer(tt.load(room), sampler="multijitter")(seed=0).stats.spp == 9
-    ready = tt.load(mi.load_dict(room))
-    assert tt.TransientRenderer(ready)(seed=0).stats.sampler == "owen"
-    assert tt.TransientRenderer(ready, sampler="multijitter")(seed=0).stats.sampler == "multijitter"
-
-
 STEADY_FILM = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "tent"}}
 STEADY = {
     "crop": ({}, {"crop_width": 3, "crop_height": 2, "crop_offset_x": 1, "crop_offset_y": 1}, {}),
@@ -272,71 +245,3 @@ def test_a_ready_scene_for_steady_pictures_takes_a_time_axis(name):
     assert all(one.abs().max() > 0 for one in found[1])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
-
-
-def test_derivatives_that_need_another_plugin_are_refused():
-    """The index of Mitsuba's dielectric has no derivative, and nothing is built in the place of what was taken."""
-    room = make_room()
-    room["box"]["bsdf"] = {"type": "dielectric"}
-    described, taken = tt.load(room, variant=VARIANT), tt.load(room | {"box": mi.load_dict(room["box"])})
-    key = next(key for key in described.parameters() if key.endswith(".eta"))
-    assert described.parameters()[key].differentiable
-    entry = taken.parameters()[key]
-    assert not entry.differentiable and "diff_dielectric" in entry.reason and "taken as it is" in entry.reason
-    with pytest.raises(tt.errors.GradientError, match="taken as it is"):
-        tt.TransientRenderer(taken, parameters=[key])
-
-
-def test_plugins_that_are_wrong_in_a_variant_are_refused():
-    room = make_room()
-    room["box"]["bsdf"] = {"type": "dielectric"}
-    lamp = make_room()
-    lamp["wall"]["emitter"] = {"type": "directionalarea"}
-    with pytest.raises(tt.errors.SceneError, match="diff_directionalarea"):
-        tt.TransientRenderer(tt.load(mi.load_dict(lamp)))
-    mi.set_variant("llvm_ad_mono_polarized")
-    with pytest.raises(tt.errors.SceneError, match="diff_dielectric"):
-        tt.TransientRenderer(tt.load(mi.load_dict(room)))
-
-
-def test_plugins_in_python_are_called_by_their_own_names():
-    """Mitsuba calls them by the class that they derive from."""
-    ready = tt.load(mi.load_dict(make_room(), optimize=False))
-    with pytest.raises(tt.errors.SceneError, match="the integrator TransientPath was taken as it is"):
-        tt.TransientRenderer(ready, max_depth=2)
-    assert tt.TransientRenderer(ready, spp=1, physics="ignore")(seed=0).stats.integrator == "TransientPath"
-
-
-def test_meshes_of_a_class_of_ones_own_are_no_plain_meshes():
-    """They may do more than their buffers say."""
-
-    class Sail(mi.Mesh):
-        def __init__(self):
-            props = mi.Properties()
-            props["bsdf"] = mi.load_dict({"type": "diffuse"})
-            mi.Mesh.__init__(self, "sail", 3, 1, props=props)
-            params = mi.traverse(self)
-            params["vertex_positions"] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
-            params["faces"] = [0, 1, 2]
-            params.update()
-
-    scene = tt.load(make_room() | {"sail": Sail()})
-    assert "sail.vertex_positions" in scene.parameters()
-    with pytest.raises(tt.errors.SceneError, match="the Sail at"):
-        pickle.dumps(scene)
-
-
-def test_other_things_are_refused():
-    with pytest.raises(tt.errors.ArgumentError, match="got the SceneParameters of one"):
-        tt.load(mi.traverse(mi.load_dict(make_room())))
-    with pytest.raises(tt.errors.ArgumentError, match="inside a dictionary"):
-        tt.load(mi.load_dict({"type": "sphere"}))
-    with pytest.raises(tt.errors.SceneError, match=r"inner is a whole mi\.Scene"):
-        tt.load({"type": "scene", "inner": mi.load_dict(make_room())})
-    scalar = mi.scalar_rgb.load_dict if hasattr(mi.scalar_rgb, "load_dict") else None
-    assert scalar is None
-    mi.set_variant("scalar_rgb")
-    thing = mi.load_dict({"type": "point"})
-    mi.set_variant(VARIANT)
-    with pytest.raises(tt.errors.VariantError, match="scalar_rgb"):
-        tt.load(make_room() | {"light": thing}).parameters()

@@ -14,8 +14,7 @@ import torch
 
 import torchtransient as tt
 from support.moving_scenes import LAMP, moving_scene, wall
-from torchtransient.errors import ArgumentError, GradientError, GradientWarning, SceneError, TorchTransientWarning
-from torchtransient.scenes import look_at
+from torchtransient.errors import GradientWarning, SceneError, TorchTransientWarning
 
 VARIANT = "llvm_ad_mono"
 SPEED = 1.5
@@ -172,26 +171,6 @@ def test_pickled_and_saved_with_values(tmp_path):
     assert mean_rate(saved) == close(2.0)
 
 
-def test_descriptions_that_move_differ():
-    still = tt.load(two_walls(), variant=VARIANT)
-    moving, other = still.moving({"wall": COMES}), still.moving({"wall": tt.Motion(linear=(0.0, 0.0, 1.0))})
-    assert not still.same_description(moving) and not moving.same_description(other)
-    assert moving.same_description(tt.load(two_walls()).moving({"wall": COMES}))
-    assert moving.same_description(pickle.loads(pickle.dumps(moving)))
-    assert still.moving({}).same_description(still) and mean_rate(moving) == close(-2 * SPEED)
-    # The scene that was there stays at rest, and a plan of one is none of the other.
-    assert not any("velocity" in key for key in still.parameters())
-    with pytest.raises(SceneError, match="another scene"):
-        tt.TransientRenderer(moving, effects=tt.plan(still, time_axis=AXIS, max_depth=2))
-    assert "wall" in repr(moving) and "wall" not in repr(still)
-
-
-def test_the_order_of_motions_is_no_difference():
-    still = tt.load(two_walls(), variant=VARIANT)
-    there = {"wall": COMES, "other": tt.Motion()}
-    assert still.moving(there).same_description(still.moving(dict(reversed(there.items()))))
-
-
 def test_the_table_of_parameters():
     table = tt.load(two_walls(), variant=VARIANT).moving({"wall": COMES}).parameters()
     info = table["wall.velocity.linear"]
@@ -201,20 +180,6 @@ def test_the_table_of_parameters():
         f"wall.velocity.{part}" for part in ("linear", "angular", "center")
     }
     assert not table["wall.to_world"].is_velocity and "wall.velocity.linear" in str(table)
-
-
-def test_what_cannot_move():
-    scene = tt.load(two_walls(), variant=VARIANT)
-    with pytest.raises(SceneError, match=r"expected the name of a body, one of .*wall.*got 'fan'"):
-        scene.moving({"fan": COMES})
-    with pytest.raises(ArgumentError, match=r"expected a tt\.Motion for 'wall'"):
-        scene.moving({"wall": (0.0, 0.0, 1.0)})
-    sky = two_walls(sky={"type": "constant"})
-    with pytest.raises(SceneError, match="light from infinity"):
-        mean_rate(tt.load(sky, variant=VARIANT).moving({"sky": COMES}))
-    wrong = two_walls(drift=motion((0, 0, 1), of="fan"))
-    with pytest.raises(SceneError, match="expected the name of a shape"):
-        mean_rate(tt.load(wrong, variant=VARIANT))
 
 
 # ------------------------------------------------------------------------------------------------------- warnings
@@ -245,36 +210,6 @@ def test_a_film_without_rates_says_that_velocities_have_no_derivative():
     assert float(rates.values[key].grad[2].abs()) > 0
 
 
-def test_mitsubas_own_derivatives_warn_too(tmp_path):
-    scene = two_walls()
-    scene["wall"]["velocity"] = motion((0, 0, -SPEED))
-    path = tt.load(scene, variant=VARIANT).save(tmp_path / "scene.xml")
-    mi.set_variant(VARIANT)
-    built = mi.load_file(str(path), optimize=False)
-    params = mi.traverse(built)
-    key = next(key for key in params.keys() if key.endswith("linear"))  # noqa: SIM118
-    dr.enable_grad(params[key])
-    params.update()
-    gradient = mi.TensorXf(1.0, (1, 1, 3 if mi.variant().endswith("rgb") else 1))
-
-    def derive():
-        built.integrator().render_backward(built, params, (gradient, None), spp=4)
-
-    found = [one for one in caught(derive) if one.category is GradientWarning]
-    assert len(found) == 1 and "linear" in str(found[0].message)
-    assert not caught(derive)
-
-
-def test_films_of_rates_where_nothing_moves():
-    for settings in ({"rates": RATES}, {"chirps": tt.Chirps(1e9, 1e-5, 1550e-9)}):
-        renderer = tt.TransientRenderer(tt.load(two_walls(), variant=VARIANT), time_axis=AXIS, spp=4, **settings)
-        [warning] = caught(lambda renderer=renderer: renderer(seed=0))
-        assert "nothing moves" in str(warning.message) and warning.filename == __file__
-        assert not caught(lambda renderer=renderer: renderer(seed=1))
-    at_rest = tt.load(two_walls(), variant=VARIANT).moving({"wall": tt.Motion()})
-    assert not caught(lambda: tt.TransientRenderer(at_rest, rates=RATES, time_axis=AXIS, spp=4)(seed=0))
-
-
 # ------------------------------------------------------------------------------------- calls with other velocities
 
 KEY = "wall.velocity.linear"
@@ -290,19 +225,6 @@ def a_moving_wall(variant=VARIANT, **nodes):
 
 def measured(out, name):
     return getattr(out, name)
-
-
-@pytest.mark.parametrize("name", FILMS)
-def test_batches_are_separate_calls(name):
-    renderer = tt.TransientRenderer(a_moving_wall(), parameters=[KEY], **FILMS[name])
-    seeds = [3, 4, 5]
-    batch = renderer({KEY: LINEAR}, seed=3)
-    singles = [renderer({KEY: one}, seed=seed) for one, seed in zip(LINEAR, batch.stats.seeds, strict=True)]
-    found = measured(batch, name)
-    assert found.shape == (len(seeds), *measured(singles[0], name).shape)
-    for k, one in enumerate(singles):
-        torch.testing.assert_close(found[k], measured(one, name))
-    assert not torch.allclose(found[0], found[1])
 
 
 @pytest.mark.parametrize("name", FILMS)
@@ -343,22 +265,6 @@ def test_vmap(name):
     assert float((forward * weights).sum()) == pytest.approx(float(given.grad @ tangent), rel=0.05, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", FILMS)
-def test_several_sensors(name):
-    """One camera moves, the other looks from the side."""
-    film = two_walls()["sensor"]["film"]
-    side = {"type": "perspective", "fov": 0.05, "near_clip": 1e-3, "film": film,
-            "to_world": look_at((2.0, 0, 0), (0, 0, 2.0)), "sampler": {"type": "independent"}}  # fmt: skip
-    scene = tt.load(two_walls(side=side), variant=VARIANT)
-    scene = scene.moving({"wall": COMES, "sensor": tt.Motion(linear=(0.0, 0.0, 1.0))})
-    both = tt.TransientRenderer(scene, sensors="all", **FILMS[name])(seed=7)
-    assert measured(both, name).shape[0] == 2
-    for k, seed in enumerate(both.stats.seeds):
-        one = tt.TransientRenderer(scene, sensors=k, **FILMS[name])(seed=seed)
-        torch.testing.assert_close(measured(both, name)[k], measured(one, name))
-    assert not torch.allclose(measured(both, name)[0], measured(both, name)[1])
-
-
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 @pytest.mark.parametrize("name", FILMS)
 def test_variants(name, variant):
@@ -375,19 +281,3 @@ def test_variants(name, variant):
             total = light[..., row, :, :, :].sum(-3)
             torch.testing.assert_close(total, out.steady.detach().double(), rtol=5e-3, atol=1e-5)
     assert float(out.steady.abs().max()) > 0
-
-
-def test_names_that_look_like_those_of_motions():
-    """A body called as the motion of another one stays in the scene."""
-    described = two_walls(wall_velocity=wall((0, 0, 1), (0, 0, 0)))
-    assert mean_rate(tt.load(described, variant=VARIANT).moving({"wall": COMES})) == close(0.0)
-    assert mean_rate(tt.load(described, variant=VARIANT).moving({"wall_velocity": COMES})) == close(-2 * SPEED)
-
-
-def test_what_has_no_velocity():
-    still = tt.load(two_walls(), variant=VARIANT)
-    with pytest.raises(SceneError, match=r"expected the name of a body.*got 'integrator'"):
-        still.moving({"integrator": COMES})
-    graph = torch.zeros(3, requires_grad=True)
-    with pytest.raises(GradientError, match=r"expected numbers for 'wall'.*wall\.velocity\.linear"):
-        still.moving({"wall": tt.Motion(linear=graph)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -11,7 +10,6 @@ from torch.autograd import forward_ad
 import torchtransient as tt
 from support.marks import long
 from tools.small_room import CAMERA, COLOUR, GREY, VARIANT, WALL_POSE, make_room, pose
-from torchtransient.scene.variant import active_variant
 
 TURN = np.array([[0.8, 0, 0.6, 0], [0, 1, 0, 0], [-0.6, 0, 0.8, 0], [0, 0, 0, 1.0]])
 
@@ -132,18 +130,6 @@ def test_forward_and_reverse_mode_agree_and_restore_the_scene(textured, room_sce
     assert along == pytest.approx(sum(float(share.sum()) / scales[key] for key, share in shares.items()), abs=2e-3)
 
 
-def test_flat_vertices_are_taken(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=["box.vertex_positions"], spp=8)
-    moved = renderer.values["box.vertex_positions"].detach() + 0.05
-    assert moved.shape == (24, 3)
-    flat = moved.reshape(-1).clone().requires_grad_()
-    out = renderer({"box.vertex_positions": flat}, seed=0).transient
-    assert torch.equal(out, renderer({"box.vertex_positions": moved}, seed=0).transient)
-    assert out.requires_grad
-    batch = renderer({"box.vertex_positions": flat.detach().expand(2, 72)}, seed=0).transient
-    assert torch.equal(batch[0], out.detach())
-
-
 @pytest.mark.slow
 def test_a_pattern_that_shifts_over_a_light_is_sampled_where_it_is(tmp_path):
     """Mitsuba samples patterns by a map that it keeps when texture coordinates alone change."""
@@ -181,15 +167,14 @@ def test_mesh_pose_keeps_authored_normals(tmp_path):
     import mitsuba as mi
 
     add_normals = tmp_path / "smooth.ply"
-    with active_variant(VARIANT):
-        mesh = mi.Mesh("tri", 3, 1, has_vertex_normals=True)
-        params = mi.traverse(mesh)
-        params["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 0, 1, 0]
-        params["faces"] = [0, 1, 2]
-        params.update()
-        params["vertex_normals"] = [0.6, 0, 0.8, -0.6, 0, 0.8, 0, 0.6, 0.8]
-        params.update()
-        mesh.write_ply(str(add_normals))
+    mesh = mi.Mesh("tri", 3, 1, has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [-1, -1, 0, 1, -1, 0, 0, 1, 0]
+    params["faces"] = [0, 1, 2]
+    params.update()
+    params["vertex_normals"] = [0.6, 0, 0.8, -0.6, 0, 0.8, 0, 0.6, 0.8]
+    params.update()
+    mesh.write_ply(str(add_normals))
     room = make_room()
     room["box"] = {"type": "ply", "filename": str(add_normals), "to_world": pose(0, 0, 0.5, 0.5)}
     scene = tt.load(room, variant=VARIANT)
@@ -235,33 +220,6 @@ def test_normals_of_a_mirror_take_a_filter_with_a_slope():
         assert renderer.has_slope_for([key])
 
 
-@pytest.mark.parametrize("plugin", ["thindielectric", "hair", "roughplastic"])
-def test_indices_that_bend_nothing_keep_the_box(plugin):
-    room = make_room()
-    room["box"]["bsdf"] = {"type": plugin}
-    scene = tt.load(room, variant=VARIANT)
-    assert scene.parameters()["box.bsdf.eta"].differentiable
-    assert tt.TransientRenderer(scene, parameters=["box.bsdf.eta"]).effective_filter == "box"
-
-
-@pytest.mark.parametrize("key", ["alpha", "eta"])
-def test_rough_plastic_is_built_with_its_derivative(key):
-    room = make_room()
-    room["box"]["bsdf"] = {"type": "twosided", "nested": {"type": "roughplastic", "alpha": 0.3}}
-    info = tt.load(room, variant=VARIANT).parameters()[f"box.bsdf.brdf_0.{key}"]
-    assert info.differentiable and not info.biased and "diff_rough_plastic" in info.reason
-
-
-def test_table_of_a_scene_with_a_parameter_that_is_not_set():
-    room = make_room()
-    with mi.variant_context(VARIANT):
-        room["box"]["bsdf"] = mi.load_dict({"type": "hair"})
-    scene = tt.load(room, variant=VARIANT)
-    absorption = scene.parameters()["box.bsdf.sigma_a"]
-    assert absorption.value is None and absorption.shape is None and not absorption.differentiable
-    assert tt.TransientRenderer(scene, parameters=["light.intensity.value"]).values
-
-
 def test_extinction_is_told_from_albedo():
     room = make_room()
     room["box"]["bsdf"] = {"type": "null"}
@@ -271,34 +229,6 @@ def test_extinction_is_told_from_albedo():
     moving = [key for key, info in table.items() if info.moves_medium and info.differentiable]
     assert moving == ["box.interior_medium.sigma_t.value.value"]
     assert table["box.interior_medium.albedo.value.value"].differentiable
-
-
-def test_a_key_that_the_table_does_not_have(room_scene):
-    table = room_scene.parameters()
-    with pytest.raises(
-        tt.errors.SceneError, match=r"^the scene has no parameter 'box\.bsdf\.reflectanse.*Did you mean"
-    ):
-        table["box.bsdf.reflectanse.value"]
-    with pytest.raises(KeyError):
-        table["nope"]
-    assert "nope" not in table and table.get("nope") is None
-
-
-@pytest.mark.parametrize(
-    "key, meant",
-    [
-        ("lamp.to_world", "lamp.position"),
-        ("lamp.radiance.value", "lamp.intensity.value"),
-        ("spot.position", "spot.to_world"),
-        ("wall.position", "wall.to_world"),
-    ],
-)
-def test_unknown_key_of_what_another_plugin_calls_so(key, meant):
-    """A point light has a position, other lights a pose; the nearest texts would be keys of other objects."""
-    scene = {"type": "scene", "lamp": {"type": "point"}, "spot": {"type": "spot"}, "wall": {"type": "rectangle"}}
-    with pytest.raises(tt.errors.UnknownKeyError) as raised:
-        tt.load(scene, variant="llvm_ad_mono").parameters()[key]
-    assert f"has no parameter '{key}'. Did you mean '{meant}'? print" in str(raised.value)
 
 
 def test_unknown_key_suggests_the_right_one(room_scene):
@@ -312,19 +242,6 @@ def test_unknown_key_suggests_the_right_one(room_scene):
 def test_key_without_derivative(room_scene):
     with pytest.raises(tt.errors.GradientError, match=r"near_clip.*no derivative"):
         tt.TransientRenderer(room_scene, parameters=["sensor.near_clip"])
-
-
-def test_two_keys_for_one_thing(room_scene):
-    with pytest.raises(tt.errors.SceneError, match="both set"):
-        tt.TransientRenderer(room_scene, parameters=["box.to_world", "box.vertex_positions"])
-
-
-def test_refused_value_names_the_key(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=["sensor.to_world"], spp=4)
-    good = renderer(seed=0).transient.detach()
-    with pytest.raises(tt.errors.SceneError, match=r"sensor\.to_world"):
-        renderer({"sensor.to_world": torch.eye(4) * 2}, seed=0)
-    assert torch.equal(renderer(seed=0).transient.detach(), good)
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import copy
 import pickle
 import warnings
 
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -119,16 +118,6 @@ def test_colours_of_a_mesh_file(room, tmp_path):
         tt.render(scene, {key: _filled(scene, key, 300.0)}, spp=1, seed=0, physics="error")
 
 
-def test_textures_that_are_referred_to(room):
-    """They have names of their own, which say nothing of what they are for."""
-    cells = {"type": "bitmap", "raw": True, "bitmap": np.full((2, 2, 1), 1.25)}
-    room["wall"]["bsdf"] = {"type": "mask", "opacity": {"type": "ref", "id": "cells"}, "bsdf": {"type": "diffuse"}}
-    scene, key = loaded({"cells": cells, **room}), "cells.data"
-    _, messages = said(tt.TransientRenderer, scene, spp=1)
-    assert len(messages) == 1 and repr(key) in messages[0] and "reaches 1.25," in messages[0]
-    assert said(tt.render, scene, {key: _filled(scene, key, 0.5)}, spp=1, seed=0)[1] == []
-
-
 RANGES = {
     "weight of a lobe": ({"type": "principled", "metallic": 1.5}, "metallic.value", "1.5", "at most 1"),
     "roughness": ({"type": "roughconductor", "alpha": -0.1}, "alpha.value", "-0.1", "at least 0"),
@@ -142,37 +131,6 @@ def test_ranges_of_surfaces(room, case):
     _, messages = said(tt.TransientRenderer, loaded(room), spp=1)
     assert len(messages) == 1 and f"wall.bsdf.{key}" in messages[0]
     assert f"reaches {number}:" in messages[0] and expected in messages[0]
-
-
-# key -> (bad values, good values)
-GIVEN = {
-    "wall.bsdf.eta": ((0.0, -1.5), (0.5, 1.0)),
-    "box.interior_medium.sigma_t.value.value": ((-0.5,), (0.0, 30.0)),
-    "box.interior_medium.phase_function.g": ((1.0, -1.2), (0.9, 0.0)),
-    "lamp.intensity.value": ((-3.0,), (0.0, 1e6)),
-    "sensor.x_fov": ((-10.0, 0.0, 200.0), (1.0, 120.0)),
-}
-
-
-def test_ranges_of_what_is_given(room):
-    room["integrator"] = {"type": "transient_prbvolpath", "max_depth": 3}
-    room["box"] |= {"interior": {**FOG, "phase": {"type": "hg", "g": 0.2}}, "bsdf": {"type": "null"}}
-    room["wall"]["bsdf"] = {"type": "dielectric"}
-    room["lamp"] = {"type": "point", "position": [0, 0, 4], "intensity": 5.0}
-    scene = loaded(room)
-    goods = [{key: _filled(scene, key, good[n]) for key, (_, good) in GIVEN.items()} for n in range(2)]
-    for values in goods:
-        tt.render(scene, values, spp=1, seed=0, physics="error")
-    for key, (bad, _) in GIVEN.items():
-        for value in bad:
-            with pytest.raises(PhysicsError, match=f"{key!r}.* reaches {value:g}:"):
-                tt.render(scene, goods[0] | {key: _filled(scene, key, value)}, spp=1, seed=0, physics="error")
-
-
-@pytest.mark.parametrize("metal", ["conductor", "roughconductor", "diff_conductor", "diff_rough_conductor"])
-def test_a_mirror_has_an_index_of_zero(room, metal):
-    room["wall"]["bsdf"] = {"type": metal, "material": "none"} if "diff" not in metal else {"type": metal, "eta": 0.0}
-    assert said(tt.TransientRenderer, loaded(room), spp=1)[1] == []
 
 
 def _filled(scene, key, value):
@@ -198,22 +156,6 @@ def test_what_may_be_larger_than_one_is_left_alone(room):
     assert said(tt.render, scene, {keys[0]: torch.tensor(1.0), keys[1]: torch.full((3,), 50.0)}, spp=1, seed=0)[1] == []
 
 
-def test_coefficients_of_spectra_are_no_shares(room):
-    mi.set_variant("llvm_ad_spectral")
-    scene = tt.load(room, variant="llvm_ad_spectral")
-    assert said(tt.TransientRenderer, scene, parameters=[COLOUR], spp=1)[1] == []
-    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=1)
-    assert said(renderer, {COLOUR: 3 * renderer.values[COLOUR].detach()}, seed=0)[1] == []
-
-
-def test_many_findings_are_a_few_words(room):
-    bad = {"type": "diffuse", "reflectance": 1.5}
-    for n in range(9):
-        room[f"cube_{n}"] = {"type": "cube", "bsdf": bad, "to_world": pose(0.0, 0.0, 0.1 * n, 0.01)}
-    _, messages = said(tt.TransientRenderer, loaded(room), spp=1)
-    assert len(messages) == 4 and messages[-1].endswith(" 5 more of such values.") and "cube_3.bsdf" in messages[-1]
-
-
 # --------------------------------------------------------------------------------------------------------------- given
 
 
@@ -231,25 +173,12 @@ def test_values_that_are_given(room):
         assert said(twin, {GREY: 1.5}, seed=0)[1] == []
 
 
-def test_functions_in_a_loop_say_it_once(room):
-    scene = loaded(room)
-    messages = [said(tt.render, scene, {GREY: 1.5 + 0.1 * n}, spp=1, seed=n)[1] for n in range(3)]
-    assert [len(one) for one in messages] == [1, 0, 0]
-
-
 def test_values_as_an_error(room):
     renderer = tt.TransientRenderer(loaded(room), parameters=[GREY], spp=1, physics="error")
     for _ in range(2):
         with pytest.raises(PhysicsError, match=r"'wall\.bsdf\.reflectance\.value' .* reaches 1\.5,.*physics='warn'"):
             renderer({GREY: 1.5}, seed=0)
     renderer({GREY: 1.0}, seed=0)
-
-
-def test_the_line_of_the_user_is_named(room):
-    scene = loaded(room)
-    with pytest.warns(PhysicsWarning) as caught:
-        tt.render(scene, {GREY: 1.5}, spp=1, seed=0)
-    assert caught[0].filename == __file__
 
 
 # ---------------------------------------------------------------------------------------------------------- transforms
@@ -263,17 +192,6 @@ def test_transforms_without_an_inverse(room):
     with pytest.raises(PhysicsError, match="no inverse"):
         tt.TransientRenderer(scene, spp=1, physics="error")
     assert said(tt.TransientRenderer, scene, parameters={WALL_POSE: pose(scale=3.0)}, spp=1)[1] == []
-
-
-def test_transforms_that_are_given(room):
-    scene = loaded(room)
-    renderer = tt.TransientRenderer(scene, parameters=[WALL_POSE, "box.to_world"], spp=1, temporal_filter="tent")
-    flat = torch.tensor(pose(scale=3.0)).float()
-    assert said(renderer, {WALL_POSE: torch.stack([flat, flat])}, seed=0)[1] == []
-    flat[:3, 2] = 0
-    assert "'wall.to_world' has no inverse" in said(renderer, {WALL_POSE: flat}, seed=0)[1][0]
-    small = torch.diag(torch.tensor([1e-4, 1e-4, 1e-6, 1.0]))
-    assert said(renderer, {"box.to_world": small}, seed=0)[1] == []
 
 
 # -------------------------------------------------------------------------------------------------------------- windows
@@ -300,29 +218,6 @@ def test_a_window_that_holds_the_light(room):
     assert said(tt.render, loaded(room), spp=16, seed=0, physics="error")[1] == []
     short = tt.TimeAxis(6.0, 0.25, 4)
     assert said(tt.render, loaded(room), spp=16, seed=0, time_axis=short, steady=False, physics="error")[1] == []
-
-
-@pytest.mark.slow
-def test_what_a_filter_spreads_over_the_rim_of_one_bin_for_all_times_is_not_missed(room):
-    everything = tt.TimeAxis(0.0, 100.0, 1)
-    scene = loaded(room)
-    renderer = tt.TransientRenderer(scene, time_axis=everything, temporal_filter="tent", spp=4, physics="error")
-    out = renderer(seed=0)
-    assert sum(out.stats.energy_before) > 0.1 * float(out.steady.mean(0).sum())
-    with pytest.raises(PhysicsError, match="misses"):
-        tt.render(scene, time_axis=tt.TimeAxis(0.0, 8.0, 1), spp=4, seed=0, physics="error")
-
-
-@pytest.mark.slow
-def test_stokes_vectors_count_by_their_first_component(room):
-    scene = tt.load(room, variant="llvm_ad_spectral_polarized")
-    _, messages = said(tt.render, scene, time_axis=tt.TimeAxis(9.0, 0.25, 16), spp=64, seed=0)
-    assert len(messages) == 1 and "misses" in messages[0]
-
-
-def test_other_words_are_refused(room):
-    with pytest.raises(tt.errors.ArgumentError, match="physics: expected one of 'warn', 'error', 'ignore', got 'loud'"):
-        tt.TransientRenderer(loaded(room), physics="loud")
 
 
 @pytest.mark.slow

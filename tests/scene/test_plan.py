@@ -1,19 +1,14 @@
 """Decisions of a plan from the description alone: it overlooks nothing in a scene and pays for nothing else."""
 
-import pickle
-import time
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 import torchtransient as tt
 from support import plan_scenes
-from torchtransient.errors import ArgumentError, GradientError, SceneError, UnitError, VariantError
-from torchtransient.rendering.films import Gates
-from torchtransient.scene.inventory import scene_inventory
+from torchtransient.errors import GradientError, SceneError
 
-VARIANT = "llvm_ad_rgb"
+VARIANT = 'llvm_ad_rgb'
 
 
 def static(scene, outputs=("transient",), **settings):
@@ -113,32 +108,6 @@ def test_bands_of_the_film():
         static(plan_scenes.grey_room(), ("bands",))
 
 
-@pytest.mark.parametrize(
-    "named, line",
-    [
-        ("independent", "sampler: owen, in place of the scene's independent"),
-        (None, "sampler: owen, since the scene names none"),
-        ("multijitter", "sampler: multijitter, as the scene names it"),
-        ("owen", "sampler: owen, as the scene names it"),
-    ],
-)
-def test_the_sampler_is_said(named, line):
-    scene = plan_scenes.grey_room()
-    scene["sensor"].pop("sampler", None)
-    if named is not None:
-        scene["sensor"]["sampler"] = {"type": named}
-    plan = static(scene)
-    assert line in plan.reasons
-    assert plan.renderer(spp=4)(seed=0).stats.sampler == line.split()[1].rstrip(",")
-
-
-def test_a_sampler_of_dependent_numbers_is_warned_of():
-    scene = plan_scenes.grey_room()
-    scene["sensor"]["sampler"] = {"type": "ldsampler"}
-    (line,) = (line for line in static(scene).reasons if line.startswith("sampler"))
-    assert "ldsampler, as the scene names it" in line and "biases" in line and "'owen'" in line
-
-
 def test_what_is_declared_and_not_used_costs_nothing():
     scene = plan_scenes.grey_room(
         red={"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 0.0, 0.0]}},
@@ -169,17 +138,6 @@ def test_a_polarizing_element_is_found(where):
     plan = static(plan_scenes.grey_room(extra=HIDING[where]))
     assert plan.variant == "llvm_ad_mono_polarized"
     assert "polarizer" in plan.reasons[0] or "pplastic" in plan.reasons[0]
-
-
-def test_a_polarizer_by_reference_and_with_colour():
-    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1.0, 0.0, 0.0]}}
-    scene = plan_scenes.grey_room(
-        filter=dict(POLARIZER),
-        red=red,
-        extra=plan_scenes.hidden({"type": "ref", "id": "filter"}),
-        wall={"type": "rectangle", "bsdf": {"type": "ref", "id": "red"}},
-    )
-    assert static(scene).variant == "llvm_ad_spectral_polarized"
 
 
 def test_stokes_vectors_take_a_polarized_variant():
@@ -247,12 +205,6 @@ def test_a_medium_is_found(tmp_path, where):
     assert plan.variant == "llvm_ad_mono"
 
 
-def test_a_coloured_medium(tmp_path):
-    fog = {**FOG, "albedo": {"type": "rgb", "value": [0.5, 0.4, 0.5]}}
-    extra = {**_mediums(tmp_path)["in a mesh file"]["extra"], "interior": fog}
-    assert static(plan_scenes.grey_room(extra=extra)).variant == "llvm_ad_rgb"
-
-
 # -------------------------------------------------------------------------------------------------------------- XML
 
 
@@ -265,22 +217,6 @@ def test_parameters_and_includes_of_a_file(tmp_path):
     file.write_text(plan_scenes.xml_room(inside, '<default name="kind" value="diffuse"/>'), encoding="utf-8")
     assert static(str(file)).variant == "llvm_ad_mono"
     assert static(tt.load(file, kind="pplastic")).variant == "llvm_ad_mono_polarized"
-
-
-def test_reasons_name_the_place_in_the_file(tmp_path):
-    file = tmp_path / "scene.xml"
-    inside = '<shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="1 0 0"/></bsdf></shape>'
-    file.write_text(plan_scenes.xml_room(inside), encoding="utf-8")
-    assert "scene.xml (line 12" in static(str(file)).reasons[0]
-
-
-def test_two_bands_in_a_file(tmp_path):
-    spectrum = tmp_path / "led.spd"
-    spectrum.write_text("450 0\n460 1\n470 0\n640 0\n650 1\n660 0\n", encoding="utf-8")
-    file = tmp_path / "scene.xml"
-    inside = '<emitter type="constant"><spectrum name="radiance" filename="led.spd"/></emitter>'
-    file.write_text(plan_scenes.xml_room(inside), encoding="utf-8")
-    assert static(str(file)).variant == "llvm_ad_spectral"
 
 
 # ------------------------------------------------------------------------------------------------ depth and overrides
@@ -336,60 +272,3 @@ def test_temporal_filter_follows_the_parameters():
         static(scene, parameters=["wall.to_world"], temporal_filter="box")
     pulsed = static(scene, parameters=["wall.to_world"], pulse=tt.Pulse.gaussian(0.1))
     assert pulsed.temporal_filter == "box"
-
-
-def test_a_plan_can_be_pickled_and_printed():
-    plan = static(plan_scenes.grey_room())
-    again = pickle.loads(pickle.dumps(plan))
-    assert again.reasons == plan.reasons
-    assert str(again).count("\n") == len(plan.reasons) - 1
-    assert plan.to_dict()["time_axis"] == {"start_opl": 0.0, "bin_width_opl": 0.1, "num_bins": 100}
-
-
-GATE = tt.Gate.gaussian(8.0, 0.5)
-BAD = {
-    "unknown output": ({"outputs": ("video",)}, "video"),
-    "two films": ({"outputs": ("transient", "phasor")}, "a plan for"),
-    "no frequencies": ({"outputs": ("phasor",)}, "frequencies"),
-    "frequencies without phasors": ({"outputs": "transient", "frequencies": [1.0]}, r"outputs=\('phasor',\)\.$"),
-    "gates of others": ({"outputs": ["steady", "stokes"], "gates": GATE}, r"\('gates', 'steady', 'stokes'\)"),
-    "another film": ({"outputs": ("phasor", "steady"), "film": Gates(GATE)}, r"outputs=\('gates', 'steady'\)"),
-    "unknown integrator": ({"integrator": "transient_teleport"}, "transient_teleport"),
-    "unknown depth": ({"max_depth": "deep"}, "scene"),
-    "unknown parameter": ({"parameters": ["wall.colour"]}, "wall.colour"),
-    "bins of the scene's axis": ({"time_axis": "scene", "num_bins": 3}, "num_bins"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_wrong_requests(name):
-    settings, message = BAD[name]
-    error = SceneError if name in ("no frequencies", "unknown integrator", "unknown parameter") else ArgumentError
-    with pytest.raises(error, match=message):
-        tt.plan(plan_scenes.grey_room(), pilot=False, **settings)
-
-
-def test_wrong_shares_and_broken_scenes():
-    with pytest.raises(UnitError, match="tail"):
-        static(plan_scenes.grey_room(), tail=0.0)
-    with pytest.raises(ArgumentError, match="effects"):
-        tt.TransientRenderer(plan_scenes.grey_room(), effects="all")
-    with pytest.raises(VariantError, match="llvm_ad_polarized"):
-        static(plan_scenes.grey_room(), variant="llvm_ad_polarized")
-    with pytest.raises(SceneError, match="could not read the scene"):
-        static(plan_scenes.grey_room(**wall({"type": "rgb", "colour": 1})))
-    steady = plan_scenes.grey_room()
-    steady["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4}
-    with pytest.raises(SceneError, match="no time axis"):
-        tt.plan(steady, pilot=False)
-
-
-def test_reading_a_scene_is_quick():
-    scene = tt.load(tt.scenes.cornell_box(64))
-    mi.set_variant(VARIANT)
-    seconds = []
-    for _ in range(7):
-        begin = time.perf_counter()
-        scene_inventory(scene)
-        seconds.append(time.perf_counter() - begin)
-    assert min(seconds) < 0.05

@@ -99,16 +99,6 @@ def test_a_renderer_takes_the_sensor_of_its_plan():
     assert plan.to_dict()["sensor"] == 1
 
 
-@pytest.mark.parametrize("sensors", [0, [0, 1], "all", [0]])
-def test_another_sensor_than_that_of_the_plan(sensors):
-    scene = tt.load(seen_twice(), variant=VARIANT)
-    plan = tt.plan(scene, sensor=1, pilot=False, time_axis="scene")
-    with pytest.raises(SceneError, match=r"made for sensor 1.*sensor=0"):
-        tt.TransientRenderer(scene, effects=plan, sensors=sensors)
-    with pytest.raises(SceneError, match=r"made for sensor 1.*sensor=0"):
-        plan.renderer(sensors=sensors)
-
-
 # ------------------------------------------------------------------- choices that a caller makes for a plan are kept
 
 GATES = {
@@ -154,23 +144,7 @@ def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
     assert pulsed.has_slope_for([WALL_POSE])
 
 
-def test_keys_of_a_film_without_a_filter_are_looked_up():
-    for output, setting in (("gates", {"gates": GATES["rectangular gate"]}), ("phasor", {"frequencies": [0.5]})):
-        with pytest.raises(SceneError, match=r"no parameter 'wall\.colour'"):
-            tt.plan(make_room(), output, pilot=False, parameters=["wall.colour"], **setting)
-
-
 # ----------------------------------------------------------------------------------------------------- descriptions
-
-
-def test_a_dictionary_does_not_depend_on_the_folder(tmp_path, monkeypatch):
-    """Unless it names files, which are looked up where it was loaded."""
-    plain, textured = make_room(), make_room()
-    textured["wall"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": "wall.png"}}
-    first = [tt.load(plain), tt.load(textured)]
-    monkeypatch.chdir(tmp_path)
-    assert tt.load(plain).same_description(first[0])
-    assert not tt.load(textured).same_description(first[1])
 
 
 def test_files_and_their_parameters(tmp_path):
@@ -186,17 +160,3 @@ def test_files_and_their_parameters(tmp_path):
         tt.TransientRenderer(path, effects=plan)
     # what the plan was made for is still there
     assert plan.renderer(spp=1)(seed=0).steady.shape == (1, 2, 2)
-
-
-def test_a_plan_is_equal_to_its_copies():
-    scene = tt.scenes.cornell_box(8)
-    plan = tt.plan(scene, pilot=False)
-    for other in (pickle.loads(pickle.dumps(plan)), copy.deepcopy(plan), tt.plan(scene, pilot=False)):
-        assert plan == other and hash(plan) == hash(other)
-    assert plan != tt.plan(scene, pilot=False, max_depth=3)
-    assert plan != tt.plan(tt.scenes.cornell_box(9), pilot=False)
-    assert plan != "plan"
-
-
-
-

@@ -1,15 +1,10 @@
 """Plans of films of rates: the bins hold the rates and beats of a moving scene, and a scene at rest says that it is."""
 
-import json
 
-import numpy as np
 import pytest
 
 import torchtransient as tt
-from support.pilot_arrivals import arrivals
-from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.rendering.films import Beats, Rates
-from torchtransient.scene.pilot import rate_axis_over
 
 VARIANT = "llvm_ad_mono"
 SPEED = 3.0
@@ -27,17 +22,6 @@ def coming(speed=SPEED):
 
 def share_inside(film, out):
     return float(film.tensor(out).sum()) / float(out.steady.sum())
-
-
-@pytest.mark.parametrize("low, high", [(-6.0, 0.0), (-3.1, 7.7), (2.0, 2.5), (-1e-9, 0.0), (0.0, 1e7)])
-def test_axes_of_rates_hold_rest_and_both_ends_with_a_bin_to_spare(low, high):
-    axis = rate_axis_over(low, high)
-    assert axis.num_bins == 64
-    assert axis.start + axis.bin_width < min(low, 0.0) and axis.end - axis.bin_width > max(high, 0.0)
-    # Not much wider than it has to be, and rest stands in the middle of a bin.
-    assert axis.end - axis.start < 1.2 * (max(high, 0.0) - min(low, 0.0))
-    place = -axis.start / axis.bin_width
-    assert abs(place - np.floor(place) - 0.5) < 1e-6
 
 
 def test_rates_are_found():
@@ -102,39 +86,3 @@ def test_settings_that_are_given_or_described():
     film |= chirp | {"type": "beat_hdr_film"}
     kept = tt.plan(tt.load(description, variant=VARIANT), outputs="beats")
     assert kept.chirps == CHIRPS and kept.time_axis.bin_width_opl == CHIRPS.resolution_opl
-
-
-def test_plans_as_plain_data():
-    told = json.loads(json.dumps(tt.plan(coming(), outputs="rates").to_dict()))
-    assert told["rates"]["rates_num_bins"] == 64 and told["chirps"] is None and told["film"] == "rates"
-
-
-def test_settings_of_a_film_ask_for_its_output():
-    chirps = tt.Chirps(1e9, 1e-5, 1550e-9)
-    found = tt.plan(coming(), chirps=chirps)
-    assert found.outputs == ("beats",) and found.chirps == chirps
-    assert found.time_axis == tt.plan(coming(), "beats", chirps=chirps).time_axis
-    assert tt.plan(coming(), film=Rates(tt.RateAxis(-4.0, 1.0, 8))).outputs == ("rates",)
-    assert tt.plan(coming()).outputs == ("transient",)
-
-
-def test_wrong_requests():
-    with pytest.raises(SceneError, match=r"chirps=tt\.Chirps"):
-        tt.plan(wall(), outputs="beats")
-    with pytest.raises(SceneError, match=r"rates=tt\.RateAxis"):
-        tt.plan(wall(), outputs="rates", pilot=False, time_axis=tt.TimeAxis(0.0, 1.0, 9))
-    with pytest.raises(ArgumentError, match="rates have no effect"):
-        tt.plan(wall(), "transient", rates=tt.RateAxis(0.0, 1.0, 3))
-    axis = tt.TimeAxis(0.0, 1.0, 9)
-    with pytest.raises(ArgumentError, match="both give a time axis"):
-        tt.plan(wall(), "rates", film=Rates(tt.RateAxis(0.0, 1.0, 3), axis), time_axis=axis)
-
-
-def test_beats_of_a_list_of_arrivals():
-    """Both spectra share the energy of each arrival, whose path and block stay."""
-    found = arrivals([4.0, 9.0], [1.0, 3.0], path=[0, 1], pixel=[0, 3], size=(2, 2), rate=[-1.0, 2.0])
-    seen = found.shifted((0.5, -0.5))
-    np.testing.assert_array_equal(seen.opl, [3.5, 10.0, 4.5, 8.0])
-    np.testing.assert_array_equal(seen.energy, [0.5, 1.5, 0.5, 1.5])
-    assert seen.total == found.total and seen.relative_error() == pytest.approx(found.relative_error())
-    assert seen.window(-1, 0.2) == (3.5, 10.0)

@@ -6,9 +6,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support import plan_scenes
 from support.marks import long, long_pairs
-from torchtransient.errors import ArgumentError
 from torchtransient.rendering.error_bars import local_mean
 
 
@@ -24,11 +22,6 @@ def test_diffuse_rooms_share_their_light():
     assert plan.rr_depth > plan.max_depth
     assert any("path reuse: used" in line for line in plan.reasons)
     assert plan.renderer(spp=16)(seed=0).stats.integrator == "transient_path_reuse"
-
-
-def test_squared_errors_are_those_of_plain_paths():
-    plan = tt.plan(box())
-    assert (plan.integrator, plan.rr_depth) == ("transient_path", None)
 
 
 @pytest.mark.parametrize("reason", ["one bounce", "polarized", "asked for", "no pilot"])
@@ -62,13 +55,6 @@ def test_depths_of_late_light_are_said_with_what_they_rest_on():
     assert "cannot tell" not in str(tt.plan(scene, integrator="transient_path"))
 
 
-def test_the_share_beyond_a_depth_for_late_light_is_in_the_report():
-    plan = tt.plan(box(max_depth=-1), error="relative", integrator="transient_path", tail=2e-3)
-    assert 0 < plan.pilot.tail < 2e-3
-    line = next(line for line in plan.reasons if line.startswith("max_depth"))
-    assert f"{plan.pilot.tail:.2g} +- " in line and "0.02 of that of any eighth" in line
-
-
 def test_roulette_stays_where_nothing_else_ends_paths():
     plan = tt.plan(box(8, max_depth=-1), error="relative", max_depth="scene", pilot=False, time_axis="scene")
     assert plan.rr_depth is None
@@ -85,33 +71,6 @@ def test_light_is_shared_up_to_the_depth_of_the_plan():
     assert any("path reuse: not used" in line and "no limit" in line for line in unlimited.reasons)
 
 
-def test_roulette_of_renderers_that_lift_the_bound_of_a_plan():
-    """Paths between walls that absorb nothing would not end."""
-    plan = tt.plan(box(8), error="relative", integrator="transient_path")
-    lifted = plan.renderer(max_depth=-1), plan.renderer().variation(max_depth=-1)
-    plain = tt.TransientRenderer(plan.scene, max_depth=-1, time_axis=plan.time_axis)(seed=0, spp=16).transient
-    for renderer in lifted:
-        torch.testing.assert_close(renderer(seed=0, spp=16).transient, plain)
-
-
-def test_dark_scenes():
-    scene = plan_scenes.grey_room()
-    del scene["light"]
-    plan = tt.plan(scene, error="relative", time_axis="scene", max_depth=6)
-    assert plan.integrator == "transient_path"
-
-
-@pytest.mark.parametrize("settings", [{"outputs": "steady"}, {"outputs": "phasor", "frequencies": [1.0]}])
-def test_films_without_times_are_refused(settings):
-    with pytest.raises(ArgumentError, match="relative"):
-        tt.plan(box(8), error="relative", **settings)
-
-
-def test_unknown_errors_are_refused():
-    with pytest.raises(ArgumentError, match="squared"):
-        tt.plan(box(8), error="absolute")
-
-
 @pytest.mark.parametrize(
     ("width", "error"), long_pairs([0.06, 6.0], ["squared", "relative"], [(0.06, "squared"), (6.0, "relative")])
 )
@@ -120,27 +79,6 @@ def test_narrow_gates_are_connected_by_path_length(width, error):
     assert plan.connections == ("ellipsoidal" if width < 1 else None)
     out = plan.renderer(spp=16)(seed=0)
     assert out.gated.isfinite().all() and out.gated.sum() > 0
-
-
-@pytest.mark.parametrize("settings", [{"integrator": "transient_path"}, {"pilot": False, "max_depth": 8}])
-def test_connections_that_no_runs_decide_about(settings):
-    plan = tt.plan(box(8), "gates", gates=tt.Gate.rectangular(7.47, 7.53), **settings)
-    assert plan.connections is None
-    assert any("ellipsoidal connections: not used" in line for line in plan.reasons)
-
-
-@pytest.mark.parametrize("outputs", ["transient", "phasor"])
-def test_other_films_have_ordinary_connections(outputs):
-    frequencies = {"frequencies": [0.3]} if outputs == "phasor" else {}
-    plan = tt.plan(box(8, connections="ellipsoidal"), outputs, **frequencies)
-    assert plan.connections == "ordinary"
-    assert plan.renderer(spp=4)(seed=0).steady.sum() > 0
-
-
-def test_gates_of_scenes_without_faces_that_shine():
-    plan = tt.plan(plan_scenes.grey_room(), "gates", gates=tt.Gate.rectangular(8.0, 8.1))
-    assert plan.connections is None
-    assert any("ellipsoidal connections: not used" in line for line in plan.reasons)
 
 
 @pytest.mark.slow

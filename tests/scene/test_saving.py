@@ -183,50 +183,6 @@ def test_every_plugin(tmp_path):
     assert all("cannot be said in XML" in text for text in refused.values())
 
 
-def numbers_said_by_others():
-    """Parameters that the description has no number of: Mitsuba makes them of names, of others, or of nothing."""
-    room = make_room()
-    room["sensor"]["fov_axis"] = "y"
-    room["box"]["bsdf"] = {"type": "roughdielectric", "int_ior": "bk7", "ext_ior": "water", "alpha": 0.3}
-    del room["wall"]["bsdf"]
-    ball = {"type": "sphere", "center": [0.4, 0.2, 0.5], "radius": 0.2}
-    room |= {
-        "ball": ball | {"bsdf": {"type": "principled", "base_color": 0.4, "clearcoat": 0.3}},
-        "gold": {"type": "disk", "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.3}},
-        "torch": {"type": "spot", "to_world": pose(0.0, 0.0, 2.0), "cutoff_angle": 40.0},
-    }
-    table = {
-        "box.bsdf.eta": 1.31, "wall.bsdf.reflectance.value": 0.7, "ball.bsdf.clearcoat.value": 0.6,
-        "gold.bsdf.k.value": [2.0, 1.5, 1.1], "torch.cutoff_angle": 30.0, "torch.intensity.value": 2.0,
-        "sensor.x_fov": 35.0,
-    }  # fmt: skip
-    moved = torch.tensor(tt.load(room, variant=VARIANT).parameters()["ball.to_world"].value)
-    moved[:3, 3] += torch.tensor([0.1, 0.0, -0.2])
-    return room, {key: torch.tensor(value) for key, value in table.items()} | {"ball.to_world": moved}
-
-
-def test_numbers_that_the_description_says_otherwise(tmp_path):
-    room, values = numbers_said_by_others()
-    scene = tt.load(room, variant=VARIANT)
-    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
-    before, found = scene.parameters(), again.parameters()
-    assert list(found) == list(before)
-    for key, info in found.items():
-        wanted = values[key] if key in values else before[key].value
-        if isinstance(wanted, torch.Tensor | np.ndarray | float):
-            np.testing.assert_allclose(info.value, wanted, rtol=1e-5, atol=1e-6, err_msg=key)
-
-
-@pytest.mark.slow
-def test_their_picture_is_the_same(tmp_path):
-    room, values = numbers_said_by_others()
-    scene = tt.load(room, variant=VARIANT)
-    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
-    expected, found = picture(scene, parameters=values), picture(again, parameters=list(values))
-    assert expected.sum() > 0 and not torch.allclose(picture(scene), expected, rtol=0.1)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.slow
 def test_every_parameter_of_every_plugin(tmp_path):
     """Each is written with another value and read back, and no other one with it."""
@@ -250,7 +206,6 @@ def test_every_parameter_of_every_plugin(tmp_path):
     blobs = {f"{kind}.{key}" for kind in ("ellipsoids", "ellipsoidsmesh") for key in ("data", "opacities")}
     assert refused.keys() == blobs | {"bsplinecurve.control_points", "linearcurve.control_points"}
     assert all("cannot be said in XML" in text and str(tmp_path) not in text for text in refused.values())
-
 
 
 def test_what_cannot_be_said_is_refused_and_nothing_is_written(tmp_path):
@@ -280,43 +235,3 @@ def test_what_cannot_be_said_is_refused_and_nothing_is_written(tmp_path):
     with pytest.raises(tt.errors.SceneError, match=r"box\.bsdf\.reflectance\.value.*cannot be said in XML"):
         spectral.save(tmp_path / "found.xml", {COLOUR: torch.tensor([0.001, -0.5, 20.0])})
     assert not list(tmp_path.iterdir())
-
-
-RETRO = {"type": "retroreflector", "share": 0.6}
-# Surfaces with parameters that their descriptions say by another name, or that belong to plugins in Python inside.
-SURFACES = {
-    "twosided": (
-        {"type": "twosided", "nested": RETRO},
-        ("brdf_0.share", "brdf_0.alpha", "brdf_0.reflectance.value"),
-    ),
-    "blend": (
-        {"type": "blendbsdf", "weight": 0.4, "first": RETRO, "second": {"type": "diffuse"}},
-        ("bsdf_0.share", "bsdf_0.reflectance.value", "bsdf_1.reflectance.value", "weight.value"),
-    ),
-    "mask": (
-        {"type": "mask", "opacity": 0.5, "nested": {"type": "diff_rough_dielectric", "int_ior": "water"}},
-        ("nested_bsdf.eta", "nested_bsdf.alpha.value", "opacity.value"),
-    ),
-    "plastic": ({"type": "plastic", "int_ior": "water", "ext_ior": 1.1}, ("eta", "diffuse_reflectance.value")),
-    "roughplastic": ({"type": "roughplastic", "int_ior": 1.4}, ("eta", "alpha")),
-    "dielectric": ({"type": "dielectric"}, ("eta",)),
-}
-
-
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SURFACES if name != "blend"]
-
-
-@pytest.mark.parametrize("name", ["blend", *SLOW])
-def test_numbers_of_surfaces(tmp_path, name):
-    surface, names = SURFACES[name]
-    room = make_room()
-    room["wall"]["bsdf"] = surface
-    room["sensor"]["fov_axis"] = "y"
-    scene = tt.load(room, variant=VARIANT)
-    values = changed(scene, [f"wall.bsdf.{each}" for each in names] + ["sensor.x_fov"])
-    again = tt.load(scene.save(tmp_path / "found.xml", values), variant=VARIANT)
-    table = again.parameters()
-    assert list(table) == list(scene.parameters())
-    for key, value in values.items():
-        np.testing.assert_allclose(np.ravel(table[key].value), value.numpy().ravel(), rtol=1e-6, err_msg=key)
-    torch.testing.assert_close(picture(again), picture(scene, parameters=values), rtol=1e-4, atol=1e-5)

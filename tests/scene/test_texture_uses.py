@@ -10,7 +10,7 @@ import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from support.marks import long
 from torchtransient.errors import SceneError
-from torchtransient.plugins.described_scene import check_textures, numbers_below
+from torchtransient.plugins.described_scene import check_textures
 
 VARIANT = "llvm_ad_rgb"
 HEIGHTS = {"type": "constvolume", "value": 0.5}
@@ -50,13 +50,6 @@ def bumpy(texture):
 def test_textures_without_a_slope_are_named(name):
     with pytest.raises(SceneError, match=r"'bumps.*bumpmap.*heights.*bitmap"):
         tt.load(bumpy(WITHOUT_SLOPE[name]), variant=VARIANT).parameters()
-
-
-@pytest.mark.parametrize("name", WITHOUT_SLOPE)
-def test_in_a_scene_of_mitsuba(name):
-    scene = mi.load_dict(bumpy(WITHOUT_SLOPE[name]), optimize=False)
-    with pytest.raises(SceneError, match="bumpmap"):
-        scene.integrator().render(scene, spp=1)
 
 
 @pytest.mark.parametrize("name", WITH_SLOPE)
@@ -153,16 +146,6 @@ def test_attributes_that_a_surface_cannot_read(name, kind):
                 check_textures(params)
 
 
-def test_one_surface_on_two_shapes():
-    """One of them has no such attribute."""
-    bsdf = {"type": "diffuse", "id": "paint", "reflectance": read()}
-    shape = {"type": "cube", "bsdf": {"type": "ref", "id": "paint"}}
-    scene = {"paint": bsdf, **room(), "wall": shape | {"vertex_paint": HEIGHTS | {"type": "uniform"}}}
-    assert tt.load(scene, variant=VARIANT).parameters()
-    with pytest.raises(SceneError, match=r"'side'.*none"):
-        tt.load(scene | {"side": shape}, variant=VARIANT).parameters()
-
-
 # -------------------------------------------------------------------------------------------------------------- lights
 
 
@@ -190,24 +173,3 @@ def test_textured_lights_need_texture_coordinates():
     lamp["emitter"] = {"type": "area", "radiance": bitmap(1)()}
     with pytest.raises(SceneError, match=r"'light'.*texture coordinates"):
         tt.load(room(light=lamp), variant=VARIANT).parameters()
-
-
-def test_lights_that_stay_dark_may_have_them():
-    assert tt.load(glowing("directionalarea"), variant=VARIANT).parameters()
-
-
-def test_numbers_of_attributes_belong_to_their_shapes():
-    """Only attributes that a texture reads, of the named shapes, count."""
-    ply = mi.Mesh("shape", 3, 1)
-    ply.add_attribute("vertex_color", 3, np.arange(9, dtype=np.float32))
-    ply.add_attribute("vertex_other", 1, np.float32([20, 21, 22]))
-    disk = mi.load_dict({"type": "disk", "face_paint": {"type": "uniform", "value": 0.25}})
-
-    def found(name, shapes):
-        reader = mi.load_dict({"type": "mesh_attribute", "name": name, "scale": 0.5})
-        return sorted(np.concatenate([np.ravel(np.array(value)) for value in numbers_below(reader, shapes)]).tolist())
-
-    assert found("vertex_color", ()) == [0.5]
-    assert found("vertex_color", (ply, disk)) == [0.0, 0.5, *map(float, range(1, 9))]
-    assert found("vertex_other", (ply,)) == [0.5, 20, 21, 22]
-    assert found("face_paint", (ply, disk)) == [0.25, 0.5]

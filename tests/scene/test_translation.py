@@ -13,10 +13,9 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import GradientError, PhysicsError, PhysicsWarning, SceneError
-from torchtransient.rendering.films import Gates, Histogram, Phasors
+from torchtransient.errors import PhysicsError, PhysicsWarning
+from torchtransient.rendering.films import Histogram
 from torchtransient.scene.edits import BuildOptions, printed_properties
-from torchtransient.scene.values import may_have_derivative
 
 VARIANT = "llvm_ad_rgb"
 AXIS = tt.TimeAxis(start_opl=0.0, bin_width_opl=1.0, num_bins=2)
@@ -116,19 +115,6 @@ def test_films_mean_what_they_mean_to_mitsuba(stated, tmp_path):
         assert of(sensor.film()) == own and sensor.film().base_channels_count() == 3
 
 
-def test_pixels_that_a_film_does_not_have_are_refused():
-    with_pixels = {name: room(film={**FILM, "pixel_format": name}) for name in ("luminance", "rgba", "xyz", "xyza")}
-    for name, scene in with_pixels.items():
-        for given in (scene, mi.load_dict(scene)):
-            with pytest.raises(SceneError, match=f"pixel_format: expected 'rgb', got '{name}'.*leave it out"):
-                translated(given)
-    mi.set_variant("llvm_ad_mono")
-    for scene in with_pixels.values():  # Mitsuba has one channel of them there
-        assert translated(scene).sensors()[0].film().base_channels_count() == 1
-    with pytest.raises(SceneError, match="expected 'luminance', got 'luminance_alpha'"):
-        translated(room(film={**FILM, "pixel_format": "luminance_alpha"}))
-
-
 def test_files_of_older_versions_spell_properties_in_another_way(tmp_path):
     path = tmp_path / "old.xml"
     path.write_text(
@@ -138,70 +124,6 @@ def test_files_of_older_versions_spell_properties_in_another_way(tmp_path):
     )
     found = translated(path)
     assert of_paths(found.integrator())[0] == 3 and found.sensors()[0].film().crop_size()[0] == 5
-
-
-# ---------------------------------------------------------------------------------------------------- what is misspelt
-
-MISSPELT = {
-    "integrator": (room({**PATH, "max_dpeth": 3}), {}, "'path' does not read 'max_dpeth' = 3"),
-    "volumes": (room({"type": "volpathmis", "rr_dpeth": 3}), {}, "'volpathmis' does not read 'rr_dpeth'"),
-    "of another": (room({**PATH, "use_spectral_mis": True}), {}, "'path' does not read 'use_spectral_mis'"),
-    "nested": (
-        room({"type": "aov", "aovs": "d:depth", "nested": {**PATH, "max_dpeth": 3}}),
-        {"integrator": "transient_path"},
-        "'path' does not read 'max_dpeth'",
-    ),
-    "around": (
-        room({"type": "stokes", "max_depth": 3, "nested": PATH}),
-        {"integrator": "transient_path"},
-        "'stokes' does not read 'max_depth'",
-    ),
-    "transient": (
-        room({"type": "transient_path", "max_dpeth": 3}),
-        {"integrator": "transient_prbvolpath"},
-        "'transient_path' does not read 'max_dpeth'",
-    ),
-    "film": (room(film={**FILM, "crop_witdh": 3}), {}, "'hdrfilm' does not read 'crop_witdh'"),
-    "film of gates": (
-        room(film={**FILM, "exhaustive_scan": True}),
-        {"film": Gates((tt.Gate.rectangular(1.0, 2.0),))},
-        "'hdrfilm' does not read 'exhaustive_scan'",
-    ),
-    "histogram": (
-        room(film={"type": "transient_hdr_film", "temporal_binz": 3}),
-        {"film": Phasors(tt.FrequencyAxis((0.5,)))},
-        "'transient_hdr_film' does not read 'temporal_binz'",
-    ),
-    "filter": (
-        room(film={**FILM, "rfilter": {"type": "gaussian", "stdev": 0.3}}), {}, "'gaussian' does not read 'stdev'",
-    ),
-    "sampler": (
-        room(sampler={"type": "independent", "sample_cuont": 9}),
-        {},
-        "'independent' does not read 'sample_cuont'",
-    ),
-    "sensor": (room(fovv=3.0), {}, "'perspective' does not read 'fovv'"),
-    "value": (room(film={**FILM, "file_format": "bmp"}), {}, 'The "file_format" parameter must .* found bmp'),
-    "depth": (room({**PATH, "max_depth": -7}), {}, '"max_depth" must be set to -1'),
-    "number": (room({**PATH, "rr_depth": 1.5}), {}, "expected integer, got float"),
-    "silhouettes": (room({"type": "prb_projective", "sppi": 4}), {}, "'sppi': expected no samples of silhouettes"),
-}  # fmt: skip
-
-
-def test_what_asks_for_no_samples_of_silhouettes_passes():
-    node = {"type": "prb_projective", "sppp": 0, "sppi": 0, "guiding": "none", "guiding_proj": False, "max_depth": 4}
-    assert of_paths(translated(room(node)).integrator())[0] == 4
-    for stated in ({"sppc": 0}, {"guiding": "grid"}):
-        with pytest.raises(SceneError, match="expected no samples of silhouettes"):
-            translated(room({**node, **stated}))
-
-
-@pytest.mark.parametrize("name", MISSPELT)
-def test_what_mitsuba_refuses_is_refused(name, tmp_path):
-    scene, options, said = MISSPELT[name]
-    for given in (scene, as_xml(tmp_path / "scene.xml", scene)):
-        with pytest.raises(SceneError, match=said):
-            translated(given, **options)
 
 
 # ------------------------------------------------------------------------------------------------------------- renders
@@ -299,51 +221,6 @@ def test_a_bound_keeps_the_light_of_a_late_window():
     torch.testing.assert_close(found.transient.sum(), deep.transient.sum(), rtol=2e-2, atol=0.0)
 
 
-def modes(function, value):
-    """Calls of a function of one number, by what torch differentiates them with."""
-    batch = value[None]
-    return {
-        "reverse": lambda: function(value.clone().requires_grad_()).backward(),
-        "grad": lambda: torch.func.grad(function)(value),
-        "jvp": lambda: torch.func.jvp(function, (value,), (value,)),
-        "vmap of grad": lambda: torch.func.vmap(torch.func.grad(function))(batch),
-        "grad of vmap": lambda: torch.func.grad(lambda x: torch.func.vmap(function)(x).sum())(batch),
-        "jvp of vmap": lambda: torch.func.jvp(torch.func.vmap(function), (batch,), (batch,)),
-    }
-
-
-def test_which_values_can_be_differentiated_by():
-    found, value = [], torch.tensor(ALBEDO)
-
-    def square(given):
-        found.append(may_have_derivative(given))
-        return given * given
-
-    square(value), torch.func.vmap(square)(value[None])
-    for run in modes(square, value).values():
-        run()
-    with torch.no_grad():
-        square(value.clone().requires_grad_())
-    assert found == [False] * 2 + [True] * 7
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("albedo", "share"), [(0.97, 1e-3), (0.99, 0.99**512)])
-def test_bounds_of_bright_rooms(albedo, share):
-    """No bound is deeper than 512 where Russian roulette ends no path, and a warning gives the rest.
-
-    A pilot run of that depth lacks a^512 of the light that it takes for all, and by the middle, a^256, the light has
-    fallen to as much as it falls from there.
-    """
-    mi.set_variant("llvm_ad_mono")
-    scene = oven()
-    scene["ball"]["bsdf"]["reflectance"]["value"] = albedo
-    renderer = tt.TransientRenderer(scene, parameters=[KEY], time_axis=WINDOW, spp=1, physics="ignore")
-    stats = renderer(seed=0).stats
-    assert stats.light_beyond == pytest.approx(albedo**stats.max_depth, rel=2 * albedo**256 + 0.02)
-    assert share * 0.9 < albedo**stats.max_depth <= share
-
-
 @pytest.mark.slow
 def test_a_bound_that_leaves_too_much_is_an_error_where_asked():
     """More than half of the light is deeper than 512 at an albedo of 0.999."""
@@ -353,43 +230,3 @@ def test_a_bound_that_leaves_too_much_is_an_error_where_asked():
     strict = tt.TransientRenderer(scene, parameters=[KEY], time_axis=WINDOW, spp=1, physics="error")
     with pytest.raises(PhysicsError, match="give max_depth= for these"):
         strict(seed=0)
-
-
-@pytest.mark.slow
-def test_which_calls_have_a_bound():
-    """Calls that may be differentiated, in either mode, have one."""
-    mi.set_variant("llvm_ad_mono")
-    renderer = tt.TransientRenderer(oven(), parameters=[KEY], time_axis=WINDOW, spp=16, physics="ignore")
-    depths, value = [], torch.tensor(ALBEDO)
-
-    def bright(given):
-        out = renderer({KEY: given}, seed=0)
-        depths.append(out.stats.max_depth)
-        return out.steady.mean()
-
-    bright(value), torch.func.vmap(bright)(value[None])
-    assert depths == [-1, -1]
-    for name, run in modes(bright, value).items():
-        depths.clear()
-        run()
-        assert depths[0] > 20, name
-    # One bound for all samplers, which differ in noise alone.
-    assert renderer.variation(sampler="stratified")(seed=1).stats.max_depth == depths[0]
-    renderer.requires_grad_(False)
-    assert renderer(seed=0).stats.max_depth == -1
-
-
-def test_bounds_that_are_not_found():
-    scene = oven()
-    scene["ball"].pop("emitter")
-    dark = tt.TransientRenderer(tt.load(scene, variant="llvm_ad_mono"), parameters=[KEY], time_axis=WINDOW, spp=1)
-    with pytest.raises(GradientError, match=r"a pilot run saw no light\. Set max_depth"):
-        dark(seed=0)
-
-
-def test_plans_say_what_has_no_limit():
-    plan = tt.plan(oven(), parameters=[KEY], time_axis=WINDOW, max_depth="scene", pilot=False)
-    assert plan.max_depth == -1 and "max_depth: no limit (derivatives: a bound that renderers find)" in str(plan)
-    pictures = oven({"type": "aov", "aovs": "d:depth", "nested": {"type": "path", "max_depth": 4}})
-    plan = tt.plan(pictures, time_axis=WINDOW, max_depth="scene", pilot=False)
-    assert plan.max_depth == 4 and "not rendered: the pictures that 'aov' adds" in str(plan)

@@ -8,13 +8,12 @@ import zlib
 
 import numpy as np
 import pytest
-import torch
 
 import torchtransient as tt
 from support import deadly_plugins
 from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
-from torchtransient.errors import ArgumentError, SceneError
+from torchtransient.errors import SceneError
 from torchtransient.plugins import _registry
 from torchtransient.scene import load as module
 
@@ -63,15 +62,6 @@ def test_faces_of_vertices_that_are_not_there(tmp_path, form):
                 render(room)
 
 
-def test_meshes_that_are_taken_as_they_are(tmp_path):
-    import mitsuba as mi
-
-    mi.set_variant(VARIANT)
-    mesh = mi.load_dict(mesh_file(tmp_path, "ascii", (0, 1, 3)) | {"face_normals": True, "bsdf": {"type": "conductor"}})
-    with pytest.raises(SceneError, match="from 0 to 2"):
-        render(make_room() | {"box": mesh})
-
-
 # -------------------------------------------------------------------------------------------- processes of their own
 
 
@@ -111,17 +101,6 @@ def test_what_is_right_is_loaded_and_what_is_wrong_is_said():
         tt.load(room, variant=VARIANT, trusted=False)
 
 
-def test_what_cannot_be_tried():
-    import mitsuba as mi
-
-    mi.set_variant(VARIANT)
-    taken = make_room() | {"box": mi.load_dict({"type": "cube", "bsdf": {"type": "conductor"}})}
-    with pytest.raises(SceneError, match=r"trusted=False\)"):
-        tt.load(taken, trusted=False)
-    with pytest.raises(ArgumentError, match="trusted: expected True or False, got 'no'"):
-        tt.load(make_room(), trusted="no")
-
-
 # ------------------------------------------------------------------------------------------------- long before kernels
 
 
@@ -139,9 +118,3 @@ def test_thousands_of_references_are_counted_at_once(kind):
     with pytest.raises(SceneError, match="at most 32 deep"):
         render(room)
     assert time.process_time() - started < 6  # 15 s of the processor where every look copies all nodes; now 0.2
-
-
-def test_angle_of_light_whose_components_are_each_below_the_floor():
-    for floor in (1e-3, 1.0):
-        light = torch.tensor([5 * floor, 0.9 * floor, 0.9 * floor, 0.0])
-        assert tt.stokes.angle_of_linear_polarization(light, -1, floor).item() == pytest.approx(np.pi / 8)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 import torchtransient as tt
-from tools.small_room import VARIANT, make_room
+from tools.small_room import VARIANT
 from torchtransient.errors import SceneError
-from torchtransient.rendering.films import layout_of_entries
 
 GATES = [tt.Gate.gaussian(8.0, 0.5)]
 
@@ -39,15 +38,6 @@ def test_films_that_are_steady(room):
     assert rendered(room, time_axis=tt.TimeAxis(6.0, 0.5, 8)).axis.num_bins == 8
 
 
-def test_plugins_that_nobody_knows(room):
-    room["sensor"]["film"]["type"] = "transient_hdr_flim"
-    with pytest.raises(SceneError, match="transient_hdr_flim"):
-        rendered(room)
-    room = make_room() | {"integrator": {"type": "transient_pth"}}
-    with pytest.raises(SceneError, match="transient_pth"):
-        rendered(room)
-
-
 def test_integrators_without_a_transient_counterpart(room):
     room["integrator"] = {"type": "depth"}
     with pytest.raises(SceneError, match=r"integrator 'depth' has no transient counterpart. Expected transient_path"):
@@ -56,23 +46,3 @@ def test_integrators_without_a_transient_counterpart(room):
     assert rendered(room)(seed=0).stats.integrator == "transient_path"
     del room["integrator"]
     assert rendered(room)(seed=0).stats.integrator == "transient_path"
-
-
-def test_files_of_something_else(tmp_path):
-    file = tmp_path / "cube.xml"
-    file.write_text('<shape version="3.0.0" type="cube"/>', encoding="utf-8")
-    with pytest.raises(SceneError, match=r"cube\.xml: expected a <scene> at the top, got <cube>"):
-        tt.load(file, variant=VARIANT).parameters()
-
-
-def test_scenes_without_a_sensor(room):
-    del room["sensor"]
-    with pytest.raises(SceneError, match="has no sensor; add one"):
-        rendered(room)
-
-
-def test_files_without_a_film():
-    with pytest.raises(KeyError, match="transient or phasor or gated"):
-        layout_of_entries({"steady": 1})
-
-

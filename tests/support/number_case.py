@@ -50,10 +50,6 @@ class Case:
     def __call__(self, **given: Any) -> Any:
         return self.call(*self.places, **{**self.base, **given})
 
-    def by_name(self, given: dict[str, Any], names: list[str]) -> Any:
-        """Call with all arguments by name; ``names``: those of the signature, in order."""
-        return self.call(**{**dict(zip(names, self.places, strict=False)), **self.base, **given})
-
     def number(self, argument: str) -> Any:
         """The number of the base; of several the first; None for none."""
         value = self.base.get(argument)

@@ -45,9 +45,6 @@ class _Called(Case):
     def __call__(self, **given):
         return super().__call__(**given)(*self.tensors)
 
-    def by_name(self, given, names):
-        return super().by_name(given, names)(*self.tensors)
-
 
 def _of_losses() -> dict[str, Case]:
     """Functions and modules of losses and metrics, by the cases that their own tests have."""

@@ -113,25 +113,9 @@ def test_plan():
         tt.plan(make_room(), "transient", film=Moments(2))
 
 
-def test_a_plan_keeps_the_settings_of_the_scene():
-    room = make_room()
-    room["sensor"]["film"] = {"type": "moments_hdr_film", "width": 4, "height": 3, "moments": 2}
-    plan = tt.plan(room, "moments", pilot=False)
-    assert "film: moments, since moments are asked for" in str(plan)
-    assert plan.renderer(spp=1)(seed=0).others["moments"].shape[1] == 2
-    with pytest.raises(ArgumentError, match="moments film has none"):
-        tt.TransientRenderer(room, temporal_filter="tent")
-
-
 @pytest.mark.parametrize("ending", ["h5", "npz"])
 def test_result_files(tmp_path, ending):
     out = tt.render(make_room(), film=Moments(2), spp=2, seed=0)
     back = read_result(write_result(tmp_path / f"a.{ending}", out))
     assert torch.equal(back.others["moments"], out.others["moments"]) and back.others["number_of_moments"] == 2
     assert back.transient is None and back.channels == out.channels
-
-
-def test_accuracy():
-    renderer = tt.TransientRenderer(make_room(), film=Moments(2))
-    report = tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, samplers=("independent",), progress=False)
-    assert {point.quantity for point in report.points} == {"moments"}

@@ -11,7 +11,7 @@ import torch
 import torchtransient as tt
 from support.marks import long_rows
 from tools.small_room import WALL_POSE, make_room
-from torchtransient.errors import ArgumentError, GradientError, SceneError
+from torchtransient.errors import GradientError, SceneError
 
 VARIANT = "llvm_ad_rgb"
 SIZE = {"width": 4, "height": 3, "rfilter": {"type": "box"}}
@@ -67,23 +67,6 @@ def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
             assert found[2] == expected[2] and bool(found[2]) == ("histogram" in name)
 
 
-def test_steady_gates_beside_a_window_that_cuts():
-    """`steady=False` is for histograms: a gated film beside one is refused."""
-    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"]), variant=VARIANT)
-    with pytest.raises(SceneError, match="'gated_hdr_film' does not read 'steady'"):
-        tt.TransientRenderer(scene, steady=False)
-
-
-def test_a_plan_is_about_the_film_of_its_sensor():
-    scene = tt.load(room_of(HISTOGRAM, FILMS["gated"], {**HISTOGRAM, "bin_width_opl": 0.5}), variant=VARIANT)
-    gated = tt.plan(scene, "gates", sensor=1)
-    assert gated.renderer(spp=1)(seed=0).gated.shape == (3, 2, 3, 4)
-    with pytest.raises(SceneError, match="neither the film nor the call has gates"):
-        tt.plan(scene, "gates")
-    plans = [tt.plan(scene, sensor=sensor, time_axis="scene", pilot=False) for sensor in (0, 2)]
-    assert [plan.time_axis.bin_width_opl for plan in plans] == [0.25, 0.5]
-
-
 def test_a_filter_that_one_film_refuses_changes_no_other():
     # A pulse and a filter that together cover more bins than are spread while rendering.
     late = {**HISTOGRAM, "gaussian_stddev": 1e4, "pulse": "gaussian", "pulse_fwhm_opl": 0.5}
@@ -117,23 +100,6 @@ def test_films_of_one_call_measure_the_same(first, second, message):
     with pytest.raises(SceneError, match=f"measure the same.*{message}.*per sensor"):
         tt.TransientRenderer(scene, sensors="all")
     tt.TransientRenderer(scene, sensors=1)
-
-
-def test_channels_of_one_call_are_the_same():
-    curve = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"}
-    films = {**HISTOGRAM, "blue": curve}, {**HISTOGRAM, "violet": curve}
-    scene = tt.load(room_of(*films), variant="llvm_ad_spectral")
-    with pytest.raises(SceneError, match=r"channels blue.*channels violet"):
-        tt.TransientRenderer(scene, sensors="all")
-
-
-def test_filters_of_one_call_are_the_same():
-    """None of them is silently replaced by that of another film."""
-    scene = tt.load(room_of(HISTOGRAM, FILMS["smooth histogram"]), variant=VARIANT)
-    with pytest.raises(ArgumentError, match="different ones, box, gaussian"):
-        tt.TransientRenderer(scene, sensors="all")
-    out = tt.TransientRenderer(scene, sensors="all", temporal_filter="tent", spp=4)(seed=[5])
-    assert out.transient.shape == (2, 3, 24, 3, 4) and out.stats.temporal_filter == "tent"
 
 
 def test_every_film_of_a_call_needs_a_slope():
