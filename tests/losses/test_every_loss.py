@@ -10,7 +10,7 @@ import pickle
 import pytest
 import torch
 
-from support.loss_cases import CASES, MESHES, OTHERS
+from support.loss_cases import CASES, IDLE, MESHES, OTHERS, WRONG, number_options
 from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
@@ -341,25 +341,13 @@ def test_what_would_be_wrong_in_silence_is_an_error(case):
 COMPLEX_TOO = (losses.squared_loss, losses.two_render_loss, losses.measurement_consistency)
 
 
-LENGTHS = ("bin_width_opl", "creation_cost_opl")
-# Of these a wrong one makes a plausible number.
-WRONG_NUMBERS = {
-    **dict.fromkeys(("floor", "background", "smoothing", "read_noise"), (-1.0, float("nan"), torch.rand(13))),
-    **dict.fromkeys(LENGTHS, (1e-10, -1.0)),  # seconds
-    **dict.fromkeys(("cycles", "periods"), (0, 2.5)),
-    "value_range": (-1.0, 0.0),
-    "dead_bins": (-1.0, float("nan")),
-    "balance": (-0.1, 1.1),
-    "window": (0, 4),
-    "scales": ((), (0,), (1, 2.5)),
-    "spacing": ((1.0, 1.0), (1.0, 0.0, 1.0)),
-}
-
-
 @every
 def test_numbers_that_make_a_plausible_loss_are_an_error(case):
+    """Of every option of the signature, where it has a part."""
     x, y = case.tensors()
-    for name in WRONG_NUMBERS.keys() & case.options.keys():
-        for wrong in WRONG_NUMBERS[name]:
+    for name in number_options(case.module):
+        if (case.name, name) in IDLE:
+            continue
+        for wrong in WRONG.get(name, (-1.0, float("nan"))):
             with pytest.raises(TorchTransientError, match="expected"):
                 dataclasses.replace(case, options={**case.options, name: wrong})(x, y)

@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import functools
-import inspect
 
 import pytest
 import torch
 
-from support.loss_cases import CASES
+from support.loss_cases import CASES, FITS, IDLE, number_options
 from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import TorchTransientError
-
-# Options that are numbers, by one that fits.
-NUMBERS = {
-    **dict.fromkeys(("floor", "background", "smoothing", "read_noise", "creation_cost_opl", "share"), 0.7),
-    **dict.fromkeys(("bin_width_opl", "balance"), 0.05),
-    **dict.fromkeys(("cycles", "periods"), 400.0),
-    **dict.fromkeys(("window", "value_range", "cells"), 3.0),
-    "dead_bins": 2.5,
-}
-SEVERAL = {"spacing": (0.1, 0.2, 0.3), "scales": (1.0, 2.0)}
 
 
 def plain(function):
@@ -33,20 +22,16 @@ def plain(function):
 
 
 def calls():
-    """(function, its options, a call with more of them)."""
+    """(options that are numbers, those that are held, a call with more of them)."""
     for case in CASES:
         x, y = case.tensors()
         more = functools.partial(case.function, *case.arguments(x, y))
-        yield case.name, case.function, case.options, more
+        yield case.name, number_options(case.module), case.options, more
     for function in (losses.anscombe, losses.relative_floor, losses.surface_distance):
-        yield function.__name__, function, {}, functools.partial(function, *plain(function))
+        yield function.__name__, number_options(function), {}, functools.partial(function, *plain(function))
 
 
 CALLS = {name: call for name, *call in calls()}
-
-
-# Options that have no part beside the others of a case: phases have a floor, and so do records of mass one.
-IDLE = {("phasor", "floor"), ("transient phasor", "floor"), ("Wasserstein, unbalanced", "floor")}
 
 
 def refused(call):
@@ -61,11 +46,12 @@ def refused(call):
 @together("name", CALLS)
 def test_an_option_with_a_gradient_has_it_or_is_refused(name):
     """Never a number in silence, whose derivative is nothing."""
-    function, options, call = CALLS[name]
-    for option in (NUMBERS.keys() | SEVERAL.keys()) & inspect.signature(function).parameters.keys():
+    numbers, options, call = CALLS[name]
+    for option in numbers:
         if (name, option) in IDLE:
             continue
-        number = NUMBERS.get(option, SEVERAL.get(option))
+        number = FITS.get(option, options.get(option))
+        assert number is not None, f"{name}: give its case in tests/support/loss_cases.py a {option}, or FITS there"
         leaf = torch.tensor(number, dtype=torch.float64, requires_grad=True)
 
         def value(x, option=option):

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from support.marks import long_rows
+from support.sensing.all_entries import ENTRIES
 from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
 from support.sweeps import together
+from torchtransient import sensing
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
+    AfterpulseDelays,
     Afterpulsing,
     AfterpulsingSPAD,
     Compose,
@@ -23,6 +31,7 @@ from torchtransient.sensing import (
 )
 
 WIDTH = 1e-10  # of a bin
+NS = 1e-9
 BINS = 40
 
 
@@ -32,29 +41,137 @@ def exponentials(dead, *parts, **keywords):
     return Afterpulsing(p, tau, dead * WIDTH, bin_width_s=WIDTH, **keywords)
 
 
-def power_law(dead, exponent, longest, **keywords):
-    law = PowerLawDelays(exponent, longest * WIDTH)
-    return Afterpulsing(0.2, dead_time_s=dead * WIDTH, delays=law, bin_width_s=WIDTH, **keywords)
+@dataclass(frozen=True)
+class Delays:
+    """A law, the dead time in bins, and the formula of carriers that are left after t bins, in any scale."""
+
+    law: Callable[[], AfterpulseDelays]
+    dead: float
+    left: Callable[[np.ndarray], np.ndarray]
+    infinite: bool = False  # at delay 0
 
 
-def measured(dead, start=0.7, **keywords):
-    law = MeasuredDelays(torch.tensor([9.0, 40, 22, 13, 9, 6, 5]), 5.3 * WIDTH, start_s=start * WIDTH, floor=4.0)
-    return Afterpulsing(0.2, dead_time_s=dead * WIDTH, delays=law, bin_width_s=WIDTH, **keywords)
+def power_law(dead, exponent, longest):
+    def left(t):
+        a = 1 - exponent
+        return -np.log(t) if a == 0 else -np.expm1(a * np.log(t)) / a
+
+    return Delays(lambda: PowerLawDelays(exponent, longest * WIDTH), dead, left, infinite=True)
+
+
+def measured(dead, start=0.7):
+    counts, width = [9.0, 40, 22, 13, 9, 6, 5], 5.3  # 4 of them are no afterpulses
+    edges, sums = start + width * np.arange(8), np.cumsum([0, *(n - 4 for n in counts)])
+    law = functools.partial(MeasuredDelays, torch.tensor(counts), width * WIDTH, start_s=start * WIDTH, floor=4.0)
+    return Delays(law, dead, lambda t: sums[-1] - np.interp(t, edges, sums))
+
+
+# Every law of delays: an entry here, and one of the contract of sensors.
+DELAYS = {
+    "power law": power_law(7.4, 1.3, 400.0),
+    "power law with exponent 1": power_law(3.0, 1.0, 90.0),
+    "power law with exponent nearly 1": power_law(3.0, 1 + 5e-7, 90.0),
+    "flat power law": power_law(2.2, 0.6, 60.0),
+    "steep power law": power_law(0.6, 2.5, 50.0),
+    "measured": measured(7.4),
+    "measured, behind its dead time": measured(2.0, start=6.5),
+    "measured, without dead time": measured(0.0),
+}
+
+
+def of_delays(name):
+    delays = DELAYS[name]
+    return Afterpulsing(0.2, dead_time_s=delays.dead * WIDTH, delays=delays.law(), bin_width_s=WIDTH)
 
 
 LAWS = {
     "two exponentials": lambda: exponentials(7.4, (0.06, 5.0), (0.14, 130.0)),
     "no dead time": lambda: exponentials(0.0, (0.1, 0.3), (0.1, 90.0)),
-    "power law": lambda: power_law(7.4, 1.3, 400.0),
-    "power law with exponent 1": lambda: power_law(3.0, 1.0, 90.0),
-    "steep power law": lambda: power_law(0.6, 2.5, 50.0),
-    "measured": lambda: measured(7.4),
-    "measured, behind its dead time": lambda: measured(2.0, start=6.5),
+    **{name: functools.partial(of_delays, name) for name in DELAYS},
 }
 each_law = pytest.mark.parametrize("name", LAWS)
 
 
 # --- laws -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_law_of_delays_is_compared():
+    public = {law for law in vars(sensing).values() if isinstance(law, type) and issubclass(law, AfterpulseDelays)}
+    laws = public - {AfterpulseDelays}
+    here = {type(delays.law()) for delays in DELAYS.values()}
+    assert here == laws, f"enter {laws - here} in DELAYS of tests/sensing/test_afterpulse_laws.py"
+    in_contract = {type(delays) for entry in ENTRIES if (delays := getattr(entry.make(), "delays", None)) is not None}
+    assert in_contract >= laws, f"give {laws - in_contract} an Entry in tests/support/sensing/entries_afterpulses.py"
+
+
+@pytest.mark.parametrize("name", DELAYS)
+def test_laws_against_quadrature(name):
+    """What is yet to come, its mean over bins of three lengths, and drawn delays, by the formula of what is left."""
+    law, dead, left = DELAYS[name].law(), DELAYS[name].dead, DELAYS[name].left
+    dead_s, end = dead * WIDTH, law.end_s() / WIDTH
+    assert math.isfinite(end)
+
+    def yet(t):
+        t = np.clip(t, dead, end)
+        return (left(t) - left(end)) / (left(np.array(dead)) - left(end))
+
+    t = torch.linspace(dead, end + 2, 50, dtype=torch.float64)
+    np.testing.assert_allclose(law.yet_to_come(t, dead_s, WIDTH).numpy(), yet(t.numpy()), atol=1e-6)
+    for width in (0.7, 3.0, 11.0):  # of a bin
+        number = min(math.ceil(end / width) + 2, 40)
+        inside = (np.arange(4000) + 0.5) / 4000
+        wanted = yet((np.arange(-1.0, number)[:, None] + inside) * width).mean(1)
+        found = law.shares(dead_s, width * WIDTH, first=0, number=number).numpy()
+        np.testing.assert_allclose(found, wanted[:-1] - wanted[1:], atol=3e-4)
+        assert float(law.kernel(dead_s, width * WIDTH, 7).sum()) == pytest.approx(1, rel=1e-9)
+    drawn = law.draw(50_000, dead_s, torch.Generator().manual_seed(0)).numpy() / WIDTH
+    assert drawn.min() >= dead * (1 - 1e-12) and drawn.max() <= end * (1 + 1e-12)
+    assert stats.kstest(drawn, lambda t: 1 - yet(t)).pvalue > 1e-3
+    if DELAYS[name].infinite:
+        with pytest.raises(UnitError):
+            law.released_after(dead_s)
+    else:
+        share = (left(np.array(dead)) - left(end)) / (left(np.array(0.0)) - left(end))
+        assert float(law.released_after(dead_s)) == pytest.approx(float(share))
+    for late in (end, end + 1):
+        with pytest.raises(UnitError):
+            law.shares(late * WIDTH, WIDTH, first=0, number=3)
+
+
+def test_measured_delays_by_hand():
+    """(4, 0, 2) of 2 ns from 1 ns on: 1 - 2/3 1/4 after 1.5 ns, 1/3 after 3 ns, nothing after 7 ns."""
+    law = MeasuredDelays(torch.tensor([4.0, 0, 2]), 2 * NS, start_s=NS)
+    assert law.end_s() == pytest.approx(7 * NS)
+    for dead, left in ((0.0, 1.0), (1.0, 1.0), (1.5, 1 - 1 / 6), (3.0, 1 / 3), (4.9, 1 / 3), (6.0, 1 / 6)):
+        assert law.released_after(dead * NS) == pytest.approx(left)
+    for dead in (7.0, 9.0):
+        with pytest.raises(UnitError, match="expected delays beyond the dead time"):
+            law.released_after(dead * NS)
+    u = (np.arange(2000) + 0.5) / 2000
+    for dead in (0.0, 2.2, 5.3):
+        below = np.interp((np.arange(8.0)[:, None] - u) * 1.5, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
+        gone = np.interp(dead, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
+        wanted = np.diff((np.maximum(below - gone, 0) / (1 - gone)).mean(1))
+        np.testing.assert_allclose(law.shares(dead * NS, 1.5 * NS, first=0, number=7).numpy(), wanted, atol=5e-4)
+        drawn = law.draw(40_000, dead * NS, torch.Generator().manual_seed(1)).numpy() / NS
+        assert drawn.min() >= max(dead, 1.0) - 1e-9 and drawn.max() <= 7
+        counted = np.histogram(drawn, [1, 3, 5, 7])[0] / 40_000
+        exact = np.diff(np.maximum(np.array([0, 2 / 3, 2 / 3, 1]) - gone, 0) / (1 - gone))
+        np.testing.assert_allclose(counted, exact, atol=0.013)  # five deviations of a half
+    folded = law.kernel(0.0, 1.5 * NS, 2)
+    shares = law.shares(0.0, 1.5 * NS, first=0, number=8)
+    assert folded.tolist() == pytest.approx([float(shares[0::2].sum()), float(shares[1::2].sum())])
+    for wrong in ([1.0, -1.0], [1.0, math.inf], [1.0, math.nan]):
+        with pytest.raises(UnitError, match="finite counts >= 0"):
+            MeasuredDelays(torch.tensor(wrong), NS)
+    for wrong in (torch.ones(0), torch.ones(2, 2)):
+        with pytest.raises(ShapeError, match="of a histogram of delays"):
+            MeasuredDelays(wrong, NS)
+
+
+def test_power_laws_need_a_dead_time():
+    with pytest.raises(UnitError):
+        PowerLawDelays(1.2, 30 * NS).draw(3, 0.0, None)
 
 
 @each_law

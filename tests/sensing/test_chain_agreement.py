@@ -8,6 +8,7 @@ from copy import deepcopy
 import pytest
 import torch
 
+from support.sensing.arguments import CALLS
 from support.sweeps import together
 from torchtransient import Chirps, TimeAxis, sensing
 from torchtransient.errors import ShapeError, StorageError, UnitError
@@ -232,43 +233,6 @@ def test_one_change_of_a_device_reaches_all_stages():
 
 # --------------------------------------------------------------------------------------------------- seconds and hertz
 
-COUNTS = torch.tensor([0.0, 1.0, 9.0, 3.0, 0.0, 0.0])
-SPAD = sensing.SynchronousSPAD(100, dead_time_s=2 * NS, axis=AXIS)
-GAUSS = sensing.GaussianResponse(300 * PS)
-# everything that takes seconds, as it is meant
-SECONDS = {
-    "Afterpulsing": {
-        "probability": 0.01, "tau_s": 30 * NS, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS
-    },
-    "CoincidencePixel": {
-        "detector": SPAD, "spads": 4, "coincidence": 2, "window_s": 1 * NS, "bin_width_s": 100 * PS
-    },
-    "DetectionJitter": {"response": GAUSS, "bin_width_s": 100 * PS},
-    "DetectionSkew": {"delay_s": 70 * PS, "bin_width_s": 100 * PS},
-    "FreeRunningSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS, "period_s": 100 * NS},
-    "GatedIntegration": {"delays_s": [2 * NS], "widths_s": 1 * NS, "axis": AXIS, "rise_s": 200 * PS, "fall_s": 2 * NS},
-    "GaussianResponse": {"fwhm_s": 60 * PS, "delay_s": 1 * NS},
-    "ImpulseResponse": {"response": GAUSS, "bin_width_s": 100 * PS},
-    "MeasuredDelays": {"counts": COUNTS, "bin_width_s": 100 * PS, "start_s": 5 * NS},
-    "MeasuredResponse": {"counts": COUNTS, "bin_width_s": 4 * PS, "delay_s": 1 * NS},
-    "PhotonBudget": {
-        "optics": sensing.Optics(f_number=2.0), "pulse_energy_j": 1e-9, "wavelength_m": 532e-9,
-        "repetition_rate_hz": 10e6, "exposure_s": 1e-3, "bin_width_s": 100 * PS,
-    },
-    "PixelSkew": {"delay_s": -70 * PS, "bin_width_s": 100 * PS},
-    "PowerLawDelays": {"exponent": 1.1, "longest_s": 10e-6},
-    "StreakCamera": {"axis": AXIS, "time_fwhm_s": 200 * PS, "jitter_fwhm_s": 100 * PS},
-    "SweepJitter": {"jitter_fwhm_s": 100 * PS, "bin_width_s": 100 * PS},
-    "SynchronousSPAD": {"cycles": 9, "dead_time_s": 20 * NS, "bin_width_s": 100 * PS},
-    "TailedResponse": {"fwhm_s": 60 * PS, "tails_s": [80 * PS], "fractions": [0.1], "delay_s": 1 * NS},
-    "UniformResponse": {"width_s": 60 * PS, "delay_s": 1 * NS},
-    "emg_response": {"fwhm_s": 60 * PS, "tau_s": 80 * PS, "delay_s": 1 * NS},
-    "free_running_rate": {"rate_hz": torch.tensor(1e6), "dead_time_s": 20 * NS},
-    "ml_position": {
-        "histogram": torch.ones(1, 128, 1, 1), "response": GAUSS, "bin_width_s": 100 * PS, "signal_to_background": 9.0
-    },
-    "range_deviation_m": {"response_fwhm_s": 300 * PS, "detections": torch.ones(1)},
-}  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
 OTHERS = {
     "BudgetReport", "CramerRaoBound", "Device", "Response", "emg_cdf", "heterodyne_speed",
@@ -282,20 +246,24 @@ def seconds_of(name):
     return [n for n in names if n.endswith("_s")]
 
 
+# one good call of each, with all of its seconds
+SECONDS = {n: {**numbers, **rest} for n, (numbers, rest) in CALLS.items() if seconds_of(n) and n not in OTHERS}
+
+
 def test_nothing_that_takes_seconds_is_left_out():
     public = {n for n, v in vars(sensing).items() if callable(v) and not n.startswith("_")}
     assert {n for n in public if seconds_of(n)} == set(SECONDS) | OTHERS
+    for name, given in SECONDS.items():
+        assert set(seconds_of(name)) <= set(given), f"{name}: its call in tests/support/sensing/arguments.py lacks some"
 
 
 @together("unit", [1e12, 1e9])
-@together("name, argument", [(n, a) for n in SECONDS for a in seconds_of(n) if a in SECONDS[n]])
+@together("name, argument", [(name, argument) for name in SECONDS for argument in seconds_of(name)])
 def test_seconds_in_another_unit_are_told(name, argument, unit):
     made, given = getattr(sensing, name), SECONDS[name]
     assert made(**given) is not None
-    value = given[argument]
-    other = [v * unit for v in value] if isinstance(value, list) else value * unit
     with pytest.raises(UnitError, match=r"expected .* got "):
-        made(**{**given, argument: other})
+        made(**{**given, argument: unit * given[argument]})
 
 
 def test_unusual_devices_are_taken():

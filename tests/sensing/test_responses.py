@@ -1,4 +1,4 @@
-"""Responses, delays of afterpulses and counts that move, for numbers that can be worked out on paper."""
+"""Responses and counts that move, for numbers that can be worked out on paper."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from scipy import stats
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.axes import FrequencyAxis
-from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     ComposedResponse,
     GaussianResponse,
@@ -91,63 +90,6 @@ def test_responses_of_tails_against_scipy():
     assert flat(response.fractions) == pytest.approx([0.3, 0.2]) and response.has_core
     normal = sensing.GaussianResponse(0.3 * NS, 0.2 * NS)
     assert normal.support_s() == pytest.approx(((0.2 - 6 * sigma) * NS, (0.2 + 6 * sigma) * NS))
-
-
-# ---------------------------------------------------------------------------------------------------------- delays
-
-
-@pytest.mark.parametrize("exponent", [1.0, 1.0 + 5e-7, 0.6, 2.3])
-def test_power_laws_against_quadrature(exponent):
-    """From 2 to 30 ns in bins of 3 ns; exponents of one have a logarithm. Draws by the inverse of it."""
-    law = sensing.PowerLawDelays(exponent, 30 * NS)
-    found = law.shares(2 * NS, 3 * NS, first=0, number=14)
-    t = np.geomspace(2.0, 30.0, 40_001)
-    density = t**-exponent
-    below = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(t))])
-    below /= below[-1]
-    u = (np.arange(1000) + 0.5) / 1000
-    edges = (np.arange(15.0)[:, None] - u) * 3
-    wanted = np.diff(np.interp(edges, t, below, left=0.0, right=1.0).mean(1))
-    np.testing.assert_allclose(found.numpy(), wanted, atol=2e-4)
-    assert float(found.sum()) == pytest.approx(1.0)
-    drawn = law.draw(50_000, 2 * NS, torch.Generator().manual_seed(0)).numpy() / NS
-    assert drawn.min() >= 2 and drawn.max() <= 30
-    assert stats.kstest(drawn, lambda x: np.interp(x, t, below)).pvalue > 1e-3
-    assert law.end_s() == 30 * NS
-    for dead in (0.0, 30 * NS, 31 * NS):
-        with pytest.raises(UnitError, match="a dead time above 0 and below longest_s"):
-            law.draw(3, dead, None)
-
-
-def test_measured_delays_by_hand():
-    """(4, 0, 2) of 2 ns from 1 ns on: 1 - 2/3 1/4 after 1.5 ns, 1/3 after 3 ns, nothing after 7 ns."""
-    law = sensing.MeasuredDelays(number(4, 0, 2), 2 * NS, start_s=NS)
-    assert law.end_s() == pytest.approx(7 * NS)
-    for dead, left in ((0.0, 1.0), (1.0, 1.0), (1.5, 1 - 1 / 6), (3.0, 1 / 3), (4.9, 1 / 3), (6.0, 1 / 6)):
-        assert law.seen(dead * NS) == pytest.approx(left)
-    for dead in (7.0, 9.0):
-        with pytest.raises(UnitError, match="expected delays beyond the dead time"):
-            law.seen(dead * NS)
-    u = (np.arange(2000) + 0.5) / 2000
-    for dead in (0.0, 2.2, 5.3):
-        below = np.interp((np.arange(8.0)[:, None] - u) * 1.5, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
-        gone = np.interp(dead, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
-        wanted = np.diff((np.maximum(below - gone, 0) / (1 - gone)).mean(1))
-        np.testing.assert_allclose(law.shares(dead * NS, 1.5 * NS, first=0, number=7).numpy(), wanted, atol=5e-4)
-        drawn = law.draw(40_000, dead * NS, torch.Generator().manual_seed(1)).numpy() / NS
-        assert drawn.min() >= max(dead, 1.0) - 1e-9 and drawn.max() <= 7
-        counted = np.histogram(drawn, [1, 3, 5, 7])[0] / 40_000
-        exact = np.diff(np.maximum(np.array([0, 2 / 3, 2 / 3, 1]) - gone, 0) / (1 - gone))
-        np.testing.assert_allclose(counted, exact, atol=0.013)  # five deviations of a half
-    folded = law.kernel(0.0, 1.5 * NS, 2)
-    shares = law.shares(0.0, 1.5 * NS, first=0, number=8)
-    assert flat(folded) == pytest.approx([float(shares[0::2].sum()), float(shares[1::2].sum())])
-    for wrong in (number(1, -1), number(1, math.inf), number(1, math.nan)):
-        with pytest.raises(UnitError, match="finite counts >= 0"):
-            sensing.MeasuredDelays(wrong, NS)
-    for wrong in (torch.ones(0), torch.ones(2, 2)):
-        with pytest.raises(ShapeError, match="of a histogram of delays"):
-            sensing.MeasuredDelays(wrong, NS)
 
 
 # ----------------------------------------------------------------------------------------------------------- moves

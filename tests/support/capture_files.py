@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -114,16 +115,44 @@ def zone_frame():
 
 
 def read_only():
-    """Arrays by name of files that are only read, each with the name of its layout."""
+    """Content of files that other programs write, each with the name of its layout: arrays by name, or JSON."""
     rng = np.random.default_rng(0)
-    yield "cdt", {"meas": rng.poisson(3.0, (4, 4, 9)).astype(np.float32)}
-    yield "cdt", {"out": rng.poisson(3.0, (9, 1)).astype(np.float64)}
-    yield "keyhole", {
-        "data": rng.poisson(3.0, (5, 9)).astype(np.float64), "xpos": np.linspace(1, 0, 5)[:, None],
-        "zpos": np.linspace(0.15, 0, 5)[:, None],
-    }  # fmt: skip
-    yield "keyhole", {"direct_before": rng.poisson(3.0, (9, 1)).astype(np.uint32)}
-    yield "rect_data", {"meas": rng.poisson(3.0, (9, 4, 4)).astype(np.uint16)}
+    along = {"xpos": np.linspace(1, 0, 5)[:, None], "zpos": np.linspace(0.15, 0, 5)[:, None]}
+    return [
+        ("cdt", {"meas": rng.poisson(3.0, (4, 4, 9)).astype(np.float32)}),
+        ("cdt", {"out": rng.poisson(3.0, (9, 1)).astype(np.float64)}),
+        ("keyhole", {"data": rng.poisson(3.0, (5, 9)).astype(np.float64), **along}),
+        ("keyhole", {"direct_before": rng.poisson(3.0, (9, 1)).astype(np.uint32)}),
+        ("rect_data", {"meas": rng.poisson(3.0, (9, 4, 4)).astype(np.uint16)}),
+        ("tmf8828", chip_frames(1)),
+        ("tmf8828", chip_frames(2)),
+        ("vl53l8", zone_frame()),
+    ]
+
+
+def write_content(path, content):
+    """Write arrays by name, or JSON, to a file as its ending says."""
+    if path.suffix == ".json":
+        path.write_text(json.dumps(content))
+    elif path.suffix == ".npz":
+        np.savez_compressed(path, **content)
+    else:
+        write_mat(path, content)
+    return path
+
+
+def sound_files(folder, layouts=tuple(ENDINGS)):
+    """(layout, path) of small files that are written to a folder: of every capture that a layout holds, and of every
+    content of layouts that other programs write.
+    """
+    found = []
+    for number, (layout, _, capture) in enumerate(holdable()):
+        if layout in layouts:
+            found.append((layout, capture.write(folder / f"{number}{ENDINGS[layout]}", layout)))
+    for number, (layout, content) in enumerate(read_only()):
+        if layout in layouts:
+            found.append((layout, write_content(folder / f"only{number}{ENDINGS[layout]}", content)))
+    return found
 
 
 def volume():

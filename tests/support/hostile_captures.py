@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import shutil
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from support.capture_files import ENDINGS, chip_frames, holdable, read_only, write_mat, zone_frame
+from support.capture_files import holdable, sound_files
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
@@ -27,18 +26,9 @@ TEXTS = (
 
 def whole_files(folder):
     """A file for each capture that a layout holds, and for each layout that is only read, as paths."""
-    paths = []
-    for number, (layout, _, capture) in enumerate(holdable()):
-        paths.append(capture.write(folder / f"{number}{ENDINGS[layout]}", layout))
-        if layout == "torchtransient":
-            paths.append(capture.write(folder / f"{number}.npz", layout))
-    for number, (layout, arrays) in enumerate(read_only()):
-        write_mat(folder / f"{layout}{number}.mat", arrays)
-        paths.append(folder / f"{layout}{number}.mat")
-    paths.append(old_mat(folder / "old.mat"))
-    (folder / "frames.json").write_text(json.dumps(chip_frames(1)))
-    np.savez_compressed(folder / "zones.npz", **zone_frame())
-    return [*paths, folder / "frames.json", folder / "zones.npz"]
+    own = [capture for layout, _, capture in holdable() if layout == "torchtransient"]
+    packed = [capture.write(folder / f"own{number}.npz") for number, capture in enumerate(own)]
+    return [*(path for _, path in sound_files(folder)), *packed, old_mat(folder / "old.mat")]
 
 
 def old_mat(path):

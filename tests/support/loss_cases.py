@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -197,3 +199,36 @@ MESHES = {
     losses.mesh_laplacian_smoothing: losses.MeshLaplacianSmoothing,
     losses.mesh_normal_consistency: losses.MeshNormalConsistency,
 }
+
+
+# Options that are numbers: those of the signatures, which are tested with the values below, or with those of a case.
+# One value that fits.
+FITS = {
+    **dict.fromkeys(("floor", "background", "smoothing", "read_noise", "creation_cost_opl", "share"), 0.7),
+    **dict.fromkeys(("bin_width_opl", "balance"), 0.05),
+    **dict.fromkeys(("cycles", "periods"), 400.0),
+    **dict.fromkeys(("window", "value_range", "cells"), 3.0),
+    "dead_bins": 2.5,
+    "spacing": (0.1, 0.2, 0.3),
+    "scales": (1.0, 2.0),
+}
+# Values of which a loss makes a plausible number; of other options a negative one and NaN.
+WRONG = {
+    **dict.fromkeys(("floor", "background", "smoothing", "read_noise"), (-1.0, float("nan"), torch.rand(13))),
+    **dict.fromkeys(("bin_width_opl", "creation_cost_opl"), (1e-10, -1.0)),  # seconds
+    **dict.fromkeys(("cycles", "periods"), (0, 2.5)),
+    "value_range": (-1.0, 0.0),
+    "balance": (-0.1, 1.1),
+    "window": (0, 4),
+    "scales": ((), (0,), (1, 2.5)),
+    "spacing": ((1.0, 1.0), (1.0, 0.0, 1.0)),
+}
+# Options without a part beside the others of a case: phases have a floor, and so do records of mass one.
+IDLE = {("phasor", "floor"), ("transient phasor", "floor"), ("Wasserstein, unbalanced", "floor")}
+
+
+def number_options(made):
+    """Names of the options of a loss, function or module, that are numbers; places of dimensions are none."""
+    options = inspect.signature(made).parameters.items()
+    numbers = [name for name, option in options if re.search(r"\b(float|int|Numbers)\b", str(option.annotation))]
+    return [name for name in numbers if name != "dim"]

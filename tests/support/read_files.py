@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from support.text_files import RECIPES, SCENE, SETUPS
+from torchtransient.files.captures.formats import LAYOUTS
 
 
 @dataclass(frozen=True)
@@ -128,26 +129,10 @@ def _read_volume(path: Path) -> str:
 
 def _foreign(layout: str) -> Reader:
     def sources(folder: Path) -> list[Path]:
-        import numpy as np
+        from support.capture_files import sound_files
+        from support.hostile_captures import old_mat
 
-        from support.capture_files import chip_frames, holdable, read_only, zone_frame
-        from support.hostile_captures import ENDINGS, old_mat
-        from torchtransient.files.captures.matlab import write_mat
-
-        found = []
-        for number, (name, _, capture) in enumerate(holdable()):
-            if name == layout:
-                found.append(capture.write(folder / f"{number}{ENDINGS[layout]}", layout))
-        for number, (name, arrays) in enumerate(read_only()):
-            if name == layout:
-                found.append(folder / f"only{number}.mat")
-                write_mat(found[-1], arrays)
-        if layout == "tmf8828":
-            found.append(folder / "frames.json")
-            found[-1].write_text(json.dumps(chip_frames(2)))
-        elif layout == "vl53l8":
-            found.append(folder / "zones.npz")
-            np.savez(found[-1], **zone_frame())
+        found = [path for _, path in sound_files(folder, (layout,))]
         return [*found, old_mat(folder / "old.mat")] if layout == "phasor_field" else found
 
     def read(path: Path) -> None:
@@ -324,10 +309,7 @@ READERS: dict[str, Reader] = {
     "result": Reader(_results, _read_result, _is_sealed),
     "capture": Reader(_captures, _read_capture, _is_sealed),
     "volume": Reader(_volumes, _read_volume, _is_sealed),
-    **{
-        f"capture of {layout}": _foreign(layout)
-        for layout in ("tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828", "vl53l8")
-    },
+    **{f"capture of {layout.name}": _foreign(layout.name) for layout in LAYOUTS},
     "shard": Reader(_shards, _read_shard, lambda path: True),
     "data set": Reader(_data_sets, _read_data_set),
     "WebDataset": Reader(_tars, _read_tar),

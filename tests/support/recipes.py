@@ -1,8 +1,8 @@
 """The recipes of docs/contributing.md: their tables of files, and their blocks carried out on a copy of the repository.
 
 The first line of a block says where it goes: ``# FILE (new)`` is the file as it stands, ``# FILE, in NAME`` an entry in
-the largest list, tuple or dictionary of what is called NAME there, below imports that it needs; ``# FILE`` alone, lines
-at its end.
+the largest list, tuple or dictionary of what is called NAME there, below imports that it needs, or a row at the end of
+the first table below the heading NAME of a page; ``# FILE`` alone, lines at its end.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ class Step:
             path.write_text(self.text, encoding="utf-8")
             return
         source = path.read_text(encoding="utf-8")
-        path.write_text(with_entry(source, self.name, self.text) if self.name else source + self.text, encoding="utf-8")
+        changed = _with_row if path.suffix == ".md" else with_entry
+        path.write_text(changed(source, self.name, self.text) if self.name else source + self.text, encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,14 @@ def with_entry(source: str, name: str, text: str) -> str:
         if isinstance(node, ast.Import | ast.ImportFrom) and getattr(node, "module", "") != "__future__"
     )
     return "".join([*changed[:place], *imports, *changed[place:]])
+
+
+def _with_row(source: str, heading: str, row: str) -> str:
+    before, head, section = source.partition(f"\n## {heading}\n")
+    assert head, f"no section is called {heading}"
+    start = re.search(r"^\|(?:-+\|)+\n(?:\|.*\n)*", section, re.MULTILINE)
+    assert start, f"no table is in {heading}"
+    return f"{before}{head}{section[: start.end()]}{row}{section[start.end() :]}"
 
 
 def _kind(entry: str) -> Any:

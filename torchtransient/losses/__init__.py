@@ -23,9 +23,7 @@ from torchtransient.losses.likelihoods import read_noise_nll as read_noise_nll
 from torchtransient.losses.likelihoods import relative_floor as relative_floor
 from torchtransient.losses.measurement import MeasurementConsistency as MeasurementConsistency
 from torchtransient.losses.measurement import PairLoss as PairLoss
-from torchtransient.losses.measurement import SquaredLoss as SquaredLoss
 from torchtransient.losses.measurement import measurement_consistency as measurement_consistency
-from torchtransient.losses.measurement import squared_loss as squared_loss
 from torchtransient.losses.meshes import MeshLaplacianSmoothing as MeshLaplacianSmoothing
 from torchtransient.losses.meshes import MeshNormalConsistency as MeshNormalConsistency
 from torchtransient.losses.meshes import mesh_laplacian_smoothing as mesh_laplacian_smoothing
@@ -54,6 +52,8 @@ from torchtransient.losses.similarity import SSIMLoss as SSIMLoss
 from torchtransient.losses.similarity import maximum_projections as maximum_projections
 from torchtransient.losses.similarity import projection_ssim_loss as projection_ssim_loss
 from torchtransient.losses.similarity import ssim_loss as ssim_loss
+from torchtransient.losses.squared import SquaredLoss as SquaredLoss
+from torchtransient.losses.squared import squared_loss as squared_loss
 from torchtransient.losses.total_variation import TotalVariation as TotalVariation
 from torchtransient.losses.total_variation import total_variation as total_variation
 from torchtransient.losses.wasserstein import CumulativeLoss as CumulativeLoss

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_level,
     check_mask,

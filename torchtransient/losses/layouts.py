@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import check_level
+from torchtransient.losses.checks import check_level
 
 _IMAGES = -3
 # One or three numbers before points are channels of a list rather than bins.

@@ -31,7 +31,7 @@ from torch import Tensor
 from torchtransient.checks import positive
 from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_level,

@@ -15,9 +15,10 @@ class LossModule(nn.Module):
         class RootLoss(LossModule, function=root_loss, by_place=("root", "reduction")):
             \"\"\"`root_loss` with its options held.\"\"\"
 
-    The constructor takes the options of `function`, those named in `by_place` by position too. They become attributes,
-    and submodules where they are modules. The function checks them when the module is called. A function of other
-    tensors than (input, target) has a `forward` with those.
+    The constructor takes the options of `function`, those named in `by_place` by position too: the few that its users
+    set first, in the order of the function, `reduction` last if it is one of them. They become attributes, and
+    submodules where they are modules. The function checks them when the module is called. A function of other tensors
+    than (input, target) has a `forward` with those.
     """
 
     function: ClassVar[Callable[..., Tensor]]

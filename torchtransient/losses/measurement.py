@@ -1,4 +1,4 @@
-"""Squared error, and the consistency of a hidden volume with its measurement under any loss."""
+"""Consistency of a hidden volume with its measurement under any loss."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchtransient.checks import function
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_mask,
@@ -19,12 +19,12 @@ from torchtransient.losses.comparison import (
     check_reduction,
     counted,
     real_product,
-    reduce,
     squared_modulus,
 )
 from torchtransient.losses.layouts import item_dims, time_dim
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, VALUES, Light, Volume, reads
+from torchtransient.losses.squared import squared_loss
 
 
 class PairLoss(Protocol):
@@ -39,32 +39,6 @@ class PairModule(Protocol):
     reduction: Reduction
 
     def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
-
-
-@reads(input=LIGHT, target=LIGHT)
-def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
-    """Squared error, `|input - target|^2`. Symmetric.
-
-    Args:
-        input: real or complex tensor, any shape.
-        target: of the same shape.
-        mask: elements that count.
-        reduction: "mean" over elements that count, "sum", or "none".
-
-    Returns:
-        Scalar, or the shape of the input for "none"; in the unit of the input, squared.
-
-    Raises:
-        ShapeError: for two shapes.
-    """
-    where = "squared_loss"
-    input, target = check_pair(input, target, where, complex_too=True)
-    mask = check_mask(mask, input, where)
-    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, where, mask)
-
-
-class SquaredLoss(LossModule, function=squared_loss, by_place=("reduction",)):
-    """`squared_loss` with its reduction held."""
 
 
 @reads(volume=VALUES, measured=LIGHT)

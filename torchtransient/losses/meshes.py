@@ -15,7 +15,7 @@ from torch import Tensor
 from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_mask,

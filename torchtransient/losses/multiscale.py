@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_level,
     check_mask,
@@ -31,8 +31,9 @@ from torchtransient.losses.comparison import (
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.likelihoods import divisor, parts_of
 from torchtransient.losses.loss_module import LossModule
-from torchtransient.losses.measurement import PairLoss, shared_dim, squared_loss, takes_dim
+from torchtransient.losses.measurement import PairLoss, shared_dim, takes_dim
 from torchtransient.losses.results import BINNED, Binned, reads
+from torchtransient.losses.squared import squared_loss
 
 # Options in bins or of an axis, which would mean something else at each scale.
 _OF_BINS = ("dead_bins", "bin_width_opl", "axis", "spacing")
@@ -68,8 +69,9 @@ def multiscale_loss(
         compare: loss `(input, target, *, mask, reduction)` with a value for each bin, called with (..., C, bins,
             places, 1) and its `dim` set. A `floor` or `background` that `functools.partial` holds is light of a bin of
             the record (number or tensor that broadcasts), and is summed as bins are. Not supported: modules, and
-            options in bins or lengths (`dead_bins`, `bin_width_opl`, `axis`). Options of a `root` are the same at each
-            scale.
+            options in bins or lengths (`dead_bins`, `bin_width_opl`, `axis`). All other options are the same at each
+            scale, those in units of light too, such as the read noise of a `root` or a threshold, though light grows
+            with the scale.
         scales: whole numbers; None: 1, 2, 4, ... below T. Pulses are pulled from about the largest one.
         dim: dimension of time (`losses.layouts`).
         mask: bins that count. The others are empty in both, and take no cycles of detectors; a coarse bin counts if one

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtransient.checks import finite, shown
 from torchtransient.errors import UnitError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_mask,
     check_pair,

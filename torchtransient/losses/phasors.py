@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_level,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchtransient.checks import Numbers, shown
 from torchtransient.errors import ShapeError
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_level,

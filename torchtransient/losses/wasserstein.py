@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.losses.comparison import (
+from torchtransient.losses.checks import (
     Reduction,
     check_level,
     check_mask,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchtransient.checks import positive
 from torchtransient.errors import UnitError
-from torchtransient.losses.comparison import check_mask, check_number, check_pair, counted
+from torchtransient.losses.checks import check_mask, check_number, check_pair, counted
 from torchtransient.losses.results import DEPTH, DepthMap, reads
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite
 

@@ -13,7 +13,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.checks import share, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_mask, check_pair, counted
+from torchtransient.losses.checks import check_mask, check_pair, counted
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
 from torchtransient.metrics.tally import Reduction, Tally, check_finite

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_level, check_mask, check_pair, counted
+from torchtransient.losses.checks import check_level, check_mask, check_pair, counted
 from torchtransient.losses.layouts import time_dim
 from torchtransient.losses.results import STEADY, TRANSIENT, Picture, Transient, reads
 from torchtransient.losses.similarity import WINDOW, ssim_loss

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchtransient.checks import positive, real_array, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.comparison import check_dense
+from torchtransient.losses.checks import check_dense
 from torchtransient.losses.results import Volume
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
 from torchtransient.reconstruction.voxels import VoxelGrid

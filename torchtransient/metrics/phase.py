@@ -13,7 +13,7 @@ from torch import Tensor
 from torchtransient.checks import positive
 from torchtransient.errors import UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_mask, check_pair, counted
+from torchtransient.losses.checks import check_mask, check_pair, counted
 from torchtransient.losses.results import PHASOR, Phasors, reads
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_weight
 

@@ -16,7 +16,7 @@ from torchtransient import stokes
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_level, check_mask, check_pair
+from torchtransient.losses.checks import check_level, check_mask, check_pair
 from torchtransient.losses.layouts import check_dim
 from torchtransient.losses.results import Picture
 from torchtransient.metrics.phase import phase_mae

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.comparison import check_mask
+from torchtransient.losses.checks import check_mask
 
 Reduction = Literal["mean", "item", "none"]
 _ROOM = __name__.rpartition(".")[0]

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtransient.checks import share, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.comparison import check_dense, check_mask, check_pair
+from torchtransient.losses.checks import check_dense, check_mask, check_pair
 from torchtransient.losses.results import Volume
 from torchtransient.metrics.tally import Reduction, Tally, check_finite, check_reduction
 from torchtransient.reconstruction.surfaces import depth_map

@@ -100,29 +100,65 @@ def exponential_kernel(tau_bins: Tensor, dead_bins: float, period_bins: int) -> 
 class AfterpulseDelays(PhysicalModule):
     """Law of delays of afterpulses that ends, for `Afterpulsing(probability, dead_time_s=..., delays=law)`.
 
-    Subclasses define `seen`, `mean_yet_to_come`, `draw` and `end_s`.
+    Delays count from the detection, not from the end of its dead time, and end after a finite `end_s`. Subclasses
+    define `end_s`, `released_after`, `yet_to_come` and `draw`; a law whose share yet to come has a closed integral, or
+    an infinite slope within a bin, overrides `mean_yet_to_come`.
     """
 
-    def seen(self, dead_time_s: float) -> Tensor | float:
+    def end_s(self) -> float:
+        """Longest delay in seconds, finite: nothing is yet to come beyond it."""
+        raise NotImplementedError(f"{type(self).__name__} has to define end_s().")
+
+    def released_after(self, dead_time_s: float) -> Tensor | float:
         """Share of all carriers that are released after the dead time.
 
         Args:
             dead_time_s: dead time in seconds.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has to define seen(dead_time_s).")
 
-    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
-        """Mean over the bin from `k` to `k` + 1 of the share of afterpulses that is yet to come.
+        Raises:
+            UnitError: for a law that is infinite at delay 0.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has to define released_after(dead_time_s).")
+
+    def yet_to_come(self, delay: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        """Share of the afterpulses after the dead time that come later than a delay.
 
         Args:
-            k: (N,) float64, bins after the detection.
+            delay: (N,) float64, bins after the detection, at least the dead time; possibly beyond `end_s`.
+            dead_time_s: dead time in seconds.
+            bin_width_s: bin width in seconds, of the delay.
+
+        Returns:
+            (N,) float64, 1 at the dead time, 0 from `end_s` on.
+
+        Raises:
+            UnitError: for a dead time beyond the law.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has to define yet_to_come(delay, dead time, bin width).")
+
+    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        """Mean of `yet_to_come` over the bin from `k` to `k` + 1, 1 while the detector is dead.
+
+        By a Gauss-Legendre rule of 8 points behind the dead time. Shares of bins are within 1e-6 for bins as long as
+        the dead time, within 3e-4 where the law ends in a bin or falls by several decades there.
+
+        Args:
+            k: (N,) float64, bins after the detection. A detection is spread evenly over its bin, so that `shares`
+                begin with `k` = -1, one bin before the detection.
             dead_time_s: dead time in seconds.
             bin_width_s: bin width in seconds.
 
         Returns:
-            (N,) float64, 1 while the detector is dead.
+            (N,) float64.
         """
-        raise NotImplementedError(f"{type(self).__name__} has to define mean_yet_to_come(k, dead time, bin width).")
+        dead = dead_time_s / bin_width_s
+        begin = torch.minimum(k.clamp_min(dead), k + 1)
+        half, mean = (k + 1 - begin) / 2, torch.zeros_like(k)
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            for side in (-1, 1):
+                delay = (begin + half * (1 + side * node)).clamp_min(dead)
+                mean = mean + 0.5 * weight * self.yet_to_come(delay, dead_time_s, bin_width_s)
+        return begin - k + 2 * half * mean
 
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
         """Draw delays beyond the dead time.
@@ -136,10 +172,6 @@ class AfterpulseDelays(PhysicalModule):
             (number,) float64, seconds after the detection.
         """
         raise NotImplementedError(f"{type(self).__name__} has to define draw(number, dead time, generator).")
-
-    def end_s(self) -> float:
-        """Longest delay in seconds."""
-        raise NotImplementedError(f"{type(self).__name__} has to define end_s().")
 
     def shares(self, dead_time_s: float, bin_width_s: float, *, first: int, number: int) -> Tensor:
         """Share of afterpulses in bins `first`, `first` + 1, ... after their detection.
@@ -213,7 +245,7 @@ class PowerLawDelays(AfterpulseDelays):
     def end_s(self) -> float:
         return self.longest_s
 
-    def seen(self, dead_time_s: float) -> float:
+    def released_after(self, dead_time_s: float) -> float:
         raise UnitError(
             "PowerLawDelays: expected counted_from='dead_time', got 'avalanche'. The law is infinite at delay 0; give "
             "the probability of what comes after the dead time."
@@ -240,17 +272,10 @@ class PowerLawDelays(AfterpulseDelays):
         safe = torch.where(flat, torch.ones_like(a), a)
         return torch.where(flat, log_x * (1 + a * log_x / 2), torch.expm1(safe * log_x) / safe)
 
-    def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+    def yet_to_come(self, delay: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
         end = self._limits(dead_time_s)
-        total = self._growth(torch.tensor(end, dtype=torch.float64, device=k.device))
-        dead = dead_time_s / bin_width_s
-        begin = torch.minimum(k.clamp_min(dead), k + 1)
-        half, mean = (k + 1 - begin) / 2, torch.zeros_like(k)
-        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-            for side in (-1, 1):
-                log_x = torch.log((begin + half * (1 + side * node)).clamp_min(dead) / dead).clamp_max(end)
-                mean = mean + 0.5 * weight * (1 - self._growth(log_x) / total)
-        return begin - k + 2 * half * mean
+        total = self._growth(torch.tensor(end, dtype=torch.float64, device=delay.device))
+        return 1 - self._growth(torch.log(delay / (dead_time_s / bin_width_s)).clamp_max(end)) / total
 
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
         end, device = self._limits(dead_time_s), self.log_exponent.device
@@ -294,7 +319,7 @@ class MeasuredDelays(AfterpulseDelays):
     def end_s(self) -> float:
         return self.start_s + self.share_of_bins.numel() * self.own_width_s
 
-    def seen(self, dead_time_s: float) -> float:
+    def released_after(self, dead_time_s: float) -> float:
         place = (dead_time_s - self.start_s) / self.own_width_s
         whole = min(max(math.floor(place), 0), self.share_of_bins.numel() - 1)
         part = min(max(place - whole, 0.0), 1.0)
@@ -307,8 +332,16 @@ class MeasuredDelays(AfterpulseDelays):
             )
         return left
 
+    def yet_to_come(self, delay: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
+        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
+        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        inside = ((delay * bin_width_s - self.start_s) / self.own_width_s).clamp(0, shares.numel())
+        whole = inside.floor().clamp_max(shares.numel() - 1).long()
+        return (yet[whole] - (inside - whole) * shares[whole]) / left
+
     def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
-        shares, left = self.share_of_bins.double(), self.seen(dead_time_s)
+        # exact: what is yet to come is a polygon
+        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
         yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
         # integral over delays of what is yet to come, in own bins, a parabola in each
         sums = torch.cat([yet.new_zeros(1), (0.5 * (yet[:-1] + yet[1:])).cumsum(0)])
@@ -330,7 +363,7 @@ class MeasuredDelays(AfterpulseDelays):
         shares = self.share_of_bins.double().flip(0)
         sums = shares.cumsum(0)
         u = torch.rand(number, dtype=torch.float64, device=shares.device, generator=generator)
-        yet = self.seen(dead_time_s) * (1 - u) * sums[-1]
+        yet = self.released_after(dead_time_s) * (1 - u) * sums[-1]
         later = torch.searchsorted(sums, yet)
         place = shares.numel() - 1 - later + (sums[later] - yet) / shares[later]
         return (self.start_s + place * self.own_width_s).clamp_min(dead_time_s)
@@ -457,7 +490,7 @@ class Afterpulsing(AddedCounts):
         if dead_time_s is None or (tau_s is None) == (delays is None):
             raise UnitError(f"{where}: expected dead_time_s (0 for none), and either tau_s or delays, got others.")
         if delays is not None and not isinstance(delays, AfterpulseDelays):
-            raise UnitError(f"{where}: expected delays to be PowerLawDelays or MeasuredDelays, got {delays!r}.")
+            raise UnitError(f"{where}: expected delays to be an AfterpulseDelays (PowerLawDelays), got {delays!r}.")
         check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s = bin_width_of(axis, bin_width_s, where)
@@ -532,7 +565,7 @@ class Afterpulsing(AddedCounts):
         if self.counted_from == "dead_time":
             return p
         if self.delays is not None:
-            return p * self.delays.seen(self.dead_time_s)
+            return p * self.delays.released_after(self.dead_time_s)
         return p * torch.exp(-self.dead_time_s / self.tau_s.reshape(-1))
 
     def _period_bins(self, x: Tensor) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import json
+import re
 from dataclasses import replace
 
 import h5py
@@ -23,8 +25,11 @@ from support.capture_files import (
     listed,
     made,
     read_only,
+    sound_files,
+    write_content,
     write_mat,
 )
+from support.pages import Page
 from support.sweeps import together
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
@@ -36,9 +41,23 @@ FOREIGN = [layout for layout in WRITTEN if layout != "torchtransient"]
 KINDS = ("single", "confocal", "exhaustive", "pairs")
 
 
-def test_every_layout_that_is_written_has_captures():
-    assert {layout for layout, _ in HOLDABLE.values()} == set(WRITTEN)
-    assert set(ENDINGS) == {*WRITTEN, "cdt", "keyhole", "tmf8828", "vl53l8"}
+def test_every_layout_has_files_in_these_tests():
+    """Of layouts that are written also captures, whose files come back."""
+    held, others = {layout for layout, _ in HOLDABLE.values()}, {layout for layout, _ in read_only()}
+    for layout in ENDINGS:
+        where = "holdable" if layout in WRITTEN else "read_only"
+        assert layout in (held if layout in WRITTEN else others), (
+            f"enter small contents of {layout!r} in {where}() of tests/support/capture_files.py"
+        )
+
+
+def test_every_layout_has_its_rows_on_the_page():
+    """In the table of what layouts hold, and those that are written in that of what they cannot."""
+    page = Page("docs/capture_files.md").text
+    for head, layouts in (("| `format` | file |", list(ENDINGS)), ("| `format` | error for |", FOREIGN)):
+        rows = page.split(head)[1].split("\n\n")[0].splitlines()[2:]
+        found = [re.match(r"\| `(\w+)` \|", row)[1] for row in rows]
+        assert sorted(found) == sorted(layouts), f"docs/capture_files.md, {head}: a row for each of {layouts}"
 
 
 @together("name", list(HOLDABLE))
@@ -271,9 +290,9 @@ def test_rectified_grids_are_regular_to_a_thousandth(tmp_path, kind, how, taken)
 
 def test_layouts_that_are_only_read_and_names_of_formats(tmp_path):
     capture = made(LEGS["confocal"])
-    for layout in ("cdt", "keyhole"):
-        with pytest.raises(StorageError):
-            capture.write(tmp_path / "a.mat", format=layout)
+    for layout in set(ENDINGS) - set(WRITTEN):
+        with pytest.raises(StorageError, match="only read"):
+            capture.write(tmp_path / f"a{ENDINGS[layout]}", format=layout)
     with pytest.raises(ArgumentError):
         capture.write(tmp_path / "a.h5", "exr")
     with pytest.raises(ArgumentError):
@@ -295,30 +314,48 @@ def foreign_files():
 def test_no_file_is_read_as_another(tmp_path, number):
     """An axis would be taken for another one."""
     layout, content = foreign_files()[number]
-    path = tmp_path / ("a.mat" if isinstance(content, dict) else f"a{ENDINGS[layout]}")
-    if isinstance(content, dict):
-        write_mat(path, content)
-    else:
+    path = tmp_path / f"a{ENDINGS[layout]}"
+    if isinstance(content, Capture):
         content.write(path, format=layout)
+    else:
+        write_content(path, content)
     for other in sorted(set(ENDINGS) - {layout, "torchtransient"})[number % 2 :: 2]:
         with pytest.raises(StorageError, match=f"got one of '{layout}'"):
             Capture.read(path, other, wall_size=0.6, bin_width_s=16e-12)
 
 
+# Entries without any of which a file is none of the layout.
 NEEDED = {
     "tal": ("H", "H_format", "sensor_grid_xyz"), "dirac": ("data_t", "xg", "yg", "da", "offset_laser"),
     "zaragoza": ("data", "cameraGridPositions", "laserGridPositions", "deltaT"), "keyhole": ("data", "xpos", "zpos"),
+    "phasor_field": ("dataset",), "rect_data": ("rect_data",), "cdt": ("meas",), "tmf8828": ("hists", "reference_hist"),
+    "vl53l8": ("hists", "pt_cloud"),
 }  # fmt: skip
+
+
+def without(path, name):
+    """Take an entry out of a file."""
+    if path.suffix == ".json":
+        frames = json.loads(path.read_text())
+        path.write_text(json.dumps([{n: value for n, value in frame.items() if n != name} for frame in frames]))
+    elif path.suffix == ".npz":
+        with np.load(path) as file:
+            arrays = {n: file[n] for n in file if n != name}
+        np.savez(path, more=np.ones(2), **arrays)
+    else:
+        with h5py.File(path, "r+") as file:
+            file["more"] = np.ones((2, 2))
+            del file[name]
 
 
 @pytest.mark.parametrize("layout", NEEDED)
 def test_layouts_are_known_by_what_they_need(tmp_path, layout):
-    for left_out in NEEDED[layout]:
-        with h5py.File(tmp_path / "a.h5", "w") as file:
-            for name in {*NEEDED[layout], "more"} - {left_out}:
-                file[name] = np.ones((2, 2))
+    for name in NEEDED[layout]:
+        _, path = sound_files(tmp_path, (layout,))[0]
+        Capture.read(path, wall_size=0.6) if layout == "cdt" else Capture.read(path)
+        without(path, name)
         with pytest.raises(StorageError, match="no known layout"):
-            Capture.read(tmp_path / "a.h5")
+            Capture.read(path)
 
 
 def test_files_of_no_layout_name_what_reads_them(tmp_path):

@@ -83,8 +83,8 @@ def read_capture(
 
     Args:
         path: the file.
-        format: "torchtransient", "tal", "zaragoza", "dirac", "phasor_field", "keyhole", "rect_data", "cdt", "tmf8828"
-            or "vl53l8"; None finds it from the content, independent of the name.
+        format: name of a layout of docs/capture_files.md, such as "tal" or "torchtransient", the library's own; None
+            finds it from the content, independent of the name of the file.
         wall_size: metres, one number or (width, height) of a scanned area whose points are the centres of its cells.
         bin_width_s: width of a bin, seconds.
         start_s: start of the first bin, seconds.
@@ -129,8 +129,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
         path: place of the file.
         capture: the capture.
         metadata: plain data beside the capture's own, in the library's own format.
-        format: as in :func:`read_capture` but "keyhole", "cdt", "tmf8828" and "vl53l8", which are only read. The
-            library's own holds all of a capture.
+        format: as in :func:`read_capture`, but layouts that are only read. The library's own holds all of a capture.
 
     Returns:
         The path.

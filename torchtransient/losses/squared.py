@@ -1,0 +1,35 @@
+"""Squared error of two records."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchtransient.losses.checks import Reduction, check_mask, check_pair, counted, reduce, squared_modulus
+from torchtransient.losses.loss_module import LossModule
+from torchtransient.losses.results import LIGHT, Light, reads
+
+
+@reads(input=LIGHT, target=LIGHT)
+def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
+    """Squared error, `|input - target|^2`. Symmetric.
+
+    Args:
+        input: real or complex tensor, any shape.
+        target: of the same shape.
+        mask: elements that count.
+        reduction: "mean" over elements that count, "sum", or "none".
+
+    Returns:
+        Scalar, or the shape of the input for "none"; in the unit of the input, squared.
+
+    Raises:
+        ShapeError: for two shapes.
+    """
+    where = "squared_loss"
+    input, target = check_pair(input, target, where, complex_too=True)
+    mask = check_mask(mask, input, where)
+    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, where, mask)
+
+
+class SquaredLoss(LossModule, function=squared_loss, by_place=("reduction",)):
+    """`squared_loss` with its reduction held."""
