@@ -124,20 +124,6 @@ def test_groups_and_tiles_have_one_mean(corner, choices):
     assert equal, z
 
 
-@pytest.mark.slow
-def test_few_chains_and_no_light():
-    """One chain, and a convex body alone, of which nothing is scattered twice."""
-    points, normals = wall_grid(2, 0.4)
-    sensors = wall_of(points, normals)
-    shapes = [mesh("a", ball((0, 0, 1), 0.3, 1))]
-    scene = scene_of(*shapes)
-    elements = table_of(shapes)
-    for count in (1, 3, 64):
-        steady, cube = chains(scene, elements, histogram(2), sensors, sensors, "confocal", count)
-        assert steady.sum() == 0
-        assert cube.sum() == 0
-
-
 def test_the_choice_says_why_not():
     shapes = [mesh("a", folded_plates())]
     # Mitsuba's parser hands on what the plugin says.

@@ -165,19 +165,6 @@ def test_films(name, kind):
     assert error < 0.15 * abs(reverse.mean())
 
 
-@pytest.mark.slow
-def test_colours():
-    """Each colour has its own derivative."""
-    mi.set_variant("llvm_ad_rgb")
-    coloured = plane(1.0, 0.6, 0.1, 0.05)
-    coloured["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}
-    scene = scan_scene({"a": coloured}, "single", film(2, **SMOOTH))
-    capture = capture_of(scene, "a.bsdf.reflectance.value", lambda start, θ: start + mi.Color3f(0, θ, 0))
-    reverse, spp = capture.reverse(0, 2**12), 2**12
-    assert capture.forward(0, spp) == pytest.approx(reverse, rel=1e-4)
-    assert reverse == pytest.approx(capture.difference(0.05, 0, spp), rel=1e-3)
-
-
 def test_second_backward_and_batches():
     """Adjoints accumulate; nothing of one pass is left in the next."""
     capture = capture_of(scan_scene(plate(), "confocal", film(3, **SMOOTH)), "a.to_world", move(0, 0, 1))

@@ -66,16 +66,6 @@ def test_images_and_renders_through_time_take_turns(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("variant", "shape"), [("llvm_ad_mono", (3, 4, 1)), ("llvm_ad_spectral_polarized", (3, 4, 3))]
-)
-def test_channels_of_other_variants(variant, shape):
-    mi.set_variant(variant)
-    plugins.sync()
-    assert image(load(FILMS["transient"]), mi.load_dict(INTEGRATORS["direct"])).shape == shape
-
-
-@pytest.mark.slow
 def test_derivatives_of_images():
     found = []
     for film in (FILMS["transient"], HDR):

@@ -119,32 +119,43 @@ def test_principled_body():
     assert arrivals(scene(at(), body=CUBE | {"bsdf": bsdf}), 1 << 14)[0] == pytest.approx(straight, abs=1.5 * BIN)
 
 
-def test_bodies_within_bodies():
-    """A drop of water in glass: its relative index says what lies around it."""
-    objects = {"drop": ball(0.4, glass("dielectric", WATER, N)), "body": ball(1.0)}
-    check(scene(at(), depth=4, **objects), WATER * 0.4 + N * 0.6 + 2.0)
-    check(scene(at(0.6), depth=4, **objects), N * 0.4 + 2.0)
+def across(size, plugin=None, z=1.0):
+    """A surface that ends nothing: what lies below it is known by its normal."""
+    pose = T().translate([0, 0, z]).scale(size)
+    return {"type": "rectangle", "to_world": pose, "bsdf": plugin or glass(inside=WATER)}
 
 
-def test_near_clip_lies_in_glass():
-    check(scene(at(near=0.9), body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
+def drop():
+    """Of water in glass: its relative index says what lies around it."""
+    return {"drop": ball(0.4, glass("dielectric", WATER, N)), "body": ball(1.0)}
 
 
-@pytest.mark.slow
-def test_outside_of_bodies():
-    """Entered and left again, seen or not, ahead or behind."""
-    ahead, behind = ball(0.3, center=[0, 0, 1.0]), ball(0.3, center=[0, 0.05, -1.0])
-    check(scene(at(), depth=4, behind=behind), 3.0)
-    check(scene(at(), depth=4, ahead=ahead, behind=behind), 3.0 + 0.6 * (N - 1))
+def pane():
+    """Of two rectangles: outside, the one is entered and the other left."""
+    shared = {"type": "ref", "id": "glass"}
+    front = across(20.0, shared) | {"to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
+    return {"glass": glass() | {"id": "glass"}, "front": front, "back": across(20.0, shared, 1.5)}
 
 
-def test_under_an_open_surface():
-    """A lake: its surface has no other side."""
-    z = -0.5
-    surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(20.0), "bsdf": glass(inside=WATER)}
-    check(scene(at(z), lake=surface), WATER * (1.0 - z) + 2.0)
-    small = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(0.1), "bsdf": glass(inside=WATER)}
-    check(scene(at(z), window=small), WATER * (1.0 - z) + 2.0)
+BEHIND = {"behind": ball(0.3, glass(), center=[0, 0.05, -1.0])}
+# Where the sensor stands, what is around it, the length to the wall.
+PLACES = {
+    "in a drop": ({}, drop, WATER * 0.4 + N * 0.6 + 2.0),
+    "beside a drop": ({"z": 0.6}, drop, N * 0.4 + 2.0),
+    "near clip plane in glass": ({"near": 0.9}, lambda: {"body": CUBE | {"bsdf": glass()}}, N * 1.0 + 2.0),
+    "before a ball": ({}, lambda: BEHIND, 3.0),
+    "between balls": ({}, lambda: BEHIND | {"ahead": ball(0.3, center=[0, 0, 1.0])}, 3.0 + 0.6 * (N - 1)),
+    "in a lake": ({"z": -0.5}, lambda: {"lake": across(20.0)}, WATER * 1.5 + 2.0),
+    "under a window": ({"z": -0.5}, lambda: {"window": across(0.1)}, WATER * 1.5 + 2.0),
+    "before a pane": ({}, pane, 1.0 + N * 0.5 + 1.5),
+    "in a pane": ({"z": 1.2}, pane, N * 0.3 + 1.5),
+}
+
+
+@pytest.mark.parametrize("place", long(PLACES, ["in a drop", "under a window", "in a pane"]))
+def test_places(place):
+    where, objects, length = PLACES[place]
+    check(scene(at(**where), depth=4, **objects()), length)
 
 
 @pytest.mark.slow
@@ -153,17 +164,6 @@ def test_above_an_open_surface():
     surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
     loaded = scene(at(), lake=surface | {"bsdf": glass(inside=WATER)})
     np.testing.assert_allclose(arrivals(loaded), 1.0 + WATER * (2.0 + TO_LAMP), atol=1.5 * BIN)
-
-
-def test_body_of_two_faces():
-    """A pane of two rectangles: outside, the one is entered and the other left."""
-    front = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
-    back = {"type": "rectangle", "to_world": T().translate([0, 0, 1.5]).scale(20.0)}
-    faces = {"glass": glass() | {"id": "glass"}, "front": front, "back": back}
-    for face in (front, back):
-        face["bsdf"] = {"type": "ref", "id": "glass"}
-    check(scene(at(), depth=4, **faces), 1.0 + N * 0.5 + 1.5)
-    check(scene(at(1.2), depth=4, **faces), N * 0.3 + 1.5)
 
 
 # -------------------------------------------------------------------------------------------------- what is remembered

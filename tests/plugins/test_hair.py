@@ -252,14 +252,6 @@ def scene_with(description, bare=False):
 KEYS = ("longitudinal_roughness", "azimuthal_roughness", "scale_tilt", "eta", "eumelanin", "pheomelanin")
 
 
-def test_hair_is_built_with_its_derivatives():
-    scene = scene_with({"type": "mask", "opacity": 0.7, "nested": {"type": "hair", **INDEX}})
-    keys = [f"wall.bsdf.nested_bsdf.{key}" for key in KEYS]
-    infos = [scene.parameters()[key] for key in keys]
-    assert all(i.differentiable and not i.biased and not i.moves_path_length for i in infos)
-    assert not any("unchecked" in i.reason for i in infos)
-
-
 @pytest.mark.parametrize(("key", "description"), [
     *((key, {"type": "hair"}) for key in KEYS),
     ("sigma_a.value", {"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}),

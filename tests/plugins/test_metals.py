@@ -163,21 +163,3 @@ def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
             scene.integrator().render_backward(scene, params, (None, adjoint), seed=0, spp=4)
         params[f"wall.bsdf.{slot}.value"] = dr.detach(x)
         params.update()
-
-
-def test_a_metal_of_no_colour_has_a_derivative_by_it():
-    """That of any other colour: light is proportional to it."""
-    mi.set_variant(MONO)
-    slopes = []
-    for share in (0.0, 0.5):
-        colour = {"type": "uniform", "value": share}
-        metal = mi.load_dict({"type": "diff_rough_conductor", "alpha": 0.4, "specular_reflectance": colour})
-        params = mi.traverse(metal)
-        dr.enable_grad(params["specular_reflectance.value"])
-        params.update()
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = mi.Vector3f(0.28, 0, 0.96)
-        value = metal.eval(mi.BSDFContext(), si, mi.Vector3f(-0.6, 0, 0.8))
-        dr.backward(value[0])
-        slopes.append(dr.grad(params["specular_reflectance.value"])[0])
-    assert slopes[0] == pytest.approx(slopes[1], rel=1e-5) and slopes[0] > 0.1

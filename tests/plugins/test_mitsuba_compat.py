@@ -84,15 +84,6 @@ def test_delta_weights_lack_the_derivative_of_their_probability(plugin, attach):
     assert not hides_lobe_probability(mi.load_dict({"type": "mask", "bsdf": {"type": plugin}}))
 
 
-@pytest.mark.parametrize("plugin", ["dielectric", "diff_dielectric"])
-def test_delta_weights_of_others_have_it(plugin):
-    activate(RGB)
-    bsdf = mi.load_dict({"type": plugin})
-    weight, density = slopes_of_lobe(bsdf, 0.01, by_direction)
-    assert density == 0 and abs(weight) > 0.1
-    assert not hides_lobe_probability(bsdf)
-
-
 def test_blends_of_delta_lobes_have_wrong_values():
     activate(RGB)
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
@@ -112,23 +103,6 @@ def test_blends_of_delta_lobes_have_wrong_values():
 def adds_up_wrongly(bsdf):
     held = [part for _, part in objects_of(bsdf) if isinstance(part, mi.BSDF)]
     return compat.adds_up_wrongly(bsdf, held, objects_below(bsdf, mi.BSDF))
-
-
-def test_blends_count_samples_that_a_part_threw_away():
-    """Rough glass and paint from behind: what a blend samples is more than what it scatters."""
-    activate(RGB)
-    paint, glass = {"type": "diffuse", "reflectance": 0.5}, {"type": "roughdielectric", "alpha": 0.3}
-    bsdf = mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": glass, "b": paint})
-    n = 1_000_000
-    rng = mi.PCG32(size=n)
-    u = [rng.next_float32() for _ in range(5)]
-    si = interaction(unit(0.3, 0.0, -0.9))
-    _, weight = bsdf.sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]))
-    wo = mi.warp.square_to_uniform_sphere(mi.Point2f(u[3], u[4]))
-    light = np.array(bsdf.eval(mi.BSDFContext(), si, wo).x) * 4 * np.pi
-    error = light.std() / np.sqrt(n)
-    assert float(dr.mean(weight.x)[0]) - light.mean() > 10 * error
-    assert adds_up_wrongly(bsdf)
 
 
 # -------------------------------------------------------------------------------------------------------- polarization
@@ -204,23 +178,6 @@ def test_samples_that_are_thrown_away_have_a_density(plugin):
     value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
     lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
     assert dr.count(lost)[0] > 20
-
-
-@pytest.mark.slow
-def test_samples_that_are_thrown_away_where_the_other_lobe_is_black():
-    """There neither weight nor value tell them from samples of the black lobe, whose slope is not zero."""
-    activate(RGB)
-    bsdf = mi.load_dict({"type": "roughdielectric", "alpha": 0.7, "specular_transmittance": 0.0})
-    sample, weight, si = many_samples(bsdf)
-    black = (dr.max(weight) == 0) & (sample.pdf > 0)
-    crosses, reflects = si.wi.z * sample.wo.z < 0, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Reflection)
-    lost = black & (reflects == crosses)
-    transmitted = black & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Transmission) & (si.wi.z * sample.wo.z < 0)
-    assert dr.count(lost)[0] > 20 and dr.count(transmitted)[0] > 100
-    assert dr.count(lost)[0] + dr.count(transmitted)[0] == dr.count(black)[0]
-    behind = lost & (si.wi.z * sample.wo.z < 0)
-    assert dr.count(behind)[0] > 20
-    assert dr.max(dr.select(behind, dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo)), 0))[0] == 0
 
 
 def clearcoat_slope(weight):
@@ -429,26 +386,6 @@ def test_merged_rectangles_have_no_bounds():
     np.testing.assert_allclose(np.array(compat.bounds_of(shape).max), [1, 1, 1])
 
 
-def test_shapes_do_not_speak_of_all_that_moves_them():
-    """Why attached parameters are asked one by one, and not ``Shape.parameters_grad_enabled()``."""
-    activate(RGB)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "group": {"type": "shapegroup", "part": {"type": "cube"}},
-            "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
-            "mirror": {"type": "cube", "bsdf": {"type": "conductor"}},
-        }
-    )
-    params = mi.traverse(scene)
-    for key in ("copy.to_world", "mirror.vertex_normals"):
-        value = type(params[key])(params[key])
-        dr.enable_grad(value)
-        params[key] = value
-    params.update()
-    assert not any(shape.parameters_grad_enabled() for shape in scene.shapes())
-
-
 def round_shape(plugin):
     shapes = {
         "sphere": {"type": "sphere", "radius": 0.8},
@@ -547,16 +484,3 @@ def test_cone_of_a_small_sphere_has_no_digits_left():
     weights = [float(towards_sphere(radius, 3.0)[1][0]) / (np.pi * (radius / 3.0) ** 2) for radius in (1e-3, 3e-4)]
     assert weights[0] == pytest.approx(1.07, abs=0.06) and abs(weights[0] - 1) > 0.01
     assert weights[1] == 0
-
-
-def test_sphere_draws_and_answers_with_different_densities_on_its_own_surface():
-    """Of points on its inner side some see it from outside."""
-    activate("llvm_ad_mono")
-    n = 1 << 12
-    rng = np.random.default_rng(0)
-    p = rng.normal(size=(3, n)).astype(np.float32)
-    p /= np.linalg.norm(p, axis=0)
-    u = mi.Point2f(rng.random((2, n)).astype(np.float32))
-    ds, _, asked = towards_sphere(1.0, 0.0, mi.Point3f(p), u, flip_normals=True)
-    different = np.abs(np.array(asked) / np.array(ds.pdf) - 1) > 0.05
-    assert 1e-3 < different.mean() < 0.1

@@ -142,31 +142,6 @@ def differentiable_keys(scene):
     return [key for key in params.properties if can_carry_gradients(params[key])]
 
 
-def test_extinction_is_told_by_who_holds_a_volume():
-    grid = mi.VolumeGrid(np.ones((3, 3, 3, 1), dtype=np.float32))
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "fog": {
-                "type": "sphere",
-                "bsdf": {"type": "null"},
-                "interior": {
-                    "type": "heterogeneous",
-                    "sigma_t": {"type": "gridvolume", "grid": grid, "filter_type": "nearest"},
-                    "albedo": {"type": "gridvolume", "grid": grid},
-                    "phase": {"type": "hg", "g": 0.1},
-                },
-            },
-            "haze": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous", "albedo": 0.4}},
-        }
-    )
-    effects = effects_in(scene)
-    moving = {key for key, effect in effects.items() if effect.moves_medium}
-    assert moving == {"fog.interior_medium.sigma_t.data", "haze.interior_medium.sigma_t.value.value"}
-    assert all(effects[key].role == "medium" and not effects[key].moves_length for key in moving)
-    assert {"fog.interior_medium.albedo.data", "fog.interior_medium.phase_function.g"} <= effects.keys() - moving
-
-
 @pytest.mark.parametrize("plugin", ["normalmap", "bumpmap"])
 @pytest.mark.parametrize(("nested", "bends"), [("conductor", True), ("dielectric", True), ("diffuse", False)])
 def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, bends):
@@ -217,5 +192,3 @@ def test_a_plugin_enters_by_its_own_file(own_rows):
         ((node, key, effect),) = found
         assert (key, effect.role, effect.moves_length) == ("lag", "delay", True)
         assert lineage(node)[:2] == ("Veil", "Curtain")
-
-

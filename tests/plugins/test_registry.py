@@ -6,7 +6,6 @@ import subprocess
 import sys
 import textwrap
 
-import drjit as dr
 import mitsuba as mi
 import pytest
 
@@ -91,15 +90,6 @@ def test_scalar_variants_register_and_refuse():
                 build(name)
 
 
-def test_sync_is_idempotent_and_reclaims_a_name_that_was_taken():
-    plugins.sync()
-    before = type(build("transient_path"))
-    mi.register_integrator("transient_path", lambda props: mi.load_dict({"type": "path"}))
-    assert not isinstance(build("transient_path"), before)
-    plugins.sync()
-    assert type(build("transient_path")) is before
-
-
 @pytest.mark.slow
 def test_no_variant_at_import_and_after():
     out = run("""
@@ -109,17 +99,6 @@ def test_no_variant_at_import_and_after():
         print(type(mi.load_dict({"type": "transient_path"})).__name__)
     """)
     assert out == ["None", "TransientPath"]
-
-
-@pytest.mark.slow
-def test_variant_chosen_before_import():
-    out = run("""
-        import mitsuba as mi
-        mi.set_variant("llvm_ad_mono")
-        import torchtransient
-        print(type(mi.load_dict({"type": "transient_path"})).__name__)
-    """)
-    assert out == ["TransientPath"]
 
 
 THIRD_PARTY = """
@@ -181,20 +160,6 @@ def test_failure_during_a_switch_warns_and_is_raised_by_the_next_call(third_part
             plugins.sync()
     mi.set_variant("llvm_ad_rgb")
     assert plugins.sync() == "llvm_ad_rgb"
-
-
-def test_a_plugin_that_refuses_its_parameters_takes_part_in_no_later_kernel():
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
-    kept = []
-    for kind in ({"alpha_u": 0.2}, {"distribution": "none"}):
-        with pytest.raises(Exception, match="diff_rough_plastic") as raised:
-            mi.load_dict({"type": "diff_rough_plastic", **kind})
-        kept.append(raised)  # with its traceback, as a notebook and a test runner keep it
-    scene = mi.load_dict({"type": "scene", "shape": {"type": "sphere"}, "film": {"type": "perspective"}})
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1)))
-    value = si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1))
-    assert dr.all(dr.isfinite(value), axis=None)
 
 
 # ------------------------------------------------------------------------------------------- first use, several threads
