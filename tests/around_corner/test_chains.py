@@ -1,4 +1,4 @@
-"""Late light from shared chains: the same as that of paths, in every kind of capture, film and colour."""
+"""Late light from shared chains: the same as that of paths, in every kind of capture and colour."""
 
 import itertools
 
@@ -6,15 +6,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient.plugins.around_corner.late_light as late_light
 from support.hidden_shapes import ball, folded_plates, join, mannequin, mesh, plate, scene_of, wall_grid
 from support.late_light_runs import agree, chains, density_of, rendered, scan_scene
 from support.marks import long, long_rows
 from support.third_bounce_runs import film_of, table_of, wall_of
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import SceneError
 
 VARIANT = "llvm_ad_mono"
-UP = (0.0, 0.0, 1.0)
+
+
 PATHS, CHAINS = 1 << 14, 1 << 10
 
 
@@ -111,70 +111,6 @@ def histogram(points, **arguments):
     return film_of(points, points, 1.2, 48, 0.05, **arguments)
 
 
-@pytest.mark.slow
-def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(corner):
-    """The same chains: to the last digits."""
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals, leg=[0.1, 0.2, 0.0, 0.3])
-    exhaustive = {"exhaustive_scan": True, "laser_scan_width": 2, "laser_scan_height": 2}
-    run = lambda film, lasers, kind: chains(scene, elements, film, sensors, lasers, kind, 200)[1]  # noqa: E731
-    every = run(histogram(2, **exhaustive), sensors, "exhaustive").reshape(4, 4, -1)
-    confocal = run(histogram(2), sensors, "confocal").reshape(4, -1)
-    spot = wall_of(points[2:3], normals[2:3], leg=0.0)
-    single = run(histogram(2), spot, "single").reshape(4, -1)
-    most = every.max()
-    assert np.abs(every[range(4), range(4)] - confocal).max() < 1e-5 * most
-    assert np.abs(every[:, 2] - single).max() < 1e-5 * most
-
-
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_phasors_are_the_transform_of_fine_bins(corner, kind):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
-    frequencies = [0.0, 0.5, 1.5]
-    film = film_of(2, 2, type="phasor_hdr_film", frequencies="0.0, 0.5, 1.5", start_opl=1.0)
-    phasors = chains(scene, elements, film, sensors, lasers, kind, 150)[1].reshape(2, 2, 3, 2)
-    fine = chains(scene, elements, film_of(2, 2, 1.0, 8000, 0.001), sensors, lasers, kind, 150)[1][..., 0]
-    middle = (np.arange(8000) + 0.5) * 0.001
-    for i, frequency in enumerate(frequencies):
-        expected = (fine * np.exp(-2j * np.pi * frequency * middle)).sum(-1)
-        found = phasors[:, :, i, 0] + 1j * phasors[:, :, i, 1]
-        # Half a bin is at most 2 pi 1.5 0.0005 of a turn's angle.
-        assert np.abs(found - expected).max() < 6e-3 * np.abs(fine.sum(-1)).max()
-
-
-def test_bins_and_what_is_outside_are_the_steady_image(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    film = film_of(2, 2, 3.2, 2, 0.1)
-    steady, cube = chains(scene, elements, film, sensors, sensors, "confocal", 300)
-    assert cube.sum() + film.energy_before + film.energy_after == pytest.approx(steady.sum(), rel=1e-5)
-    assert min(film.energy_before, film.energy_after) > 0.05 * steady.sum()
-
-
-@pytest.mark.slow
-def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    runs = [chains(scene, elements, film_of(2, 2, 3.2, 9, 0.1, **more), sensors, sensors, "confocal", 100)
-            for more in ({}, {"steady": False})]  # fmt: skip
-    assert runs[1][1] == pytest.approx(runs[0][1], rel=1e-6)
-    assert runs[1][0].sum() == pytest.approx(runs[0][1].sum(), rel=1e-6) and runs[0][0].sum() > 1.1 * runs[0][1].sum()
-
-
-@pytest.mark.parametrize("busy", [1, 64])
-def test_groups_at_a_time_do_not_matter(corner, monkeypatch, busy):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    usual = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
-    for table in (late_light._BUSY,):
-        for backend in list(table):
-            monkeypatch.setitem(table, backend, busy)
-    again = chains(scene, elements, histogram(2), sensors, sensors, "confocal", 300)[1]
-    assert np.allclose(usual, again, rtol=1e-4, atol=1e-6 * usual.max())
-
-
 @pytest.mark.parametrize("choices", [{"size": 1}, {"side": 2}])
 def test_groups_and_tiles_have_one_mean(corner, choices):
     scene, elements, points, normals = corner
@@ -202,38 +138,6 @@ def test_few_chains_and_no_light():
         assert cube.sum() == 0
 
 
-@pytest.mark.slow
-def test_chains_name_their_material_points(corner):
-    """Shape, primitive and barycentrics of every vertex give its place again."""
-    import drjit as dr
-
-    from torchtransient.plugins.around_corner.late_light import ChainPlan, trace_chains
-
-    scene, elements, points, _ = corner
-    center, seed = mi.Point3f(*np.mean(points, 0).tolist()), dr.opaque(mi.UInt32, 5)
-    _, tails = trace_chains(scene, ChainPlan(elements, center, 32, 4, 3, seed), dr.arange(mi.UInt32, 128))
-    v = np.array(elements.shapes[0].vertex_positions_buffer()).reshape(-1, 3)
-    f = np.array(elements.shapes[0].faces_buffer()).reshape(-1, 3)
-    for vertex in tails:
-        alive = np.array(vertex.alive & (vertex.shape == mi.ShapePtr(elements.shapes[0])))
-        corners = v[f[np.array(vertex.primitive)[alive]]]
-        b = np.array(vertex.uv).T[alive]
-        place = corners[:, 0] + b[:, :1] * (corners[:, 1] - corners[:, 0]) + b[:, 1:] * (corners[:, 2] - corners[:, 0])
-        assert alive.any()
-        assert np.abs(place - np.array(vertex.p).T[alive]).max() < 1e-4
-
-
-def test_arguments_are_checked(corner):
-    scene, elements, points, normals = corner
-    sensors = wall_of(points, normals)
-    run = lambda **more: chains(scene, elements, histogram(2), sensors, sensors, "confocal", 8, **more)  # noqa: E731
-    for bounces in ((3, 5), (4, late_light.MOST + 1), (6, 5)):
-        with pytest.raises(SceneError, match="expected bounces"):
-            run(bounces=bounces)
-    with pytest.raises(UnitError, match="power of two"):
-        run(size=12)
-
-
 def test_the_choice_says_why_not():
     shapes = [mesh("a", folded_plates())]
     # Mitsuba's parser hands on what the plugin says.
@@ -258,29 +162,6 @@ def test_progress_goes_up_to_one():
 
 
 # ------------------------------------------------------------------------------------------------ colours
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", long(["confocal", "single"], ["single"]))
-def test_chains_are_the_same_in_every_colour(corner, kind):
-    """Light of two hidden bounces goes by the square of their albedo, also where another colour is not scattered."""
-    given = corner[2:]
-    grey = by_chains(mesh("a", folded_plates(), 0.5, two_sided=True), *given, kind)
-    albedos = [0.0, 0.8, 0.3]
-    shape = {"type": "rgb", "value": albedos}
-    with mi.variant_context("llvm_ad_rgb"):
-        colours = by_chains(mesh("a", folded_plates(), shape, two_sided=True), *given, kind)
-    assert not colours[..., 0].any()
-    for channel in (1, 2):
-        expected = grey[..., 0] * (albedos[channel] / 0.5) ** 2
-        np.testing.assert_allclose(colours[..., channel], expected, rtol=1e-3, atol=1e-4 * grey.max())
-
-
-def by_chains(shape, points, normals, kind):
-    scene, sensors = scene_of(shape), wall_of(points, normals)
-    elements = density_of(scene, table_of([shape]), points, normals)
-    lasers = sensors if kind == "confocal" else wall_of(points[:1], normals[:1])
-    return chains(scene, elements, histogram(2), sensors, lasers, kind, 64, bounces=(4, 4))[1]
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ import pytest
 
 from support.marks import long, long_rows
 from support.nlos_scenes import captures, film, plane, ratio, scan_scene, transform
-from torchtransient.plugins.around_corner.division import Division
 
 VARIANT = "llvm_ad_mono"
 SIGMAS = 4.0
@@ -67,34 +66,6 @@ def division(description):
     scene = mi.load_dict(description)
     integrator = scene.integrator()
     return integrator.division(scene, integrator.contents(scene, scene.sensors()[0]))
-
-
-def test_a_wall_is_what_scan_and_laser_meet():
-    on_wall = division(scan(False, False))
-    assert list(on_wall.shared) == [3]
-    assert not on_wall.walks
-    for points, spot in ((False, True), (True, False)):
-        found = division(scan(points, spot))
-        assert not found.shared
-        assert "the wall is not flat" in found.why_not
-    # Everything on the floor: that is the wall of this scan.
-    assert list(division(scan(True, True)).shared) == [3]
-    shared = division(scan(True, False, third_bounce="shared"))
-    assert list(shared.shared) == [3]
-    assert shared.longest == 2
-
-
-@pytest.mark.parametrize(
-    ("shared", "first", "last", "itself", "longest"),
-    [
-        (range(3, 4), 0, 3, False, 0), (range(3, 4), 0, 3, True, 2), (range(3, 4), 3, 3, True, 0),
-        (range(4, 8), 0, 7, False, 3), (range(4, 8), 4, 7, False, 0), (range(3, 6), 0, 9, False, 9),
-        (range(3, 8), 2, 7, True, 2), (range(4, 6), 0, 5, True, 3),
-    ],
-)  # fmt: skip
-def test_what_is_left_for_paths(shared, first, last, itself, longest):
-    found = Division.of(shared, first, last, itself)
-    assert (found.longest, found.walks) == (longest, longest > 0)
 
 
 # ------------------------------------------------------------------------------------------- surfaces near each other

@@ -1,155 +1,102 @@
-"""Every film through its own interface: the same light as the histogram has, whatever the number of lanes a pixel."""
+"""Every film around a corner: gates, phasors, bins and what is outside of them show the same light, which is drawn
+alike for the same seed.
+"""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient.plugins.around_corner.launches as launches
-from support.hidden_shapes import mannequin, mesh, scene_of, wall_grid
-from support.marks import long
-from support.third_bounce_runs import captured, film_of, table_of, wall_of
-from torchtransient.errors import SceneError, ShapeError, VariantError
-from torchtransient.plugins.around_corner.geometry import WallPoints
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
-from torchtransient.plugins.sampling.shared_samples import draw_samples
+from support.hidden_shapes import folded_plates, mesh
+from support.marks import long_pairs
+from support.nlos_scenes import scan_scene
 
 VARIANT = "llvm_ad_mono"
-GRID, COUNT, START, WIDTH, BINS = 2, 500, 1.2, 0.05, 40
+GRID, SAMPLES = 2, 256
+LIGHT = {
+    "third": {"filter_bounces": 3, "max_depth": 3, "third_bounce": "shared"},
+    "late": {"min_bounces": 4, "max_depth": 5, "late_light": "chains"},
+}
+KINDS = ("confocal", "single", "exhaustive")
+QUICK = [("third", "confocal"), ("late", "single"), ("third", "exhaustive")]
+HISTOGRAM = {"type": "transient_hdr_film", "start_opl": 1.2, "temporal_bins": 40, "bin_width_opl": 0.05}
+every_light = pytest.mark.parametrize(("which", "kind"), long_pairs(LIGHT, KINDS, QUICK))
 
 
-@pytest.fixture(scope="module")
-def body():
-    shapes = [mesh("a", mannequin(1))]
-    return scene_of(*shapes), draw_samples(table_of(shapes), COUNT, 2)
+def render(which, kind, response, albedo=0.7, **settings):
+    """(steady image, what the film keeps, film) of a fold and a plate before the wall."""
+    film = {"width": GRID, "height": GRID, "rfilter": {"type": "box"}, **response}
+    if kind == "exhaustive":
+        film |= {"exhaustive_scan": True, "laser_scan_width": GRID, "laser_scan_height": GRID}
+    shape = mesh("a", folded_plates(), albedo, two_sided=True)
+    scene = mi.load_dict(scan_scene({"a": shape}, kind, film, **LIGHT[which], **settings), optimize=False)
+    steady, kept = scene.integrator().render(scene, seed=2, spp=SAMPLES)
+    return np.array(steady, dtype=float), np.array(kept, dtype=float), scene.sensors()[0].film()
 
 
-@pytest.fixture
-def run(body):
-    points, normals = wall_grid(GRID, 0.4)
-    sensors = wall_of(points, normals, leg=[0.1, 0.2, 0.0, 0.3])
-
-    def of(film, spot=False, **arguments):
-        def add():
-            job = ThirdBounce(body[0], film, body[1], sensors, 3.0, **arguments)
-            job.add_single(wall_of(points[:1], normals[:1], leg=0.05)) if spot else job.add_confocal()
-
-        return captured(film, add, COUNT)
-
-    return of
-
-
-def histogram(**arguments):
-    return film_of(GRID, GRID, START, BINS, WIDTH, **arguments)
-
-
-@pytest.mark.parametrize("spot", [False, True])
-@pytest.mark.parametrize("filter_name", ["box", "tent", "gaussian"])
-def test_bins_and_what_is_outside_are_the_steady_image(run, filter_name, spot):
-    more = {"gaussian_stddev": 2.0} if filter_name == "gaussian" else {}
-    film = film_of(GRID, GRID, 2.4, 3, WIDTH, temporal_filter=filter_name, **more)
-    steady, cube = run(film, spot)
+@every_light
+@pytest.mark.parametrize("filter_name", ["box", "tent"])
+def test_bins_and_what_is_outside_are_the_steady_image(which, kind, filter_name):
+    window = {"start_opl": 2.6 if which == "third" else 3.4, "temporal_bins": 3, "temporal_filter": filter_name}
+    steady, cube, film = render(which, kind, HISTOGRAM | window)
     assert cube.sum() + film.energy_before + film.energy_after == pytest.approx(steady.sum(), rel=1e-5)
     assert min(film.energy_before, film.energy_after) > 0.05 * steady.sum()
 
 
-def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(run):
-    _, cube = run(histogram())
-    steady, same = run(histogram(steady=False))
-    assert same == pytest.approx(cube, rel=1e-6) and steady.sum() == pytest.approx(cube.sum(), rel=1e-6)
+@every_light
+def test_a_film_without_a_steady_image_leaves_out_what_it_cannot_see(which, kind):
+    _, cube, _ = render(which, kind, HISTOGRAM)
+    steady, same, _ = render(which, kind, HISTOGRAM | {"steady": False})
+    assert cube.sum() > 0 and same == pytest.approx(cube, rel=1e-5, abs=1e-7 * cube.max())
+    assert steady.sum() == pytest.approx(cube.sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("spot", [False, True])
-def test_phasors_are_the_transform_of_fine_bins(run, spot):
-    frequencies = [0.0, 0.7, 2.5]
-    fine = film_of(GRID, GRID, 0.0, 4096, 0.001)
-    _, cube = run(fine, spot)
-    film = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0, 0.7, 2.5", start_opl=0.3)
-    steady, phasors = run(film, spot)
-    centers = 0.001 * (np.arange(4096) + 0.5) - 0.3
-    for f, frequency in enumerate(frequencies):
-        expected = (cube[..., 0] * np.exp(-2j * np.pi * frequency * centers)).sum(-1)
-        found = phasors[:, :, f, 0] + 1j * phasors[:, :, f, 1]
-        # Within a bin the phase changes by 2 pi nu 0.5 mm at most, at random.
-        assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
-    assert steady[..., 0] == pytest.approx(phasors[:, :, 0, 0], rel=1e-5)
+@every_light
+def test_gates_are_sums_of_bins(which, kind):
+    _, cube, _ = render(which, kind, HISTOGRAM)
+    gates = {"type": "gated_hdr_film", "gates": "rectangular 1.2 2.2; rectangular 2.2 3.2"}
+    _, gated, _ = render(which, kind, gates)
+    expected = cube.reshape(*cube.shape[:-2], 2, 20, 1).sum(-2)
+    assert gated == pytest.approx(expected, rel=1e-4, abs=1e-6 * expected.max())
 
 
-def test_phasors_in_several_launches(run, monkeypatch):
-    film = film_of(GRID, GRID, type="phasor_hdr_film", frequencies="0.7, 2.5")
-    _, whole = run(film)
-    for most in (24, 1):
-        monkeypatch.setattr(type(film), "lanes_at_most", lambda self, events, most=most: most)
-        assert len(launches.launches_of(film, COUNT)) > 4
-        _, parts = run(film)
-        assert parts == pytest.approx(whole, rel=1e-5, abs=1e-6 * np.abs(whole).max())
-
-
-def test_gates_are_sums_of_bins(run):
-    _, cube = run(histogram())
-    film = film_of(GRID, GRID, type="gated_hdr_film", gates="rectangular 1.2 2.2; rectangular 2.2 3.2")
-    _, gated = run(film)
-    expected = cube.reshape(GRID, GRID, 2, 20, 1).sum(3)
-    assert gated == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize("busy", [1, 13, 4096])
-def test_lanes_of_a_pixel_add_up(run, monkeypatch, busy):
-    _, expected = run(histogram())
-    monkeypatch.setattr(launches, "_BUSY", dict.fromkeys(launches._BUSY, busy))
-    monkeypatch.setattr(launches, "_CONNECTIONS", 700)
-    fractions = []
-    _, cube = run(histogram(), progress=fractions.append)
-    assert cube == pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
-    assert fractions == pytest.approx([k / 3 for k in (1, 2, 3)])
-
-
-def test_legs_are_path_length(body):
-    points, normals = wall_grid(GRID, 0.4)
-    cubes = []
-    for leg in (0.0, 0.1):
-        film = histogram()
-        sensors = wall_of(points, normals, leg=leg)
-        cubes.append(captured(film, lambda s=sensors, f=film: ThirdBounce(body[0], f, body[1], s).add_confocal())[1])
-    # To the scan point and back: 0.2 m, four bins; what lies at the rim of a bin may be rounded to either side.
-    moved = np.abs(cubes[1][:, :, 4:] - cubes[0][:, :, :-4]).sum()
-    assert moved < 0.01 * cubes[0].sum()
+@pytest.mark.parametrize(("which", "kind"), [(which, kind) for which in LIGHT for kind in ("confocal", "single")])
+def test_phasors_are_the_transform_of_fine_bins(which, kind):
+    frequencies, width, bins = [0.0, 0.7, 1.5], 0.001, 8000
+    fine = {"start_opl": 0.0, "temporal_bins": bins, "bin_width_opl": width}
+    _, cube, _ = render(which, kind, HISTOGRAM | fine)
+    phasors = {"type": "phasor_hdr_film", "frequencies": "0, 0.7, 1.5", "start_opl": 0.3}
+    steady, found, _ = render(which, kind, phasors)
+    centers = width * (np.arange(bins) + 0.5) - 0.3
+    expected = cube[..., 0] @ np.exp(-2j * np.pi * np.outer(centers, frequencies))
+    # Within a bin the phase changes by 2 pi nu 0.5 mm at most.
+    np.testing.assert_allclose(found[..., 0] + 1j * found[..., 1], expected, atol=6e-3 * np.abs(expected).max())
+    assert steady[..., 0] == pytest.approx(found[:, :, 0, 0], rel=1e-5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vertex_normals", long([False, True], [True]))
-def test_colours(vertex_normals):
-    """Every channel of a single and a confocal capture is one of its own albedo and energy."""
-
-    def captures(albedo, energy, variant):
-        with mi.variant_context(variant):
-            shapes = [mesh("a", mannequin(1), albedo, two_sided=True, vertex_normals=vertex_normals)]
-            scene, samples = scene_of(*shapes), draw_samples(table_of(shapes), 128, 2)
-            points, normals = wall_grid(GRID, 0.4)
-            sensors, laser, film = wall_of(points, normals), wall_of(points[:1], normals[:1]), histogram()
-            job = lambda: ThirdBounce(scene, film, samples, sensors, mi.UnpolarizedSpectrum(energy))  # noqa: E731
-            return [captured(film, lambda: job().add_confocal())[1], captured(film, lambda: job().add_single(laser))[1]]
-
-    rgb = captures({"type": "rgb", "value": [0.2, 0.5, 0.8]}, [1.0, 2.0, 3.0], "llvm_ad_rgb")
-    for channel, (albedo, energy) in enumerate(((0.2, 1.0), (0.5, 2.0), (0.8, 3.0))):
-        for found, expected in zip(rgb, captures(albedo, energy, "llvm_ad_mono"), strict=True):
-            assert found[..., channel] == pytest.approx(expected[..., 0], rel=1e-5, abs=1e-7 * expected.max())
+@pytest.mark.parametrize("kind", KINDS)
+def test_colours(kind):
+    """Every channel is a capture of its own albedo and energy."""
+    albedos, energies = [0.2, 0.5, 0.8], [1.0, 2.0, 3.0]
+    with mi.variant_context("llvm_ad_rgb"):
+        laser = {"type": "laser_beam", "energy": {"type": "rgb", "value": energies}}
+        _, cube, _ = render("third", kind, HISTOGRAM, {"type": "rgb", "value": albedos}, laser=laser)
+    for channel, (albedo, energy) in enumerate(zip(albedos, energies, strict=True)):
+        _, expected, _ = render("third", kind, HISTOGRAM, albedo, laser={"type": "laser_beam", "energy": energy})
+        assert expected.max() > 0
+        assert cube[..., channel] == pytest.approx(expected[..., 0], rel=1e-4, abs=1e-6 * expected.max())
 
 
-def test_arguments_are_checked(body):
-    points, normals = wall_grid(GRID, 0.4)
-    sensors = wall_of(points, normals)
-    film = histogram()
-    with pytest.raises(SceneError, match="start_render"):
-        ThirdBounce(*(body[0], film, body[1], sensors))
-    film.start_render()
-    with pytest.raises(ShapeError, match="2 x 2 pixels and 9"):
-        ThirdBounce(body[0], film, body[1], wall_of(*wall_grid(3)))
-    job = ThirdBounce(body[0], film, body[1], sensors)
-    with pytest.raises(ShapeError, match="one laser spot, got 4"):
-        job.add_single(sensors)
-    with pytest.raises(ShapeError, match="9 spots"):
-        job.add_confocal(wall_of(*wall_grid(3)))
-    with pytest.raises(ShapeError, match="leg"):
-        WallPoints(sensors.p, sensors.n, 0.3, mi.Float64([1, 2]))
-    with mi.variant_context("llvm_ad_spectral"), pytest.raises(VariantError, match="spectral"):
-        ThirdBounce(None, film, None, None)
+@pytest.mark.parametrize("which", LIGHT)
+def test_the_diagonal_is_the_confocal_capture_and_a_column_a_single_one(which):
+    """The same samples; an arrival at the rim of a bin may be rounded into the other one."""
+    fine = {"start_opl": 0.0, "temporal_bins": 40, "bin_width_opl": 0.2}
+    _, every, _ = render(which, "exhaustive", HISTOGRAM | fine)
+    _, confocal, _ = render(which, "confocal", HISTOGRAM | fine)
+    _, single, _ = render(which, "single", HISTOGRAM | fine, spot=(-0.25, 0.25, 0.0))
+    every = every.reshape(GRID**2, GRID**2, -1)
+    for found, expected in ((every[range(4), range(4)], confocal), (every[:, 2], single)):
+        found, expected = found.cumsum(-1), expected.reshape(GRID**2, -1).cumsum(-1)
+        assert expected.max() > 0
+        assert np.median(np.abs(found - expected)) < 1e-6 * expected.max()
+        assert found[:, -1] == pytest.approx(expected[:, -1], rel=1e-4)

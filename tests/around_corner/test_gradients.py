@@ -225,22 +225,6 @@ def test_tangents_arrive_whoever_brings_them(name, by_caller, third_bounce):
     assert abs(forward) > 0
 
 
-@pytest.mark.slow
-def test_a_leaf_of_the_scene_itself_carries_a_tangent():
-    hidden = plate()
-    hidden["a"]["bsdf"] = {"type": "diffuse", "reflectance": bitmap()}
-    description = scan_scene(hidden, "single", film(3, **SMOOTH))
-    capture = MovedCapture(description, "a.bsdf.reflectance.data", lambda start, θ: start + θ)
-    expected = capture.reverse(0, 2**10)
-    value = mi.TensorXf(capture.start["a.bsdf.reflectance.data"])
-    dr.enable_grad(value)
-    dr.set_grad(value, 1.0)
-    capture.parameters["a.bsdf.reflectance.data"] = value
-    capture.parameters.update()
-    found = capture.scene.integrator().render_forward(capture.scene, capture.parameters, spp=2**10)
-    assert capture.weighed(found) == pytest.approx(expected, rel=1e-4)
-
-
 def mirrored():
     return transform().translate([0.1, 0.05, 1.0]).rotate([0, 1, 0], 160).scale([-0.3, 0.3, 1])
 

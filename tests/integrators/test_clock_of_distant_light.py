@@ -4,9 +4,7 @@ through whichever integrator, sensor, copy or call values came in.
 
 from __future__ import annotations
 
-import gc
 import pickle
-import weakref
 
 import mitsuba as mi
 import numpy as np
@@ -140,17 +138,6 @@ def test_scene_without_an_integrator_of_its_own():
         assert integrator.reference(scene).center[2] == pytest.approx(-1.5)
 
 
-@pytest.mark.slow
-def test_two_integrators_in_turn():
-    """An integrator that meets another scene in between has not forgotten the first."""
-    scenes, outside = [load(), load(LIGHTS["directional"])], mi.load_dict({"type": "transient_path", "max_depth": 2})
-    for distance in (20.0, 7.0):
-        for scene in scenes:
-            move(scene, distance)
-            arrival(scene, outside)
-            assert outside.reference(scene).center[2] == pytest.approx(-1.5)
-
-
 def test_sensor_at_infinity():
     sensor = {"type": "distant", "film": film(**AXIS), **looking_down(4.0), "target": [0.0, 0.0, 0.0]}
     lamp = {"type": "point", "position": [0.0, 0.0, 1.0]}
@@ -217,18 +204,3 @@ def test_renderers_with_and_without_parameters_share_a_clock():
     bins = out.transient.double().sum((0, 2, 3))
     centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
     assert float(bins @ centers / bins.sum()) == pytest.approx(moved, abs=0.02)
-
-
-def test_a_film_on_the_only_shape_is_freed():
-    """The film keeps what the scene was like, and the shape keeps the film."""
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    meter = square(0, 0) | {"to_world": mi.ScalarTransform4f(), "meter": {"type": "irradiancemeter", "film": film()}}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "transient_path"}, "meter": meter})
-    mi.traverse(scene)
-    scene.integrator().render(scene, spp=1)
-    gone = weakref.ref(scene.sensors()[0].film())
-    assert gone() is not None
-    del scene
-    gc.collect()
-    assert gone() is None

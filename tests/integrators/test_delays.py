@@ -14,7 +14,6 @@ from support.gradient_cases.scenes import camera, film, room
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
-from torchtransient.plugins.bsdfs.delay_table import DECAY_NODES, DelayedBSDFs, _distribution
 from torchtransient.plugins.guards import no_collection
 from torchtransient.pulses import Pulse
 from torchtransient.sensing.impulse_response import pulse_kernel
@@ -105,7 +104,7 @@ def test_measured_decay():
     bsdf = mi.load_dict(node)
     shares = pulse_kernel(1e-4, pulse)[1].numpy()
     mean = float((shares * (np.arange(shares.size) * 1e-4)).sum())
-    assert float(bsdf.lifetime[0]) == pytest.approx(mean, rel=1e-3) and bsdf.decay.size == DECAY_NODES
+    assert float(bsdf.lifetime[0]) == pytest.approx(mean, rel=1e-3)
     _, transient = runs(scene(node))
     check(transient, YIELD * exact_delays(undelayed(2), 0.001, pulse.cumulative), slack=1e-4)
     # a lifetime stretches the decay to that mean
@@ -289,27 +288,6 @@ def test_errors(node, message):
         mi.load_dict({"type": "delayed", **node})
 
 
-def test_numbers_at_the_ends_of_their_ranges():
-    for more in ({"elastic_fraction": 0.0}, {"elastic_fraction": 1.0}, {"quantum_yield": 0.0}, {"lifetime": 0.0}):
-        bsdf = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "lifetime": 1.0, **more})
-        assert float(getattr(bsdf, next(iter(more)))[0]) == next(iter(more.values()))
-    assert mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": "0 1", "decay_values": "1 1"}).decay[0] == 0
-
-
-@pytest.mark.parametrize(("opl", "values", "mean", "at"), [
-    ("0 2", "3 3", 1.0, lambda p: 2 * p), ("0.5 2.5", "1 1", 1.5, lambda p: (0.5 + 2 * p) / 1.5),
-    ("0 3", "0 2", 2.0, lambda p: 1.5 * np.sqrt(p)), ("0 3", "2 0", 1.0, lambda p: 3 * (1 - np.sqrt(1 - p))),
-])  # fmt: skip
-def test_measured_decays_in_units_of_their_mean(opl, values, mean, at):
-    """At equal steps of probability; a lifetime stretches them."""
-    bsdf = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": opl, "decay_values": values})
-    assert float(bsdf.lifetime[0]) == pytest.approx(mean, rel=1e-6)
-    np.testing.assert_allclose(bsdf.decay, at(np.linspace(0, 1, len(bsdf.decay))), atol=2e-4 * mean + 1e-6)
-    longer = mi.load_dict({"type": "delayed", "nested": DIFFUSE, "decay_opl": opl, "decay_values": values,
-                           "lifetime": 7.0})  # fmt: skip
-    assert float(longer.lifetime[0]) == 7.0 and np.array_equal(longer.decay, bsdf.decay)
-
-
 def test_spectra_that_are_none():
     def shifted(**spectra):
         return mi.load_dict({"type": "delayed", "lifetime": 1.0, "nested": DIFFUSE, "emission": GREEN,
@@ -330,41 +308,3 @@ def test_a_delay_inside_another_bsdf_is_refused(outer):
     target = scene({**outer, "nested": LATE})
     with pytest.raises(SceneError, match="outermost"):
         target.integrator().render(target, spp=1)
-
-
-@pytest.mark.parametrize(
-    ("resolution", "count"), [(0.0, 471), (-1.0, 471), (1e-4, 4096), (2.0, 151), (7.0, 65), (300.0, 65)]
-)
-def test_nodes_of_spectra(resolution, count):
-    """As many as the spectrum has, within bounds, between its ends."""
-    mi.set_variant("llvm_ad_spectral")
-
-    class Ramp:
-        def wavelength_range(self):
-            return 400.0, 700.0
-
-        def spectral_resolution(self):
-            return resolution
-
-        def eval(self, si):
-            return si.wavelengths - 399
-
-    found = _distribution(Ramp(), "emission")
-    np.testing.assert_allclose(np.array(found.pdf), np.linspace(1, 301, count), rtol=1e-5, atol=1e-4)
-    assert float(found.integral()[0]) == pytest.approx(300 * 151, rel=1e-4)
-
-
-def test_delays_are_read_between_the_nodes_of_their_own_table():
-    """Two measured decays and an exponential one between them, in units of the lifetime."""
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    other = {"decay_opl": "0, 0.5, 3.0", "decay_values": "0.2 1 0"}
-    bsdfs = [mi.load_dict({"type": "delayed", "nested": DIFFUSE, **how}) for how in (DECAY, {"lifetime": 0.9}, other)]
-    table = DelayedBSDFs(bsdfs).read()
-    v = np.random.default_rng(4).random(400).astype(np.float32)
-    v[:3] = 0, 0.5 / (DECAY_NODES - 1), 1
-    for row, bsdf in enumerate(bsdfs):
-        found = np.array(table._delay(mi.Float(v), mi.UInt32(row), mi.Bool(True)))
-        x = np.minimum(v, np.float32(1 - 2.0**-24)).astype(float)
-        expected = -np.log1p(-x) if row == 1 else np.interp(x * (DECAY_NODES - 1), np.arange(DECAY_NODES), bsdf.decay)
-        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,6 @@ import torchtransient as tt
 from support.marks import long, long_pairs, long_rows
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError
-from torchtransient.scene.variant import active_variant
 from torchtransient.scenes import look_at, rotate, scale, translate
 
 VARIANT = "llvm_ad_rgb"
@@ -189,7 +189,7 @@ def test_it_is_the_light_of_ordinary_connections(name):
 
 @pytest.mark.parametrize("variant", long(("llvm_ad_mono", "llvm_ad_spectral"), ("llvm_ad_mono",)))
 def test_in_other_variants(variant):
-    with active_variant(variant):
+    with mi.variant_context(variant):
         plain, ellipsoidal = (
             runs(renderer(room(), kind, variant), 16, seed) for kind, seed in (("ordinary", 0), ("ellipsoidal", 5000))
         )
@@ -315,7 +315,7 @@ def without_lamp():
     ],
 )
 def test_what_it_cannot_do_is_refused(scene, variant, words):
-    with active_variant(variant), pytest.raises(SceneError, match=words):
+    with mi.variant_context(variant), pytest.raises(SceneError, match=words):
         renderer(scene(), variant=variant)(seed=0)
 
 

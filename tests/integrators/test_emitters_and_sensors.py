@@ -63,13 +63,6 @@ def test_sensor_over_a_plane(name):
     assert width < 2.5e-3
 
 
-def test_start_of_meters_is_on_the_sensor():
-    """Mitsuba lifts the rays of these meters off by 8.9e-5 m, which bins of 1e-5 m can see."""
-    sharp = film(start=4.9, bins=20000, width=1e-5)
-    loaded = load(scene(SENSORS["radiancemeter"].make(sharp), LIGHTS["point"].make()))
-    assert one_arrival(loaded)[0] == pytest.approx(5.0, abs=6e-6)
-
-
 def meter(size=1e-3, height=1.0, **arguments):
     """An irradiance meter that looks down on the plane."""
     return facing_down(height, size, {"meter": {"type": "irradiancemeter", "film": film(**arguments)}})

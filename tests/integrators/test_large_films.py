@@ -49,10 +49,3 @@ def test_direct_sums_lose_nothing(scene, monkeypatch):
     monkeypatch.setattr(type(film), "knows_crowds", False)
     together = np.array(scene.integrator().render(scene, seed=1, spp=16)[1], dtype=np.float64)
     np.testing.assert_allclose(direct, together, rtol=1e-4, atol=1e-6 * together.max())
-
-
-def test_few_bins_and_small_films_are_added_up_by_dr_jit(scene):
-    film = scene.sensors()[0].film()
-    assert film.reduce_mode(dr.zeros(mi.Float, 1000), False, True) == dr.ReduceMode.Auto
-    assert film.reduce_mode(dr.zeros(mi.Float, 2**24), False, False) == dr.ReduceMode.Auto
-    assert film.reduce_mode(dr.zeros(mi.Float, 2**24), True, True) == dr.ReduceMode.NoConflicts

@@ -6,7 +6,6 @@ sum of those of its parts. The bound is derived: three standard errors of indepe
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -27,8 +26,6 @@ from support.gradient_cases.cases_mixtures import (
     two_sided,
 )
 from support.marks import long
-from torchtransient.errors import SceneError
-from torchtransient.plugins.bsdfs.mixtures import flags_of
 
 VARIANT = "llvm_ad_mono"
 SEEDS = 6
@@ -157,54 +154,3 @@ def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags
         images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
     assert images[0].max() > 0
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("flags", FLAGS[1:3], ids=str)
-def test_hidden_flags_are_found(flags):
-    mi.set_variant(VARIANT)
-    for make in (lambda: around_metal(FLAT, 0.0, flags), lambda: bump(blend(DIFFUSE, MIRROR), 0.5, 0.5) | flags):
-        assert flags_of(mi.load_dict(make())) == flags
-
-
-def test_what_samples_as_no_choice_of_flags():
-    mi.set_variant(VARIANT)
-    drawn = []
-
-    class Fickle(mi.BSDF):
-        """Other directions with every sample."""
-
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.m_components = [mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide]
-            self.m_flags = self.m_components[0]
-
-        def sample(self, ctx, si, sample1, sample2, active):
-            drawn.append(len(drawn))
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo, bs.pdf = dr.normalize(mi.Vector3f(0.01 * len(drawn), 0, 1)), mi.Float(1)
-            return bs, mi.Spectrum(1)
-
-    mi.register_bsdf("fickle", Fickle)
-    described = {"type": "normalmap", "id": "rug", "normalmap": {"type": "uniform", "value": 0.5}}
-    with pytest.raises(SceneError, match=r"NormalMap 'rug': .* choice of flip_invalid_normals, use_shadowing_function"):
-        flags_of(mi.load_dict(described | {"nested": {"type": "fickle"}}))
-    assert len(drawn) == 5
-
-
-def test_looking_for_flags_leaves_values_and_their_derivatives():
-    mi.set_variant(VARIANT)
-    bsdf = mi.load_dict(around_metal(FLAT, 0.3, FLAGS[0]))
-    params = mi.traverse(bsdf)
-    before = {key: np.array(value) for key, value in params.items()}
-    x = mi.TensorXf(params["normalmap.data"])
-    dr.enable_grad(x)
-    params["normalmap.data"] = x
-    params.update()
-    with dr.suspend_grad():
-        flags_of(bsdf)
-    after = mi.traverse(bsdf)
-    for key, value in before.items():
-        np.testing.assert_array_equal(np.array(dr.detach(after[key])), value)
-    dr.backward(dr.sum(after["normalmap.data"] * 2))
-    np.testing.assert_array_equal(np.array(dr.grad(x)), np.full((4, 4, 3), 2.0))

@@ -281,21 +281,6 @@ def test_polarized_light_of_a_glossy_surface():
     agree(stokes[..., :1], plain, 0.02)
 
 
-# ------------------------------------------------------------------------------------------------- what walks are of
-
-
-@pytest.mark.parametrize(("given", "kind"), [
-    ("single", 1), ("Confocal", 2), ("EXHAUSTIVE", 3), ("1", 1), (" 2", 2), (3, 3), (2.0, 2), ("pairs", 4),
-])  # fmt: skip
-def test_types_of_captures(given, kind):
-    from torchtransient.plugins.integrators.nlos_path import capture_type
-
-    assert capture_type(given).value == kind
-    for wrong in ("0", "-1", 5, "both", 1.5):
-        with pytest.raises(SceneError, match="capture_type: expected single, confocal, exhaustive or pairs"):
-            capture_type(wrong)
-
-
 # ---------------------------------------------------------------------------------------------------------- errors
 
 WRONG = {

@@ -14,7 +14,6 @@ from support.marks import long
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError
-from torchtransient.scene.variant import active_variant
 from torchtransient.scenes import rotate, scale, translate
 
 VARIANT = "llvm_ad_rgb"
@@ -153,7 +152,7 @@ def runs(one, count, seed=0):
 
 
 def check_same_light(scene, variant=VARIANT):
-    with active_variant(variant):
+    with mi.variant_context(variant):
         plain, shared = renderer(scene, PATH, variant), renderer(scene, REUSE, variant)
         result = two_sample_z_test(runs(plain, 16), runs(shared, 8, 5000), rounding=1e-5)
     assert result.passed, str(result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -117,6 +118,22 @@ def test_one_bounce_in_closed_form():
     np.testing.assert_allclose(phasors[0, 0], expected, atol=2e-5 * steady.max())
 
 
+def test_the_derivative_by_the_light_is_the_render():
+    """Phasors are linear in the light: for one seed ``<g, render> = radiance <g, d render / d radiance>``."""
+    scene, key = scene_of(phasor_camera()), "lamp.emitter.radiance.value"
+    g = np.random.default_rng(1).normal(size=scene.sensors()[0].film().cube_shape()).astype(np.float32)
+    _, phasors = scene.integrator().render(scene, seed=3, spp=64)
+    params = mi.traverse(scene)
+    radiance = type(params[key])(params[key])
+    dr.enable_grad(radiance)
+    params[key] = radiance
+    params.update()
+    scene.integrator().render_backward(scene, params, (None, mi.TensorXf(g)), seed=3, spp=64)
+    found = np.vdot(np.ravel(dr.grad(radiance)), np.ravel(dr.detach(radiance)))
+    terms = np.array(phasors, dtype=np.float64) * g
+    assert found == pytest.approx(terms.sum(), abs=2e-6 * np.abs(terms).sum())
+
+
 @pytest.mark.slow
 def test_crop_window():
     crop = {"crop_offset_x": 2, "crop_offset_y": 1, "crop_width": 3, "crop_height": 2}
@@ -175,18 +192,6 @@ def test_several_launches_and_bands(monkeypatch):
     mean = one.mean((0, 1, 2))
     result = z_test((one - mean).real.mean((1, 2)), (flat[..., 0] - mean.real).mean((0, 1)), alpha=1e-6, rounding=0.05)
     assert result.passed, str(result)
-
-
-@pytest.mark.slow
-def test_sums_of_large_jobs_in_double_precision(monkeypatch):
-    monkeypatch.setattr(f"{FILMS}.base.MAX_SINGLE_PRECISION_SAMPLES", 16)
-    scene = scene_of(phasor_camera())
-    scene.sensors()[0].film().start_render(17)
-    assert dr.type_v(scene.sensors()[0].film().bands[0][2]) == dr.VarType.Float64
-    _, double = render(scene)
-    monkeypatch.undo()
-    _, single = render(scene)
-    np.testing.assert_allclose(double, single, atol=1e-6 * np.abs(single).max())
 
 
 @pytest.mark.slow

@@ -134,9 +134,3 @@ def test_bitmaps_of_stokes_vectors_name_their_channels():
     found = scene.sensors()[0].film().bitmap()
     assert [field.name for field in found.struct_()] == ["L.S0", "L.S1", "L.S2", "L.S3"]
     assert np.array_equal(np.array(found), steady)
-
-
-def test_blocks_of_an_image_that_was_not_begun_are_refused():
-    film = load(FILMS["transient"]).sensors()[0].film()
-    with pytest.raises(SceneError, match="expected an image that was begun"):
-        film.create_block()

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from tools.small_room import GREY, WALL_POSE, make_room
-from torchtransient import plugins
-from torchtransient.plugins.sampling.lights import MovingSun
-from torchtransient.plugins.sampling.sphere_lights import SphereLights
 
 VARIANT = "llvm_ad_mono"
 SUN, SUN_VARIANT = "light.sun_direction", "llvm_ad_rgb"
@@ -82,36 +77,3 @@ def test_the_direction_of_a_sun_is_that_of_one_that_is_drawn():
     """Its disk turns with it along the paths that hit it; at fixed directions hardly anything changed."""
     drawn, hit = (gradients(under_a_sun(weight, [SUN], spp=16384))[SUN].numpy() for weight in (1.0, 0.0))
     np.testing.assert_allclose(hit, drawn, atol=0.08 * np.abs(drawn).max())  # of one, 1.2 %; lost, a twentieth was left
-
-
-def test_each_of_a_thousand_lights_is_drawn_often_enough():
-    """What is rare is told from an even share: all of them together would be left to paths otherwise."""
-    mi.set_variant(VARIANT)
-    plugins.sync()
-    lights = {f"point{n}": {"type": "point"} for n in range(1000)}
-    for name, weight in (("drawn", 1.0), ("rare", 1e-4)):
-        lights[name] = {"type": "sphere", "emitter": {"type": "area", "sampling_weight": weight}}
-    scene = mi.load_dict({"type": "scene", **lights}, optimize=False)
-    draws = np.array(SphereLights.from_scene(scene).read(scene).draws(scene.emitters_dr()))
-    spheres = [light.get_shape() is not None for light in scene.emitters()]
-    expected = [light.sampling_weight() == 1 for light in scene.emitters()]
-    np.testing.assert_array_equal(draws, np.logical_and(spheres, expected))
-
-
-@pytest.mark.parametrize(("weight", "rare"), [(0.0, True), (1e-6, True), (0.01, False), (1.0, False)])
-def test_a_sun_is_rare_by_the_weight_of_its_sky(weight, rare):
-    mi.set_variant(SUN_VARIANT)
-    plugins.sync()
-    scene = mi.load_dict({"type": "scene", "sky": wide_sun(weight), "two": {"type": "point"}})
-    assert MovingSun(scene, scene.environment()).rare is rare
-
-
-def test_a_directional_light_before_the_sun_is_not_the_sun():
-    mi.set_variant(SUN_VARIANT)
-    plugins.sync()
-    beam = {"type": "directional", "direction": [-0.3, -0.4, -0.7]}
-    scene = mi.load_dict({"type": "scene", "sky": wide_sun(1.0), "beam": beam}, optimize=False)
-    sun = MovingSun(scene, scene.environment())
-    assert dr.all(sun.contains(sun.direction))
-    shines = np.array(sun.shines(scene.emitters_dr(), dr.detach(sun.direction)))
-    np.testing.assert_array_equal(shines, [light.class_name() == "SunskyEmitter" for light in scene.emitters()])

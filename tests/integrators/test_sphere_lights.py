@@ -13,7 +13,6 @@ from support.marks import long, long_rows
 from support.runs import T, runs
 from support.surface_samples import start
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.plugins.sampling.sphere_lights import SphereLights
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
 RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
@@ -179,66 +178,12 @@ def test_lights_that_move(number):
     assert steady(scene, 8, 1 << 14).mean() == pytest.approx(4 * before, rel=1e-2)
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_lights_that_stand_still_are_looked_up_once(number):
-    scene = over_a_plane(*[lamp(0.01)] * number)
-
-    def launched(seed):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            dr.eval(scene.integrator().render(scene, seed=seed, spp=4))
-            return len(dr.kernel_history([dr.KernelType.JIT]))
-
-    assert [launched(seed) for seed in range(3)][1:] == [1, 1]
-
-
 def densities(table, scene, p, u):
     """Samples towards a light from ``p``, their weights, and the densities that are asked for."""
     ref = dr.zeros(mi.Interaction3f, dr.width(u))
     ref.p = p
     ds, weight = table.sample(scene, ref, u, mi.Bool(True))
     return ds, weight, table.pdf(scene, ref, ds, mi.Bool(True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("inside", [False, True])
-def test_texture_coordinates_of_samples(inside):
-    """Those where a ray meets the point: between 0 and 1, so that textures that do not repeat are the same ones."""
-    scene = over_a_plane({**on_its_side(1.0), "flip_normals": inside})
-    n = 1 << 12
-    rng = np.random.default_rng(5)
-    u = mi.Point2f(*rng.random((2, n)).astype(np.float32))
-    table, p = SphereLights.from_scene(scene).read(scene), mi.Point3f(0.1, 0.05, 1.1 if inside else 0.1)
-    ds, _, _ = densities(table, scene, p, u)
-    si = scene.ray_intersect(mi.Ray3f(ds.p - 0.01 * ds.d, ds.d))
-    assert np.array(si.is_valid()).all() and np.abs(np.array(dr.norm(si.p - ds.p))).max() < 1e-5
-    off = np.abs(np.array(si.uv - ds.uv))
-    assert np.quantile(off, 0.999) < 1e-4 and np.array(ds.uv).min() >= 0 and np.array(ds.uv).max() <= 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("ratio", "flipped"), [(1e-6, False), (0.99, False), (0.5, True), (1.5, True)])
-def test_densities_agree_and_integrate_to_the_solid_angle(ratio, flipped):
-    scene = over_a_plane(lamp(ratio, flip_normals=flipped), {"type": "point", "position": [0, 0, 1], "intensity": 1})
-    table = SphereLights.from_scene(scene).read(scene)
-    n = 1 << 18
-    x = (dr.arange(mi.Float, n) + 0.5) / n
-    turns = 0.61803 * mi.Float(dr.arange(mi.UInt32, n) % 4096)
-    ds, weight, pdf = densities(table, scene, mi.Point3f(0.1, 0, 0), mi.Point2f(0.5 * x, turns - dr.floor(turns)))
-    lit = dr.dot(ds.d, ds.n) < 0
-    assert bool(dr.all(lit)) == ((ratio > 1) == flipped)
-    if not dr.any(lit)[0]:
-        assert dr.all(pdf == 0)
-        return
-    np.testing.assert_allclose(np.array(pdf), np.array(ds.pdf), rtol=2e-4 if ratio < 1 else 1e-2)
-    away = ratio * DISTANCE / np.hypot(DISTANCE, 0.1)
-    expected = 4 * np.pi if ratio > 1 else 2 * np.pi * away**2 / (1 + np.sqrt(max(1 - away**2, 0)))
-    # One of two lights is chosen: half of the samples bring twice their light.
-    assert float(dr.mean(weight.x)[0]) / 2 == pytest.approx(RADIANCE * expected, rel=2e-3)
-    # Points lie on the sphere, in the direction and at the distance that is said.
-    p = mi.Point3f(0.1, 0, 0) + ds.d * ds.dist
-    off = dr.norm(p - mi.Point3f(0, 0, DISTANCE)) - ratio * DISTANCE
-    assert float(dr.max(dr.abs(off))[0]) < 3e-6 * max(1, ratio) * DISTANCE
 
 
 @pytest.mark.parametrize(
@@ -291,40 +236,3 @@ def test_small_light_in_fog():
     box = {"type": "cube", "to_world": middle, "bsdf": {"type": "null"}, "interior": fog}
     scene = over_a_plane(lamp(1e-4), integrator="transient_prbvolpath", box=box)
     close_to(steady(scene), RHO * RADIANCE * 1e-8 * np.exp(-0.5), slack=1e-4)
-
-
-def test_rows_are_the_same_in_recordings():
-    """Where a call is recorded, numbers are written into the table by kernels."""
-    scene = over_a_plane(on_its_side(1.0), lamp(0.1, 2.0))
-    lights = SphereLights.from_scene(scene)
-    plain = lights.read(scene).tables()[0]
-    rows = lights.read(scene)._rows
-    with dr.scoped_set_flag(dr.JitFlag.FreezingScope, True):
-        written = lights.read(scene)._laid_out(rows)
-    assert np.array_equal(np.array(written), np.array(plain)) and len(np.array(plain)) == 2 * 20
-
-
-def test_numbers_of_lights():
-    """Center, radius, its square, that of the edge inside of which a point is, side, and probability of being drawn."""
-    turned = T().translate([0.5, -1, 7]).rotate([0, 1, 0], 30).scale(3.0)
-    inward = {"type": "sphere", "to_world": turned, "flip_normals": True, "emitter": {"type": "area", "radiance": 1.0}}
-    inward["emitter"]["sampling_weight"] = 3.0
-    scene = over_a_plane(inward, lamp(0.25, 2.0))
-    rows = np.array([[np.array(x)[0] for x in row] for row in SphereLights.from_scene(scene).read(scene)._rows])
-    eps = float(mi.math.RayEpsilon)
-    outer = [0, 0, 2, 0.5, 0.25, (0.5 * (1 - eps)) ** 2, 1, 0.25]
-    np.testing.assert_allclose(rows, [[0.5, -1, 7, 3, 9, (3 * (1 + eps)) ** 2, -1, 0.75], outer], rtol=3e-6)
-
-
-@pytest.mark.parametrize("inside", [False, True])
-def test_no_density_along_the_surface(inside):
-    """Neither towards a point that is seen from the side or from behind, nor where there is no way to it."""
-    scene = over_a_plane(lamp(0.1, flip_normals=inside))
-    table = SphereLights.from_scene(scene).read(scene)
-    ds = dr.zeros(mi.DirectionSample3f, 4)
-    ds.d, ds.n = mi.Vector3f(0, 0, 1), mi.Normal3f([1, 0, 0, 0], 0, [0, 1, -1, -1])
-    ds.dist, ds.emitter = mi.Float(2.0, 2.0, 0.0, 2.0), scene.emitters_dr()[0]
-    ref = dr.zeros(mi.Interaction3f, 4)
-    ref.p = mi.Point3f(0, 0, DISTANCE if inside else 0)
-    pdf = np.array(table.pdf(scene, ref, ds, mi.Bool(True)))
-    assert (pdf[:3] == 0).all() and 0 < pdf[3] < 1e3

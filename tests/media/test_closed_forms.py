@@ -1,12 +1,11 @@
 """Light in a medium against what is known exactly: moments of the random walk, ballistic and single-scattered light."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 
 import torchtransient as tt
 from support.marks import long
-from support.media_scenes import film, homogeneous, load, rgb
+from support.media_scenes import film, homogeneous, load
 from support.runs import T, runs
 from support.walks import recorded_paths
 from torchtransient.accuracy import z_test
@@ -126,24 +125,6 @@ def single_scattering(radius, cosine, μ_s, μ_t, edges, phase=isotropic):
     return np.histogram(s + d, edges, weights=value)[0]
 
 
-@pytest.mark.slow
-def test_single_scattering_formula():
-    """The radiance above, integrated over all directions, is the energy density of Sato's formula."""
-    radius, μ_s = 1.5, 0.7
-    edges = np.linspace(2.0, 4.0, 11)
-    nodes, weights = np.polynomial.legendre.leggauss(60)
-    total = sum(
-        2 * np.pi * w * single_scattering(radius, c, μ_s, μ_s, edges) for c, w in zip(nodes, weights, strict=True)
-    )
-    τ = np.linspace(2.0, 4.0, 10_001)
-    density = μ_s / (radius * τ) * np.exp(-μ_s * τ) * np.log((τ + radius) / (τ - radius))
-    expected = np.histogram(0.5 * (τ[1:] + τ[:-1]), edges, weights=0.5 * (density[1:] + density[:-1]) * (τ[1] - τ[0]))[
-        0
-    ]
-    # Four pi: the formula is for a source of unit power, this one has unit intensity.
-    np.testing.assert_allclose(total, expected, rtol=2e-3)
-
-
 @pytest.mark.parametrize(
     ("name", "angle"), [("isotropic", 0.5), ("isotropic", 2.5), ("backward", 0.5), ("rayleigh", 2.5), ("blend", 2.5)]
 )
@@ -160,31 +141,6 @@ def test_single_scattering(name, angle):
     result = z_test(transient.reshape(10, -1), expected, rounding=2e-7)
     assert result.passed, str(result)
     assert result.entries > 15 and result.chi2_z < 4
-
-
-@pytest.mark.parametrize("variant", long(["llvm_ad_mono", "llvm_ad_rgb"], ["llvm_ad_rgb"]))
-def test_furnace(variant):
-    """A medium that absorbs nothing cannot be seen before a sky of one radiance. Without connections to the sky every
-    single path says so, since colours share their samples in proportion to what they carry.
-    """
-    mi.set_variant(variant)
-    grey = variant == "llvm_ad_mono"
-    σ_t = 0.7 if grey else rgb(0.2, 0.9, 0.5)
-    medium = homogeneous(σ_t, 1.0, 0.6, scale=3.0, sample_emitters=False)
-    objects = {
-        "sky": {"type": "constant", "radiance": 1.0},
-        "ball": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium},
-    }
-    scene = load(objects, max_depth=-1)
-    steady, _ = runs(scene, count=2, spp=64)
-    # One channel, or the mean of all, without any noise.
-    np.testing.assert_allclose(steady.mean(-1), 1.0, rtol=2e-5)
-    connected = load(
-        objects | {"ball": objects["ball"] | {"interior": medium | {"sample_emitters": True}}}, max_depth=-1
-    )
-    steady, _ = runs(connected, count=8, spp=64)
-    result = z_test(steady, 1.0, rounding=1e-5)
-    assert result.passed, str(result)
 
 
 @pytest.mark.filterwarnings("ignore:the derivative by")  # of shadows, of which a large wall casts none here

@@ -15,11 +15,6 @@ def test_extrapolation_length_of_the_published_foam():
     assert extrapolation_length(262.0, 1.12) == pytest.approx(3.65e-3, abs=0.01e-3)
 
 
-def test_no_reflection_without_a_step_of_the_index():
-    assert internal_reflection(1.0) == pytest.approx(0.0, abs=1e-12)
-    assert extrapolation_length(100.0, 1.0) == pytest.approx(2 / 300, rel=1e-9)
-
-
 @pytest.mark.parametrize("thickness, late", [(0.0508, [4.0, 5.0]), (0.1016, [14.0, 15.0])])
 def test_late_decay_is_that_of_the_lowest_mode(thickness, late):
     before, after = slab_transmittance(np.array(late), thickness, **FOAM)

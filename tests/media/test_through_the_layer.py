@@ -67,18 +67,6 @@ def test_steady_scenes_with_media(integrator):
     torch.testing.assert_close(out.transient.sum(1), out.steady, rtol=2e-3, atol=1e-4)
 
 
-def test_python_integrators_of_mitsuba_keep_their_depth():
-    """Mitsuba does not tell the kind of plugins written in Python, its own included."""
-    shallow = tt.load(
-        {"type": "scene", "integrator": {"type": "prb", "max_depth": 1}, "sensor": camera(transient=False)}
-        | {key: value for key, value in block(homogeneous()).items() if key != "block"},
-        variant=VARIANT,
-    )
-    out = tt.TransientRenderer(shallow, parameters=[], time_axis=AXIS, spp=16)(seed=0)
-    assert out.stats.integrator == "transient_path"
-    assert out.steady.sum() == 0, "light that is not seen directly needs a depth of two"
-
-
 @pytest.mark.slow
 def test_peer_scene_file(tmp_path):
     path = tmp_path / "volumetric.xml"

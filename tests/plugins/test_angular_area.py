@@ -77,37 +77,6 @@ def test_angles_out_of_range():
             mi.load_dict({"type": "angulararea", **angles})
 
 
-@pytest.mark.parametrize("beam", [10.0, 40.0])
-def test_what_a_point_below_and_above_is_sent(beam):
-    """By a lamp at 2 m that faces down, linear between 10 degrees and 40, or all of it within 40."""
-    emitter = {"type": "angulararea", "radiance": 5.0, "cutoff_angle": 40.0, "beam_width": beam}
-    scene = lamp_over_floor(emitter)
-    (light,) = scene.emitters()
-    # Straight below, at 25 degrees, at 45, above; as seen from the middle of the lamp.
-    angle = np.radians([0.0, 25.0, 45.0])
-    it = dr.zeros(mi.SurfaceInteraction3f, 4)
-    it.p = mi.Point3f([*np.tan(angle), 0.0], 0, [1.0, 1.0, 1.0, 4.0])
-    ds, weight = light.sample_direction(it, mi.Point2f(0.5, 0.5))
-    share = [1, 0.5 if beam == 10 else 1, 0, 0]
-    cosine = np.array([*np.cos(angle), 1.0])
-    distance = np.array([*(1 / np.cos(angle)), 2.0])
-    density = np.array([1, 1, 1, 0]) * distance**2 / np.where(cosine, cosine, 1) / 0.04
-    np.testing.assert_allclose(np.array(light.eval_direction(it, ds)).ravel(), 5.0 * np.array(share), rtol=1e-4)
-    np.testing.assert_allclose(np.array(light.pdf_direction(it, ds)), density, rtol=1e-4)
-    expected = 5.0 * np.array(share) / np.where(density > 0, density, 1)
-    np.testing.assert_allclose(np.array(weight).ravel(), expected, rtol=1e-4)
-    assert dr.all(ds.emitter == mi.EmitterPtr(light)) and dr.all(light.eval_direction(it, ds, False) == 0, axis=None)
-    for off in (light.sample_direction(it, mi.Point2f(0.5, 0.5), False)[1], light.pdf_direction(it, ds, False)):
-        assert not np.array(off).any()
-    ps, position_weight = light.sample_position(0.0, mi.Point2f(0.5, 0.5))
-    assert float(position_weight[0]) == pytest.approx(0.04) and float(ps.p.z[0]) == pytest.approx(2.0)
-    assert float(light.sample_position(0.0, mi.Point2f(0.5, 0.5), False)[1][0]) == 0
-    # Its back is dark.
-    si = scene.ray_intersect(mi.Ray3f([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]))
-    assert not np.array(light.eval(si)).any()
-    assert light.bbox().max.z == pytest.approx(2.0)
-
-
 def test_the_slope_of_a_profile():
     """By the cosine: that of the arc cosine over the width between both angles, and none beside it."""
     scene = lamp_over_floor({"type": "angulararea", "radiance": 5.0, "cutoff_angle": 40.0, "beam_width": 10.0})

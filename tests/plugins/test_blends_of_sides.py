@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from tools.gradient_sweep.bsdfs import METAL, ROUGH_GLASS, blend
+from tools.gradient_sweep.bsdfs import ROUGH_GLASS, blend
 from tools.gradient_sweep.measure import Subject
 from tools.gradient_sweep.stages import between_lights, matte
 from torchtransient import plugins
-from torchtransient.plugins.bsdfs.mixtures import needs_choice
 
-PAINT = {"type": "diffuse", "reflectance": 0.5}
 GLASS = {"type": "roughdielectric", **ROUGH_GLASS}
-METALLIC = {"type": "roughconductor", **METAL, "alpha": 0.3}
 
 
 @pytest.fixture(autouse=True)
@@ -45,21 +42,6 @@ def test_mitsuba_counts_light_twice():
         mi.load_dict({"type": "blendbsdf", "weight": 0.4, "a": GLASS, "b": matte(0.0)})
     )
     assert blended > 0.6 * glass * 1.03 + 5 * error
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "expected"),
-    [
-        (GLASS, PAINT, True),
-        ({"type": "twosided", "nested": PAINT}, METALLIC, True),
-        (GLASS, GLASS | {"alpha": 0.1}, True),
-        (PAINT, METALLIC, False),
-        ({"type": "twosided", "nested": PAINT}, {"type": "twosided", "nested": METALLIC}, False),
-    ],
-)
-def test_which_are_taken_apart(a, b, expected):
-    assert needs_choice(mi.load_dict({"type": "blendbsdf", "weight": 0.5, "a": a, "b": b})) == expected
-    assert not needs_choice(mi.load_dict(a)) and not needs_choice(mi.load_dict(b))
 
 
 def total(bsdf, spp):

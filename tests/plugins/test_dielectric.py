@@ -106,7 +106,7 @@ def compare(ours, theirs, ctx, power_alone=False):
     weight = expected[5]
     lit = weight.reshape(-1, weight.shape[-1]).max(0) > 0
     # Mitsuba computes Mueller matrices of refraction from the refracted cosine, which loses up to a quarter at grazing
-    # incidence (the matrix's first entry must be 1 / eta^2 here; see test_grazing_mueller_matrix).
+    # incidence (the matrix's first entry must be 1 / eta^2 here).
     steep = np.abs(inputs(weight.shape[-1])[0][:, 2]) > 0.05
     for k, (a, b) in enumerate(zip(got, expected, strict=True)):
         assert np.isfinite(a).all()
@@ -155,28 +155,6 @@ def test_density_of_all_normals_is_mitsubas(roughness):
     expected, found = (bsdf.pdf(mi.BSDFContext(), si, wo).numpy() for bsdf in (theirs, ours))
     assert (expected > 1e-3).sum() > 200
     assert np.max(np.abs(found - expected) / (expected + 2e-3)) < 1e-3
-
-
-@pytest.mark.parametrize("number", [0.0, 0.5, 1 - 2.0**-24])
-def test_what_does_not_reflect_transmits_whatever_is_drawn(number):
-    """Between equal indices; and where all light is reflected, nothing is transmitted."""
-    activate("llvm_ad_mono")
-    ctx, glass = mi.BSDFContext(), mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    nothing = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.25, "ext_ior": 1.25})
-    for bsdf, wi, component in ((nothing, [0, 0.6, 0.8], 1), (glass, [0, 0.8, -0.6], 0)):
-        bs, weight = bsdf.sample(ctx, interaction(mi.Vector3f(wi)), mi.Float(number), mi.Point2f(0.5))
-        found = [*bs.sampled_component, *bs.pdf, *weight[0]]
-        assert found == pytest.approx([component, 1, 1])
-
-
-def test_grazing_mueller_matrix():
-    activate("llvm_ad_mono_polarized")
-    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0})
-    z = np.float32([1e-3, 1e-2, 0.1, 0.5, 1])
-    wi = mi.Vector3f(np.stack([np.sqrt(1 - z * z), 0 * z, z]))
-    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(0.9999999), mi.Point2f(0.5))
-    assert dr.all(bs.sampled_component == 1)
-    np.testing.assert_allclose(np.array(weight)[0, 0].ravel(), 1 / 2.25, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("roughness", "sample_visible"), [(ROUGHNESSES[2], True), (ROUGHNESSES[3], False)])
@@ -317,76 +295,7 @@ def test_rough_eval_and_pdf_are_attached(ggx, alphas):
     assert checked == 10
 
 
-@pytest.mark.parametrize("side", long([1, -1], [-1]))
-def test_detached_estimator_of_a_rough_lobe(side):
-    """What the integrator does: mean of ``weight * relative_grad(pdf) * g(wo)`` over detached samples.
-
-    Its derivative in eta and alpha must be that of the integral over the sphere of directions.
-    """
-    activate("llvm_ad_mono")
-    plugin = {"type": "diff_rough_dielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": 0.4, "distribution": "ggx"}
-    wi = mi.Vector3f(dr.normalize(mi.Vector3f(0.4, 0.2, 0.9 * side)))
-    weigh = mi.Vector3f(0.3, -0.5, 0.7)
-
-    # Midpoint rule over the sphere, in double precision.
-    z = (np.arange(400) + 0.5) / 200 - 1
-    phi = (np.arange(400) + 0.5) * (2 * np.pi / 400)
-    Z, P = (torch.tensor(x.ravel()) for x in np.meshgrid(z, phi))
-    R = torch.sqrt(1 - Z * Z)
-    wo = torch.stack([R * torch.cos(P), R * torch.sin(P), Z], -1)
-    w = torch.tensor(wi.numpy()[:, 0], dtype=torch.float64).expand_as(wo)
-    eta = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
-    alpha = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    value, _ = rough_dielectric(w, wo, eta.expand(len(wo)), alpha.expand(len(wo)), alpha.expand(len(wo)), True)
-    integrand = value * (1 + wo @ torch.tensor(weigh.numpy()[:, 0], dtype=torch.float64))
-    slopes = torch.autograd.grad(integrand.sum() * (4 * np.pi / len(wo)), (eta, alpha))
-
-    count = 200000
-    rng = np.random.default_rng(3)
-    u1, u2 = mi.Float(rng.random(count)), mi.Point2f(rng.random((2, count)))
-    for key, slope in zip(("eta", "alpha.value"), slopes, strict=True):
-        bsdf = mi.load_dict(plugin)
-        params = mi.traverse(bsdf)
-        dr.enable_grad(params[key])
-        params.update()
-        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), u1, u2)
-        estimate = weight[0] * dr.relative_grad(bs.pdf) * (1 + dr.dot(bs.wo, weigh))
-        estimate = dr.select(weight[0] > 0, estimate, 0)
-        dr.set_grad(params[key], 1)
-        samples = dr.forward_to(estimate).numpy()
-        mean, error = samples.mean(), samples.std() / np.sqrt(count)
-        assert abs(mean - slope.item()) < 4 * error + 2e-3 * abs(slope.item()), key
-
-
-def test_gradient_passes_through_a_call_by_pointer():
-    """The plugins are reached through arrays of pointers in a loop: the index must collect its derivative there too."""
-    activate("llvm_ad_rgb")
-    for kind in ("diff_dielectric", "diff_rough_dielectric"):
-        scene = mi.load_dict(
-            {"type": "scene", "a": {"type": "rectangle", "bsdf": {"type": kind, "int_ior": 1.5, "ext_ior": 1.0}}}
-        )
-        params = mi.traverse(scene)
-        dr.enable_grad(params["a.bsdf.eta"])
-        params.update()
-        rays = mi.Ray3f(mi.Point3f(0.1, 0.2, 2), dr.normalize(mi.Vector3f(mi.Float([0.3, -0.2, 0.1]), 0.1, -1)))
-        si = scene.ray_intersect(rays)
-        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.9), mi.Point2f(0.4))
-        dr.backward(dr.sum(bs.eta + bs.pdf * 0))
-        assert dr.grad(params["a.bsdf.eta"])[0] == pytest.approx(3, rel=1e-5)
-
-
 # ----------------------------------------------------------------------------------------------------- parameters
-
-
-def test_parameters():
-    activate("llvm_ad_mono")
-    smooth = mi.traverse(mi.load_dict({"type": "diff_dielectric", "int_ior": "bk7", "ext_ior": "air"}))
-    assert smooth["eta"][0] == pytest.approx(1.5046 / 1.000277, rel=1e-6)
-    assert smooth.flags("eta") & mi.ParamFlags.Discontinuous
-    textured = {"type": "diff_rough_dielectric", "alpha_u": 0.2, "alpha_v": 0.3, "specular_reflectance": 0.5}
-    assert set(mi.traverse(mi.load_dict(textured)).keys()) == {
-        "eta", "alpha_u.value", "alpha_v.value", "specular_reflectance.value",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,6 @@ from support.hidden_shapes import ball, disc, join, mesh
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.table import EdgeTable
 from torchtransient.plugins.edges.topology import Topology, topology_of
-from torchtransient.plugins.frozen_state import state_below
-from torchtransient.plugins.guards import no_collection
-from torchtransient.plugins.node_walk import members_of
 
 VARIANT = "llvm_ad_mono"
 STRETCH = (0.8, 0.5, 1.2)
@@ -191,84 +188,6 @@ def test_outlines_are_found_where_their_motion_puts_them():
             assert share(at(inside), here) > 0.9 and share(still, here) < 0.05, one.shape.id()
 
 
-def test_gradients_of_passes_add_up_at_the_parameters():
-    """Two tables of one scene, in an isolated scope: every step arrives."""
-    scene = mi.load_dict({"type": "scene", "a": {"type": "cube"}, "b": {"type": "disk", "to_world": placed(6, 0, 0)}})
-    params = mi.traverse(scene)
-    keys = ("a.vertex_positions", "b.to_world")
-    for key in keys:
-        dr.enable_grad(params[key])
-    params.update()
-    with dr.suspend_grad():
-        topology = Topology(scene)
-        tables = [EdgeTable(topology, frozenset()) for _ in range(2)]
-        with dr.isolate_grad():
-            for factor, table in zip((1, 10, 100), (*tables, tables[0]), strict=True):
-                u = mi.Float((np.arange(100, dtype=np.float32) + 0.5) / 100)
-                b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(1, 2, 9), True)
-                with dr.resume_grad():
-                    dr.backward_from(dr.sum(dr.select(b.valid, factor * table.moving(b).x, 0)))
-    valid, of_disk = np.array(b.valid), bodies_of(table, b) == 1
-    total = np.array(dr.grad(params[keys[0]])).reshape(-1, 3)[:, 0].sum()
-    assert total == pytest.approx(111 * (valid & ~of_disk).sum(), rel=1e-4)
-    moved = np.array(dr.grad(params[keys[1]].matrix)).squeeze()
-    assert moved[0, 3] == pytest.approx(111 * (valid & of_disk).sum(), rel=1e-4)
-
-
-def test_samples_go_to_what_moves():
-    """Half of them, or all; of the others half go by length, and half to every body alike."""
-    scene = mi.load_dict({"type": "scene", "a": {"type": "cube"}, "b": {"type": "sphere", "center": [6, 0, 0]}})
-    moving = frozenset(s.ptr for s in scene.shapes() if s.id() == "b")
-    for alone, expected in ((False, 0.5), (True, 1.0)):
-        _, b = looked_at(scene, moving, alone)
-        own = np.array(b.k.ball).mean()
-        length = 2 * np.pi / (24 / np.sqrt(2) + 2 * np.pi)
-        assert own == pytest.approx(expected + (0 if alone else 0.5 * (0.5 * length + 0.25)), abs=0.01)
-
-
-@pytest.mark.parametrize("on_mesh", [False, True])
-def test_candidates_leave_the_sum_as_it_is(scene, on_mesh):
-    """Of what is seen of outlines from one point, whichever are chosen: of a mesh, those around the face there, too."""
-    table = EdgeTable(Topology(scene), frozenset())
-    V = mi.Point3f(8, 5, 12)
-    pi = dr.zeros(mi.PreliminaryIntersection3f)
-    if on_mesh:
-        body = next(shape for shape in scene.shapes() if shape.is_mesh() and shape.face_count() > 4)
-        ray = mi.Ray3f(V, dr.normalize(mi.Point3f(body.bbox().center()) - V))
-        pi = scene.ray_intersect_preliminary(ray)
-        assert dr.all(pi.shape == mi.ShapePtr(body))
-        V = pi.compute_surface_interaction(ray).p
-    totals = []
-    for candidates in (1, 8):
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(1, 4 * COUNT)
-        worth = lambda d, dist, crease: 1 / dr.square(dist)  # noqa: E731
-        k = table.choose(table.by_length, sampler, V, (pi, mi.Bool(on_mesh)), mi.Bool(True), candidates, worth)
-        b = table.seen_from(k, V, True)
-        value = np.array(dr.select(b.valid & ~b.crease, b.sin * b.inv_pdf / dr.square(b.dist), 0), np.float64)
-        totals.append((value.mean(), value.std() / len(value) ** 0.5))
-    (one, error), (many, smaller) = totals
-    assert many == pytest.approx(one, abs=4 * np.hypot(error, smaller)) and smaller < 0.8 * error
-
-
-def page(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[0, -1, 0], [0, 1, 0], [c, 0.2, s]]), np.array([[0, 1, 2]])
-
-
-def test_of_three_faces_those_next_to_each_other_are_seen():
-    """From a gap the two faces beside it, as a crease, or as an outline where it is wider than half a turn."""
-    for angles, creases in (((0, 2.0, 4.0), 1.0), ((0, 0.7, 1.4), 2 * 0.7)):
-        scene = mi.load_dict({"type": "scene", "book": mesh("book", join(*(page(a) for a in angles)))})
-        _, b = looked_at(scene)
-        spine = (np.abs(np.array(b.p)[::2]).max(0) < 1e-6) & np.array(seen(scene, b))
-        inside, outside = (beside(scene, b, sign * 1e-3) for sign in (-1, 1))
-        crease = np.array(b.crease)
-        assert share(same(inside, b.inner), spine) > 0.98
-        assert share(same(outside, b.facing), spine & crease) > 0.98
-        assert share(outside.is_valid(), spine & ~crease) < 0.02 if creases > 1 else (~crease & spine).sum() == 0
-
-
 def test_rims_of_two_meshes_are_one_until_they_part():
     """A roof of two plates: the ridge once, with a face of each; pulled apart, two rims."""
     turned = [mi.ScalarAffineTransform4f().rotate([0, 1, 0], 40 * s).translate([s, 0, 0]) for s in (-1, 1)]
@@ -306,15 +225,6 @@ def test_short_rims_far_from_the_origin(corners):
     assert total_length(scene, (100, 0.1, 9)) == pytest.approx(0.6 * np.pi, rel=0.02)
 
 
-def test_how_near_rims_are_one_does_not_follow_from_other_bodies():
-    plates = {f"r{i}": {"type": "rectangle", "to_world": mi.ScalarAffineTransform4f().translate([0, 0, 0.003 * i])}
-              for i in (0, 1)}  # fmt: skip
-    ground = mi.ScalarAffineTransform4f().translate([0, 0, -5]).scale(1e4)
-    for more in ({}, {"ground": {"type": "rectangle", "to_world": ground}}):
-        topology = Topology(mi.load_dict({"type": "scene", **plates, **more}, optimize=False))
-        assert not topology.has_twins
-
-
 def test_faces_that_get_an_area():
     """A mesh of none, which has no edges; then it has three, and none again."""
     flat = mesh("flat", (np.zeros((3, 3)), np.array([[0, 1, 2]])))
@@ -326,65 +236,3 @@ def test_faces_that_get_an_area():
         topology = topology_of(scene, memory)
         assert (len(topology.bodies), topology.count - 5) == ((2, 3) if area else (1, 0))
         EdgeTable(topology, frozenset())
-
-
-def test_an_open_face_seen_edge_on_has_no_outline():
-    scene = mi.load_dict({"type": "scene", "r": {"type": "rectangle"}})
-    assert total_length(scene, (5, 0.3, 0)) == 0
-    assert total_length(scene, (5, 0.3, 1e-3)) == pytest.approx(8, rel=1e-3)
-
-
-def test_what_an_edge_lies_on_is_met_beside_it():
-    """The lower edge of a plate that stands on a floor, seen from above the floor."""
-    upright = mi.ScalarAffineTransform4f().translate([0.1, 0.2, 0.5]).rotate([1, 0, 0], 90).scale(0.5)
-    scene = mi.load_dict(
-        {"type": "scene", "floor": {"type": "rectangle", "to_world": mi.ScalarAffineTransform4f().scale(9)},
-         "plate": {"type": "rectangle", "to_world": upright}}
-    )  # fmt: skip
-    plate = frozenset(s.ptr for s in scene.shapes() if s.id() == "plate")
-    _, b = looked_at(scene, plate, alone=True)
-    low = seen(scene, b) & (dr.abs(b.p.z) < 1e-6) & (b.V.z > 0.5)
-    si = scene.ray_intersect(mi.Ray3f(b.beside, b.d))
-    low = np.array(low)
-    assert low.sum() > 1000
-    assert np.array(si.is_valid())[low].all() and np.array(dr.norm(si.p - b.p))[low].max() < 2e-3
-
-
-def test_shapes_without_edges_have_no_rows(tmp_path):
-    (tmp_path / "curve.txt").write_text("0 0 0 0.1\n1 0 0 0.1\n")
-    curve = {"type": "linearcurve", "filename": str(tmp_path / "curve.txt")}
-    grid = {"type": "sdfgrid", "grid": mi.TensorXf(np.linspace(-1, 1, 8).reshape(2, 2, 2, 1))}
-    for shapes, count in (({"curve": curve}, 0), ({"grid": grid, "ball": {"type": "sphere"}}, 1)):
-        topology = Topology(mi.load_dict({"type": "scene", **shapes}))
-        assert topology.count == count
-        assert EdgeTable(topology, frozenset()).count == count
-
-
-def test_members_of_an_instance(scene):
-    copy = next(s for s in scene.shapes() if s.class_name() == "Instance")
-    assert [s.id() for s in members_of(scene, copy)] == [f"part{i}" for i in range(5)]
-
-
-def test_one_recording_for_all_numbers():
-    """A table that is built within a recorded call follows the shapes."""
-    scene = mi.load_dict(
-        {"type": "scene", "cube": {"type": "cube"}, "tube": {"type": "cylinder", "to_world": placed(6, 0, 0)}}
-    )
-    params, topology = mi.traverse(scene), Topology(scene)
-    base = {key: dr.copy(params[key]) for key in ("cube.vertex_positions", "tube.to_world")}
-    moving = frozenset(s.ptr for s in scene.shapes()[:1])
-
-    def call(scene, u):
-        table = EdgeTable(topology, moving)
-        b = table.seen_from(table.pick(table.by_length, u, u * 0.7), mi.Point3f(1, 2, 9), True)
-        return b.p, b.n, b.inv_pdf, table.moving(b)
-
-    frozen = dr.freeze(call, state_fn=lambda *_: state_below([topology, vars(topology.corners)])[1])
-    for x in (0.0, 0.1, 0.2, 0.3):
-        install(params, base, dr.opaque(mi.Float, x))
-        u = mi.Float((np.arange(500, dtype=np.float32) + 0.5) / 500 * (1 - x))
-        with no_collection():
-            expected, got = call(scene, u), frozen(scene, u)
-        for a, b in zip(expected, got, strict=True):
-            np.testing.assert_allclose(np.array(b), np.array(a), rtol=1e-5, atol=1e-5)
-    assert frozen.n_recordings <= 2

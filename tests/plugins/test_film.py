@@ -4,8 +4,6 @@ layout.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,8 +13,7 @@ from scipy.special import erf
 from support.film_storage import storage
 from support.marks import long_rows
 from torchtransient import plugins
-from torchtransient.errors import SceneError, StorageError
-from torchtransient.plugins.films.temporal_filters import make_temporal_filter
+from torchtransient.errors import SceneError
 
 SLOPED = [("tent", 0.5), ("gaussian", 0.5), ("gaussian", 0.2), ("gaussian", 3.0)]
 FILTERS = long_rows([("box", 0.5), *SLOPED], [("box", 0.5), *SLOPED[:2]])
@@ -140,45 +137,6 @@ def test_slope_is_the_derivative_of_what_is_read(name, stddev):
         np.testing.assert_allclose(slope[c], (4 * near[c] - far[c]) / 3, atol=2e-3 * np.abs(slope[c]).max())
 
 
-def test_box_reads_no_slope():
-    film = make_film()
-    _, slope = film.read((mi.Float(np.arange(BINS * 3)), 3, 1), mi.UInt32(0), mi.Float64(1.1), mi.Bool(True))
-    assert all(np.all(np.array(s) == 0) for s in slope)
-
-
-@pytest.mark.parametrize("name, stddev", SLOPED)
-def test_forward_splat_is_the_transpose_of_value_and_slope(name, stddev):
-    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
-    rng = np.random.default_rng(3)
-    n = 300
-    opl, active = mi.Float64(rng.uniform(-4, BINS + 4, n) * WIDTH), mi.Bool(True)
-    df, f_dtau, g = rng.normal(size=(3, n)), rng.normal(size=(3, n)), rng.normal(size=BINS * 3)
-    cube = storage(film, BINS * 3)
-    film.put_slope(0, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in f_dtau], active)
-    A, slope = film.read((mi.Float(g), 3, 1), mi.UInt32(0), opl, active)
-    dr.eval(cube, A, slope)
-    read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * f_dtau[c]).sum(dtype=float) for c in range(3))
-    stored = np.array(cube, dtype=float)
-    assert abs(stored @ g - read) < 1e-5 * np.abs(stored * g).sum()
-
-
-def test_exhaustive_layout():
-    film = make_film(width=3, height=2, exhaustive_scan=True, laser_scan_width=4, laser_scan_height=5)
-    assert film.cube_shape() == (2, 3, 5, 4, BINS, 3)
-    film.start_render()
-    row, column, laser_row, laser_column, k = 1, 2, 3, 1, 17
-    base = mi.UInt32((row * 3 + column) * film.entries_per_pixel())
-    value = [mi.Float(v) for v in (1.0, 2.0, 3.0)]
-    film.put(
-        0, base, mi.Float64((k + 0.5) * WIDTH), value, mi.Bool(True), laser=mi.UInt32(laser_row * 4 + laser_column)
-    )
-    steady, transient = film.develop()
-    assert steady.shape == (2, 3, 3)
-    cube = np.array(transient)
-    np.testing.assert_array_equal(cube[row, column, laser_row, laser_column, k], [1, 2, 3])
-    assert cube.sum() == 6
-
-
 @pytest.mark.parametrize(
     "arguments, words",
     [
@@ -199,11 +157,6 @@ def test_bad_parameters(arguments, words):
         make_film(**arguments)
 
 
-def test_unknown_parameter_is_reported():
-    with pytest.raises(RuntimeError, match="temporal_binz"):
-        mi.load_dict({"type": "transient_hdr_film", "temporal_binz": 3})
-
-
 def test_four_channels_a_colour_in_polarized_variants():
     for variant, channels in (("llvm_ad_mono_polarized", 4), ("llvm_ad_spectral_polarized", 12)):
         with mi.variant_context(variant):
@@ -211,116 +164,3 @@ def test_four_channels_a_colour_in_polarized_variants():
             assert make_film().channel_count() == channels
 
 
-def test_row_too_large(monkeypatch):
-    monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", 100)
-    with pytest.raises(StorageError, match="fewer bins"):
-        make_film().start_render()
-
-
-def test_filter_follows_its_settings():
-    film = make_film(temporal_filter="gaussian", gaussian_stddev=0.5)
-    x = np.array([20.3])
-    film.gaussian_stddev = 2.0
-    np.testing.assert_allclose(put_each(film, x)[0][0, :, 0], exact_weights("gaussian", 2.0, x)[:, 0], atol=5e-7)
-    film.temporal_filter = "tent"
-    np.testing.assert_allclose(put_each(film, x)[0][0, :, 0], exact_weights("tent", 2.0, x)[:, 0], atol=5e-7)
-    with pytest.raises(SceneError, match="expected one of"):
-        film.temporal_filter = "none"
-    with pytest.raises(SceneError, match="positive"):
-        film.gaussian_stddev = 0.0
-    assert film.temporal_filter == "tent"
-
-
-@pytest.mark.parametrize("variant, channels", [("llvm_ad_mono", 1), ("llvm_ad_rgb", 3), ("llvm_ad_spectral", 3)])
-def test_channels_of_the_variant(variant, channels):
-    mi.set_variant(variant)
-    plugins.sync()
-    film = make_film(width=5, height=4, crop_width=3, crop_height=2, crop_offset_x=1)
-    film.start_render()
-    assert film.channel_count() == channels
-    steady, transient = film.develop()
-    assert steady.shape == (2, 3, channels) and transient.shape == (2, 3, BINS, channels)
-    assert "temporal_filter = box" in str(film)
-
-
-@pytest.mark.parametrize("name, stddev", [("tent", 0.5)])
-def test_lengths_from_an_origin_are_lengths(name, stddev):
-    """Events whose lengths are counted from an origin of their sample, before, in and behind the window, go where those
-    of the whole length do: bins and what is lost.
-    """
-    film = make_film(temporal_filter=name, gaussian_stddev=stddev)
-    n, per_pixel = 10, film.entries_per_pixel()
-    origin = np.array([-3.3, -0.1, 0.0, 0.7, 4.9, 9.7, 9.99, 10.6, 4.775, -2e12])
-    opl = np.array([1.9, 0.45, 0.3, 5.2, 3.1, 0.2, 0.3, 0.7, 0.05, 5.0])
-    value, active = [mi.Float(np.arange(2.0, 12.0) * k) for k in (1, 2, 3)], mi.Bool([True] * 9 + [False])
-    job, base = SimpleNamespace(band=0), dr.arange(mi.UInt32, n) * per_pixel
-    found, ways = [], set()
-    for start, lengths in ((mi.Float64(origin), opl), (None, origin + opl)):
-        cube = storage(film, n * per_pixel)
-        match = SimpleNamespace(to_channels=lambda spectrum: spectrum)
-        block = film.create_event_block(job, base, match, 1, origin=start)
-        ways.add(type(block))
-        lost = block.put(block.begin(), mi.Float64(lengths), value, active)
-        found.append([np.array(cube, dtype=float), *(np.array(part) for part in lost)])
-    assert all(np.abs(part).sum() > 0 for part in found[1]) and len(ways) == 2
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("stddev", [0.0, -0.5, np.nan, np.inf, -np.inf])
-def test_widths_of_no_gaussian(stddev):
-    with pytest.raises(SceneError, match="positive number of bins"):
-        make_temporal_filter("gaussian", stddev)
-
-
-# ----------------------------------------------------------------------------------------- pieces of the histogram
-
-
-@pytest.mark.parametrize("settings", [
-    {"temporal_filter": "tent"},
-    {"pulse": "tabulated", "pulse_opl": "0 1 5", "pulse_values": "1 3 0"},
-])  # fmt: skip
-def test_the_adjoint_of_the_sum_over_the_bins(settings):
-    """Weighs what is in the window alone, at its rims too, whether bins have an adjoint of their own or not."""
-    film = make_film(steady=False, **settings)
-    x = np.array([-22.3, -1.2, -0.3, 0.2, 17.4, BINS - 0.7, BINS + 0.3, BINS + 5.0, 11.3])
-    n, size = len(x), film.entries_per_pixel()
-    steady, opl = [mi.Float(v) for v in (2, 3, 5)], mi.Float64(x * WIDTH)
-    base, active = dr.arange(mi.UInt32, n) * size, mi.Bool([True] * (n - 1) + [False])
-    weights, slopes = storage(film, n * size), None
-    film.put(0, base, opl, [mi.Float(1)] * 3, active)
-    slopes = storage(film, n * size)
-    film.put_slope(0, base, opl, [mi.Float(0)] * 3, [mi.Float(1)] * 3, active)
-    weights, slopes = (np.array(part, dtype=float).reshape(n, BINS, 3)[..., 0] for part in (weights, slopes))
-    assert (weights.sum(1) > 0.99).sum() < (weights.sum(1) > 0.01).sum() < n - 1
-    rows = np.random.default_rng(1).normal(size=(BINS, 3))
-    for adjoint, own in ((None, 0), ((mi.Float(rows.ravel()), 3, 1), rows)):
-        A, slope = film.read(adjoint, mi.UInt32(0), opl, active, steady)
-        dr.eval(A, slope)
-        for found, shares in ((A, weights), (slope, slopes)):
-            expected = shares @ (own + np.broadcast_to([2.0, 3.0, 5.0], (BINS, 3)))
-            np.testing.assert_allclose(np.array(found).T, expected, atol=2e-5 * np.abs(shares).sum(1).max() * 8)
-
-
-def test_bins_far_behind_the_first_are_told_apart():
-    """An event a short way behind its origin, in the middle of a million bins."""
-    film = make_film(temporal_bins=2**20, bin_width_opl=1.0)
-    cube = storage(film, film.entries_per_pixel())
-    match = SimpleNamespace(to_channels=lambda spectrum: spectrum)
-    origin = mi.Float64([1000000.998, 700000.5])
-    block = film.create_event_block(SimpleNamespace(band=0), mi.UInt32(0), match, 1, origin=origin)
-    lost = block.put({}, mi.Float64([0.001, 0.499]), [mi.Float(1)] * 3, mi.Bool(True))
-    assert np.flatnonzero(np.array(cube)).tolist() == [2100000, 2100001, 2100002, 3000000, 3000001, 3000002]
-    assert not np.any(np.array(lost))
-
-
-@pytest.mark.parametrize(("settings", "first", "last"), [
-    ({}, 0, BINS), ({"temporal_filter": "tent"}, -0.5, BINS + 0.5),
-    ({"temporal_filter": "gaussian", "gaussian_stddev": 0.5}, -2, BINS + 2),
-    ({"pulse": "rectangular", "pulse_width_opl": 3 * WIDTH, "pulse_center_opl": 5.5 * WIDTH}, -8, BINS - 4),
-])  # fmt: skip
-def test_arrivals_that_can_reach_the_window(settings, first, last):
-    """Of a film without a steady image: a late pulse is met by arrivals before the window."""
-    assert make_film(**settings).arrivals() is None
-    window = make_film(steady=False, **settings).arrivals()
-    assert (window.first, window.last) == (first * WIDTH, last * WIDTH)

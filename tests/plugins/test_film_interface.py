@@ -4,7 +4,6 @@ is still one of ours.
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ FILMS = {
     },
     "slow_phasor_hdr_film": {"frequencies": "0 1", "slow_times": "0 0.5"},
 }
-PULSED = {"type": "transient_hdr_film", "temporal_bins": 40, "pulse": "gaussian", "pulse_fwhm_opl": 0.05}
 
 
 @pytest.fixture(autouse=True)
@@ -83,15 +81,6 @@ def test_a_film_without_a_member_is_refused():
 # ------------------------------------------------------------------------------------------ temporal filters
 
 
-def test_a_filter_that_cannot_be_used_changes_nothing():
-    film = mi.load_dict({**PULSED, "bin_width_opl": 0.02})
-    with pytest.raises(SceneError, match="4096"):
-        film.take_filter("gaussian", 1e4)
-    with pytest.raises(SceneError, match="expected one of"):
-        film.take_filter("triangle", 2.0)
-    assert (film.temporal_filter, film.gaussian_stddev, film.filter.name) == ("box", 0.5, "box")
-
-
 def test_films_without_a_temporal_filter():
     for kind in ("phasor_hdr_film", "gated_hdr_film"):
         film = make(kind)
@@ -99,31 +88,6 @@ def test_films_without_a_temporal_filter():
         assert film.temporal_filter == ""
         with pytest.raises(AttributeError):
             film.temporal_filter = "tent"
-
-
-# ------------------------------------------------------------------------------------------------- arrays of others
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["transient_hdr_film", "phasor_hdr_film"])
-def test_films_add_to_an_array_that_was_lent(kind):
-    """From its first entry on, where nothing else is touched."""
-    film = make(kind)
-    wall, lamp = {"type": "rectangle"}, {"type": "point", "position": [0.3, 0.2, 0.8]}
-    sensor = {"type": "perspective", "film": film}
-    sensor["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, 0], [0, 1, 0])
-    node = {"type": "transient_path", "max_depth": 2}
-    scene = mi.load_dict({"type": "scene", "integrator": node, "sensor": sensor, "wall": wall, "lamp": lamp})
-    film = scene.sensors()[0].film()
-    expected = np.array(scene.integrator().render(scene, seed=2, spp=8)[1]).ravel()
-    film.lend((dr.zeros(mi.Float, 7 + expected.size + 4), 7))
-    scene.integrator().render(scene, seed=2, spp=8, develop=False)
-    found = np.array(film.release_storage()[-1])
-    film.lend(None)
-    assert np.abs(expected).sum() > 0
-    np.testing.assert_allclose(found[7:-4], expected, rtol=1e-5, atol=1e-6)
-    assert not found[:7].any() and not found[-4:].any()
-    assert film.release_storage() == [None, None]
 
 
 # -------------------------------------------------------------------------------------------------------- pictures
@@ -145,42 +109,3 @@ def test_the_picture_of_a_steady_image():
     assert film.base_channels_count() == 1
     with mi.variant_context("llvm_ad_rgb"):
         assert make("transient_hdr_film").base_channels_count() == 3
-
-
-def test_sums_in_double_precision_are_handed_over_in_single():
-    """Ones that are lost beside 2^24 in single precision."""
-    film = make("transient_hdr_film")
-    for samples, expected in ((2**16, 2**24), (2**16 + 1, 2**24 + 2)):
-        film.start_render(samples)
-        film.add_steady(mi.UInt32(3), [mi.Float(2**24)])
-        for _ in range(2):
-            film.add_steady(mi.UInt32(3), [mi.Float(1)])
-            dr.eval(film.steady)
-        film.finish_render()
-        assert dr.type_v(film.steady) == dr.type_v(mi.Float)
-        assert np.array(film.develop()[0]).ravel().tolist() == [0, 0, 0, expected]
-
-
-def test_films_without_a_steady_image_sum_up_their_bins():
-    film = mi.load_dict({"type": "transient_hdr_film", "width": 3, "height": 2, "steady": False, "temporal_bins": 5})
-    film.start_render()
-    assert film.outside is None and film.energies_outside() == (0, 0)
-    values = np.arange(1.0, 31.0).reshape(2, 3, 5, 1) ** 2
-    film.bands = [(0, 2, mi.Float(values.ravel()))]
-    film.finish_render()
-    np.testing.assert_array_equal(np.array(film.develop()[0]), values.sum(2))
-
-
-@pytest.mark.parametrize(("variant", "pixels"), [("llvm_ad_mono", "Y"), ("llvm_ad_rgb", "RGB")])
-def test_the_image_of_integrators_that_know_nothing_of_time(variant, pixels):
-    """As large as the film, with its crop and its filter."""
-    mi.set_variant(variant)
-    size = {"width": 7, "height": 6, "crop_width": 4, "crop_height": 3, "crop_offset_x": 2, "crop_offset_y": 1}
-    node = {"type": "transient_hdr_film", "sample_border": True, "rfilter": {"type": "tent", "radius": 1.5}}
-    from torchtransient.plugins.films.base import plain_image
-
-    image = plain_image(mi.load_dict(node | size))
-    assert [list(part) for part in (image.size(), image.crop_size(), image.crop_offset())] == [[7, 6], [4, 3], [2, 1]]
-    assert image.rfilter().radius() == 1.5 and image.sample_border()
-    image.prepare([])
-    assert (image.bitmap(raw=False).pixel_format().name, image.bitmap().component_format().name) == (pixels, "Float32")

@@ -16,9 +16,6 @@ from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import ArgumentError, GradientError, SceneError
 from torchtransient.files import read_result, write_result
-from torchtransient.gates import Gate
-from torchtransient.plugins.films.block import ArrivalWindow, GappedWindow
-from torchtransient.plugins.sampling.lights import LightBox
 
 VARIANT = "llvm_ad_rgb"
 START = 2.0
@@ -65,31 +62,6 @@ def test_weights_are_those_of_the_gates(name):
     assert want.max() > 0.5
 
 
-READ = [("overlapping", "film", True), ("with gaps", "channels first", False), ("a sweep", "channels first", True)]
-
-
-@pytest.mark.parametrize(("name", "layout", "steady"), READ)
-def test_read_is_the_transpose_of_put(name, layout, steady):
-    film, x = make_film(SETS[name]), arrivals()
-    rng, pixels, gates = np.random.default_rng(1), 5, film.gate_count()
-    n = len(x)
-    pixel, value = rng.integers(0, pixels, n), rng.normal(size=(3, n))
-    g, g_steady = rng.normal(size=(pixels, gates, 3)), rng.normal(size=(pixels, 3)) * steady
-    active, opl = mi.Bool(rng.random(n) > 0.1), mi.Float64(x - START)
-    cube = storage(film, pixels * gates * 3)
-    film.put(0, mi.UInt32(pixel) * (gates * 3), opl, [mi.Float(v) for v in value], active)
-    if layout == "film":
-        adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (gates * 3)
-    else:
-        adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, gates * pixels), mi.UInt32(pixel)
-    A, _ = film.read(adjoint, base, opl, active, [mi.Float(g_steady[pixel, c]) for c in range(3)] if steady else None)
-    dr.eval(cube, A)  # in one kernel
-    stored = np.array(cube, dtype=float).reshape(g.shape)
-    total = (stored * (g + g_steady[:, None])).sum()
-    read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
-    assert abs(total - read) < 2e-6 * np.abs(stored * g).sum()
-
-
 def test_slopes():
     film, x = make_film(SMOOTH), arrivals()
     assert film.has_slope and not make_film(SETS["one"]).has_slope
@@ -113,39 +85,6 @@ def test_slopes():
     assert (np.array(cube).reshape(3, 3) * g).sum() == pytest.approx(want, rel=1e-4)
 
 
-def test_gates_see_nothing_before_and_behind_them():
-    """From its start on, until before its end; nor what never arrives. No gate is asked where none is open."""
-    ramp = Gate.tabulated([3.0, 5.0, 9.0], [2.0, 4.0, 8.0])
-    from torchtransient.plugins.films.gated import GateTable
-
-    table = GateTable([ramp, Gate.rectangular(12.0, 13.0)], 1.0)
-    at = np.array([3.0, np.nextafter(3.0, 0), 4.0, 7.0, np.nextafter(9.0, 0), 9.0, np.inf, -np.inf])
-    value, slope = table.value(mi.UInt32(0), mi.Float64(at - 1.0), mi.Bool([True] * 8))
-    np.testing.assert_allclose(np.array(value), [2, 0, 3, 6, 8, 0, 0, 0], rtol=1e-5)
-    np.testing.assert_allclose(np.array(slope), [1, 0, 1, 1, 1, 0, 0, 0], rtol=1e-5)
-    value, slope = table.value(mi.UInt32(0), mi.Float64(4.0), mi.Bool([True, False]))
-    assert (list(np.array(value)), list(np.array(slope))) == ([4, 0], [1, 0])
-    asked = np.array([2.9, 3.0, 6.0, 12.5, np.nextafter(13.0, 0), 13.0, np.inf])
-    low, high = (np.array(part) for part in table.candidates(mi.Float64(asked - 1.0), mi.Bool(True)))
-    np.testing.assert_array_equal(high - low, [0, 1, 1, 1, 1, 0, 0])
-    np.testing.assert_array_equal(low[[1, 2, 3, 4]], [0, 0, 1, 1])
-    low, high = table.candidates(mi.Float64(5.0), mi.Bool([True, False]))
-    assert list(np.array(high)) == [1, 0]
-    assert table.open_cells[[0, 2000, -1]].tolist() == [1, 1, 1] and not table.open_cells[2500:3600].any()
-
-
-def test_windows_count_from_their_start_until_before_their_end():
-    """With gaps, cells of equal length count or not."""
-    at = np.array([1.9999, 2.0, 3.4999, 3.5, 4.9999, 5.0, 6.4999, 6.5, 7.0, 7.9999, 8.0, np.inf])
-    window = ArrivalWindow(2, 8)
-    assert np.array(window.counts(mi.Float64(at))).tolist() == [False] + [True] * 9 + [False] * 2
-    assert np.array(window.over(mi.Float64(at))).tolist() == [False] * 10 + [True] * 2
-    gapped = GappedWindow(2, 8, [1, 0, 0, 1])
-    expected = [False, True, True] + [False] * 4 + [True] * 3 + [False] * 2
-    assert np.array(gapped.counts(mi.Float64(at))).tolist() == expected
-    assert np.array(gapped.over(mi.Float64(at))).tolist() == [False] * 10 + [True] * 2
-
-
 def test_a_pulse_opens_a_gate_softly():
     film = make_film("rectangular 6 7", pulse="gaussian", pulse_fwhm_opl=0.2)
     assert film.has_slope
@@ -165,11 +104,6 @@ def test_a_pulse_opens_a_gate_softly():
 def test_errors(arguments, message):
     with pytest.raises(SceneError, match=message):
         make_film(**arguments)
-
-
-def test_gates_are_needed():
-    with pytest.raises(SceneError, match="expected gates"), plugins.plugin_errors():
-        mi.load_dict({"type": "gated_hdr_film"})
 
 
 # ------------------------------------------------------------------------------------------------ in renders
@@ -221,24 +155,14 @@ def test_a_histogram_without_steady_image():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name, stddev", [("tent", 0.5), ("gaussian", 2.0)])
-def test_cut_windows_keep_what_filters_spread_into_them(name, stddev):
+@pytest.mark.parametrize("spread", [
+    {"temporal_filter": "tent"}, {"temporal_filter": "gaussian"}, {"pulse": tt.Pulse.gaussian(0.8, 0.3)},
+])  # fmt: skip
+def test_cut_windows_keep_what_is_spread_into_them(spread):
     room = mirrored()
-    room["integrator"]["gaussian_stddev"] = stddev
+    room["integrator"]["gaussian_stddev"] = 2.0
+    settings = {"time_axis": tt.TimeAxis(8.5, 0.1, 8), "spp": 512} | spread
     scene = tt.load(room, variant=VARIANT)
-    axis = tt.TimeAxis(8.0, 0.1, 12)
-    settings = {"time_axis": axis, "spp": 512, "temporal_filter": name}
-    cut, _ = runs(tt.TransientRenderer(scene, steady=False, **settings))
-    full, _ = runs(tt.TransientRenderer(scene, **settings))
-    # the same paths, some of them shorter
-    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
-    assert full.mean() > 0
-
-
-@pytest.mark.slow
-def test_cut_windows_with_a_pulse():
-    scene = tt.load(mirrored(), variant=VARIANT)
-    settings = {"time_axis": tt.TimeAxis(8.5, 0.1, 8), "spp": 512, "pulse": tt.Pulse.gaussian(0.8, 0.3)}
     cut, _ = runs(tt.TransientRenderer(scene, steady=False, **settings))
     full, _ = runs(tt.TransientRenderer(scene, **settings))
     # the same paths, some of them shorter
@@ -379,20 +303,3 @@ def test_a_sky_over_a_wall(steady, lamp):
     totals = [np.array(scene.integrator().render(scene, seed=k, spp=8192)[1]).sum() / 3 for k in range(6)]
     assert np.std(totals) < 0.01 * 1.2
     assert np.mean(totals) == pytest.approx(1.2, rel=0.01)
-
-
-def test_light_box():
-    with mi.variant_context(VARIANT):
-        plugins.sync()
-        lamp = {"type": "sphere", "center": [0, 0, 3], "radius": 0.5, "emitter": {"type": "area"}}
-        scene = mi.load_dict({"type": "scene", "lamp": lamp, "spot": {"type": "point", "position": [2, 0, 3]}})
-        p = mi.Point3f([0, 1, -1, 4], [0, 0, 0, 4], [0, 3, 3, 3])
-        box = LightBox.from_scene(scene, [])
-        np.testing.assert_allclose(box.distance(p), [2.5, 0, 0.5, np.hypot(2, 3.5)], rtol=2e-5)
-        glass = mi.load_dict({"type": "dielectric"})
-        assert LightBox.from_scene(scene, [glass]) is None
-        assert LightBox.from_scene(mi.load_dict({"type": "scene", "sky": {"type": "constant"}}), []) is None
-        lit = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "lamp": lamp})
-        assert LightBox.from_scene(lit, []) is None
-        sun = {"type": "directional", "direction": [0, 0, -1]}
-        assert LightBox.from_scene(mi.load_dict({"type": "scene", "sun": sun, "lamp": lamp}), []) is None

@@ -6,8 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import torch
-from scipy import special, stats
+from scipy import stats
 
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
@@ -68,29 +67,6 @@ def towards(theta, phi):
     return np.array([np.cos(theta) * np.cos(phi), np.sin(theta), np.cos(theta) * np.sin(phi)])[:, None]
 
 
-def test_coefficients_of_bessel_functions():
-    """Abramowitz and Stegun 9.6.10 and 9.7.1, of the orders 0 and 1."""
-    from torchtransient.plugins.bsdfs.hair import _asymptotic_coefficients, _power_coefficients  # of a variant
-
-    np.testing.assert_allclose(_power_coefficients(0)[:4], [1, 1, 1 / 4, 1 / 36])
-    np.testing.assert_allclose(_power_coefficients(1)[:4], [1, 1 / 2, 1 / 12, 1 / 144])
-    np.testing.assert_allclose(_asymptotic_coefficients(0)[:3], [1, 1 / 8, 9 / 128])
-    np.testing.assert_allclose(_asymptotic_coefficients(1)[:3], [1, -3 / 8, -15 / 128])
-
-
-def test_bessel_function_and_its_slope():
-    from torchtransient.plugins.bsdfs.hair import scaled_i0  # of a variant
-
-    x = np.concatenate([[0.0], np.geomspace(1e-3, 1e4, 20000), np.linspace(9.9, 10.1, 200)]).astype(np.float32)
-    argument = mi.Float(x)
-    dr.enable_grad(argument)
-    value = scaled_i0(argument)
-    dr.backward(dr.sum(value))
-    x = x.astype(np.float64)
-    np.testing.assert_allclose(np.array(value), special.i0e(x), rtol=1e-6)
-    np.testing.assert_allclose(np.array(dr.grad(argument)), special.i1e(x) - special.i0e(x), rtol=1e-5)
-
-
 @pytest.mark.parametrize("fibre", FIBRES, ids=str)
 def test_values_are_those_of_the_model(fibre):
     roughness, tilt, eta, sigma = fibre
@@ -102,28 +78,6 @@ def test_values_are_those_of_the_model(fibre):
         found = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(wo)))[0]
         # Rounding of angles, over widths that are a fraction of the roughness.
         np.testing.assert_allclose(found, expected, rtol=2e-5 / roughness[0], atol=1e-6)
-
-
-@pytest.mark.parametrize("fibre", long(FIBRES[:3], FIBRES[1:2]), ids=str)
-def test_values_of_mitsuba_differ_by_its_bessel_function(fibre):
-    """It ends the power series after x^20, and has half of the first term of the asymptotic one beyond x = 12. Both
-    lose most at x = 12.
-    """
-    kept = sum(36.0**k / special.factorial(k) ** 2 for k in range(11))
-    lost = max(1 - kept / special.i0(12.0), 1 - np.exp(1 / 192) / np.sqrt(24 * np.pi) / special.i0e(12.0))
-    assert lost == pytest.approx(0.0057, abs=1e-4)
-    theirs, ours = (mi.load_dict(described(*fibre, plugin=plugin)) for plugin in ("hair", "diff_hair"))
-    wi = directions()
-    si = interaction(wi)
-    for wo in (directions(1), np.array(sampled(ours, si)[0].wo)):
-        pairs = zip(*(bsdf.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wo)) for bsdf in (theirs, ours)), strict=True)
-        for one, other in pairs:
-            one, other = (np.array(x).ravel() for x in (one, other))
-            seen = other > 1e-6
-            ratio = one[seen] / other[seen] - 1
-            # Mitsuba's angles lose half of their digits where the offset or its complement is small.
-            low, high = np.percentile(ratio, [0.2, 99.8])
-            assert -lost - 3e-4 < low and high < 1e-3
 
 
 @pytest.mark.slow
@@ -306,17 +260,6 @@ def test_hair_is_built_with_its_derivatives():
     assert not any("unchecked" in i.reason for i in infos)
 
 
-@pytest.mark.slow
-def test_its_absorption_is_built_with_it():
-    scene = scene_with({"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}})
-    key = "wall.bsdf.sigma_a.value"
-    assert "unchecked" not in scene.parameters()[key].reason
-    renderer = tt.TransientRenderer(scene, parameters=[key, "wall.bsdf.eumelanin"], spp=64)
-    renderer(seed=0).steady.sum().backward()
-    assert (renderer.values[key].grad < 0).all()
-    assert torch.equal(renderer.values["wall.bsdf.eumelanin"].grad, torch.zeros(()))
-
-
 @pytest.mark.parametrize(("key", "description"), [
     *((key, {"type": "hair"}) for key in KEYS),
     ("sigma_a.value", {"type": "hair", "sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}),
@@ -342,27 +285,3 @@ def test_derivatives_of_mitsubas_own_are_refused(key, description):
 def test_what_is_refused(settings, words):
     with pytest.raises(SceneError, match=words), plugins.plugin_errors():
         mi.load_dict({"type": "diff_hair", **settings})
-
-
-def test_a_roughness_below_the_least_one_keeps_its_slope():
-    from torchtransient.plugins.bsdfs.hair import LEAST_ROUGHNESS, _at_least  # of a variant
-
-    for given, value in ((0.0, LEAST_ROUGHNESS), (0.5 * LEAST_ROUGHNESS, LEAST_ROUGHNESS), (0.4, 0.4)):
-        roughness = mi.Float(given)
-        dr.enable_grad(roughness)
-        used = _at_least(roughness)
-        assert used[0] == pytest.approx(value, rel=1e-6)
-        dr.backward(used)
-        assert dr.grad(roughness)[0] == 1
-
-
-@pytest.mark.parametrize(
-    ("wi", "eta", "sigma"), [((0, 1, 0), 1.0, 0.3), ((0.6, 0.8, 0), 1.5, 0.0), ((0, 1, 0), 0.7, 0.0)]
-)
-def test_shares_where_nothing_enters(wi, eta, sigma):
-    """Along the fibre, and along its surface where nothing is absorbed: no number is divided by zero."""
-    hair = mi.load_dict(described((0.3, 0.4), 2.0, eta, sigma))
-    si = interaction(np.float32(wi)[:, None])
-    fibre = hair._fibre(si, True)
-    shares = np.array([np.array(share[0])[0] for share in fibre.shares])
-    assert np.isfinite(shares).all() and shares.sum() == pytest.approx(1, abs=1e-4)

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
 from torchtransient import plugins
-from torchtransient.plugins import mitsuba_compat as compat
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchtransient.errors.VersionWarning")
 
-PACKAGE = Path(compat.__file__).parents[1]
-POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
-NORMALS = np.tile(np.float32([0, 0, 1]), (4, 1))
-TEXCOORDS = POSITIONS[:, :2]
-FACES = np.array([[0, 1, 2], [2, 1, 3]], np.uint32)
+
 # Names in Mitsuba 3.9, those in Mitsuba 3.10, and columns.
 NAMES = {
     "vertex_positions": ("positions", 3),
@@ -152,89 +143,3 @@ def test_renders_and_gradients_are_the_same(request, key, face_normals):
     assert image.abs().sum() > 0 and grad.abs().sum() > 0
     torch.testing.assert_close(new_image, image)
     torch.testing.assert_close(new_grad, grad, rtol=1e-4, atol=1e-5)
-
-
-def wrapped_derivative(key):
-    """Return values and a gradient of a function of ``mitsuba.SceneParameters``, and the positions that it leaves."""
-    params = mi.traverse(mi.load_dict({"type": "scene", "cube": {"type": "cube"}}))
-    positions = params[key].numpy().reshape(-1, 3)
-    size = positions.size
-    function = tt.wrap(lambda held: compat.flat_array(held[key]) * dr.arange(mi.Float, size), params)
-    x = torch.tensor(positions * 2, requires_grad=True)
-    found = function({key: x})
-    found.square().sum().backward()
-    np.testing.assert_array_equal(params[key].numpy().reshape(-1, 3), positions)
-    return found.detach(), x.grad
-
-
-def test_wrapped_functions_have_the_keys_of_mitsuba(request):
-    found, grad = wrapped_derivative("cube.vertex_positions")
-    request.getfixturevalue("new_meshes")
-    new_found, new_grad = wrapped_derivative("cube.positions")
-    torch.testing.assert_close(new_found, found)
-    torch.testing.assert_close(new_grad, grad)
-
-
-def mesh_of_arrays():
-    return mi.load_dict(
-        {
-            "type": "mesh_arrays",
-            "vertices": mi.TensorXf(POSITIONS),
-            "faces": mi.TensorXf(FACES.astype(np.float32)),
-            "normals": mi.TensorXf(NORMALS),
-            "texcoords": mi.TensorXf(TEXCOORDS),
-        }
-    )
-
-
-READERS = {
-    compat.mesh_positions: POSITIONS,
-    compat.mesh_normals: NORMALS,
-    compat.mesh_texcoords: TEXCOORDS,
-    compat.mesh_faces: FACES,
-}
-
-
-@pytest.mark.parametrize("name", ["3.9", "3.10"])
-def test_arrays(request, name):
-    mesh = mesh_of_arrays()
-    if name == "3.10":
-        request.getfixturevalue("new_meshes")
-    for read, array in READERS.items():
-        found = read(mesh)
-        assert isinstance(found, mi.UInt32 if array is FACES else mi.Float)
-        np.testing.assert_array_equal(np.array(found), array.ravel())
-
-
-def test_vertices_that_share_positions(new_meshes):
-    cube = mi.load_dict({"type": "cube"})
-    rows = np.array(compat.mesh_positions(cube)).reshape(-1, 3)
-    index = np.arange(len(rows))[::-1].copy()
-    new_meshes["position_index"] = mi.UInt32(index)
-    np.testing.assert_array_equal(np.array(compat.mesh_positions(cube)).reshape(-1, 3), rows[index])
-    np.testing.assert_array_equal(compat.rows_of_faces(cube, "vertex_positions"), np.arange(len(rows)))
-
-
-def test_new_meshes_are_handed_their_arrays(monkeypatch):
-    made = {}
-    monkeypatch.setattr(compat, "shows_rows", lambda: True)
-    monkeypatch.setattr(compat.mi, "Mesh", lambda name, **given: made.update(given))
-    compat.mesh_of_arrays(mi.Properties("mesh_arrays"), POSITIONS, FACES, None, TEXCOORDS)
-    assert set(made) == {"props", "positions", "faces", "texcoords"}
-    assert made["positions"].shape == (4, 3) and made["faces"].shape == (2, 3)
-    assert isinstance(made["faces"], mi.TensorXu)
-
-
-@pytest.mark.parametrize(("version", "rows"), [("3.9.1", False), ("3.10.0", True), ("3.10.0.dev2", True), ("4.0", 1)])
-def test_versions(monkeypatch, version, rows):
-    monkeypatch.setattr(mi, "__version__", version)
-    assert compat.shows_rows() == rows
-
-
-def test_mitsubas_names_stand_in_one_file():
-    names = r"vertex_(positions|normals|texcoords)"
-    spelled = rf"({names}|faces)_buffer\(|has_{names}\(|[\"'.]{names}[\"']"
-    for path in PACKAGE.rglob("*.py"):
-        if path.stem != "mitsuba_compat":
-            found = re.search(spelled, path.read_text(encoding="utf-8"))
-            assert found is None, f"{path}: {found}"

@@ -14,9 +14,7 @@ import torchtransient as tt
 from support.gradient_cases.cases_metals import slanted
 from support.gradient_cases.scenes import mirror_room, room
 from support.surface_samples import activate, directions, interaction
-from support.sweeps import together
 from torchtransient.errors import GradientError
-from torchtransient.plugins.mitsuba_compat import METALS, loses_slope_of_metal
 
 MONO, POLARIZED = "llvm_ad_mono", "llvm_ad_mono_polarized"
 LANES = 1000
@@ -81,18 +79,6 @@ def test_rough_metal_equals_mitsubas(variant, chosen):
             np.testing.assert_allclose(np.array(bs.pdf)[drawn], np.array(their_bs.pdf)[drawn], rtol=5e-4, atol=1e-6)
 
 
-def test_materials_are_mitsubas_and_so_are_mistakes():
-    activate(MONO)
-    for wrong in (
-        {"distribution": "phong"}, {"alpha_u": 0.1}, {"alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.1},
-        {"material": "Au", "eta": 0.5}, {"material": "unobtainium"}, {"roughness": 0.1},
-    ):  # fmt: skip
-        with pytest.raises(RuntimeError):
-            mi.load_dict({"type": "diff_rough_conductor", **wrong})
-    shown = str(mi.load_dict({"type": "diff_rough_conductor", "alpha_u": 0.1, "alpha_v": 0.4, "distribution": "ggx"}))
-    assert "ggx" in shown and "alpha_v" in shown and "eta" in shown
-
-
 # -------------------------------------------------------------------------------------------------------------- slopes
 
 
@@ -143,31 +129,12 @@ def test_slopes_of_metals(variant, plugin):
         assert slope_of(plugin, slot, eta, k) == pytest.approx(right, rel=2e-4, abs=2e-5), (eta, k, slot)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", [MONO, POLARIZED])
-@pytest.mark.parametrize("plugin", METALS.values())
-def test_where_mitsubas_metals_lose_their_slopes(variant, plugin):
-    """They do, and what is said of them covers all of it."""
-    activate(variant)
-    lost = set()
-    for (eta, k), slot in itertools.product(AT, ("eta", "k")):
-        right, theirs = true_slope(slot, eta, k), slope_of(plugin, slot, eta, k)
-        if abs(theirs - right) > 2e-3 * abs(right) + 1e-4:
-            lost.add((eta, k, slot))
-            assert loses_slope_of_metal(slot, (eta, eta), (k, k)), (eta, k, slot)
-    assert (0.4, 0.0, "k") in lost
-    assert ((0.0, 2.0, "eta") in lost) == (variant == MONO)
-    for slot in ("eta", "k"):
-        assert not loses_slope_of_metal(slot, (1.5, 1.5), (0.0, 0.0))
-        assert not loses_slope_of_metal(slot, (0.2, 0.5), (1.0, 3.0))
-
-
 OF_SLOTS = {"eta": (0.0, 2.0), "k": (0.4, 0.0)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slot", OF_SLOTS)
-@pytest.mark.parametrize("plugin", METALS.values())
+@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
 def test_a_described_metal_is_built_anew(plugin, slot):
     index = OF_SLOTS[slot]
     bsdf = {"type": plugin, "eta": number(index[0]), "k": number(index[1])}
@@ -181,7 +148,7 @@ def test_a_described_metal_is_built_anew(plugin, slot):
     assert float(renderer.values[key].grad) < -1e-3
 
 
-@pytest.mark.parametrize("plugin", METALS.values())
+@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
 def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
     activate(MONO)
     for index, slot in (((0.0, 2.0), "eta"), ((0.4, 0.0), "k")):
@@ -196,53 +163,6 @@ def test_mitsubas_own_is_refused_where_it_has_no_slope(plugin):
             scene.integrator().render_backward(scene, params, (None, adjoint), seed=0, spp=4)
         params[f"wall.bsdf.{slot}.value"] = dr.detach(x)
         params.update()
-
-
-def test_ranges_of_textures():
-    """The partner's numbers count wherever they are: in bitmaps, and in spectra over wavelength."""
-    activate(MONO)
-    from torchtransient.plugins.parameters import ParameterTracker
-
-    grid = mi.TensorXf(np.array([[0.3, 2.0], [1.0, 3.0]], dtype=np.float32)[..., None])
-    dark = mi.TensorXf(np.array([[0.3, 2.0], [0.0, 3.0]], dtype=np.float32)[..., None])
-    for data, needed in ((grid, False), (dark, True)):
-        k = {"type": "bitmap", "data": data, "raw": True}
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "wall": {"type": "sphere", "bsdf": {"type": "roughconductor", "eta": number(0.5), "k": k}},
-            }
-        )
-        tracker = ParameterTracker(scene)
-        _, _, node, flags = next(v for key, v in mi.traverse(scene).properties.items() if key.endswith("k.data"))
-        assert tracker.effect_of(node, "data", flags).stand_in == "diff_rough_conductor"
-        assert tracker.effect_of(node, "data", flags).stand_in_needed == needed
-
-
-@together("slot, eta, k, lost", [
-    # Where the other number is zero, the slope truly is.
-    ("eta", (0.0, 0.0), (2.0, 2.0), True), ("eta", (0.5, 0.5), (0.0, 0.0), False), ("k", (0.0, 0.0), (2.0, 2.0), False),
-    ("k", (0.5, 0.5), (0.0, 0.0), True), ("k", (1.0, 1.0), (0.0, 0.0), False), ("k", (1.5, 1.5), (0.0, 0.0), False),
-    # eta k beside 0.8 % of 1 + k^2, for an index below one or a large absorption.
-    ("k", (1.5, 1.5), (180.0, 180.0), False), ("k", (1.5, 1.5), (200.0, 200.0), True),
-    ("k", (0.5, 0.5), (0.0159, 0.0159), True), ("k", (0.5, 0.5), (0.0161, 0.0161), False),
-    ("eta", (0.0199, 0.0199), (2.0, 2.0), True), ("eta", (0.0201, 0.0201), (2.0, 2.0), False),
-    # Of a range the smallest index, and either end of the absorption.
-    ("eta", (0.01, 3.0), (2.0, 2.0), True), ("k", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.5, 3.0), (2.0, 80.0), True),
-    # At these bounds nothing is lost: 2 * 0.008, and an index of one over a smaller absorption.
-    ("k", (0.016, 0.016), (1.0, 1.0), False), ("k", (1.0, 1.0), (1e-3, 1e-3), False),
-    ("k", (0.5, 3.0), (2.0, 3.0), False), ("eta", (0.5, 3.0), (0.0, 2.0), True), ("k", (0.0, 3.0), (2.0, 2.0), True),
-])  # fmt: skip
-def test_which_metals_lose_their_slopes(slot, eta, k, lost):
-    activate(MONO)
-    assert loses_slope_of_metal(slot, eta, k) == lost
-
-
-def test_polarized_metals_lose_the_slope_of_no_absorption_alone():
-    activate(POLARIZED)
-    assert loses_slope_of_metal("k", (0.5, 2.0), (0.0, 1.0)) and not loses_slope_of_metal("eta", (0.5, 2.0), (0.0, 1.0))
-    for eta, k in (((0.0, 2.0), (0.0, 1.0)), ((1.0, 2.0), (0.0, 1.0)), ((0.5, 2.0), (1e-4, 1.0))):
-        assert not loses_slope_of_metal("k", eta, k)
 
 
 def test_a_metal_of_no_colour_has_a_derivative_by_it():

@@ -114,11 +114,6 @@ def test_ellipsoids_do_not_show_what_they_are_made_of():
     assert "SmoothConductor" not in [bsdf.class_name() for bsdf in bsdfs_below(scene)]
 
 
-def test_only_instances_and_groups_have_no_surface():
-    scene = copied({"type": "rectangle"})
-    assert not compat.has_surface(scene.shapes()[0]) and compat.has_surface(mi.load_dict({"type": "disk"}))
-
-
 def test_the_slope_of_a_bump_map_is_one_for_a_texel():
     """Moving its coordinates changes it by jumps alone, which no derivative sees."""
     pixels = np.array([[0.0, 0.2, 0.9, 1.0]] * 4, dtype=np.float32)[..., None]

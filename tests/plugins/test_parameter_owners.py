@@ -11,12 +11,11 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.scenes import area_light, room
 from torchtransient.errors import GradientError
-from torchtransient.plugins.parameters import ALMOST_BLACK, ParameterTracker, attached_effects
+from torchtransient.plugins.parameters import ALMOST_BLACK, ParameterTracker
 
 VARIANT = "llvm_ad_mono"
 NAME = "vertex_numbers"
 READER = {"type": "mesh_attribute", "name": NAME}
-MIRROR = {"type": "conductor", "material": "none"}
 
 
 def volume(*numbers):
@@ -63,90 +62,6 @@ SOURCES = {
 @pytest.fixture(autouse=True)
 def variant():
     mi.set_variant(VARIANT)
-
-
-def effect_in(shape, group=False):
-    """The effect of the numbers of the shape's texture, asked in both ways."""
-    if isinstance(shape, dict):
-        shape = mi.load_dict(shape)
-    if group:
-        held = {"type": "shapegroup", "thing": shape}
-        scene = mi.load_dict({"type": "scene", "held": held, "copy": {"type": "instance", "group": held}})
-    else:
-        scene = mi.load_dict({"type": "scene", "thing": shape})
-    params = mi.traverse(scene)
-    (key,) = (key for key in params.keys() if key.endswith((NAME, ".data")))  # noqa: SIM118 (not a dictionary)
-    value = type(params[key])(params[key])
-    dr.enable_grad(value)
-    params[key] = value
-    params.update()
-    (by_params,), (by_tracker,) = attached_effects(params), ParameterTracker(scene).attached()
-    assert by_params[2] == by_tracker[2]
-    return by_tracker[2]
-
-
-@pytest.mark.parametrize("source", SOURCES)
-def test_normals_of_a_mirror(source):
-    def turned(nested):
-        return lambda texture: {"type": "normalmap", "normalmap": texture, "nested": {"type": nested}}
-
-    mirror, paint = (effect_in(SOURCES[source](turned(nested), (0.5, 0.5, 1.0))) for nested in ("conductor", "diffuse"))
-    assert mirror.role == "normal" and mirror.moves_length
-    assert paint.role == "value" and not paint.moves
-
-
-@pytest.mark.parametrize("source", SOURCES)
-def test_weights_of_lobes(source):
-    def painted(texture):
-        return {"type": "principled", "spec_trans": texture}
-
-    lost, kept = (effect_in(SOURCES[source](painted, (weight,))) for weight in (0.0, 0.4))
-    assert lost.stand_in == kept.stand_in == "diff_principled"
-    assert lost.stand_in_needed and not kept.stand_in_needed
-
-
-def dark(texture):
-    return {"type": "directionalarea", "radiance": texture}
-
-
-@pytest.mark.parametrize("source", [bitmap, volume])
-def test_lights_that_stay_dark(source):
-    assert not effect_in({"type": "rectangle", "emitter": dark(source(1.0))}).supported
-
-
-def test_attributes_of_lights_that_stay_dark():
-    mesh = mi.load_dict({"type": "cube", "emitter": dark(READER)})
-    mesh.add_attribute(NAME, 1, [1.0] * mesh.vertex_count())
-    assert not effect_in(mesh).supported
-
-
-def test_attributes_inside_groups():
-    def turned(texture):
-        return {"type": "mask", "nested": {"type": "normalmap", "normalmap": texture, "nested": MIRROR}}
-
-    mesh = with_attribute(turned, (0.5, 0.5, 1.0))
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "group": {"type": "shapegroup", "thing": mesh},
-            "copy": {"type": "instance", "shapegroup": {"type": "ref", "id": "group"}},
-        }
-    )
-    for key in (NAME, f"group.thing.{NAME}"):
-        assert ParameterTracker(scene).effect_of(mesh, key).role == "normal"
-
-
-def test_attributes_that_nothing_reads_are_values():
-    mesh = with_attribute(lambda _: {"type": "conductor"}, (0.5,))
-    effect = effect_in(mesh)
-    assert effect.role == "value" and not effect.moves and not effect.stand_in
-
-
-def test_where_an_attribute_is():
-    mesh = with_attribute(lambda texture: {"type": "diffuse", "reflectance": texture}, (0.5,))
-    scene = mi.load_dict({"type": "scene", "thing": mesh})
-    place = ParameterTracker(scene).location_of(mesh, NAME)
-    assert set(place) == {f"Cube.{NAME}", f"MeshAttribute.{NAME}", "SmoothDiffuse.reflectance", "Cube.bsdf"}
 
 
 # ------------------------------------------------------------------------------------------------------- black numbers

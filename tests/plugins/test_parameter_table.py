@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from pathlib import Path
 
 import drjit as dr
@@ -20,7 +18,6 @@ from torchtransient.plugins.parameters import (
     ParameterTracker,
     attached_effects,
     can_carry_gradients,
-    effect_of,
 )
 
 NON_DIFFERENTIABLE, READ_ONLY = 0x1, 0x4
@@ -123,12 +120,6 @@ def test_what_every_plugin_moves(folder):
     assert {name for name, _ in EXPECTED} <= {name for name, _ in met}
 
 
-def test_poses_of_meshes_are_ours():
-    cube = mi.load_dict({"type": "cube"})
-    assert effect_of(cube, "to_world") == effect_of(cube, "box.vertex_positions")
-    assert effect_of(cube, "vertex_color").role == "value"
-
-
 # --------------------------------------------------------------------------------------------------- where a plugin is
 
 
@@ -176,24 +167,6 @@ def test_extinction_is_told_by_who_holds_a_volume():
     assert {"fog.interior_medium.albedo.data", "fog.interior_medium.phase_function.g"} <= effects.keys() - moving
 
 
-def test_a_volume_that_is_albedo_and_extinction_is_both():
-    shared = {"type": "ref", "id": "shared"}
-    grid = mi.VolumeGrid(np.full((3, 3, 3, 1), 0.5, dtype=np.float32))
-    medium = {"type": "heterogeneous", "albedo": shared, "sigma_t": shared}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "shared": {"type": "gridvolume", "grid": grid},
-            "fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": medium},
-        }
-    )
-    # Mitsuba lists it once, under the name that it meets first.
-    (key,) = (key for key in mi.traverse(scene).properties if key.endswith("data"))
-    attach(scene, key)
-    ((_, _, effect),) = ParameterTracker(scene).attached()
-    assert effect.moves_medium
-
-
 @pytest.mark.parametrize("plugin", ["normalmap", "bumpmap"])
 @pytest.mark.parametrize(("nested", "bends"), [("conductor", True), ("dielectric", True), ("diffuse", False)])
 def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, bends):
@@ -208,56 +181,6 @@ def test_normals_move_lengths_where_a_delta_lobe_follows_them(plugin, nested, be
     assert effects["mirror.vertex_texcoords"].biased == (plugin == "bumpmap")
     colours = [effect for key, effect in effects.items() if "reflectance" in key or ".k." in key]
     assert not any(effect.moves for effect in colours)
-
-
-def test_coordinates_of_a_mask_over_a_normal_map():
-    inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
-    scene = mi.load_dict({"type": "scene", "it": {"type": "cube", "bsdf": {"type": "mask", "nested": inner}}})
-    assert effect_of(scene.shapes()[0], "vertex_texcoords").moves_length
-
-
-def test_coordinates_of_a_light_with_a_texture_belong_to_its_shape():
-    plain = {"type": "cube", "emitter": {"type": "area", "radiance": 2.0}}
-    patterned = {"type": "cube", "emitter": {"type": "area", "radiance": normals()}}
-    inner = {"type": "normalmap", "normalmap": normals(), "nested": {"type": "conductor"}}
-    told = [effect_of(mi.load_dict(d), "vertex_texcoords") for d in (plain, patterned, patterned | {"bsdf": inner})]
-    assert [(letters(effect), effect.role) for effect in told] == [("S", "value"), ("S", "shape"), ("LS", "shape")]
-
-
-def test_opacities_of_ellipsoids_move_them_where_they_are_clamped():
-    data = {"data": mi.TensorXf([[0.0] * 3 + [1.0] * 3 + [0.0] * 3 + [1.0]]), "opacities": mi.TensorXf([[0.9]])}
-    for clamped in (True, False):
-        shape = mi.load_dict({"type": "ellipsoids", "extent_adaptive_clamping": clamped} | data)
-        assert effect_of(shape, "opacities").moves_length == clamped
-
-
-def test_emitting_meshes_are_right_with_and_without_coordinates():
-    mesh = mi.Mesh("lamp", 3, 1, props=emitting())
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 0, 1, 0]
-    params["faces"] = [0, 1, 2]
-    params.update()
-    for key in ("to_world", "vertex_positions"):
-        effect = effect_of(mesh, key)
-        assert effect.supported and not effect.biased and effect == effect_of(mi.load_dict({"type": "cube"}), key)
-
-
-def emitting():
-    props = mi.Properties()
-    props["light"] = mi.load_dict({"type": "area"})
-    return props
-
-
-# ---------------------------------------------------------------------------------------------------- marks of Mitsuba
-
-
-def test_marks_count_unless_the_row_is_trusted():
-    sphere, projector = mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "projector", "irradiance": normals()})
-    assert effect_of(sphere, "to_world", NON_DIFFERENTIABLE).supported
-    assert not effect_of(sphere, "to_world", READ_ONLY).supported
-    refused = effect_of(projector, "to_world", NON_DIFFERENTIABLE)
-    assert not refused.supported and refused.moves_length and "Projector" in refused.reason
-    assert (int(mi.ParamFlags.NonDifferentiable), int(mi.ParamFlags.ReadOnly)) == (NON_DIFFERENTIABLE, READ_ONLY)
 
 
 # ------------------------------------------------------------------------------------------------- plugins of one's own
@@ -294,31 +217,5 @@ def test_a_plugin_enters_by_its_own_file(own_rows):
         ((node, key, effect),) = found
         assert (key, effect.role, effect.moves_length) == ("lag", "delay", True)
         assert lineage(node)[:2] == ("Veil", "Curtain")
-
-
-# -------------------------------------------------------------------------------------------------------- the tracker
-
-
-def room():
-    return {
-        "type": "scene",
-        "group": {"type": "shapegroup", "part": {"type": "sphere", "bsdf": {"type": "diff_dielectric"}}},
-        "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
-        "box": {"type": "cube"},
-        "light": {"type": "point"},
-        "sensor": {"type": "perspective", "film": {"type": "transient_hdr_film"}},
-        "integrator": {"type": "transient_path"},
-    }
-
-
-def test_an_integrator_may_keep_it():
-    scene = mi.load_dict(room())
-    film = weakref.ref(scene.sensors()[0].film())
-    integrator = scene.integrator()
-    integrator.tracker = ParameterTracker(scene)
-    gone = weakref.ref(integrator)
-    del scene, integrator
-    gc.collect()
-    assert gone() is None and film() is None
 
 

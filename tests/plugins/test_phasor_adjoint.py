@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.plugins.films import phasor_sums
-from torchtransient.plugins.films.colour import ChannelMatch
 
 LENGTHS = [0.0, 0.37, 12.125, 731.0625, 1000.0 + 1 / 3, 4.1e4]
 CYCLES = 1e-6
-GRID = {"frequency_first": -0.4, "frequency_step": 0.11, "frequency_count": 37}
-LIST = {"frequencies": "0, 3.7 -1.25, 0.5, 12.5"}
 
 
 @pytest.fixture(autouse=True)
@@ -77,13 +73,6 @@ def test_a_grid_on_both_sides_of_zero():
     assert film.step is not None and worst(film) < CYCLES
 
 
-def test_phases_that_are_never_set_anew_drift_away(monkeypatch):
-    """Without a phase in double precision every 16 frequencies the bound above does not hold."""
-    film = make_film(frequency_first=0.1, frequency_step=99.9 / 1024, frequency_count=1025)
-    monkeypatch.setattr(phasor_sums, "STEPS", 2000)
-    assert worst(film) > 5 * CYCLES
-
-
 @pytest.mark.parametrize("deviation, is_grid", [(5e-15, True), (1e-12, False), (1e-9, False), (1e-3, False)])
 def test_spacing_that_is_only_almost_equal(deviation, is_grid):
     """Taken for a grid where no phase could show the difference, else frequency by frequency."""
@@ -93,55 +82,3 @@ def test_spacing_that_is_only_almost_equal(deviation, is_grid):
     assert (film.step is not None) == is_grid and worst(film) < CYCLES
 
 
-# -------------------------------------------------------------------------------------------- arrivals together
-
-
-def adjoint_block(film, pixels, rng):
-    """The block of some lanes, and the adjoint of the film."""
-    g = rng.normal(size=(pixels, film.frequency_count(), 2)).astype(np.float32)
-    base = dr.arange(mi.UInt32, pixels) * (2 * film.frequency_count())
-    match = ChannelMatch(mi.Spectrum(0), mi.Spectrum(1))
-    return film.create_adjoint_block((mi.Float(g.ravel()), 2, 1), base, [mi.Float(0)], match), g
-
-
-@pytest.mark.parametrize("frequencies", [GRID, LIST], ids=["grid", "list"])
-@pytest.mark.parametrize("with_slope", [False, True])
-def test_arrivals_together_are_arrivals_alone(frequencies, with_slope):
-    film, rng, n = make_film(**frequencies), np.random.default_rng(0), 40
-    block, _ = adjoint_block(film, n, rng)
-    opls = [mi.Float64(rng.uniform(0, 1000, n)) for _ in range(5)]
-    active = mi.Bool(rng.random(n) > 0.2)
-    A, slope = block.read_together(opls, with_slope, active)
-    assert (slope is None) == (not with_slope)
-    for e, opl in enumerate(opls):
-        alone, slope_alone = film.read(block.response, block.base, opl, active)
-        np.testing.assert_array_equal(np.array(A[e][0]), np.array(alone[0]))
-        if with_slope:
-            np.testing.assert_array_equal(np.array(slope[e][0]), np.array(slope_alone[0]))
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 37, 301])
-def test_arrivals_together_are_the_transpose_of_put(count):
-    film = make_film(frequency_first=0.3, frequency_step=0.21, frequency_count=count)
-    rng, n = np.random.default_rng(1), 64
-    block, g = adjoint_block(film, n, rng)
-    opl, value = rng.uniform(0, 300, (6, n)), rng.normal(size=(6, n))
-    A, _ = block.read_together([mi.Float64(o) for o in opl], False, mi.Bool(True))
-    right = sum((np.array(a[0], dtype=np.float64) * v).sum() for a, v in zip(A, value, strict=True))
-    phasors = (value[..., None] * np.exp(-2j * np.pi * film.frequencies * opl[..., None])).sum(0)
-    left = (phasors.real * g[..., 0] + phasors.imag * g[..., 1]).sum()
-    assert left == pytest.approx(right, abs=2e-6 * np.sqrt(6 * n * count))
-
-
-def test_how_many_are_read_together():
-    """As many as there is room for sums, one at least; none ahead where nothing is to be read."""
-    film, rng = make_film(**GRID), np.random.default_rng(2)
-    block, _ = adjoint_block(film, 1, rng)
-    assert block.together(100, False) == phasor_sums.MOST_ARRIVALS and block.together(3, False) == 3
-    film.channel_count = lambda: 12
-    assert block.together(100, False) * 12 <= phasor_sums.SUMS < (block.together(100, False) + 1) * 12
-    assert block.together(100, True) * 24 <= phasor_sums.SUMS < (block.together(100, True) + 1) * 24
-    film.channel_count = lambda: 100
-    assert block.together(100, True) == 1
-    block.response = None
-    assert block.together(100, False) == 0

@@ -39,16 +39,6 @@ def directions(count):
     return si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
 
 
-def test_numbers_that_round_to_one():
-    """A choice before has stretched them: in total reflection neither lobe is drawn, and nothing is infinite."""
-    plastic = mi.load_dict({"type": "diff_plastic", "int_ior": 0.7, "ext_ior": 1.0, "diffuse_reflectance": 0.6})
-    si = dr.zeros(mi.SurfaceInteraction3f, 3)
-    si.wi = mi.Vector3f([0.96, 0.8, 0.0], [0.0, 0.0, 0.6], [0.28, 0.6, 0.8])
-    bs, weight = plastic.sample(mi.BSDFContext(), si, mi.Float(1.0), mi.Point2f(0.3, 0.4))
-    assert np.array(weight[0])[:2].tolist() == [0, 0] and np.array(weight[0])[2] > 0.1
-    assert np.array(bs.pdf)[:2].tolist() == [0, 0]
-
-
 @pytest.mark.parametrize(
     ("variant", "settings"),
     [*(("llvm_ad_mono", case) for case in CASES), (POLARIZED, CASES[0]),
@@ -177,12 +167,6 @@ def test_plastic_of_a_high_index(nonlinear):
         assert float(plain) == pytest.approx(1, abs=noise)
         keyed = tt.render(scene, {"wall.bsdf.eta": torch.tensor(index)}, time_axis=axis, spp=4096, seed=0).steady.mean()
         assert float(keyed) == pytest.approx(float(plain), rel=1e-5)
-
-
-def test_the_index_of_a_described_plastic():
-    scene = scene_with("plastic")
-    info = scene.parameters()["wall.bsdf.eta"]
-    assert info.differentiable and not info.biased and not info.moves_path_length and "diff_plastic" in info.reason
 
 
 @pytest.mark.slow

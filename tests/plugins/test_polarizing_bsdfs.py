@@ -9,11 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient as tt
-from support.gradient_cases.scenes import mirror_room
 from support.marks import long
 from support.surface_samples import activate, directions, interaction
-from torchtransient.plugins import mitsuba_compat as compat
 
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
 LANES = 500
@@ -179,62 +176,3 @@ def test_derivatives(plugin, wi):
         d1, d2 = ((evaluate(s, key, tangent, False) - evaluate(-s, key, tangent, False)) / (2 * s) for s in (h, 2 * h))
         expected = (4 * d1 - d2) / 3
         assert evaluate(0.0, key, tangent, True) == pytest.approx(expected, rel=2e-3, abs=3e-4)
-
-
-# (which number, its value, the other one, cosine, slope of the reflectance): at normal incidence the reflectance is
-# 1 - 4 eta / ((1 + eta)^2 + k^2); at 1.2 rad light is reflected totally where nothing absorbs it (Born and Wolf, 14.2,
-# in double precision).
-SMALL = [
-    ("eta", 0.0, 2.0, 1.0, -0.8),
-    ("eta", 1e-4, 2.0, 1.0, -0.79987),
-    ("k", 0.0, 0.5, math.cos(1.2), -1.7072),
-    ("k", 1e-4, 0.5, math.cos(1.2), -1.7069),
-]
-
-
-@pytest.mark.parametrize("plugin", ["conductor", "roughconductor"])
-@pytest.mark.parametrize(("slot", "value", "other", "cosine", "expected"), SMALL)
-def test_a_metal_of_small_index_or_absorption_has_a_slope(plugin, slot, value, other, cosine, expected):
-    """Mitsuba's own loses it."""
-    activate("llvm_ad_mono")
-    rates = {slot: {"type": "uniform", "value": value}, "k" if slot == "eta" else "eta": other}
-    wi = mi.Vector3f(math.sqrt(1 - cosine * cosine), 0, cosine)
-    slopes = {}
-    for name in (plugin, compat.DIFFERENTIABLE_PLUGINS[plugin]):
-        bsdf = mi.load_dict({"type": name, **rates})
-        params, x = mi.traverse(bsdf), mi.Float(value)
-        dr.enable_grad(x)
-        params[f"{slot}.value"] = x
-        params.update()
-        if plugin == "conductor":
-            _, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), 0.5, mi.Point2f(0.5))
-        else:
-            weight = bsdf.eval(mi.BSDFContext(), interaction(wi), mi.Vector3f(-wi.x, 0, wi.z))
-        share = float(dr.detach(weight)[0][0]) / reflectance(slot, value, other, cosine)
-        dr.backward(weight[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-        slopes[name] = float(dr.grad(x)[0]) / share
-    assert abs(slopes[plugin]) < 1e-6
-    assert slopes[compat.DIFFERENTIABLE_PLUGINS[plugin]] == pytest.approx(expected, rel=1e-3)
-
-
-def reflectance(slot, value, other, cosine):
-    """Of a smooth metal, by complex arithmetic in double precision."""
-    eta, k = (value, other) if slot == "eta" else (other, value)
-    n = complex(eta, -k)
-    p = np.conj(np.sqrt(np.conj(n * n) - (1 - cosine**2)))
-    s, r = (cosine - p) / (cosine + p), (n * n * cosine - p) / (n * n * cosine + p)
-    return float(abs(s) ** 2 + abs(r) ** 2) / 2
-
-
-@pytest.mark.slow
-def test_a_described_metal_of_index_zero_is_built_anew():
-    metal = {"type": "conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}
-    scene = tt.load(mirror_room(metal), variant="llvm_ad_mono")
-    info = scene.parameters()["wall.bsdf.eta.value"]
-    assert info.differentiable and not info.biased and "diff_conductor" in info.reason
-    renderer = tt.TransientRenderer(scene, parameters=["wall.bsdf.eta.value"], spp=64)
-    image = renderer(seed=0).steady.sum()
-    image.backward()
-    # Mirrored light falls by 4 / (1 + k^2) for each unit, near normal incidence.
-    slope = renderer.values["wall.bsdf.eta.value"].grad / image.detach()
-    assert float(slope) == pytest.approx(-4 / 5, rel=0.1)

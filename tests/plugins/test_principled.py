@@ -152,22 +152,6 @@ def test_what_is_not_asked_for_is_sampled_as_by_mitsuba():
     np.testing.assert_array_equal(*directions)
 
 
-def test_index_and_keys_are_those_of_mitsuba():
-    for kind, settings in (("principled", {}), ("principled", {"eta": 1.3}), ("principledthin", {"eta": 1.3})):
-        theirs, ours = (mi.traverse(mi.load_dict({"type": name, **settings})) for name in (kind, TWINS[kind]))
-        rates = {key for key in theirs.properties if key.endswith("_rate")}
-        assert set(theirs.properties) - rates == set(ours.properties)
-        assert all(theirs.flags(key) == ours.flags(key) for key in ours.properties)
-    bsdf = mi.load_dict({"type": "diff_principled", "spec_trans": 0.5, "eta": 1.3})
-    params, si = mi.traverse(bsdf), dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = at(ABOVE)
-    params["eta"] = mi.Float(1.6)
-    params.update()
-    expected = mi.load_dict({"type": "principled", "spec_trans": 0.5, "eta": 1.6})
-    values = (float(b.eval(mi.BSDFContext(), si, at((0.4, -0.1, -0.8)))[0][0]) for b in (bsdf, expected))
-    assert next(values) == pytest.approx(next(values), rel=1e-6)
-
-
 def test_a_described_surface_is_built_anew():
     paint = {"type": "principled", "base_color": 0.6}
     scene = tt.load(room(bsdf={"type": "twosided", "nested": paint}, light=area_light()), variant="llvm_ad_mono")
@@ -266,35 +250,3 @@ def test_lost_lobes_of_mitsubas_own_are_refused(kind, slot):
     adjoint = dr.ones(mi.TensorXf, scene.sensors()[0].film().cube_shape())
     with pytest.raises(GradientError, match="diff_principled"):
         scene.integrator().render_backward(scene, params, (None, adjoint), spp=4)
-
-
-def slope_at(description, key, value, step):
-    """(derivative of the value of a BSDF between two directions on opposite sides, forward difference)."""
-    bsdf = mi.load_dict(description)
-    params, si = mi.traverse(bsdf), dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = at(ABOVE)
-
-    def value_at(x):
-        params[key] = x
-        params.update()
-        return mi.Float(bsdf.eval(mi.BSDFContext(), si, at((0.4, -0.1, 0.7)))[0])
-
-    x = mi.Float(value)
-    dr.enable_grad(x)
-    dr.backward(value_at(x), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-    return float(dr.grad(x)[0]), float((value_at(mi.Float(value + step)) - value_at(mi.Float(value)))[0]) / step
-
-
-def test_a_black_base_under_tints_and_transmission_has_a_finite_slope():
-    tints = {"sheen": 0.5, "sheen_tint": 0.5, "spec_tint": 0.5, "spec_trans": 0.5, "eta": 1.4}
-    description = {"type": "diff_principled", "base_color": {"type": "uniform", "value": 0.0}, **tints}
-    found, difference = slope_at(description, "base_color.value", 0.0, 0.01)
-    assert found == pytest.approx(difference, rel=1e-2)
-
-
-def test_a_specular_of_zero_has_a_slope():
-    """That beside it, where a difference can be taken."""
-    found, _ = slope_at({"type": "diff_principled", "specular": 0.0}, "specular", 0.0, 0.01)
-    _, difference = slope_at({"type": "diff_principled", "specular": 1e-5}, "specular", 1e-5, 1e-4)
-    lost, _ = slope_at({"type": "principled", "specular": 0.0}, "specular", 0.0, 0.01)
-    assert lost == 0 and found == pytest.approx(difference, rel=2e-2) and found > 1e-3

@@ -13,7 +13,6 @@ from support.film_storage import storage
 from support.marks import long, long_pairs, long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.plugins.films.temporal_filters import BoxFilter, PulsedFilter
 from torchtransient.pulses import Pulse
 
 VARIANT = "llvm_ad_rgb"
@@ -114,30 +113,6 @@ def test_stored_and_lost_make_one(kernel, name):
     np.testing.assert_allclose(after[late], 1, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("kernel", "layout"), [("short gaussian", "film"), ("measured", "channels first"), ("box, late", "film")]
-)
-def test_read_is_the_transpose_of_put(kernel, layout):
-    film = make_film(**KERNELS[kernel][0])
-    rng = np.random.default_rng(1)
-    n, pixels = 500, 5
-    x, pixel = rng.uniform(-8, BINS + 8, n), rng.integers(0, pixels, n)
-    value, g = rng.normal(size=(3, n)), rng.normal(size=(pixels, BINS, 3))
-    active = mi.Bool(rng.random(n) > 0.1)
-    opl = mi.Float64(x * WIDTH)
-    cube = storage(film, pixels * BINS * 3)
-    film.put(0, mi.UInt32(pixel) * (BINS * 3), opl, [mi.Float(v) for v in value], active)
-    if layout == "film":
-        adjoint, base = (mi.Float(g.ravel()), 3, 1), mi.UInt32(pixel) * (BINS * 3)
-    else:
-        adjoint, base = (mi.Float(g.transpose(2, 1, 0).ravel()), pixels, BINS * pixels), mi.UInt32(pixel)
-    A, _ = film.read(adjoint, base, opl, active)
-    dr.eval(cube, A)
-    stored = np.array(cube, dtype=float).reshape(g.shape)
-    read = sum((np.array(A[c], dtype=float) * value[c] * np.array(active)).sum() for c in range(3))
-    assert abs((stored * g).sum() - read) < 2e-6 * np.abs(stored * g).sum()
-
-
 @pytest.mark.parametrize("kernel", long([k for k in KERNELS if k != "far shorter than a bin"], ["box, late", "both"]))
 def test_slope_is_the_derivative_of_what_is_read(kernel):
     film = make_film(**KERNELS[kernel][0])
@@ -159,30 +134,6 @@ def test_slope_is_the_derivative_of_what_is_read(kernel):
         assert np.median(error) < 2e-2 and error.mean() < 0.05 * np.abs(differences).mean()
 
 
-@pytest.mark.parametrize("kernel", long(KERNELS, ["short gaussian", "both"]))
-def test_put_slope_is_the_transpose_of_the_slope(kernel):
-    film = make_film(**KERNELS[kernel][0])
-    rng = np.random.default_rng(3)
-    n = 300
-    x, g = rng.uniform(-4, BINS + 4, n), rng.normal(size=(BINS, 3))
-    df, fdtau = rng.normal(size=(2, 3, n))
-    opl, cube = mi.Float64(x * WIDTH), storage(film, BINS * 3)
-    film.put_slope(0, mi.UInt32(0), opl, [mi.Float(v) for v in df], [mi.Float(v) for v in fdtau], mi.Bool(True))
-    A, slope = film.read((mi.Float(g.ravel()), 3, 1), mi.UInt32(0), opl, mi.Bool(True))
-    dr.eval(cube, A, slope)
-    read = sum((np.array(A[c]) * df[c] + np.array(slope[c]) * fdtau[c]).sum() for c in range(3))
-    stored = np.array(cube, dtype=float).reshape(BINS, 3)
-    assert abs((stored * g).sum() - read) < 1e-5 * np.abs(stored * g).sum()
-
-
-def test_a_pulse_gives_the_box_a_slope():
-    assert not make_film().has_slope
-    film = make_film(pulse="gaussian", pulse_fwhm_opl=0.5)
-    assert film.has_slope and film.temporal_filter == "box"
-    film.temporal_filter = "tent"
-    assert film.has_slope and film.filter.name == "tent" and len(film.pulses) == 1
-
-
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -197,46 +148,3 @@ def test_a_pulse_gives_the_box_a_slope():
 def test_errors(arguments, message):
     with pytest.raises(SceneError, match=message):
         make_film(**arguments)
-
-
-# -------------------------------------------------------------------------------------------- the table of a kernel
-
-
-def box_of(bins, **settings):
-    return PulsedFilter(BoxFilter(), [Pulse.rectangular(bins * 0.5, **settings)], 0.5)
-
-
-@pytest.mark.parametrize("bins", [2, 30])
-def test_arrivals_at_the_start_of_a_bin(bins):
-    """Have weights that add up to one, and the slopes of arrivals right after it: of a kernel that is written out, and
-    of one that is looped over.
-    """
-    film = make_film(pulse="tabulated", pulse_opl=f"0 {bins * WIDTH}", pulse_values="1 3")
-    at = np.array([0.0, 1.0, 20.0, 29.0])
-    cube, before, after = put_each(film, at)
-    np.testing.assert_allclose(cube[..., 0].sum(1) + before + after, 1, atol=1e-6)
-    edges = (np.arange(BINS + 1) - at[:, None]).clip(0, bins) / bins
-    np.testing.assert_allclose(cube[..., 0], np.diff((edges + edges**2) / 2), atol=1e-5)
-    adjoint = (mi.Float(np.random.default_rng(6).normal(size=BINS * 3)), 3, 1)
-    slopes = [
-        np.array(film.read(adjoint, mi.UInt32(0), mi.Float64((at + late) * WIDTH), mi.Bool(True))[1], dtype=float)
-        for late in (0, 1e-5)
-    ]
-    np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-3 * np.abs(slopes[1]).max())
-    _, taps = film.filter.weights(mi.Float64(20.0))
-    assert len(taps) == bins + 1
-    density = (1 + 2 * np.arange(bins + 1) / bins) / (2 * bins)
-    # what leaves at the lower edge comes in at the upper one; nothing comes in before the first, nor leaves the last
-    expected = np.r_[-density[1], density[1:-1] - density[2:], density[-1]]
-    np.testing.assert_allclose([float(slope[0]) for _, _, slope in taps], expected, atol=2e-3 / bins)
-
-
-def test_how_far_an_asymmetric_kernel_reaches():
-    """From the first bin that a pulse before its arrival meets to the last that one in the same bin does."""
-    spread = box_of(2.5, center_opl=0.5 * 7.25)
-    # from 6 to 8.5 bins behind an arrival
-    assert (spread.first, spread.count, spread.reach) == (6, 4, (6, 10))
-    base, node, share = spread.begin(mi.Float64([3.0, 3.25, 3.96875]))
-    assert list(base) == [9, 9, 9]
-    edges = (np.array(node) + np.array(share)) / spread.nodes_per_bin
-    np.testing.assert_allclose(edges, [1, 0.75, 0.03125], atol=1e-6)

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs, index_of
+from torchtransient.plugins.bsdfs.refraction_table import RefractiveBSDFs
 
 VARIANT = "llvm_ad_mono"
 
@@ -72,11 +72,3 @@ def test_parts_that_become_different_are_refused():
     params.update()
     with pytest.raises(ValueError, match=r"its parts have 1.3, 1.5"):
         found.read()
-
-
-@pytest.mark.parametrize("specular", [0.25, 0.5, 0.98])
-def test_the_index_of_a_principled_surface_by_its_reflectance(specular):
-    """8 % of `specular` at normal incidence."""
-    bsdf = mi.load_dict({"type": "principled", "spec_trans": 0.5, "specular": specular})
-    n = float(index_of(bsdf)[0])
-    assert ((n - 1) / (n + 1)) ** 2 == pytest.approx(0.08 * specular, rel=1e-5)

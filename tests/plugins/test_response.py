@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,8 +13,6 @@ from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
 from torchtransient.files import read_result, write_result
-from torchtransient.plugins.films.colour import ChannelMatch, SensorResponse, StandardObserver, mean_of
-from torchtransient.plugins.polarized import FrameRotation
 
 VARIANT = "llvm_ad_spectral"
 BANDS = {
@@ -107,21 +102,6 @@ def test_channels_are_integrals_over_wavelength():
     assert result.passed, str(result)
 
 
-def test_wavelengths_are_drawn_where_the_curves_are():
-    response = mi.load_dict(film()).curves
-    assert isinstance(response, SensorResponse) and response.names == ("red", "blue", "ragged")
-    u = mi.Float((np.arange(4096) + 0.5) / 4096)
-    wavelengths, weight = response.sample(u)
-    drawn = np.array(wavelengths, dtype=float)
-    assert drawn.min() >= 400 and drawn.max() <= 800
-    # in proportion to the sum of the curves, each scaled to one
-    counts, _ = np.histogram(drawn, bins=np.arange(400, 801, 20))
-    share = counts / counts.sum()
-    assert share[2] > 3 * share[0]
-    # the reciprocal density averages to the length of the range
-    assert np.array(weight, dtype=float).mean() == pytest.approx(400, rel=1e-2)
-
-
 @pytest.mark.slow
 def test_less_noise_than_wavelengths_drawn_for_the_eye():
     far_red = {"far": {"type": "regular", "wavelength_min": 760, "wavelength_max": 800, "values": "0, 1, 0"}}
@@ -143,14 +123,6 @@ def test_a_variant_without_wavelengths_is_refused(variant):
         plugins.plugin_errors(),
     ):
         mi.load_dict(film())
-
-
-def test_a_second_response_curve_is_refused():
-    node = description(film())
-    node["sensor"]["srf"] = {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"}
-    scene = mi.load_dict(node)
-    with pytest.raises(SceneError, match="srf"):
-        scene.integrator().render(scene, spp=1)
 
 
 @pytest.mark.parametrize("value", [-1.0, 0.0])
@@ -197,97 +169,3 @@ def numbers(value):
     """A sample as an array (components, wavelengths, lanes)."""
     parts = [value[i] for i in range(4)] if mi.is_polarized else [value]
     return np.array([[np.broadcast_to(np.array(part[k], dtype=float), 3) for k in range(len(part))] for part in parts])
-
-
-@pytest.mark.parametrize(("variant", "curves"), [("rgb", False), ("spectral", False), ("spectral_polarized", True)])
-def test_channels_and_spectra_are_transposes(variant, curves):
-    """Of each other; channels are those of the weight, summed over wavelengths, in the sensor's frame."""
-    mi.set_variant(f"llvm_ad_{variant}")
-    plugins.sync()
-    polarized = mi.is_polarized
-    rng = np.random.default_rng(2)
-    weight, wavelengths = spectrum(rng), spectrum(rng) * 200 + 590 if mi.is_spectral else None
-    response = StandardObserver.of_variant()
-    if curves:
-        response = mi.load_dict(film()).curves
-    rotation = FrameRotation(mi.Float(0.6), mi.Float(0.8)) if polarized else None
-    match = ChannelMatch(wavelengths, weight, response, rotation)
-    value = light(rng)
-    channels = match.to_channels(value)
-    matrix = np.eye(len(weight)) if response is None else None
-    if matrix is None:
-        rows = [[np.broadcast_to(np.array(x, dtype=float), 3) for x in row] for row in response.matrix(wavelengths)]
-        shares = np.array(rows)  # wavelength, channel, lane
-    else:
-        shares = np.repeat(matrix[:, :, None], 3, axis=2)
-    power = numbers(value) * np.array([np.array(weight[k], dtype=float) for k in range(len(weight))])
-    expected = np.einsum("ikn,kcn->icn", power, shares)
-    if polarized:
-        turned = expected.copy()
-        turned[1], turned[2] = 0.6 * expected[1] + 0.8 * expected[2], 0.6 * expected[2] - 0.8 * expected[1]
-        expected = turned
-    np.testing.assert_allclose(np.array(channels), expected.reshape(-1, 3), rtol=1e-4, atol=1e-6)
-    adjoint = [mi.Float(rng.uniform(-1, 1, 3)) for _ in channels]
-    back = numbers(match.to_spectrum(adjoint))
-    forth = sum(np.array(a, dtype=float) * np.array(c, dtype=float) for a, c in zip(adjoint, channels, strict=True))
-    np.testing.assert_allclose((back * numbers(value)).sum((0, 1)), forth, rtol=1e-4, atol=1e-4 * np.abs(forth).max())
-    power_alone = expected[0] if polarized else expected.reshape(-1, 3)
-    np.testing.assert_allclose(np.array(mean_of(channels)), power_alone.mean(0), rtol=1e-4, atol=1e-6)
-
-
-def test_the_observer_is_mitsuba_s():
-    """At wavelengths between its nodes, at both ends, and none beyond them."""
-    mi.set_variant("llvm_ad_spectral")
-    at = np.array([360.0, 361.3, 447.0, 555.5, 700.1, 829.9, 830.0, 359.9, 830.1])
-    wavelengths = mi.UnpolarizedSpectrum(*(mi.Float(np.roll(at, k)) for k in range(4)))
-    rows = StandardObserver().matrix(wavelengths)
-    for k in range(4):
-        unit = mi.UnpolarizedSpectrum(0)
-        unit[k] = 1
-        # Mitsuba takes the mean over the wavelengths, a row the share of one.
-        expected = np.array(mi.spectrum_to_srgb(unit, wavelengths))
-        outside = (np.roll(at, k) < 360) | (np.roll(at, k) > 830)
-        np.testing.assert_allclose(np.array(rows[k])[:, ~outside], expected[:, ~outside], rtol=1e-3, atol=1e-6)
-        assert not np.array(rows[k])[:, outside].any()
-
-
-def curves_of(**nodes):
-    mi.set_variant("llvm_ad_spectral")
-    return SensorResponse({name: mi.load_dict(node) for name, node in nodes.items()})
-
-
-def test_curves_count_alike_where_wavelengths_are_drawn():
-    """Each is scaled to one; what the channels see are the curves as they are, over the number of wavelengths."""
-    high = {"type": "regular", "wavelength_min": 400, "wavelength_max": 600, "values": "1, 8, 2"}
-    low = {"type": "regular", "wavelength_min": 400, "wavelength_max": 600, "values": "0.5, 0, 0.25"}
-    response = curves_of(high=high, low=low)
-    at = np.linspace(400, 600, 65)
-    curves = [np.interp(at, [400, 500, 600], values) for values in ([1, 8, 2], [0.5, 0, 0.25])]
-    np.testing.assert_allclose(np.array(response._density.pdf), curves[0] / 8 + curves[1] / 0.5, rtol=1e-5)
-    places = np.array([425.0, 450.0, 580.0])
-    rows = response.matrix(mi.UnpolarizedSpectrum(*(mi.Float(np.roll(places, k)) for k in range(4))))
-    for k, row in enumerate(rows):
-        expected = [np.interp(np.roll(places, k), at, curve) / 4 for curve in curves]
-        np.testing.assert_allclose(np.array(row), expected, rtol=1e-5)
-    assert len(rows) == 4
-    wavelengths, weight = response.sample(mi.Float([0.1, 0.27]))
-    density = (curves[0] / 8 + curves[1] / 0.5) / np.trapezoid(curves[0] / 8 + curves[1] / 0.5, at)
-    for k in range(4):
-        found = np.interp(np.array(wavelengths[k], dtype=float), at, density)
-        np.testing.assert_allclose(1 / np.array(weight[k], dtype=float), found, rtol=1e-3)
-    assert len(set(np.array(wavelengths).ravel().round(3))) == 8
-    # the floor is a share of the highest density, of whatever sum
-    low["values"] = "0, 4, 0"
-    assert np.array(curves_of(a=low, b=low)._density.pdf).min() == pytest.approx(0.02)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_curve_that_is_no_number_is_refused(value):
-    mi.set_variant(VARIANT)
-    curve = SimpleNamespace(
-        wavelength_range=lambda: (400, 500),
-        spectral_resolution=lambda: 0.0,
-        eval=lambda si: dr.select(si.wavelengths > 450, mi.UnpolarizedSpectrum(value), 1),
-    )
-    with pytest.raises(SceneError, match=r"'bad' must be finite"):
-        SensorResponse({"bad": curve})

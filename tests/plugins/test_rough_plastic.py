@@ -58,14 +58,6 @@ def test_values_densities_and_samples_are_those_of_mitsuba(settings):
         assert np.mean(np.array(a.sampled_component) != np.array(b.sampled_component)) < 1e-3
 
 
-def test_names_of_distributions():
-    for wrong in ("phong", "as"):
-        with pytest.raises(RuntimeError, match=f"'distribution' must be 'beckmann' or 'ggx', got '{wrong}'"):
-            mi.load_dict({"type": "diff_rough_plastic", "distribution": wrong})
-    for right, ggx in (("ggx", True), ("Beckmann", False)):
-        assert mi.load_dict({"type": "diff_rough_plastic", "distribution": right}).ggx == ggx
-
-
 QUICK = [(external_transmittance, True, 0.6)]
 TABLES = [
     pytest.param(table, ggx, alpha, eta, marks=[] if (table, ggx, alpha) in QUICK else [pytest.mark.slow])
@@ -112,14 +104,6 @@ def test_tables_follow_an_update():
     assert np.abs(np.array(ours.transmittance) - before).max() > 1e-2
     np.testing.assert_allclose(np.array(ours.transmittance), np.array(expected.transmittance), atol=1e-6)
     np.testing.assert_allclose(np.array(ours.thrown_back), np.array(expected.thrown_back), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "settings", [{"int_ior": 1.5, "ext_ior": 1.5}, {"distribution": "phong"}, {"alpha_u": 0.1, "alpha_v": 0.2}]
-)
-def test_bad_settings(settings):
-    with pytest.raises(RuntimeError, match="diff_rough_plastic"):
-        mi.load_dict({"type": "diff_rough_plastic", **settings})
 
 
 @pytest.mark.parametrize("key", ["eta"])

@@ -33,13 +33,3 @@ def test_only_it_is_drawn(plugin, number):
         ctx.component = component
         bs, weight = bsdf.sample(ctx, si, mi.Float(number), mi.Point2f(0.4, 0.3))
         assert list(bs.sampled_component) == [component] and weight[0][0] > 0 and bs.pdf[0] > 0
-
-
-@pytest.mark.parametrize("plugin", ["diff_dielectric", "diff_rough_dielectric", "diff_plastic"])
-def test_an_index_is_no_literal_of_a_kernel(plugin):
-    """A new one would compile a new kernel."""
-    params = mi.traverse(mi.load_dict({"type": plugin, **SURFACES[plugin]}))
-    assert params["eta"].state == dr.VarState.Evaluated
-    params["eta"] = 1.6
-    params.update()
-    assert params["eta"].state == dr.VarState.Evaluated

@@ -271,7 +271,7 @@ SECONDS = {
 }  # fmt: skip
 # formulas that hold in any unit, what others compute, and devices, which say it when they are built
 OTHERS = {
-    "BudgetReport", "CramerRaoBound", "Device", "Response", "emg_cdf",
+    "BudgetReport", "CramerRaoBound", "Device", "Response", "emg_cdf", "heterodyne_speed",
     "emg_survival", "gate_profiles", "resample_counts",
 }  # fmt: skip
 

@@ -5,11 +5,11 @@ Renders, their gradients and errors are the first choice. Each name stands for a
 
 - the loop alone, on strategies and sinks of a test's own: `trace`, `primary_rays`, `Connection`, `Event`, `Step`,
   `Vertex`, `Sink`;
-- what a walk hands to other sinks than a film: `AdjointSumSink`, `EventListSink`; and `recorded_paths`, the random walk
-  itself, before any light;
-- mathematics with a closed form, at single points: `damped_motion`, the field by which points near a vertex move along
-  with it; `attached_interaction` and `attached_distance`, hits of curves, ellipsoids and instances with the derivatives
-  that Mitsuba lacks; `varies_by_place`, a property of every plugin that costs time or derivatives where it is wrong;
+- what a walk hands to another sink than a film: `AdjointSumSink`; and `recorded_paths`, the random walk itself, before
+  any light;
+- mathematics with a closed form, at single points: `attached_interaction` and `attached_distance`, hits of curves,
+  ellipsoids and instances with the derivatives that Mitsuba lacks; `varies_by_place`, a property of every
+  plugin that costs time or derivatives where it is wrong;
 - what an author of strategies gets wrong: `Guide`, `Surface`;
 - the same numbers by another way: `nail_down`, `no_flat_shortcut`, `limit_records`;
 - moments in the middle of a trace, for interrupts, errors and scenes that are dropped there: `before_each_turn`.
@@ -29,9 +29,8 @@ import numpy as np
 from torchtransient.plugins.integrators.job import passes_of
 from torchtransient.plugins.transport import scene_contents, walk
 from torchtransient.plugins.transport.context import Wanted
-from torchtransient.plugins.transport.geometry_terms import damped_motion
 from torchtransient.plugins.transport.record import RecordedVertex, RecordSink
-from torchtransient.plugins.transport.sinks import AdjointSumSink, EventListSink, Sink
+from torchtransient.plugins.transport.sinks import AdjointSumSink, Sink
 from torchtransient.plugins.transport.strategy import Connection, Event, Guide, Step, Vertex
 from torchtransient.plugins.transport.surface_interactions import (
     AttachedSurfaces,
@@ -46,7 +45,6 @@ __all__ = [
     "AdjointSumSink",
     "Connection",
     "Event",
-    "EventListSink",
     "Guide",
     "Sink",
     "Step",
@@ -55,7 +53,6 @@ __all__ = [
     "attached_distance",
     "attached_interaction",
     "before_each_turn",
-    "damped_motion",
     "limit_records",
     "nail_down",
     "no_flat_shortcut",

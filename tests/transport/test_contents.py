@@ -35,17 +35,6 @@ def assert_change_is_seen(make, change):
     np.testing.assert_allclose(found, rendered(expected), rtol=1e-5, atol=1e-6 * before.max())
 
 
-@pytest.mark.parametrize("names", [("emitter_found", ""), ("emitter_found", "emitter_found"), ("walk", "other")])
-def test_strategies_need_names_of_their_own(scene, monkeypatch, names):
-    integrator = scene.integrator()
-    segment, scattering, connections = integrator.strategies(integrator.contents(scene, scene.sensors()[0]))
-    for connection, name in zip(connections, names, strict=True):
-        connection.name = name
-    monkeypatch.setattr(type(integrator), "strategies", lambda *_: (segment, scattering, connections))
-    with pytest.raises(ValueError, match="expected a name of its own for each"):
-        integrator.render(scene, spp=1)
-
-
 def test_sensors_take_turns():
     """Each sees what it sees alone."""
     description = room(depth=3)

@@ -144,12 +144,3 @@ def test_numbers_of_a_call_are_no_literals(kind, monkeypatch):
     monkeypatch.setattr("torchtransient.plugins.integrators.job.MAX_LANES", 4 * 2 * 16)
     parts = hashes(scene, seed=0, spp=16)
     assert len(parts) > len(first) and len(set(parts)) == len(first)
-
-
-@pytest.mark.parametrize("seed", [np.int64(3), 3 + 2**32, 3 - 2**32])
-def test_any_whole_number_is_a_seed(seed):
-    scene = mi.load_dict(scene_of("surfaces"), optimize=False)
-    expected, got = (arrays(scene.integrator().render(scene, seed=s, spp=2)) for s in (3, seed))
-    np.testing.assert_allclose(got[0], expected[0], rtol=1e-5)
-    with pytest.raises(ValueError, match="seed: expected a whole number"):
-        scene.integrator().render(scene, seed=1.5, spp=2)

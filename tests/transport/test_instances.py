@@ -171,14 +171,6 @@ def test_distance_to_where_a_ray_leaves(name):
     np.testing.assert_allclose(found, (above - below) / (10 * STEP), rtol=0.02, atol=0.01)
 
 
-@pytest.mark.parametrize("follows", long([False, True], [True]))
-def test_rays_that_meet_nothing_have_no_slope(follows):
-    scene, x = scene_of(), unknown()
-    si = interaction(scene, rays(x), mi.RayFlags.All | (mi.RayFlags.FollowShape if follows else mi.RayFlags.Empty))
-    (longer,) = derivative(x, [si.t * 1])
-    assert not np.array(si.is_valid())[9] and longer[9] == 0 and np.abs(longer[:9]).min() > 1e-4
-
-
 @pytest.mark.slow
 def test_idle_lanes_reach_no_pose():
     """What nothing was met by may hold what is no number, or lie at the ray's start: the poses, which all lanes share,

@@ -53,15 +53,6 @@ def test_paths_are_those_of_any_surface(monkeypatch):
     np.testing.assert_allclose(found[1], asked[1], rtol=1e-4)
 
 
-def test_samples_without_derivative_are_left_out(monkeypatch):
-    """The gradient by an albedo is the same when shadow rays are traced for all samples of value zero."""
-    scene = mi.load_dict(described())
-    few = gradient(scene, ALBEDO)
-    sampled = name_in(scene.integrator(), "EmitterSampled")
-    monkeypatch.setattr(sampled, "_may_change", lambda self, world, proposal, answer: mi.Bool(True))
-    np.testing.assert_allclose(few, gradient(scene, ALBEDO), rtol=1e-4)
-
-
 def test_black_texels_of_a_lamp_have_derivatives():
     """Light is linear in the slide of a projecting lamp: derivatives are the same where the slide is black."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,6 @@ import torchtransient as tt
 from support.gradient_cases.problem import Case, Problem, weights
 from support.gradient_cases.scenes import transform
 from support.gradient_cases.unknowns import move, move_vertices
-from torchtransient.plugins.sensors.seen_from import SensorPlaces
 
 SIZE = 8
 ACROSS = (1, 0.3, 0)
@@ -227,52 +225,6 @@ def test_films_of_several_bands(monkeypatch, name):
 
     (found, error), (expected, other) = (mean_and_error(v) for v in ([forward(seed) for seed in range(6)], reverse))
     assert abs(found - expected) < 4 * np.hypot(error, other), (found, error, expected, other)
-
-
-SENSORS = {
-    "orthographic": orthographic, "lens": lens, "shifted": shifted, "cropped": lambda: cropped("box"),
-    "cameras": lambda: batch(camera), "lenses": lambda: batch(lens),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_points_are_seen_where_rays_meet_them(name):
-    """Places of the film, beyond its rim too, and the importance: one over the area that a place sees, across."""
-    mi.set_variant("llvm_ad_mono")
-    sensor = mi.load_dict(SENSORS[name]())
-    count, n = 2 if name.startswith("camera") or name == "lenses" else 1, 256
-    rng = np.random.default_rng(2)
-    rim = 0 if count > 1 else 0.1  # beyond the rim of a camera lies the next one
-    uv, aperture = rng.uniform(-rim, 1 + rim, (2, n)), mi.Point2f(rng.random((2, n)))
-    index = np.minimum((uv[0] * count).astype(int), count - 1)
-    numbers = SimpleNamespace(aperture=aperture, wavelength=mi.Float(0), camera=mi.UInt32(index))
-    depth = mi.Float(rng.uniform(1, 4, n))
-
-    def ray(du=0, dv=0):
-        return sensor.sample_ray(0, 0.5, mi.Point2f(uv + np.array([[du], [dv]])), aperture)[0]
-
-    middle = ray()
-    p = middle.o + middle.d * depth
-    at = dr.zeros(mi.Interaction3f, n)
-    at.p = p
-    places = SensorPlaces(sensor, sensor.film(), mi.Float(4))
-    ds, importance = places.seen_from(at, numbers, mi.Bool(True))
-    size = np.array(sensor.film().crop_size())[:, None]
-    assert np.array(ds.pdf).all()
-    np.testing.assert_allclose(np.array(ds.uv) / size, uv, atol=2e-4)
-    assert np.array(dr.norm(ds.d + middle.d)).max() < 2e-4
-
-    def crossed(other):
-        """Where another ray meets the plane across the first one."""
-        t = dr.dot(p - other.o, middle.d) / dr.dot(other.d, middle.d)
-        return other.o + other.d * t - p
-
-    h = 1e-2
-    inside = np.minimum(uv[0] * count % 1, 1 - uv[0] * count % 1) > 2 * h * count
-    right, up = (0.5 * (crossed(ray(*step)) - crossed(ray(*-np.array(step)))) for step in ((h, 0), (0, h)))
-    area = np.array(dr.norm(dr.cross(right, up))) / h**2
-    # One camera of several is chosen, with the share that it has of the film.
-    np.testing.assert_allclose((np.array(importance) * area)[inside], count, rtol=5e-3)
 
 
 def missing(scene, key="body.to_world", variant="llvm_ad_rgb"):

@@ -35,11 +35,6 @@ def test_every_bsdf_without_a_varying_texture(name):
     assert not varies_by_place(mi.load_dict(bsdfs()[name]))
 
 
-def test_textures_of_what_is_held():
-    paint = {"type": "mask", "nested": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": BOARD}}}
-    assert varies_by_place(mi.load_dict(paint))
-
-
 def test_attributes_of_meshes():
     """Mitsuba's texture of them says that it does not vary."""
     attribute = {"type": "mesh_attribute", "name": "vertex_color"}

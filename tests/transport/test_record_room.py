@@ -72,19 +72,6 @@ def test_launches_are_as_small_as_the_memory_wants(monkeypatch):
 
 
 @pytest.mark.slow
-def test_phasors_do_without_a_list_of_arrivals(monkeypatch):
-    def found():
-        renderer = tt.TransientRenderer(make_room(), [COLOUR], spp=4, frequencies=[0.5, 1.0])
-        renderer(seed=0).phasor.abs().square().sum().backward()
-        return renderer.values[COLOUR].grad
-
-    expected = found()
-    # The record of four vertices fits, the list of all arrivals beside it does not.
-    limit_records(monkeypatch, stack=4 * 100)
-    torch.testing.assert_close(found(), expected, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.slow
 def test_a_thread_with_a_small_stack_records_in_memory():
     """Records of 2000 bounces fit the stack of a process's own thread, not one of half a MiB."""
     found, before = [], threading.stack_size(2**19)

@@ -9,7 +9,7 @@ import pytest
 
 from support.marks import long
 from support.plain_scenes import as_mitsuba
-from support.walks import AdjointSumSink, EventListSink, Sink, primary_rays, trace
+from support.walks import AdjointSumSink, Sink, primary_rays, trace
 from torchtransient.scenes import cornell_box
 
 VARIANT = "llvm_ad_mono"
@@ -54,31 +54,6 @@ def test_adjoint_sum_is_the_product_with_the_render(kind):
     _, kept = traced(scene, sink_of)
     expected = float((np.array(cube, dtype=np.float64).ravel() * weights).sum())
     assert np.array(kept["sum"], dtype=np.float64).sum() == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["plain", "fog", "glass"])
-def test_depth_of_an_event_is_that_of_the_render_that_has_it(kind):
-    def sink_of(integrator, contents, film, rays, job):
-        match = integrator.channel_match(contents, film, rays)
-        return EventListSink(dr.width(rays.row), 32, lambda value: dr.mean(value * match.weight))
-
-    sink, _ = traced(scene_of(kind), sink_of)
-    assert int(np.array(sink.used).max()) <= 32
-    depth, energy = np.array(sink.depth), np.array(sink.energy, dtype=np.float64)
-    shares = []
-    for most in (1, 2, 5):
-        scene = scene_of(kind, depth=most)
-        image = np.array(scene.integrator().render(scene, seed=SEED, spp=SPP)[0], dtype=np.float64)
-        shares.append(image.sum())
-        assert energy[(depth > 0) & (depth <= most)].sum() == pytest.approx(image.sum(), rel=1e-4, abs=1e-9)
-    assert shares[-1] > shares[1] > 0
-
-
-def test_every_event_has_a_place_in_the_list():
-    """A list that is too short says so, and keeps what there was room for."""
-    _, kept = traced(scene_of("plain"), lambda *_: EventListSink(5 * 5 * SPP, 1, dr.mean))
-    assert int(np.array(kept["used"]).max()) > 1
 
 
 def test_a_sink_of_one_s_own():

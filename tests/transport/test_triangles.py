@@ -8,8 +8,6 @@ import torch
 import torchtransient as tt
 from support.gradient_cases.cases_curves import file_of
 from support.gradient_cases.scenes import film, transform
-from support.walks import Guide, Surface
-from torchtransient.errors import SceneError
 
 VARIANT = "llvm_ad_mono"
 SHEETS = {
@@ -55,15 +53,3 @@ def test_meshes_that_move_together_have_the_derivatives_of_each_alone():
         (expected,) = gradients(name)
         assert expected.shape[-2] == SHEETS[name].count("v") and expected.abs().amax(-1).min() > 1e-3
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4 * float(expected.abs().max()))
-
-
-class Shared(Guide):
-    def __init__(self, share):
-        self.share = share
-
-
-@pytest.mark.parametrize("shares", [(0.5, 0.5), (1.0,), (0.3, 0.0), (-0.1,), (0.4, 0.7)])
-def test_shares_of_guides_that_leave_nothing(shares):
-    said = ", ".join(map(str, shares))
-    with pytest.raises(SceneError, match=f"positive shares that sum to less than one, got {said}"):
-        Surface([Shared(share) for share in shares])

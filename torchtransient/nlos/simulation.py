@@ -236,8 +236,7 @@ def simulate(
 
     Returns:
         Capture. ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``,
-            ``light``
-        (the estimators of light), ``parts``.
+            ``light`` (the estimators of light), ``parts``.
 
     Raises:
         ArgumentError, SceneError, ShapeError, UnitError, VariantError: for a set-up that cannot be simulated.

@@ -32,9 +32,8 @@ def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: Posit
         function: "softplus" or "exp".
 
     Returns:
-        Values above `low` as far as the precision of `x` has numbers: `low` itself where it has none in between
-            (float32:
-        below -104 with low=0, below -17 with low=1), and with "exp" infinite where it ends (float32: above 88).
+        Values above `low`, or `low` itself where the precision of `x` has no number in between (float32: below -104
+            with low=0, below -17 with low=1). With "exp" infinite where it ends (float32: above 88).
 
     Raises:
         UnitError, ShapeError: for other settings and tensors.

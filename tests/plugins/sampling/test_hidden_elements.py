@@ -5,9 +5,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import join, mannequin, mesh, plate, scene_of, wall_grid
+from support.hidden_shapes import mannequin, mesh, plate, scene_of, wall_grid
 from support.marks import long
-from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
 VARIANT = "llvm_ad_rgb"
@@ -118,42 +118,6 @@ def test_frequencies_are_the_densities_and_densities_integrate_to_one():
     assert not np.allclose(table._probabilities(tiles[:1], normals[None]), p)
 
 
-def test_probabilities_are_those_of_the_formula():
-    """One by one, of triangles whose centre is all that counts."""
-    front, back = plate(0.2, 0.2, (0.1, 0, 1.0), 2), plate(0.2, 0.2, (0.1, 0, 1.5), 2)
-    back = back[0], back[1][:, ::-1]
-    shapes = [mesh("front", front), mesh("back", back), mesh("both", (back[0] + [0, 0, 1], back[1]), two_sided=True)]
-    points, normals = wall_grid(2)
-    table = HiddenElements(shapes, points, normals)
-    expected, area = [], []
-    for shape, primitive in zip(table.elements.shape, table.elements.primitive, strict=True):
-        v = np.array(shapes[shape].vertex_positions_buffer(), dtype=float).reshape(-1, 3)
-        a, b, c = v[np.array(shapes[shape].faces_buffer()).reshape(-1, 3)[primitive]]
-        n = np.cross(b - a, c - a) / 2
-        area.append(np.linalg.norm(n))
-        d = points - (a + b + c) / 3
-        r = np.linalg.norm(d, axis=1)
-        cos = d @ n / area[-1] / r
-        cos = np.abs(cos) if shape == 2 else np.maximum(cos, 0)
-        expected.append(area[-1] * np.sqrt(np.mean((cos**2 * (d[:, 2] / r) ** 2 / r**4) ** 2)))
-    expected, area = np.array(expected), np.array(area)
-    expected = 0.9 * expected / expected.sum() + 0.1 * area / area.sum()
-    x = np.array(table.density_of(dr.arange(mi.UInt32, len(area))), dtype=float) * area
-    assert x == pytest.approx(expected, rel=1e-5)
-    turned_away = table.elements.shape == 1
-    assert x[turned_away] == pytest.approx(0.1 * area[turned_away] / area.sum(), rel=1e-5)
-
-
-def test_what_is_not_in_the_table_has_no_density():
-    shapes, _ = scene_with_many()
-    wall = mi.load_dict({"type": "rectangle"})
-    table = HiddenElements(shapes[:1], *wall_grid(3))
-    for other in (wall, *shapes[1:]):
-        assert dr.all(table.per_area(mi.ShapePtr(other), mi.UInt32(0), mi.Point3f(0)) == 0)
-    assert dr.all(table.per_area(dr.zeros(mi.ShapePtr, 2), mi.UInt32(0), mi.Point3f(0)) == 0)
-    assert dr.all(table.per_area(mi.ShapePtr(shapes[0]), mi.UInt32(0), mi.Point3f(0), mi.Mask(False)) == 0)
-
-
 def test_copies_of_groups_are_named():
     scene = mi.load_dict(
         {
@@ -205,47 +169,3 @@ def test_large_triangles_are_cut():
     same = np.abs(found / drawn - 1)[hit] < 1e-4
     assert same.mean() > 0.9995
     assert np.mean(1 / found[hit]) == pytest.approx(24, abs=float(4 * np.std(1 / found[hit]) / COUNT**0.5))
-
-
-def test_cut_triangles_of_equal_density_are_uniform():
-    shape = mesh("m", plate(4, 4, (0, 0, 1)))
-    table = HiddenElements([shape], *wall_grid(3), defensive=1.0)
-    p = np.array(table.draw(random_points(49 << 11))[0])
-    count, _, _ = np.histogram2d(p[0], p[1], bins=7, range=[[-2, 2]] * 2)
-    # 49 numbers of the Poisson distribution.
-    assert len(table.elements) > 100 and np.abs(count - 2048).max() < 4.5 * 2048**0.5
-
-
-def test_elements_that_face_no_wall_point_are_drawn_by_area():
-    v, f = join(plate(1, 1, (0, 0, 1)), plate(1, 3, (0, 0, 2)))
-    table = HiddenElements([mesh("m", (v, f[:, ::-1]))], *wall_grid(3))
-    assert np.array(table.density_of(dr.arange(mi.UInt32, len(table.elements)))) == pytest.approx(1 / 4, rel=1e-4)
-
-
-def test_kernels_do_not_depend_on_values_and_sizes():
-    """One kernel for tables of other shapes: sizes and probabilities are arrays in memory."""
-    u = random_points(64)
-    dr.eval(u)
-    kernels = []
-    for level in (0, 1, 2):
-        table = HiddenElements([mesh("m", mannequin(level))], *wall_grid(3))
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            dr.eval(table.draw(u))
-            kernels += [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    assert len(set(kernels)) == 1
-
-
-def test_arguments_are_checked():
-    shape = mesh("m", plate(1, 1, (0, 0, 1)))
-    points, normals = wall_grid(2)
-    with pytest.raises(ShapeError, match="match"):
-        HiddenElements([shape], points, normals[:1])
-    with pytest.raises(ShapeError, match="finite"):
-        HiddenElements([shape], points * np.nan, normals)
-    with pytest.raises(UnitError, match="defensive"):
-        HiddenElements([shape], points, normals, defensive=0)
-    as_mitsuba = HiddenElements([shape], mi.Point3f(points.T), mi.Normal3f(normals.T))
-    assert (
-        as_mitsuba.density_of(mi.UInt32(0))[0] == HiddenElements([shape], points, normals).density_of(mi.UInt32(0))[0]
-    )

@@ -5,8 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import ball, mannequin, mesh, plate, scene_of, wall_grid
-from torchtransient.errors import SceneError, UnitError, VariantError
+from support.hidden_shapes import scene_of, wall_grid
+from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -47,35 +47,11 @@ def test_samples_are_mitsubas_surface_points():
         assert np.all(np.array(samples.shape == mi.ShapePtr(shape))) and not samples.smooth
 
 
-def test_weights_sum_to_the_area():
-    shapes = [mesh("body", mannequin(2)), mi.load_dict({"type": "sphere", "center": [1, 0, 1], "radius": 0.2})]
-    table = HiddenElements(shapes, *wall_grid(3))
-    total = [dr.sum(draw_samples(table, 1 << 12, seed).weight)[0] for seed in range(16)]
-    area, error = table.elements.area.sum(), np.std(total, ddof=1) / 4
-    # One over the density varies from element to element: the strata leave little of that.
-    assert error < 5e-3 * area and abs(np.mean(total) - area) < 4 * error
-
-
 def test_both_sides_and_both_albedos():
     sides = {name: {"type": "diffuse", "reflectance": albedo} for name, albedo in (("a", 0.2), ("b", 0.6))}
     shape = mi.load_dict({"type": "rectangle", "bsdf": {"type": "twosided", **sides}})
     samples = draw_samples(HiddenElements([shape], *wall_grid(3)), 8, 0)
     assert np.allclose(samples.front, 0.2 / np.pi) and np.allclose(samples.back, 0.6 / np.pi)
-
-
-def test_interpolated_normals():
-    shape = mesh("ball", ball((0, 0, 1), 0.5, 3), vertex_normals=True)
-    samples = draw_samples(HiddenElements([shape], *wall_grid(3)), 512, 0)
-    assert samples.smooth
-    cos = np.array(dr.dot(samples.n, dr.normalize(samples.p - mi.Point3f(0, 0, 1))))
-    flat = np.array(dr.dot(samples.geometric_n, dr.normalize(samples.p - mi.Point3f(0, 0, 1))))
-    assert cos.min() > 0.9998 > 0.999 > flat.min()
-
-
-def test_a_seed_in_memory_and_as_a_number_are_the_same():
-    table = HiddenElements([mesh("body", mannequin(0))], *wall_grid(3))
-    a, b = draw_samples(table, 64, 9), draw_samples(table, 64, dr.opaque(mi.UInt32, 9))
-    assert dr.all(a.p == b.p, axis=None) and not dr.all(a.p == draw_samples(table, 64, 10).p, axis=None)
 
 
 @pytest.mark.parametrize(
@@ -92,16 +68,3 @@ def test_other_surfaces_are_refused(bsdf):
     table = HiddenElements([mi.load_dict({"type": "rectangle", "id": "shiny", "bsdf": bsdf})], *wall_grid(3))
     with pytest.raises(SceneError, match="shiny"):
         draw_samples(table, 8, 0)
-
-
-def test_arguments_are_checked():
-    table = HiddenElements([mesh("m", plate(1, 1, (0, 0, 1)))], *wall_grid(2))
-    with pytest.raises(UnitError, match="samples"):
-        draw_samples(table, 0, 0)
-
-
-def test_spectral_variants_are_refused():
-    with mi.variant_context("llvm_ad_spectral"):
-        table = HiddenElements([mi.load_dict({"type": "rectangle"})], *wall_grid(2))
-        with pytest.raises(VariantError, match="spectral"):
-            draw_samples(table, 8, 0)
