@@ -19,7 +19,7 @@ from support.moving_scenes import (
     wall_phasor,
 )
 from tools.small_room import make_room
-from torchtransient.testing.finite_differences import central_difference
+from torchtransient.testing import finite_differences
 
 VARIANT = "llvm_ad_rgb"
 HETERODYNE = tt.Exposure(EXPOSURE_S, beat_hz=BEAT_HZ)
@@ -98,7 +98,9 @@ def test_differences_in_a_corner(name):
         return float(torch.autograd.grad(image(x, seed), x)[0])
 
     with torch.no_grad():
-        found = central_difference(lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, step, range(12))
+        found = finite_differences.central_difference(
+            lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, step, range(12)
+        )
     reverse = np.array([gradient(seed) for seed in range(100, 112)])
     error = np.hypot(float(found.standard_error), reverse.std(ddof=1) / 12**0.5)
     # Differences over a step are off by its square, 1e-3 of what they are.
@@ -132,7 +134,9 @@ def test_differences_where_an_outline_crosses_pixels(name, step):
         return float(torch.autograd.grad(image(x, seed), x)[0])
 
     with torch.no_grad():
-        found = central_difference(lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, step, range(12))
+        found = finite_differences.central_difference(
+            lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, step, range(12)
+        )
     reverse = np.array([gradient(seed) for seed in range(100, 112)])
     error = np.hypot(float(found.standard_error), reverse.std(ddof=1) / 12**0.5)
     assert abs(reverse.mean() - float(found.mean)) < 3 * error

@@ -37,16 +37,6 @@ def gradient(renderer, x, weights, seed=0):
     return x.grad
 
 
-def test_two_backwards_give_the_same_gradient(renderer, weights):
-    x = START.clone().requires_grad_()
-    loss = (renderer({COLOUR: x}, seed=0).transient * weights).sum()
-    first = torch.autograd.grad(loss, x, retain_graph=True)[0]
-    torch.autograd.grad(3 * loss, x, retain_graph=True)
-    again = torch.autograd.grad(loss, x)[0]
-    assert first.abs().min() > 0
-    same_gradient(first, again)
-
-
 def test_second_backward_follows_its_own_cotangent(renderer, weights):
     x = START.clone().requires_grad_()
     out = renderer({COLOUR: x}, seed=0).transient

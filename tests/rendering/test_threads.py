@@ -6,14 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
-import threading
 
 import drjit as dr
 import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.plugins.drjit_pool import engine_lock
 from torchtransient.rendering import threads as module
 
 VARIANT = 'llvm_ad_rgb'
@@ -62,17 +60,6 @@ def test_a_context_puts_back_what_was():
     with tt.threads():
         tt.threads(1)
     assert tt.threads() == module.Threads(torch=2, drjit=3)
-
-
-def test_renders_of_other_threads_end_first():
-    done = []
-    with engine_lock:
-        other = threading.Thread(target=lambda: done.append(tt.threads(3)))
-        other.start()
-        other.join(0.2)
-        assert not done
-    other.join(10)
-    assert done[0].drjit == 3
 
 
 NUMBERS = """

@@ -11,18 +11,11 @@ import torch
 import torchtransient as tt
 from tools.small_room import GREY, make_room
 from torchtransient.errors import SceneError
-from torchtransient.scene.description import (
-    describe_dict,
-)
 
 VARIANT = "llvm_ad_rgb"
 
 
 # ------------------------------------------------------------------------------------------------------ dictionaries
-
-
-def plain(value):
-    return describe_dict({"type": "scene", "x": value}).tree["x"]
 
 
 def test_tensors_of_three_rows_are_no_colours_or_points(capfd):

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 import torchtransient as tt
 from support import plan_scenes
 from support.marks import long
+from torchtransient.__main__ import main
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.cli.main import main
-from torchtransient.rendering.films import Histogram
+from torchtransient.rendering import films
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.variant import active_variant
 
@@ -25,7 +25,7 @@ def pilot_of(scene, seed=0):
     with active_variant(VARIANT):
         from torchtransient.plugins.integrators.pilot import pilot_events
 
-        options = BuildOptions(film=Histogram(tt.TimeAxis(0.0, 1.0, 1)), transient=True, merge=True)
+        options = BuildOptions(film=films.Histogram(tt.TimeAxis(0.0, 1.0, 1)), transient=True, merge=True)
         built = loaded.built(options).scene
         return pilot_events(built, built.integrator(), 0, seed=seed, pixels=256, paths=8192)
 

@@ -4,7 +4,7 @@
 import pytest
 
 import torchtransient as tt
-from torchtransient.rendering.films import Beats, Rates
+from torchtransient.rendering import films
 
 VARIANT = "llvm_ad_mono"
 SPEED = 3.0
@@ -26,7 +26,7 @@ def share_inside(film, out):
 
 def test_rates_are_found():
     plan = tt.plan(coming(), outputs="rates")
-    assert isinstance(plan.film_choice, Rates) and plan.film == "rates"
+    assert isinstance(plan.film_choice, films.Rates) and plan.film == "rates"
     # 0.5 m from the camera the light sees the wall at an angle: cos from 0.98 to 1 on both legs.
     assert plan.rates.start < -2 * SPEED < plan.rates.end and plan.rates.bin_width < 0.05 * SPEED
     assert any(line.startswith("rates: -5.9") for line in plan.reasons)
@@ -42,7 +42,7 @@ def test_beats_are_found_where_they_stand():
     """The up chirp sees the wall behind the camera, at a negative length."""
     plan = tt.plan(coming(), outputs=("beats", "steady"), chirps=CHIRPS)
     shift = 2 * SPEED * CHIRPS.rate_scale_s
-    assert isinstance(plan.film_choice, Beats) and plan.chirps == CHIRPS
+    assert isinstance(plan.film_choice, films.Beats) and plan.chirps == CHIRPS
     axis = plan.time_axis
     assert axis.start_opl < 8 - shift < 0 and axis.end_opl > 8 + shift and axis.end_opl < 8 + shift + 5
     assert axis.bin_width_opl == CHIRPS.resolution_opl
@@ -71,13 +71,14 @@ def test_settings_that_are_given_or_described():
     rates, axis = tt.RateAxis(-8.0, 0.5, 24), tt.TimeAxis(6.0, 0.1, 40)
     plan = tt.plan(coming(), outputs="rates", rates=rates, time_axis=axis)
     assert (plan.rates, plan.time_axis) == (rates, axis)
-    assert plan.film_choice == tt.plan(coming(), "rates", film=Rates(rates, axis)).film_choice == Rates(rates, axis)
-    assert plan.renderer(spp=1).film == Rates(rates, axis)
+    assert plan.film_choice == films.Rates(rates, axis)
+    assert plan.film_choice == tt.plan(coming(), "rates", film=films.Rates(rates, axis)).film_choice
+    assert plan.renderer(spp=1).film == films.Rates(rates, axis)
     description = tt.scenes.moving_wall(resolution=4, max_depth=2)
     own = {"rate_start": -8.0, "rate_width": 0.5, "rate_bins": 24, "start_opl": 6.0, "bin_width_opl": 0.1}
     description["sensor"]["film"] |= own | {"type": "rate_hdr_film", "temporal_bins": 40}
     kept = tt.plan(tt.load(description, variant=VARIANT), outputs="rates", time_axis="scene", pilot=False)
-    assert kept.film_choice == Rates(rates, axis) and "the scene's own" in str(kept)
+    assert kept.film_choice == films.Rates(rates, axis) and "the scene's own" in str(kept)
     film = description["sensor"]["film"]
     for name in own:
         if name.startswith("rate"):

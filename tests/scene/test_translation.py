@@ -14,12 +14,12 @@ import torch
 
 import torchtransient as tt
 from torchtransient.errors import PhysicsError, PhysicsWarning
-from torchtransient.rendering.films import Histogram
+from torchtransient.rendering import films
 from torchtransient.scene.edits import BuildOptions, printed_properties
 
 VARIANT = "llvm_ad_rgb"
 AXIS = tt.TimeAxis(start_opl=0.0, bin_width_opl=1.0, num_bins=2)
-HISTOGRAM = Histogram(AXIS)
+HISTOGRAM = films.Histogram(AXIS)
 PATH, FILM = {"type": "path"}, {"type": "hdrfilm"}
 
 

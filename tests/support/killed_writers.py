@@ -17,8 +17,8 @@ import torch
 
 def output(seed: int):
     """A render of half a megabyte, all of whose numbers depend on the seed."""
+    from torchtransient import RenderOutput, RenderStats
     from torchtransient.axes import TimeAxis
-    from torchtransient.rendering.output import RenderOutput, RenderStats
 
     stats = RenderStats(
         spp=16, seconds=0.5, samples_per_second=1e4, variant="llvm_ad_rgb", integrator="transient_path",

@@ -35,10 +35,10 @@ def _results(folder: Path) -> list[Path]:
     import torch
 
     from support.sealed_files import as_first_version
+    from torchtransient import RenderOutput, RenderStats
     from torchtransient.axes import FrequencyAxis, TimeAxis
     from torchtransient.files import write_result
     from torchtransient.gates import Gate
-    from torchtransient.rendering.output import RenderOutput, RenderStats
 
     generator = torch.Generator().manual_seed(0)
     stats = RenderStats(

@@ -7,7 +7,6 @@ import json
 import pickle
 
 import mitsuba as mi
-import numpy as np
 import pytest
 import torch
 
@@ -15,12 +14,10 @@ import torchtransient as tt
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.files import read_result, write_result
-from torchtransient.rendering import film_layout, films
-from torchtransient.rendering.films import Beats, Gates, Histogram, Phasors, Rates, SlowPhasors
-from torchtransient.rendering.output import RenderOutput, RenderStats
+from torchtransient.rendering import films
 
 VARIANT = "llvm_ad_rgb"
-STATS = RenderStats(
+STATS = tt.RenderStats(
     spp=16,
     seconds=0.5,
     samples_per_second=1e4,
@@ -66,11 +63,10 @@ def output_of(choice, leading=(), components=1):
     response = choice.channels_first(items if leading else items[0], leading, components)
     image = (*leading, *((components,) if components > 1 else ()), 3)
     assert tuple(response.shape) == (*image, *choice.shape, 3, 2)
-    return RenderOutput.of(choice, torch.zeros(*image, 3, 2), response, stats=STATS, channels=("R", "G", "B"))
+    return tt.RenderOutput.of(choice, torch.zeros(*image, 3, 2), response, stats=STATS, channels=("R", "G", "B"))
 
 
 def test_the_list():
-    assert list(films.FILMS) == [Histogram, Phasors, Gates, Rates, Beats, SlowPhasors]
     assert [type(choice_for(argument)) for argument in GIVEN] == list(films.FILMS)
     for name in ("measures", "plugin", "argument", "output", "letter"):
         assert len({getattr(kind, name) for kind in films.FILMS}) == 6, name
@@ -114,29 +110,16 @@ def test_output_and_file(tmp_path, argument, ending, leading, components):
     assert torch.equal(choice.tensor(back), choice.tensor(out)) and torch.equal(back.steady, out.steady)
 
 
-@pytest.mark.parametrize(
-    "given, argument",
-    [
-        (lambda: Gates(list(GIVEN["gates"])), "gates"),
-        (lambda: Gates(gate for gate in GIVEN["gates"]), "gates"),
-        (lambda: Phasors(GIVEN["frequencies"]), "frequencies"),
-    ],
-)
-def test_objects_take_what_their_keywords_take(given, argument):
-    choice = given()
-    assert choice == choice_for(argument) and hash(choice) == hash(choice_for(argument))
-
-
 def test_settings_in_a_scene():
-    assert Gates.from_properties({}) is None and Phasors.from_properties({"frequencies": "1"}) is None
-    assert Gates.from_properties({"gates": "rectangular 3 4"}) == Gates(GIVEN["gates"][0])
+    assert films.Gates.from_properties({}) is None and films.Phasors.from_properties({"frequencies": "1"}) is None
+    assert films.Gates.from_properties({"gates": "rectangular 3 4"}) == films.Gates(GIVEN["gates"][0])
     with pytest.raises(SceneError, match=r"gated_hdr_film: .*kind out of"):
-        Gates.from_properties({"gates": "round 1 2"})
-    assert Histogram.from_properties({}) == Histogram(tt.TimeAxis(0.0, 0.003, 2048))
-    found = Histogram.from_properties({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7})
-    assert found == Histogram(tt.TimeAxis(2.0, 0.5, 7))
+        films.Gates.from_properties({"gates": "round 1 2"})
+    assert films.Histogram.from_properties({}) == films.Histogram(tt.TimeAxis(0.0, 0.003, 2048))
+    found = films.Histogram.from_properties({"start_opl": 2, "bin_width_opl": 0.5, "temporal_bins": 7})
+    assert found == films.Histogram(tt.TimeAxis(2.0, 0.5, 7))
     with pytest.raises(SceneError, match=r"rate_hdr_film: .*bin_width"):
-        Rates.from_properties({"rate_start": -1.0, "rate_width": 0.0, "rate_bins": 4})
+        films.Rates.from_properties({"rate_start": -1.0, "rate_width": 0.0, "rate_bins": 4})
 
 
 def test_rows_without_an_axis_have_that_of_the_scenes_film():
@@ -148,36 +131,3 @@ def test_rows_without_an_axis_have_that_of_the_scenes_film():
         out = renderer()
         assert films.layout_of_output(out) == choice_for(argument)
         assert tuple(choice_for(argument).tensor(out).shape) == (3, *choice_for(argument).shape, 4, 4)
-
-
-@pytest.mark.parametrize("leading", [(), (7,), (7, 1)])
-@pytest.mark.parametrize("components", [1, 4])
-def test_layouts_of_torch(leading, components):
-    """Channels first, behind batch and sensors; of pairs the laser's rows and columns before the sensor's."""
-    generator = np.random.default_rng(3)
-    items, shape = leading[:1], {"h": 2, "w": 3, "l": 5, "m": 6, "t": 4, "s": components, "c": 11}
-
-    def drawn(letters):
-        return generator.normal(size=(*items, *(shape[letter] for letter in letters)))
-
-    def expected(values, letters, order):
-        axes = [letters.index(letter) - len(letters) for letter in order]
-        moved = np.moveaxis(values, axes, range(-len(order), 0))
-        moved = moved.reshape(*leading, *moved.shape[len(items) :])
-        return moved if components > 1 else moved.squeeze(-len(order))
-
-    def joined(values):
-        return torch.from_numpy(values.reshape(*values.shape[:-2], -1))
-
-    steady, cube, pairs = drawn("hwsc"), drawn("hwtsc"), drawn("hwlmtsc")
-    layouts = (
-        (film_layout.steady_channels_first, steady, "hwsc", "schw"),
-        (film_layout.cube_channels_first, cube, "hwtsc", "scthw"),
-        (film_layout.cube_channels_first, pairs, "hwlmtsc", "sctlmhw"),
-    )
-    for function, values, letters, order in layouts:
-        found = function(joined(values), leading, components).numpy()
-        np.testing.assert_array_equal(found, expected(values, letters, order))
-    waves = cube[..., None] * np.array([2.0, -3.0])
-    found = film_layout.phasor_channels_first(torch.from_numpy(waves.reshape(*items, 2, 3, 4, -1)), leading, components)
-    np.testing.assert_allclose(found.numpy(), expected(cube * (2 - 3j), "hwtsc", "scthw"), rtol=1e-12)
