@@ -115,7 +115,11 @@ class Capture(TensorRecord):
 
     @classmethod
     def merged_notes(cls, records: Sequence[Capture]) -> dict[str, Any]:
-        """Return the metadata of a batch."""
+        """Return the metadata of a batch.
+
+        Args:
+            records: captures of the batch.
+        """
         return {"metadata": {"batch": [dict(record.metadata) for record in records]}}
 
     def _shown_notes(self) -> dict[str, str]:

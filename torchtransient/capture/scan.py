@@ -306,7 +306,14 @@ class Scan:
     # ------------------------------------------------------------------------------------------------- other scans
 
     def to(self, device: Any) -> Self:
-        """Return the scan with its tensors on a device; they stay float64."""
+        """Return the scan with its tensors on a device; they stay float64.
+
+        Args:
+            device: as of `torch.Tensor.to`.
+
+        Raises:
+            ShapeError: for a dtype.
+        """
         if isinstance(device, torch.dtype):
             raise ShapeError(f"Scan.to: expected a device, got {device}; points are float64 throughout.")
         names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")

@@ -236,12 +236,20 @@ class Wall:
     def grid(
         self, size: int | Sequence[int], extent: Numbers | None = None, *, cell_centers: bool = True
     ) -> tuple[Array, Array]:
-        """Points and normals (ny, nx, 3) of a regular grid; `size` is (nx, ny) or one number for both.
+        """Return points and normals of a regular grid; rows run along v, columns along u.
 
-        Rows run along v, columns along u. `extent` (u0, v0, u1, v1) is the part of the wall that is scanned, None for
-        all of it. `cell_centers`: points are the middles of nx x ny cells; else they begin and end on the edges of the
-        extent (a single one stands in the middle). Raises ShapeError for sizes below 1, SceneError for an extent
-        without an area or outside of the wall, and as :meth:`at`.
+        Args:
+            size: (nx, ny), or one number for both.
+            extent: part of the wall that is scanned, (u0, v0, u1, v1), None for all of it.
+            cell_centers: points are the middles of nx x ny cells; else they begin and end on the edges of the extent (a
+                single one stands in the middle).
+
+        Returns:
+            Points and unit normals, (ny, nx, 3) each, metres.
+
+        Raises:
+            ShapeError: for sizes below 1.
+            SceneError: for an extent without an area or outside of the wall, and as :meth:`at`.
         """
         nx, ny = grid_size(size, "Wall.grid")
         flag("cell_centers", cell_centers)
@@ -250,8 +258,17 @@ class Wall:
         return self.at(u[None, :], v[:, None])
 
     def normals_at(self, points: Array, what: str) -> Array:
-        """Unit normals (N, 3) at points (N, 3) of the wall, up to `ON_WALL` of its diagonal. `what` the points are, for
-        messages. Raises SceneError when some are not on it.
+        """Return the unit normals at points of the wall.
+
+        Args:
+            points: (N, 3), metres, on the wall up to `ON_WALL` of its diagonal.
+            what: name of the points, for messages.
+
+        Returns:
+            (N, 3).
+
+        Raises:
+            SceneError: for points beside it.
         """
         relative = points - self.center
         basis = np.stack([self.half_u, self.half_v, self.normal], axis=1)

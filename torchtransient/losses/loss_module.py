@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
 from torch import Tensor, nn
+
+
+def _described(function: Callable[..., Tensor], names: Collection[str]) -> str:
+    """Return the lines about some arguments in the docstring of a function."""
+    described = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
+    entries = re.findall(r"^    \w.*(?:\n     .*)*", described, flags=re.MULTILINE)
+    return "\n".join(entry for entry in entries if set(re.split(r", ", entry.strip().partition(":")[0])) & set(names))
 
 
 class LossModule(nn.Module):
@@ -51,6 +59,8 @@ class LossModule(nn.Module):
         initialize.__signature__ = inspect.Signature([own, *places, *named])  # type: ignore[attr-defined]
         initialize.__name__, initialize.__qualname__ = "__init__", f"{cls.__qualname__}.__init__"
         cls.__init__ = initialize  # type: ignore[method-assign,assignment]
+        described = _described(function, cls._signature.parameters)
+        cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nArgs:\n{described}"
 
     def loss(self, *tensors: Any, mask: Tensor | None) -> Tensor:
         """Return the function of tensors with the options held.

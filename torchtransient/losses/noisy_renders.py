@@ -77,9 +77,16 @@ class SampleSchedule:
         schedule = SampleSchedule(64, 512, steps)
         out = renderer(values, spp=schedule(step), seed=step)
 
-    `first` up to the share `hold` of `steps`, then doubled in equal parts of the rest, and `last` from the end on; (64,
-    100, 10) ends at 100. Doubling, since every other number of samples is compiled and recorded anew. Raises UnitError
-    for `last` below `first` and a `hold` outside of [0, 1].
+    Doubled in equal parts, since every other number of samples is compiled and recorded anew.
+
+    Args:
+        first: samples up to the share `hold` of the steps.
+        last: samples from the end on; (64, 100, 10) ends at 100.
+        steps: number of steps.
+        hold: share of the steps with `first`, in [0, 1].
+
+    Raises:
+        UnitError: for `last` below `first` and a `hold` out of range.
     """
 
     first: int

@@ -128,7 +128,14 @@ class Bounded(Settings):
 
     @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return `bounded_inverse` of a value. Raises UnitError."""
+        """Return `bounded_inverse` of a value.
+
+        Args:
+            value: of any shape, inside of the range.
+
+        Raises:
+            UnitError: for values outside of it.
+        """
         return _inverse(value, self.low, self.high, self.margin, type(self).__name__)
 
     def extra_repr(self) -> str:
@@ -136,14 +143,23 @@ class Bounded(Settings):
 
 
 class Albedo(Bounded):
-    """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes."""
+    """Shares of the light, 0 to 1: reflectances, transmittances, albedos of media, opacities, weights of lobes.
+
+    Args:
+        low, high: ends of the range.
+        margin: as of `Bounded`.
+    """
 
 
 class Roughness(Bounded):
     """`alpha` of microfacets, 0.001 to 1. Not for `principled`: `PrincipledRoughness`.
 
     `diff_rough_dielectric` and others render smaller ones as 0.001, the rest as 0.0001 (`low=1e-4`), where the slope is
-    zero. Arguments as of `Bounded`.
+    zero.
+
+    Args:
+        low, high: ends of the range.
+        margin: as of `Bounded`.
     """
 
     def __init__(self, low: Any = 1e-3, high: Any = 1.0, margin: float | None = None) -> None:
@@ -155,7 +171,10 @@ class PrincipledRoughness(Bounded):
 
     Mitsuba renders with its square, and squares below 0.001 as 0.001, where the slope is zero. With `anisotropic` of
     `a`, one of the two axes gets there at the fourth root of 1e-6 / (1 - 0.9 a), 0.0563 at most: give that as `low`.
-    Arguments as of `Bounded`.
+
+    Args:
+        low, high: ends of the range.
+        margin: as of `Bounded`.
     """
 
     def __init__(self, low: Any = LEAST_PRINCIPLED, high: Any = 1.0, margin: float | None = None) -> None:
@@ -166,7 +185,11 @@ class IndexOfRefraction(Bounded):
     """`eta` of dielectrics, inside over outside, 1 to 4: gases to germanium.
 
     Below 1 the inside is the thinner one: give another `low`, greater than 0. Not for metals, whose `eta` and `k` are
-    `Positive`. Arguments as of `Bounded`.
+    `Positive`.
+
+    Args:
+        low, high: ends of the range.
+        margin: as of `Bounded`.
     """
 
     def __init__(self, low: Any = 1.0, high: Any = 4.0, margin: float | None = None) -> None:
@@ -177,7 +200,9 @@ class Anisotropy(Bounded):
     """`g` of the phase functions `hg`, the mean cosine of scattering, -0.99 to 0.99: Mitsuba takes -1 to 1 without the
     ends.
 
-    Arguments as of `Bounded`.
+    Args:
+        low, high: ends of the range.
+        margin: as of `Bounded`.
     """
 
     def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:

@@ -203,16 +203,21 @@ class _RigidPose(Settings):
 class AxisAnglePose(_RigidPose):
     """Six numbers to `to_world` (..., 4, 4): `base`, turned about a point by an axis-angle vector, then moved.
 
-    `base`: (4, 4) or (..., 4, 4), what the numbers 0 stand for; its scale and shear are kept, so of a shape the present
-    `to_world`. None: the identity, for poses that are rigid themselves. `about`: the point that stays when it turns:
-    "self" (where `base` puts the origin), "world" (the world's origin), or a point [x, y, z] of the world. `frame`:
-    "world" turns and moves along the world's axes (`motion @ base`), "local" along those of the thing before its
-    `base` (`base @ motion`, in its units of length). `length_scale`: metres (with
-    "local", units of `base`) for 1 in the last three numbers, so that one learning rate fits turns and moves.
-
     Turns by more than pi are taken, and come back as smaller ones. All but `about` itself is part of `state_dict` (the
     point in its place), in float64, also when the module is made half: a state that is loaded brings its own base.
-    Raises SceneError (also of a state of the other kind of pose), ShapeError, UnitError.
+
+    Args:
+        base: pose of the numbers 0, (4, 4) or (..., 4, 4); its scale and shear are kept, so of a shape the present
+            `to_world`. None: the identity, for poses that are rigid themselves.
+        about: point that stays as it turns: "self" (where `base` puts the origin), "world" (the world's origin), or a
+            point [x, y, z] of the world.
+        frame: "world" turns and moves along the world's axes (`motion @ base`), "local" along those of the thing before
+            its `base` (`base @ motion`, in its units of length).
+        length_scale: metres (with "local", units of `base`) for 1 in the last three numbers, so that one learning rate
+            fits turns and moves.
+
+    Raises:
+        SceneError, ShapeError, UnitError: for other poses and points; SceneError also for a state of the other kind.
     """
 
     _kind = "AxisAnglePose"
@@ -223,6 +228,9 @@ class AxisAnglePose(_RigidPose):
 class SE3Pose(_RigidPose):
     """As `AxisAnglePose`, by the exponential of SE(3): turn and move at once along a screw. To first order the same;
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.
+
+    Args:
+        base, about, frame, length_scale: as of `AxisAnglePose`.
     """
 
     _kind = "SE3Pose"

@@ -100,7 +100,14 @@ class Positive(Settings):
 
     @without_autocast
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return `positive_inverse` of a value. Raises UnitError."""
+        """Return `positive_inverse` of a value.
+
+        Args:
+            value: of any shape, positive.
+
+        Raises:
+            UnitError: for values out of range.
+        """
         value = floating(value, "Positive")
         return _inverse(value, self.low.to(value), self.scale.to(value), self.function, "Positive")
 

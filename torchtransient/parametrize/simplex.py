@@ -85,7 +85,14 @@ class Simplex(Settings):
 
     @without_autocast
     def right_inverse(self, weights: Tensor) -> Tensor:
-        """Return `simplex_inverse` of weights. Raises UnitError."""
+        """Return `simplex_inverse` of weights.
+
+        Args:
+            weights: shares that sum to one along the dimension of the module.
+
+        Raises:
+            UnitError: for anything else.
+        """
         return _inverse(weights, self.dim, self.margin, "Simplex")
 
     def get_extra_state(self) -> Tensor:

@@ -95,11 +95,25 @@ class LinearOperator(nn.Module, ABC):
 
     @abstractmethod
     def map_(self, x: Tensor) -> Tensor:
-        """Return ``A x``, (..., *data_shape) of (..., *volume_shape)."""
+        """Return ``A x``.
+
+        Args:
+            x: (..., *volume_shape).
+
+        Returns:
+            (..., *data_shape).
+        """
 
     @abstractmethod
     def adjoint_(self, y: Tensor) -> Tensor:
-        """Return ``A^H y``, (..., *volume_shape) of (..., *data_shape)."""
+        """Return ``A^H y``.
+
+        Args:
+            y: (..., *data_shape).
+
+        Returns:
+            (..., *volume_shape).
+        """
 
     def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
         if x.numel():

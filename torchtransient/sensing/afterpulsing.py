@@ -572,14 +572,28 @@ class Afterpulsing(AddedCounts):
         return self.period_bins or x.shape[TIME]
 
     def kernel(self, period_bins: int) -> Tensor:
-        """Afterpulses of one detection k bins after it, folded into one period: (period_bins,) float64."""
+        """Return the afterpulses of one detection k bins after it, folded into one period.
+
+        Args:
+            period_bins: bins of a period.
+
+        Returns:
+            (period_bins,) float64.
+        """
         if self.delays is not None:
             return self.seen() * self.delays.kernel(self.dead_time_s, self.bin_width_s, period_bins)
         tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s
         return self.seen() @ exponential_kernel(tau, dead, period_bins)
 
     def first_kernel(self, bins: int) -> Tensor:
-        """Afterpulses that come less than `bins` bins later, without later rounds: (bins,) float64."""
+        """Return the afterpulses of one detection that come less than `bins` bins later, without later rounds.
+
+        Args:
+            bins: number of bins.
+
+        Returns:
+            (bins,) float64.
+        """
         if self.delays is not None:
             return self.seen() * self.delays.shares(self.dead_time_s, self.bin_width_s, first=0, number=bins)
         tau, dead = self.tau_s.reshape(-1) / self.bin_width_s, self.dead_time_s / self.bin_width_s

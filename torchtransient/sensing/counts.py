@@ -307,7 +307,12 @@ class Moves:
         return (tallies.double() * shares.view(-1, *[1] * (tallies.ndim - 1))).sum(0)
 
     def of_lag(self, index: int, like: Tensor) -> Tensor:
-        """Return the share of one lag for entries (..., T, H, W)."""
+        """Return the share of one lag.
+
+        Args:
+            index: number of the lag.
+            like: light (..., T, H, W) whose dtype and device are taken.
+        """
         share = self.shares[index].to(like)
         return share.view(-1, 1, 1) if share.ndim else share
 

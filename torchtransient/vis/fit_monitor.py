@@ -351,6 +351,9 @@ class FitMonitor:
 
         The page is one file that needs no network. Losses that are not finite are named with their first step. Raises
         StorageError when it cannot be written.
+
+        Args:
+            path: file to write.
         """
         ending = path_of(path, "FitMonitor.save: path").suffix.lower()
         if ending not in (".html", ".htm"):

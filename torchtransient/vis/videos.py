@@ -47,7 +47,12 @@ class FrameSettings(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames (H, W, 3) uint8 that are made when they are asked for; `len`, iteration (any number of times), indices."""
+    """Frames (H, W, 3) uint8 that are made when they are asked for; `len`, iteration (any number of times), indices.
+
+    Args:
+        count: number of frames.
+        make: function of the number of a frame.
+    """
 
     count: int
     make: Callable[[int], Image]

@@ -53,10 +53,15 @@ class Speckle(_Averaged):
 
     The field of a bin is circular Gaussian with the expected power as variance; its square, averaged over ``looks``
     independent fields (chirps of a rough surface that moves on, polarizations, pixels), has the contrast
-    ``1 / sqrt(looks)``. ``looks``: 1 and more, also an effective number that is not whole.
+    ``1 / sqrt(looks)``. The draw is linear in the input: every policy but ``expected`` gives its ordinary gradient,
+    which is unbiased for any loss.
 
-    The draw is linear in the input: every policy but ``expected`` gives its ordinary gradient, which is unbiased for
-    any loss. Raises UnitError for fewer looks, and for negative power and NaN in a draw.
+    Args:
+        looks: averaged fields, 1 and more, also an effective number that is not whole.
+        grad: policy of gradients.
+
+    Raises:
+        UnitError: for fewer looks, and for negative power and NaN in a draw.
     """
 
     gives = "the same"
@@ -71,12 +76,27 @@ class Speckle(_Averaged):
         return check_transient(x, "Speckle").square() / self.looks
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A draw, differentiable in `x`: no normal surrogate."""
+        """Draw, differentiable in `x`; these draws need no normal surrogate.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: of the random numbers.
+
+        Returns:
+            The shape of the expectation.
+        """
         _check_power(check_transient(x, "Speckle"), "Speckle")
         return x * (_gamma(self.looks, x, generator) / self.looks)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Logarithm of the density of spectra whose expectation is `x`, time summed: (..., C, H, W).
+        """Return the logarithm of the density of spectra whose expectation is `x`, summed over time.
+
+        Args:
+            measurement: drawn spectra (..., C, T, H, W).
+            x: expectation, of the same shape.
+
+        Returns:
+            (..., C, H, W).
 
         Behind a `BeatNoise` of as many looks, speckled light has this density with the expectation of the `BeatNoise`:
         ``speckle.log_prob(measured, noise.expected(beats))``. Bins without light, which have no density, are left out.
@@ -103,8 +123,15 @@ class BeatNoise(_Averaged):
     phase and intensity, of amplifiers, and a weak local oscillator.
 
     Every policy but ``expected`` gives the gradient of the draw, unbiased for any loss; below 1e-4 photons the field
-    grows like the power, so that the slope is finite at zero. Raises UnitError for numbers out of range, and for
-    negative power and NaN in a draw.
+    grows like the power, so that the slope is finite at zero.
+
+    Args:
+        photons_per_unit: detected photons in a bin of light 1.
+        looks: averaged spectra, 1 and more.
+        grad: policy of gradients.
+
+    Raises:
+        UnitError: for numbers out of range, and for negative power and NaN in a draw.
     """
 
     gives = "counts"
@@ -120,7 +147,15 @@ class BeatNoise(_Averaged):
         return (1 + 2 * self._photons(x)) / self.looks
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A draw, differentiable in `x`: no normal surrogate."""
+        """Draw, differentiable in `x`; these draws need no normal surrogate.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: of the random numbers.
+
+        Returns:
+            The shape of the expectation.
+        """
         n = self._photons(x)
         _check_power(n, "BeatNoise")
         field = _root(n)
@@ -131,7 +166,14 @@ class BeatNoise(_Averaged):
         return n + (2 / math.sqrt(self.looks)) * field * noise + (noise.square() + rest) / self.looks
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        """Logarithm of the density of spectra of the power `x`, which has no speckle, time summed: (..., C, H, W).
+        """Return the logarithm of the density of spectra of a power without speckle, summed over time.
+
+        Args:
+            measurement: drawn spectra (..., C, T, H, W), photons.
+            x: power, of the same shape.
+
+        Returns:
+            (..., C, H, W).
 
         That of a noncentral chi-squared distribution, right to 1e-7, differentiable in `x` and the measurement. Behind
         a `Speckle` spectra have another one, :meth:`Speckle.log_prob` of the expectation.
@@ -203,7 +245,11 @@ class CoherentReceiver(RandomSensor):
         return _over_bins(self.transform.square(), self._photons(x)) + 1
 
     def variance(self, x: Tensor) -> Tensor:
-        """Variance of every bin; those of neighbours are not independent."""
+        """Return the variance of every bin; neighbours depend on each other.
+
+        Args:
+            x: light (..., C, T, H, W).
+        """
         return self.expected(x).square() / self.looks
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -214,7 +260,15 @@ class CoherentReceiver(RandomSensor):
             return self.gaussian(x, generator)
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """A draw, differentiable in `x`: no normal surrogate."""
+        """Draw, differentiable in `x`; these draws need no normal surrogate.
+
+        Args:
+            x: light (..., C, T, H, W).
+            generator: of the random numbers.
+
+        Returns:
+            The shape of the expectation.
+        """
         n = self._photons(x)
         _check_power(n, "CoherentReceiver")
         amplitude = _root(n)
