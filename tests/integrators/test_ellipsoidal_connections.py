@@ -181,7 +181,7 @@ def runs(one, count, seed=0):
 @pytest.mark.parametrize("name", long(SCENES, ("gates", "lamps", "fog")))
 def test_it_is_the_light_of_ordinary_connections(name):
     scene = SCENES[name]()
-    plain, ellipsoidal = runs(renderer(scene, "ordinary", spp=256), 24), runs(renderer(scene), 24, 5000)
+    plain, ellipsoidal = runs(renderer(scene, "ordinary", spp=256), 24), runs(renderer(scene, spp=128), 24, 5000)
     result = two_sample_z_test(plain, ellipsoidal, rounding=1e-6)
     assert result.passed, str(result)
     assert result.chi2_z < 4.5, str(result)

@@ -226,7 +226,7 @@ def test_interval_of_the_share_of_samples(cut, samples):
 
 @pytest.mark.slow
 def test_all_data_sets_have_the_same_samples(tmp_path):
-    recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 45), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
+    recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 40), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
     with pytest.warns(PhysicsWarning, match="of 64 samples"):
         done = D.generate(recipe, tmp_path / "set", 8, workers=1, progress=False)
     with pytest.warns(PhysicsWarning, match="of 64 samples"):

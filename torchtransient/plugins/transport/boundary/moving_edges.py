@@ -400,7 +400,7 @@ def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> tuple[list[Any], 
         for sensor in sensors:
             random = mi.PCG32(size=_PROBES * _PROBES)
             uniform = lambda random=random: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
-            ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, uniform(), uniform())
+            ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, uniform(), uniform())
             si = scene.ray_intersect(ray)
             wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
             for shape, maps in mapped:
