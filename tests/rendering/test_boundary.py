@@ -301,3 +301,12 @@ def test_bodies_that_run_into_each_other(parts, names):
         assert names in words
     for moved in (BODY, "light.position"):
         assert crossing(moved, **parts) == []
+
+
+def test_meters_beside_smooth_meshes_have_a_table():
+    """An irradiance meter draws rays with differentials alone."""
+    meter = {"type": "irradiancemeter", "film": {"type": "transient_hdr_film", "width": 1, "height": 1}}
+    ball = {"type": "sphere", "radius": 0.2, "to_world": tt.scenes.translate([0, 0, 1])}
+    nodes = {"type": "scene", "floor": {"type": "rectangle", "meter": meter}, "ball": ball, "cube": {"type": "cube"}}
+    table = tt.load(nodes, variant="llvm_ad_mono").parameters()
+    assert table["ball.to_world"].differentiable and table["cube.vertex_positions"].differentiable
