@@ -35,7 +35,7 @@ def settings(bare: bool) -> list[Setting]:
 
 
 def response(out):
-    return next(t for t in (out.transient, out.phasor, out.gated) if t is not None)
+    return next(t for t in (out.transient, out.phasor, out.gated, out.rates) if t is not None)
 
 
 def compared(scene, key):
