@@ -80,7 +80,7 @@ def test_motion(folder):
     assert found["out"].phasor.shape == (3, 1, 6, 6) and found["velocity"].grad.norm() > 0
     assert found["taps"].shape == (3, 4, 6, 6) and found["rows"].phasor.shape == (3, 1, 6, 6)
     # A beat drops out of what stands still: the box is a thousandth of the picture.
-    assert found["out"].phasor.abs().sum() < 0.01 * found["rows"].phasor.abs().sum()
+    assert found["out"].phasor.abs().max() < 0.01 * found["rows"].phasor.abs().max()
     assert found["light"].shape == (3, 33, 64, 6, 6) and found["lidar"].beats.shape[:2] == (3, 2)
     assert all(bool((value.grad != 0).any()) for value in found["doppler"].values.values())
     assert found["range_m"].shape == found["approach_m_s"].shape == (3, 6, 6)
