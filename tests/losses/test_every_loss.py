@@ -92,6 +92,11 @@ def test_modules_hold_the_options_of_functions(case):
         case.module(redution="sum")
 
 
+def test_tensors_move_with_their_module():
+    module = losses.PoissonNLL(floor=torch.tensor(0.5)).to("meta")
+    assert module.floor.device.type == "meta" and module.double().floor.dtype == torch.float64
+
+
 class Halved(losses.PoissonNLL):
     """A subclass of a user, with a constructor and a forward of its own."""
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
 
-import torchtransient as tt  # isort: skip
-
+import torchtransient as tt
+from support.film_storage import storage
 from support.marks import long_pairs
 from support.rates import plate, scene
 from torchtransient.pulses import Pulse, cumulative_of_sum
@@ -109,3 +113,18 @@ def test_batches_of_a_crop():
         torch.testing.assert_close(batch.beats.sum(-3), whole, rtol=2e-3, atol=0)
         for albedo, beats in zip(albedos, batch.beats, strict=True):
             torch.testing.assert_close(beats, renderer({key: albedo}, seed=3).beats, rtol=1e-4, atol=1e-7)
+
+
+def test_lengths_that_are_no_numbers_are_nowhere():
+    """An arrival that overflows adds to no node, before the window, in it or behind it."""
+    mi.set_variant("llvm_ad_rgb")
+    film = mi.load_dict({
+        "type": "beat_hdr_film", "width": 1, "height": 1, "temporal_bins": 64, "start_opl": 0.0, "bin_width_opl": 0.3,
+        "chirp_bandwidth": 1e9, "chirp_duration": 1e-6, "chirp_wavelength": 1550e-9,
+    })  # fmt: skip
+    assert film.splined
+    nodes = storage(film, math.prod(film.storage_shape()))
+    opl = mi.Float64([math.nan, math.inf, 1e300, -1e300])
+    film.put(0, mi.UInt32(0), opl, [mi.Float(1)] * 3, mi.Bool(True), rate=mi.Float(0))
+    dr.eval(nodes)
+    assert not np.array(nodes).any()

@@ -184,10 +184,10 @@ def mapped(normals, tilt):
     return {"type": "rectangle", "to_world": pose(0, 0, 0.8) @ tilt @ np.diag([0.45, 0.35, 1, 1]), "bsdf": bsdf}
 
 
-def shaded(*normal):
-    """A triangle that faces the camera, with one normal at all of its vertices."""
+def shaded(normal, other=None):
+    """A triangle that faces the camera, with one normal at its vertices; another one at its right, if it is given."""
     return {"type": "mesh_arrays", "vertices": np.array([[0, 0, 0.8], [0.4, 0, 0.8], [0, 0.4, 0.8]]),
-            "faces": np.array([[0, 1, 2]]), "normals": np.array([normal] * 3, float)}  # fmt: skip
+            "faces": np.array([[0, 1, 2]]), "normals": np.array([normal, other or normal, normal], float)}  # fmt: skip
 
 
 SPOT = {"type": "spot", "to_world": CAMERA, "cutoff_angle": 20}
@@ -219,7 +219,7 @@ def box(z, tilt=UPRIGHT):
     ({"body": mapped(STEEP, TILT)}, BODY, "normals away from the camera"),
     ({"body": mapped(STEEP, TILT)}, "body.bsdf.normalmap.data", "normals away from the camera"),
     ({"body": mapped(STEEP, TILT)}, "sensor.to_world", "normals away from the camera"),
-    ({"body": shaded(0.9, 0, -0.1)}, "body.vertex_normals", "rim of 'body'"),
+    ({"body": shaded((0.9, 0, 0.5), (0.9, 0, -0.9))}, "body.vertex_normals", "rim of 'body'"),
     ({"box": box(0.1)}, "box.vertex_positions", "where 'box' and 'wall' run into each other"),
 ])  # fmt: skip
 def test_edges_that_are_not_followed(more, key, words):
@@ -247,7 +247,9 @@ def test_what_is_called_correct(tmp_path):
     for body in (mapped(STEEP, np.eye(4)), mapped(0.3 * STEEP + np.float32([0.35, 0.35, 0.7]), TILT)):
         table = plate(body=body).parameters()
         assert table[BODY].edges_missing == table["body.bsdf.normalmap.data"].edges_missing == ()
-    assert plate(body=shaded(0.6, 0, 0.8)).parameters()["body.vertex_normals"].edges_missing == ()
+    assert plate(body=shaded((0.6, 0, 0.8))).parameters()["body.vertex_normals"].edges_missing == ()
+    turned = shaded((0.6, 0, 0.8)) | {"faces": np.array([[0, 2, 1]])}  # faces that turn another side out
+    assert plate(body=turned).parameters()["body.vertex_normals"].edges_missing == ()
     off = plate(integrator={"type": "transient_path", "max_depth": 3, "boundary": False}).parameters()
     assert off[BODY].biased and "boundary" in off[BODY].reason and off[PAINT].reason == "correct"
     (tmp_path / "curve.txt").write_text("\n".join(f"{x} 0 1 0.1" for x in range(3)), encoding="utf-8")

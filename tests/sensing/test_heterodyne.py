@@ -56,3 +56,14 @@ def test_wrong_requests():
         heterodyne_speed(beat, plain, (60e6, 50e6, 40e6), duration_s=EXPOSURE_S)
     with pytest.raises(UnitError, match="duration_s"):
         heterodyne_speed(beat, plain, HERTZ, duration_s=0.0)
+
+
+def test_dark_pixels_leave_gradients_alone():
+    beat, plain = (x.to(torch.complex64) for x in exposures(3.0, 1))
+    shared = torch.tensor(1.0, requires_grad=True)
+    lit = torch.tensor([1.0, 0.0, 1e-20]).reshape(3, *[1] * beat.ndim)
+    found = heterodyne_speed(shared * lit * beat, lit * plain, HERTZ, duration_s=EXPOSURE_S)
+    torch.testing.assert_close(found[2], found[0], rtol=1e-4, atol=0)
+    assert found[1].isnan().all()
+    found[found.isfinite()].sum().backward()
+    assert shared.grad.isfinite() and shared.grad != 0

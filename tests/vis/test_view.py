@@ -226,3 +226,13 @@ def test_colours_are_told_apart(blindness):
         some = seen[:: 256 // 8]
         steps = np.linalg.norm(some[:, None] - some[None], axis=-1)[~np.eye(len(some), dtype=bool)]
         assert steps.min() > TOLD_APART, name
+
+
+def test_two_results_of_which_one_has_errors():
+    """In either order: the page has no bands, and says so."""
+    scene = tt.load(tt.scenes.cornell_box(resolution=4, num_bins=20, bin_width_opl=0.45), variant="llvm_ad_mono")
+    with_errors, plain = (tt.render(scene, spp=4, seed=n, errors=n == 0) for n in range(2))
+    for pair in ((with_errors, plain), (plain, with_errors)):
+        notes = " ".join(tt.vis.view(pair).notes)
+        assert "No bands of errors" in notes and "two standard errors" not in notes
+    assert "two standard errors" in " ".join(tt.vis.view((with_errors, with_errors)).notes)

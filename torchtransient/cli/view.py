@@ -13,7 +13,9 @@ _PAGE_BYTES = 600_000_000
 
 @click.command()
 @click.argument("results", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="The page.  [default: RESULT.html]")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="The page.  [default: RESULT.html, A-B.html of two]"
+)
 @click.option("--megabytes", type=click.FloatRange(min=2), default=20.0, show_default=True, help="Size of the page.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of the server for large files.  [default: any]")
 @click.option("--server", "served", is_flag=True, help="Read an HDF5 result as it is looked at, whatever its size.")
@@ -47,7 +49,8 @@ def command(
     from torchtransient.vis.pages.page import view  # which takes longer to import than a server to start
 
     started = time.monotonic()
-    target = results[0].with_suffix(".html") if output is None else output
+    named = results[0].with_name("-".join(result.stem for result in results) + ".html")
+    target = named if output is None else output
     title = " | ".join(result.name for result in results)
     page = view(results[0] if len(results) == 1 else results, target, title=title, max_megabytes=megabytes)
     click.echo(f"{target}: {len(page.html) / 1e6:.1f} MB in {time.monotonic() - started:.1f} s")

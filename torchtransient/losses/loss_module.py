@@ -14,7 +14,7 @@ def _described(function: Callable[..., Tensor], names: Collection[str]) -> str:
     """Return the lines about some arguments in the docstring of a function."""
     described = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
     entries = re.findall(r"^    \w.*(?:\n     .*)*", described, flags=re.MULTILINE)
-    return "\n".join(entry for entry in entries if set(re.split(r", ", entry.strip().partition(":")[0])) & set(names))
+    return "\n".join(entry for entry in entries if set(entry.strip().partition(":")[0].split(", ")) & set(names))
 
 
 class LossModule(nn.Module):
@@ -24,9 +24,9 @@ class LossModule(nn.Module):
             \"\"\"`root_loss` with its options held.\"\"\"
 
     The constructor takes the options of `function`, those named in `by_place` by position too: the few that its users
-    set first, in the order of the function, `reduction` last if it is one of them. They become attributes, and
-    submodules where they are modules. The function checks them when the module is called. A function of other tensors
-    than (input, target) has a `forward` with those.
+    set first, in the order of the function, `reduction` last if it is one of them. They become attributes; tensors
+    move with the module and are no part of its state, modules are submodules. The function checks them when the module
+    is called. A function of other tensors than (input, target) has a `forward` with those.
     """
 
     function: ClassVar[Callable[..., Tensor]]
@@ -53,7 +53,10 @@ class LossModule(nn.Module):
                 raise TypeError(f"{cls.__name__}.__init__(): {error}") from None
             bound.apply_defaults()
             for name, value in bound.arguments.items():
-                setattr(self, name, value)
+                if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):
+                    self.register_buffer(name, value, persistent=False)
+                else:
+                    setattr(self, name, value)
 
         own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
         initialize.__signature__ = inspect.Signature([own, *places, *named])  # type: ignore[attr-defined]

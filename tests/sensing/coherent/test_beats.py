@@ -102,11 +102,11 @@ def test_density_of_speckle():
     torch.testing.assert_close(sensor.log_prob(torch.cat([y, torch.zeros_like(y)], -3), dark), torch.from_numpy(wanted))
 
 
-@pytest.mark.parametrize("looks", [1, 2.5, 12, 60])
+@pytest.mark.parametrize("looks", [1, 2.5, 12, 24, 30, 60])
 def test_density_of_shot_noise(looks):
     """Noncentral chi-squared, from no light to bright lines, with derivatives."""
     sensor = BeatNoise(3.0, looks)
-    x = torch.tensor([0.0, 1e-3, 0.2, 4.0, 900.0], dtype=torch.float64).reshape(1, 5, 1, 1)
+    x = torch.tensor([0.0, 1e-3, 0.2, 4.0, 60.0, 900.0], dtype=torch.float64).reshape(1, 6, 1, 1)
     for factor in (0.3, 1.0, 2.5):
         y = factor * sensor.expected(x)
         wanted = stats.ncx2.logpdf(2 * looks * y.numpy(), 2 * looks, 6 * looks * x.numpy()) + np.log(2 * looks)

@@ -161,12 +161,14 @@ class SplinedHDRFilm(TransientHDRFilm):
         """
         node, d = self.filter.node(opl_from_start)
         # Weights of the first and of the last node are zero.
-        before, after = node < 1, node >= self.node_count() - 1
+        last = self.node_count() - 1
+        before, after = node < 1, node >= last
         packet = 1 if self.lanes() == 1 else PACKET
         stride = self.lanes() // packet
         # The first one wraps around below zero and back again.
         first = dr.fma(mi.UInt32(mi.Int32(node)), stride, base // packet - stride)
-        return before, after, active & ~(before | after), [first, first + stride, first + 2 * stride], d
+        # Lengths that are not numbers are nowhere.
+        return before, after, active & (node >= 1) & (node < last), [first, first + stride, first + 2 * stride], d
 
     def _add(self, cube, index, values, inside):
         copies = dr.backend_v(cube) is dr.JitBackend.LLVM and dr.width(cube) * dr.thread_count() <= MOST_COPIES

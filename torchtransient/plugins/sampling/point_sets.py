@@ -57,7 +57,8 @@ def second_pair(index: Any) -> Any:
 
     A linear map of the bits, triangular, so that of every aligned block of ``2^m`` indices both pairs are nets. Of 16,
     64, 256, 1024 points the four coordinates are a (t, m, 4)-net of t = 1, 2, 2, 3, where Sobol's first four have 2, 2,
-    3, 2; of ``2^12`` to ``2^20`` points t is 4 to 6, of ``2^23`` 7. The best of some million products of shifts: each
+    3, 2; of ``2^12`` to ``2^20`` points t is 4 to 6, of ``2^23`` 7, where Sobol's stays at 3 and its second pair is no
+    net. The best of some million products of shifts: each
     step brings higher bits down, without which many points would fill the same few boxes again and again.
     """
     x = mi.UInt32(index)

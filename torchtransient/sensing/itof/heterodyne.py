@@ -43,7 +43,9 @@ def heterodyne_speed(
     check_broadcast(me, beat=beat, plain=plain)
     values, turns = check_frequencies(frequencies_hz, me), check_count(beats, "beats", me)
     seconds = check_number(duration_s, "duration_s", me, open_low=True)
-    real = (beat * plain.conj()).real / (plain.real.square() + plain.imag.square())
+    dark = plain == 0
+    # Masked before the division, so that dark pixels have no gradient in place of NaN.
+    real = torch.where(dark, torch.nan, (beat / torch.where(dark, 1, plain)).real)
     ratio = -real if turns % 2 else real
     hertz = torch.tensor(values, dtype=ratio.dtype, device=ratio.device)
     if len(values) > 1:

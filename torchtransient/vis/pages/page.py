@@ -184,7 +184,8 @@ def _expected(content: Content, times: int, pixels: int) -> float:
 
 def _joined(parts: list[Planes]) -> Planes:
     """Return bins of several parts in one."""
-    held = [name for name in ("light", "ratios", "phase", "error") if getattr(parts[0], name) is not None]
+    names = ("light", "ratios", "phase", "error")
+    held = [name for name in names if all(getattr(part, name) is not None for part in parts)]
     return Planes(**{name: torch.cat([getattr(part, name) for part in parts], -3) for name in held})
 
 
@@ -212,13 +213,14 @@ def _tables(content: Content) -> dict[str, Table]:
         tables |= dict.fromkeys(("s1", "s2", "s3"), RATIO)
     if planes[0].phase is not None:
         tables["phase"] = PHASE
-    if planes[0].error is not None:
-        tables["error"] = table_of("error", [part.error for part in planes if part.error is not None])
+    errors = [part.error for part in planes if part.error is not None]
+    if len(errors) == len(planes):
+        tables["error"] = table_of("error", errors)
     return tables
 
 
 def _codes_of(planes: Planes, tables: dict[str, Table]) -> dict[str, NDArray[np.uint8]]:
-    return {name: tables[name].encode(plane) for name, plane in planes.named().items()}
+    return {name: tables[name].encode(plane) for name, plane in planes.named().items() if name in tables}
 
 
 def _not_finite_said(content: Content) -> list[str]:
@@ -247,4 +249,6 @@ def _errors_said(content: Content, tables: dict[str, Table]) -> list[str]:
         said.append(f"Phases are within {np.degrees(PHASE.error):.2g} degrees.")
     if "error" in tables:
         said.append("Bands: two standard errors.")
+    elif any(part.error is not None for part in content.planes):
+        said.append("No bands of errors, which only a part of the results has.")
     return said

@@ -16,12 +16,12 @@ from torchtransient.plugins.sensors.origin import sensors_of
 from torchtransient.plugins.sensors.seen_from import clip_planes_at, has_clip_planes
 from torchtransient.plugins.transport.scene_contents import is_open
 
-# Lines across the picture, in each direction, along which clip planes are searched; shapes that are found along each.
-_LINES, _MOST_HITS = 64, 16
+# Lines across the picture, in each direction, along which clip planes are searched; surfaces that are met along each.
+_LINES, _MOST_HITS = 64, 1024
 
 
 def clipped_shapes(scene: Any, sensors: Sequence[Any]) -> list[Any]:
-    """Return the shapes, instances included, through which clip planes go where sensors look.
+    """Return the shapes, instances included, through which clip planes go within the picture, hidden ones too.
 
     Searched along lines of the planes, so that a cut that is shorter than 1 / 64 of the picture may be missed.
 

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.edges.topology import Body
-from torchtransient.plugins.kernel_arrays import host_numbers
+from torchtransient.plugins.kernel_arrays import host_numbers, registry_number
 from torchtransient.plugins.mitsuba_compat import (
     NORMALS,
     TEXCOORDS,
@@ -182,7 +182,6 @@ class MovingEdges:
             return ()
         where = f"where {_listed([_named_pair(*pair) for pair in pairs])} run into each other"
         return (Gap(where, "Keep a gap between them, or join them to one mesh that has an edge there."),)
-
 
     @cached_property
     def _turned_away_shapes(self) -> tuple[list[Any], list[Any]]:
@@ -402,6 +401,7 @@ def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> tuple[list[Any], 
             uniform = lambda random=random: mi.Point2f(random.next_float32(), random.next_float32())  # noqa: E731
             ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, uniform(), uniform())
             si = scene.ray_intersect(ray)
+            dr.eval(si)  # read once for each texture
             wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
             for shape, maps in mapped:
                 hit = si.is_valid() & (si.shape == mi.ShapePtr(shape))
@@ -409,10 +409,12 @@ def _shapes_turned_away(scene: Any, sensors: Sequence[Any]) -> tuple[list[Any], 
                     n = mi.Vector3f(texture.eval_3(si, hit)) * 2 - 1
                     if bool(dr.any(hit & (dr.dot(n, wi) < 0))):
                         found[0][shape.ptr] = shape
-            away = si.is_valid() & (dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d) < 0)
-            for shape in smooth:
-                if bool(dr.any(away & (si.shape == mi.ShapePtr(shape)))):
-                    found[1][shape.ptr] = shape
+            # Of faces that turn another side out than their normals, all hits have the one sign, which is no rim.
+            sign = dr.select(si.is_valid(), dr.dot(si.sh_frame.n, ray.d) * dr.dot(si.n, ray.d), 0)
+            number = dr.reinterpret_array(mi.UInt32, si.shape)
+            away, towards = (np.unique(np.array(dr.select(one, number, 0))) for one in (sign < 0, sign > 0))
+            both = np.intersect1d(away, towards)
+            found[1].update({shape.ptr: shape for shape in smooth if registry_number(shape) in both})
     return list(found[0].values()), list(found[1].values())
 
 
