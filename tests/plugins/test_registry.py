@@ -196,6 +196,33 @@ def test_a_module_loads_a_scene_of_other_plugins_while_it_is_executed(tmp_path):
     ) == ["Mine"]
 
 
+def test_mitsuba_keeps_the_constructors_that_its_threads_call(tmp_path):
+    """A module of the library that is imported while another one is executed hands Mitsuba no second constructor."""
+    (tmp_path / "loads_hair.py").write_text(
+        textwrap.dedent(
+            """
+            import mitsuba as mi
+            first, again = mi.register_bsdf, []
+            mi.register_bsdf = lambda name, constructor: (first(name, constructor), again.append(name))[0]
+            mi.load_dict({"type": "diff_hair"})
+            mi.register_bsdf = first
+            """
+        )
+    )
+    assert run(
+        f"""
+        import sys
+        sys.path.insert(0, {str(tmp_path)!r})
+        from torchtransient import plugins
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        plugins.register_module("loads_hair")
+        print(len(sys.modules["loads_hair"].again))
+        """
+    ) == ["0"]
+
+
+
 def test_a_scene_may_be_freed_before_its_render_is_read():
     """Spheres are met through their addresses: what is rendered must not wait for the scene to be gone."""
     assert run(

@@ -239,11 +239,13 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
     caller = sys._getframe(1).f_globals.get("__name__", "?")
     module = caller if loading is None or caller in _OWN_MODULES else loading
     with _state.tables:
+        if caller in _OWN_MODULES and key in _state.waiting:
+            # Its first use: Mitsuba has a constructor that asks for this one, unless somebody took the name. Handing it
+            # another one would free the first, which a thread of Mitsuba's may be about to call.
+            _state.waiting.discard(key)
+            _state.constructors[key] = _keeping_errors(constructor)
+            return
         if loading is None and caller in _OWN_MODULES:
-            # Its first use: Mitsuba has a constructor that asks for this one, unless somebody took the name.
-            if key in _state.waiting:
-                _state.waiting.discard(key)
-                _state.constructors[key] = _keeping_errors(constructor)
             return
         other = _state.owner.get(key)
         if loading is not None and other is not None and other != module:
