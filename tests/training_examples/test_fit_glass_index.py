@@ -15,7 +15,7 @@ SCRIPT = Path(__file__).parents[2] / "training_examples" / "fit_glass_index.py"
 @pytest.mark.slow
 def test_runs_and_moves_towards_the_truth(tmp_path):
     picture = tmp_path / "curves.png"
-    options = {"--steps": 6, "--spp": 1024, "--resolution": 4, "--repetitions": 6, "--output": picture}
+    options = {"--steps": 6, "--spp": 16384, "--resolution": 4, "--repetitions": 6, "--output": picture}
     done = subprocess.run(
         [sys.executable, SCRIPT, *(str(x) for pair in options.items() for x in pair)],
         capture_output=True,
@@ -25,6 +25,7 @@ def test_runs_and_moves_towards_the_truth(tmp_path):
     assert done.returncode == 0, done.stderr
     results = dict(re.findall(r"^from the (\w+) image: index ([\d.]+)", done.stdout, re.MULTILINE))
     assert set(results) == {"transient", "steady"}
-    # Six steps of at most 0.02 each from 1.2 on, all of them upwards when the derivative from the transient is right.
+    # Six steps of at most 0.02 each from 1.2 on. All of them go upwards: at 16,384 samples the derivative of the
+    # transient is twice its deviation and more.
     assert 1.25 < float(results["transient"]) <= 1.321
     assert picture.read_bytes().startswith(b"\x89PNG")
