@@ -12,26 +12,22 @@ import pytest
 import torch
 from scipy import stats
 
-from support.marks import long_rows
 from support.sensing.all_entries import ENTRIES
 from support.sensing.event_driven import Afterpulse, compare, detect, exponential_delays, measured_delays
 from support.sweeps import together
 from torchtransient import sensing
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import UnitError
 from torchtransient.sensing import (
     AfterpulseDelays,
     Afterpulsing,
     AfterpulsingSPAD,
-    Compose,
     FreeRunningSPAD,
     MeasuredDelays,
     PowerLawDelays,
-    ScoreFunction,
     SynchronousSPAD,
 )
 
 WIDTH = 1e-10  # of a bin
-NS = 1e-9
 BINS = 40
 
 
@@ -138,42 +134,6 @@ def test_laws_against_quadrature(name):
             law.shares(late * WIDTH, WIDTH, first=0, number=3)
 
 
-def test_measured_delays_by_hand():
-    """(4, 0, 2) of 2 ns from 1 ns on: 1 - 2/3 1/4 after 1.5 ns, 1/3 after 3 ns, nothing after 7 ns."""
-    law = MeasuredDelays(torch.tensor([4.0, 0, 2]), 2 * NS, start_s=NS)
-    assert law.end_s() == pytest.approx(7 * NS)
-    for dead, left in ((0.0, 1.0), (1.0, 1.0), (1.5, 1 - 1 / 6), (3.0, 1 / 3), (4.9, 1 / 3), (6.0, 1 / 6)):
-        assert law.released_after(dead * NS) == pytest.approx(left)
-    for dead in (7.0, 9.0):
-        with pytest.raises(UnitError, match="expected delays beyond the dead time"):
-            law.released_after(dead * NS)
-    u = (np.arange(2000) + 0.5) / 2000
-    for dead in (0.0, 2.2, 5.3):
-        below = np.interp((np.arange(8.0)[:, None] - u) * 1.5, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
-        gone = np.interp(dead, [1, 3, 5, 7], [0, 2 / 3, 2 / 3, 1])
-        wanted = np.diff((np.maximum(below - gone, 0) / (1 - gone)).mean(1))
-        np.testing.assert_allclose(law.shares(dead * NS, 1.5 * NS, first=0, number=7).numpy(), wanted, atol=5e-4)
-        drawn = law.draw(40_000, dead * NS, torch.Generator().manual_seed(1)).numpy() / NS
-        assert drawn.min() >= max(dead, 1.0) - 1e-9 and drawn.max() <= 7
-        counted = np.histogram(drawn, [1, 3, 5, 7])[0] / 40_000
-        exact = np.diff(np.maximum(np.array([0, 2 / 3, 2 / 3, 1]) - gone, 0) / (1 - gone))
-        np.testing.assert_allclose(counted, exact, atol=0.013)  # five deviations of a half
-    folded = law.kernel(0.0, 1.5 * NS, 2)
-    shares = law.shares(0.0, 1.5 * NS, first=0, number=8)
-    assert folded.tolist() == pytest.approx([float(shares[0::2].sum()), float(shares[1::2].sum())])
-    for wrong in ([1.0, -1.0], [1.0, math.inf], [1.0, math.nan]):
-        with pytest.raises(UnitError, match="finite counts >= 0"):
-            MeasuredDelays(torch.tensor(wrong), NS)
-    for wrong in (torch.ones(0), torch.ones(2, 2)):
-        with pytest.raises(ShapeError, match="of a histogram of delays"):
-            MeasuredDelays(wrong, NS)
-
-
-def test_power_laws_need_a_dead_time():
-    with pytest.raises(UnitError):
-        PowerLawDelays(1.2, 30 * NS).draw(3, 0.0, None)
-
-
 @each_law
 def test_every_afterpulse_has_its_bin(name):
     """Folded round a period the shares add up to the probability, whatever the period."""
@@ -183,23 +143,6 @@ def test_every_afterpulse_has_its_bin(name):
     folded, first = module.kernel(7), module.first_kernel(7 * 20_000)
     rest = 0.2 - float(first.sum())
     torch.testing.assert_close(folded, first.view(-1, 7).sum(0), rtol=1e-6, atol=rest + 1e-12)
-
-
-@each_law
-def test_shares_are_those_of_drawn_delays(name):
-    """400 000 delays, begun anywhere in a bin, against the shares: chi square."""
-    module, number = LAWS[name](), 400_000
-    g = torch.Generator().manual_seed(0)
-    start = torch.rand(number, dtype=torch.float64, generator=g)
-    delay = module._draw_delays(start, g)
-    assert float(delay.min()) >= module.dead_time_s / WIDTH - 1e-9
-    seen = torch.bincount((start + delay).floor().long().clamp_max(600), minlength=601)[:600].double()
-    mean = module.first_kernel(600) * 5 * number
-    use = mean > 5
-    dof = int(use.sum())
-    chi2 = float((((seen - mean) ** 2 / mean)[use]).sum()) / dof
-    assert chi2 < 1 + 5 * (2 / dof) ** 0.5
-    assert float(seen[~use].sum()) == pytest.approx(float(mean[~use].sum()), abs=5 * float(mean[~use].sum()) ** 0.5 + 5)
 
 
 @each_law
@@ -243,13 +186,6 @@ def test_draws_of_a_window_of_a_longer_period():
     assert float((added - mean).abs().max()) < 5 * (1.2 * mean / 4096) ** 0.5
 
 
-def test_one_of_several_exponentials_is_one():
-    x = torch.rand(1, BINS, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    one = Afterpulsing(0.1, 12e-10, 30e-10, bin_width_s=WIDTH)
-    torch.testing.assert_close(one(x), exponentials(30, (0.1, 12.0))(x), rtol=1e-14, atol=0)
-    assert one.logit_probability.shape == () and one.tau_s.shape == ()
-
-
 def test_a_measured_exponential_is_an_exponential():
     """Histogram of an exponential from the avalanche on, in bins of a tenth of its mean: what dies in the dead time."""
     tau, dead, width = 20.0, 13.7, 0.1
@@ -262,23 +198,6 @@ def test_a_measured_exponential_is_an_exponential():
     assert float(wanted.sum()) == pytest.approx(0.3 * math.exp(-dead / tau), rel=1e-9)
     # straight lines instead of a curve within bins of width/tau = 1/200: (1/200)^2 / 8 of what is yet to come
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0.3 / 200**2 / 8)
-
-
-@pytest.mark.slow
-def test_exponents_and_times_are_learnt():
-    law = PowerLawDelays(1.5, 300 * WIDTH, learnable=True)
-    module = Afterpulsing(0.1, dead_time_s=4 * WIDTH, delays=law, bin_width_s=WIDTH, learnable=True)
-    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
-    x[0, 3] = 1000.0
-    true = PowerLawDelays(1.1, 300 * WIDTH)
-    wanted = Afterpulsing(0.06, dead_time_s=4 * WIDTH, delays=true, bin_width_s=WIDTH)(x)
-    optimizer = torch.optim.Adam(module.parameters(), lr=0.1)
-    for _ in range(120):
-        optimizer.zero_grad()
-        (module(x) - wanted).square().sum().backward()
-        optimizer.step()
-    assert float(module.delays.log_exponent.exp().detach()) == pytest.approx(1.1, abs=0.01)
-    assert float(module.probability.detach()) == pytest.approx(0.06, rel=0.01)
 
 
 # --- detectors ------------------------------------------------------------------------------------------------------
@@ -330,31 +249,27 @@ def test_events(mode, dead, total):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
-@pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize(
-    "mode, dead", [("first", 12.3), ("several", 1.3), ("several", 12.3), ("free", 12.3), ("free", 55.7)]
-)
+@pytest.mark.parametrize("kind, total", [("constant", 100.0), ("pulse", 1.0), ("edges", 10.0)])
+@pytest.mark.parametrize("mode, dead", [("first", 12.3), ("several", 1.3), ("several", 12.3), ("free", 55.7)])
 def test_events_everywhere(mode, dead, total, kind):
     found = [agreement(mode, dead, total, kind, *two(dead), seed=s) for s in range(3)]
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("total", [1.0, 30.0])
-def test_events_of_measured_delays(total):
+def test_events_of_measured_delays():
     """Carriers that are set free while the detector is dead are lost, and counted as such."""
     counts, own, dead = [20.0, 30, 11, 7, 5, 4, 2, 1], 9.7, 12.3
     law = MeasuredDelays(torch.tensor(counts), own * WIDTH)
     parts = Afterpulsing(0.06, dead_time_s=dead * WIDTH, delays=law, counted_from="avalanche", bin_width_s=WIDTH)
     laws = [Afterpulse(0.06, measured_delays(np.arange(9) * own, counts))]
-    found = [agreement("free", dead, total, "pulse", parts, laws, seed=s) for s in range(3)]
+    found = [agreement("free", dead, 30.0, "pulse", parts, laws, seed=s) for s in range(3)]
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tau", [0.3, 5.0, 300.0])
-@pytest.mark.parametrize("mode, dead", [("several", 1.3), ("several", 12.3), ("free", 1.3), ("free", 25.0)])
+@pytest.mark.parametrize("tau", [0.3, 300.0])
+@pytest.mark.parametrize("mode, dead", [("several", 1.3), ("free", 25.0)])
 def test_frequent_afterpulses(mode, dead, tau):
     """Of 30 %, from delays below a bin to carriers that are trapped for many dead times: shape and total."""
     for total in (1.0, 100.0):
@@ -363,29 +278,6 @@ def test_frequent_afterpulses(mode, dead, tau):
         for kind in ("constant", "pulse"):
             found = agreement(mode, dead, total, kind, parts, laws, runs=200, periods=60, warm_up=60)
             assert found.within(1.5), (total, kind, found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "mode, dead, tau, total",
-    long_rows(
-        [(*mode, total) for mode in (("free", 25.0, 3.0), ("several", 1.3, 30.0)) for total in (1.0, 100.0)],
-        [("free", 25.0, 3.0, 1.0), ("several", 1.3, 30.0, 100.0)],
-    ),
-)
-def test_totals_of_frequent_afterpulses(mode, dead, tau, total):
-    """Within 4 standard errors of the runs' totals, of which 30 % of detections leave carriers."""
-    rate = light(total, "pulse")
-    events = detect(
-        np.random.default_rng(0), rate, 200, 40, dead, free_running=mode == "free",
-        afterpulses=[Afterpulse(0.3, exponential_delays(tau, after=dead))], warm_up=20,
-    )  # fmt: skip
-    sensor = AfterpulsingSPAD(detector(mode, dead), exponentials(dead, (0.3, tau)))
-    found = float(sensor.expected(torch.as_tensor(rate).view(1, -1, 1, 1)).sum())
-    totals = events.counts.sum(1) / events.periods
-    assert abs(found - totals.mean()) < 4 * totals.std(ddof=1) / len(totals) ** 0.5
-    bare = float(detector(mode, dead).expected(torch.as_tensor(rate).view(1, -1, 1, 1)).sum())
-    assert found > bare
 
 
 @pytest.mark.slow
@@ -452,22 +344,3 @@ def test_a_detector_in_a_window_of_a_longer_period():
     assert float(y.max() / y.min() - 1) < 1e-6
     # the cycle's own pile-up is 4e-7 of it
     assert float(y.mean()) == pytest.approx(level * cycles / 0.9, rel=1e-6)
-
-
-@pytest.mark.parametrize("policy", ["expected", "gaussian", "straight_through", "score"])
-def test_policies_are_the_detectors(policy):
-    sensor = AfterpulsingSPAD(detector("first", 12.3, cycles=1000), two(12.3)[0], grad=policy)
-    x = torch.full((50, 1, BINS, 2, 2), 0.05, dtype=torch.float64, requires_grad=True)
-    with ScoreFunction() as score:
-        y = sensor(x, generator=torch.Generator().manual_seed(0))
-        losses = y.sum((1, 2, 3, 4)) / 1000
-    if policy == "score":
-        losses = score.surrogate(losses, baseline="leave_one_out")
-    losses.sum().backward()
-    whole = AfterpulsingSPAD(detector("first", 12.3, cycles=1000), two(12.3)[0])
-    mean = torch.full((1, 1, BINS, 2, 2), 0.05, dtype=torch.float64, requires_grad=True)
-    (whole(mean).sum() / 1000).backward()
-    found, wanted = x.grad.mean(0).sum(), mean.grad.sum()
-    assert float(found) == pytest.approx(float(wanted), rel=0.35 if policy == "score" else 0.02)
-    chain = Compose([AfterpulsingSPAD(detector("first", 12.3, cycles=10), two(12.3)[0])], grad=policy)
-    assert chain.stages[0].detector.grad == policy

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from support.sensing.all_entries import each_long, each_quick
+from support.sensing.all_entries import each
 from support.sensing.contract import parts
 from torchtransient import TimeAxis, sensing
 
 
-def are_those_outside(entry):
+@pytest.mark.slow
+@each
+def test_expectation_and_derivatives_are_those_outside(entry):
     """First and second derivatives, whether the backward pass runs behind the context, as torch asks for, or in it."""
     module, x = entry.module(torch.float32), entry.x(torch.float32)
 
@@ -29,18 +31,6 @@ def are_those_outside(entry):
         for a, b in zip(run(*inside), wanted, strict=True):
             assert a.dtype == b.dtype
             assert torch.equal(a, b)
-
-
-@pytest.mark.slow
-@each_quick
-def test_expectation_and_derivatives_are_those_outside(entry):
-    are_those_outside(entry)
-
-
-@pytest.mark.slow
-@each_long
-def test_long_expectations_and_derivatives_are_those_outside(entry):
-    are_those_outside(entry)
 
 
 @pytest.mark.parametrize("code", [None, sensing.hamiltonian_code(3)], ids=["fourier", "by shape"])
@@ -73,24 +63,3 @@ def test_backward_of_functions_inside_is_that_outside(name):
             call(leaf).square().sum().backward()
         found.append(leaf.grad)
     assert torch.equal(*found)
-
-
-def test_taps_in_half_precision_have_phases():
-    """bfloat16 keeps 8 bits of a tap: phases within 2 / 256 of those in double."""
-    turns = torch.linspace(0, 0.9, 10, dtype=torch.float64)
-    taps = (1 + sensing.sine_code(4).evaluate(turns)).reshape(4, 1, 10)[None]
-    exact = sensing.read_itof(taps, (40e6,), 4)
-    for dtype in (torch.bfloat16, torch.float16):
-        found = sensing.read_itof(taps.to(dtype), (40e6,), 4)
-        assert found.phase.dtype == torch.float32
-        assert float(sensing.wrapped_difference(found.phase.double(), exact.phase).abs().max()) < 2 / 256
-
-
-def test_pulses_are_those_outside():
-    from torchtransient.pulses import Pulse
-
-    axis = TimeAxis(0.0, 0.01, 40)
-    light = torch.rand(1, 40, 2, 3, generator=torch.Generator().manual_seed(0))
-    wanted = sensing.apply_pulse(light, axis, Pulse.gaussian(0.03))
-    with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(sensing.apply_pulse(light, axis, Pulse.gaussian(0.03)), wanted)

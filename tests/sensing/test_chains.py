@@ -46,22 +46,6 @@ def test_parts_stand_in_the_order_of_light():
     assert chain.stages[3].grad == "straight_through"
 
 
-def test_constant_light_stays_constant():
-    """A free-running detector in ambient light alone: whatever moves or adds detections, all bins are alike."""
-    whole = {k: v for k, v in parts().items() if k in ("jitter", "skew", "pulse", "optics", "crosstalk")}
-    period = sensing.Afterpulsing(0.02, 20 * NS, 10 * NS, axis=AXIS)
-    chain = sensing.counting_chain(
-        budget(repetition_rate_hz=1 / 6.4e-9, ambient_rate_hz=3e7),
-        sensing.FreeRunningSPAD(500, 10 * NS, axis=AXIS),
-        **whole,
-        afterpulsing=period,
-    )
-    counts = chain.expected(torch.zeros(1, 64, 4, 5, dtype=torch.float64))
-    middle = counts[:, 32:33].expand_as(counts)
-    assert float(counts.min()) > 0.5  # 500 periods, 64 bins, 0.19 photons a period, dead for 0.3 of the time
-    torch.testing.assert_close(counts, middle, rtol=1e-6, atol=0)
-
-
 @pytest.mark.parametrize(
     "changes, error, words",
     [

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import io
-import pickle
 from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, Dataset
 
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing import (
     Compose,
-    GatedIntegration,
     GaussianResponse,
     ImpulseResponse,
     ItofCorrelation,
@@ -65,15 +61,6 @@ def light(*lead):
     return torch.rand(*lead, 1, 32, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
-def test_stages_in_order():
-    sensor, x = chain(), light(2)
-    y = x
-    for stage in sensor.stages:
-        y = stage.expected(y)
-    assert torch.equal(sensor.expected(x), y) and torch.equal(sensor(x), y)
-    assert y.shape == (2, 1, 4, 2, 3)
-
-
 @pytest.mark.parametrize("policy", ["gaussian", "straight_through", "score"])
 def test_policy_reaches_every_stage(policy):
     response, taps, electronics = chain().stages
@@ -120,39 +107,6 @@ def test_takes_a_phasor_image():
         chain()(Rendered(phasor=z, steady=torch.ones(1, 1, 1), frequencies=frequencies))
     with pytest.raises(ShapeError, match="not in a chain"):
         Compose([sensor])(Rendered(phasor=z, steady=torch.ones(1, 1, 1), frequencies=frequencies))
-
-
-class Measured(Dataset):
-    def __init__(self, sensor):
-        self.sensor = sensor
-
-    def __len__(self):
-        return 6
-
-    def __getitem__(self, i):
-        x = light() * (i + 1)
-        return self.sensor(x, generator=torch.Generator().manual_seed(i))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 1])
-def test_in_a_data_loader(workers):
-    data = Measured(chain("straight_through"))
-    context = "spawn" if workers else None
-    batches = list(DataLoader(data, batch_size=3, num_workers=workers, multiprocessing_context=context))
-    assert [tuple(b.shape) for b in batches] == [(3, 1, 4, 2, 3)] * 2
-    assert torch.equal(batches[1][2], data[5])
-
-
-def test_checkpoints():
-    sensor = Compose([GatedIntegration([6e-9], 1e-9, AXIS, learnable=True), PixelElectronics()])
-    other = Compose([GatedIntegration([9e-9], 3e-9, AXIS, learnable=True), PixelElectronics()])
-    buffer = io.BytesIO()
-    torch.save(sensor.state_dict(), buffer)
-    buffer.seek(0)
-    other.load_state_dict(torch.load(buffer, weights_only=True))
-    assert torch.equal(other(light()), sensor(light()))
-    assert torch.equal(pickle.loads(pickle.dumps(sensor))(light()), sensor(light()))
 
 
 @pytest.mark.parametrize("length", [(), (3,)])

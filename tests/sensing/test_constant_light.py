@@ -79,6 +79,7 @@ def test_constant_light_through_every_preset(name):
         DetectionJitter(response(), AXIS),
         DetectionJitter(response(), AXIS, within_bin="center"),
         SweepJitter(400 * PS, AXIS),
+        PixelSkew(torch.tensor([[730 * PS, -25e-9]]), AXIS),
         TDC(torch.ones(64), dither=True, offset_bins=1.7, sliding_scale=3),
         TDC(torch.ones(64), dither=True, offset_bins=-70.2, acts_on="rates"),
         StreakCamera(AXIS, time_fwhm_s=300 * PS, jitter_fwhm_s=200 * PS, spatial_fwhm_px=0),
@@ -86,7 +87,7 @@ def test_constant_light_through_every_preset(name):
     ids=lambda s: f"{type(s).__name__}",
 )
 def test_constant_light_through_every_stage(stage):
-    x = torch.full((1, 64, 2, 2), 3.0, dtype=torch.float64)
+    x = torch.full((1, 64, 1, 2), 3.0, dtype=torch.float64)
     assert flatness(stage.expected(x)) < 1e-12
     assert float(stage.expected(x).sum()) == pytest.approx(float(x.sum()), rel=1e-12)
 
@@ -115,12 +116,9 @@ def zero():
     "stages",
     [
         lambda: [budget(), zero()],
-        lambda: [Compose([budget()]), Compose([zero()])],
         lambda: [torch.nn.Sequential(budget(), torch.nn.Identity()), zero()],
         lambda: [budget(ambient_rate_hz=0.0, dark_count_rate_hz=torch.eye(2)), zero()],
         lambda: [budget(), SynchronousSPAD(1000), DetectionJitter(response(), AXIS, boundary="zero")],
-        lambda: [budget(), SweepJitter(400 * PS, AXIS, boundary="zero")],
-        lambda: [budget(), StreakCamera(AXIS, time_fwhm_s=300 * PS, boundary="zero")],
         lambda: [budget(), TDC(torch.ones(64), boundary="zero")],
         lambda: [budget(), PixelSkew(torch.full((2, 2), 90 * PS), AXIS, boundary="zero")],
     ],

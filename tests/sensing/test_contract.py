@@ -61,10 +61,13 @@ def test_dtype_and_device_are_kept(entry):
             assert error <= LOOSE[dtype] * (exact.abs().max() + 1e-12)
 
 
-def same_as_in_single(entry, dtype, policies):
+@pytest.mark.slow
+@each
+@together("dtype", HALVES)
+def test_half_precision_is_measured_in_single(entry, dtype):
     """The mean and every draw of it: of the same numbers in float32, to the bit; the gradient goes back in halves."""
     x = entry.x(dtype)[:1]
-    for policy in policies:
+    for policy in entry.policies if entry.random else [None]:
         module = entry.module(torch.float32, **({"grad": policy} if policy else {}))
 
         def measured(light, module=module):
@@ -79,19 +82,6 @@ def same_as_in_single(entry, dtype, policies):
     assert torch.equal(mean.detach(), parts(expected(entry.module(torch.float32), x.float()))[0].detach())
     (gradient,) = torch.autograd.grad(mean.sum(), leaf)
     assert gradient.dtype == dtype
-
-
-@pytest.mark.slow
-@each
-def test_half_precision_is_measured_in_single(entry):
-    same_as_in_single(entry, torch.bfloat16, ["straight_through" if entry.random else None])
-
-
-@pytest.mark.slow
-@each
-@together("dtype", HALVES)
-def test_half_precision_under_every_policy(entry, dtype):
-    same_as_in_single(entry, dtype, entry.policies if entry.random else [None])
 
 
 @each
@@ -217,7 +207,8 @@ def test_errors(name, call, error):
         call()
 
 
-def reproduces(entry, policy):
+@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p in ("gaussian", "straight_through")], named)
+def test_generator_reproduces(entry, policy):
     module, x = entry.module(grad=policy), entry.x()
 
     def draw(seed):
@@ -234,28 +225,14 @@ def reproduces(entry, policy):
         assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
 
 
-# Under one policy that draws.
-@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p == "straight_through"], named)
-def test_generator_reproduces(entry, policy):
-    reproduces(entry, policy)
-
-
-@pytest.mark.slow
-@together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p in ("gaussian", "score")], named)
-def test_generator_reproduces_under_every_policy(entry, policy):
-    reproduces(entry, policy)
-
-
 # a train of detections takes long to draw; test_bright_light and test_several_hits hold its means to events
 TRAINS = ("FreeRunningSPAD", "AfterpulsingSPAD-dead-time")
-number_of_draws = [(e, 200 if e.name in TRAINS else 1000) for e in ENTRIES if e.random]
-number_of_draws += [pytest.param(e, 2000, marks=pytest.mark.slow) for e, number in number_of_draws]
 
 
-@pytest.mark.parametrize("entry, number", number_of_draws, ids=lambda v: getattr(v, "name", v))
-def test_mean_and_dtype_of_samples(entry, number):
+@pytest.mark.parametrize("entry", [e for e in ENTRIES if e.random], ids=lambda e: e.name)
+def test_mean_and_dtype_of_samples(entry):
     """The mean of many draws is the expectation, within 5 standard errors everywhere (and rounding)."""
-    module = entry.module()
+    module, number = entry.module(), 200 if entry.name in TRAINS else 1000
     x = entry.x()[:1]
     g = torch.Generator().manual_seed(11)
     draws = module.sample(x.expand(number, *x.shape[1:]), g)

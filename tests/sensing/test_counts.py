@@ -7,11 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
-from support.sweeps import together
 from torchtransient import TimeAxis, sensing
-from torchtransient.sensing import Moves, draws
 from torchtransient.sensing import counts as moved_counts
-from torchtransient.sensing.counts import move_counts
+from torchtransient.sensing import draws
 from torchtransient.sensing.draws import LagTable, halve, thin
 
 
@@ -51,30 +49,6 @@ def test_first_photons_of_few_and_of_many_counts(monkeypatch, few, kind):
     assert abs(covariance - expected) < 5 * float(pair.var(0).prod().sqrt()) / repeats**0.5
 
 
-@pytest.mark.parametrize("boundary", ["periodic", "zero"])
-@pytest.mark.parametrize("lost", [0.0, 0.3])
-@pytest.mark.parametrize("first", [-2, 0, 9])
-def test_moves_of_few_and_of_many_counts(monkeypatch, boundary, lost, first):
-    shares = torch.tensor([0.1, 0.0, 0.6, 0.3], dtype=torch.float64) * (1 - lost)
-    moves = Moves(first, shares, boundary)
-    counts = torch.zeros(400, 1, 7, 2, 1)
-    counts[..., 0, :, :], counts[..., 4, 1, :], counts[..., 6, 0, :] = 11.0, 3.0, 2.0
-    expected = 400 * moves.mean(counts[:1].double())[0, 0, :, :, 0]
-    for most in (1 << 30, -1):
-        monkeypatch.setattr(moved_counts, "_SINGLE", most)
-        moved, _ = move_counts(counts, moves, torch.Generator().manual_seed(5))
-        assert moved.dtype == counts.dtype
-        assert torch.equal(moved, moved.round())
-        found = moved.sum((0, 1)).double()[..., 0]
-        assert bool(((found - expected).abs() <= 5 * expected.sqrt()).all())
-        if boundary == "periodic" and not lost:
-            assert torch.equal(moved.sum((1, 2)), counts.sum((1, 2)))
-        elif expected.sum() > 0:
-            assert float(moved.sum()) <= float(counts.sum())
-    alone, _ = move_counts(counts * 0, moves, torch.Generator().manual_seed(5))
-    assert not bool(alone.any())
-
-
 DRAWS = 25_000
 
 
@@ -100,7 +74,6 @@ def dense(events, like):
     return out.view(like.shape)
 
 
-SLOW = pytest.mark.slow
 CASES = [
     (n, p)
     for n in (0, 1, 2, 3, 7, 25, 31, 32, 62, 63, 400)
@@ -109,8 +82,7 @@ CASES = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=SLOW)], ids=str)
-@pytest.mark.parametrize("draw", ["thin", "halve"])
+@pytest.mark.parametrize("draw, dtype", [("thin", torch.float32), ("halve", torch.float64)], ids=str)
 def test_frequencies(draw, dtype):
     """All cases shuffled into one tensor, so that every block holds all of them."""
     order = torch.randperm(len(CASES) * DRAWS, generator=torch.Generator().manual_seed(0))
@@ -123,18 +95,6 @@ def test_frequencies(draw, dtype):
     for k, (number, share) in enumerate(CASES):
         exact = float(torch.tensor(share).to(dtype)) if share not in (0.0, 1.0) else share
         chi_square_is_small(found[case == k].numpy(), number, exact)
-
-
-@pytest.mark.slow
-@together("n, p", CASES)
-def test_frequencies_of_equal_entries(n, p):
-    """Every case alone: blocks take the way that suits all of their entries."""
-    counts = torch.full((200, 250), float(n))
-    g = torch.Generator().manual_seed(2)
-    chi_square_is_small(dense(thin(counts, p, g), counts).flatten().numpy(), n, p)
-    share = torch.full_like(counts, p, dtype=torch.float64).to(counts.dtype)
-    exact = float(share.flatten()[0].double()) if 0 < p < 1 else p
-    chi_square_is_small(halve(counts, share, g).flatten().numpy(), n, exact)
 
 
 @pytest.mark.parametrize("p", [1e-7, 1e-4])
@@ -260,17 +220,6 @@ def test_what_is_added_to_an_item_does_not_depend_on_what_is_beside_it(make):
     dark = torch.cat([torch.zeros_like(x[:1]), x[1:2], x[2:] * 1000])
     y = sensor.sample(dark, generator())
     assert float(y[0].abs().max()) == 0 and bool((y[1] >= dark[1]).all()) and bool((y[2] > dark[2]).any())
-
-
-@pytest.mark.parametrize("make", ADDS.values(), ids=ADDS)
-def test_an_item_beside_bright_ones_is_followed(make, monkeypatch):
-    """Poisson numbers for the bright ones alone."""
-    seen, sensor = [], make()
-    trigger = type(sensor).trigger
-    monkeypatch.setattr(type(sensor), "trigger", lambda s, c, g: seen.append(c.clone()) or trigger(s, c, g))
-    x = three_items()
-    sensor.sample(torch.cat([x[:1], x[2:] * 1000]), generator())
-    assert torch.equal(seen[0][0], x[0]) and float(seen[0][1].abs().max()) == 0
 
 
 @pytest.mark.parametrize("make", MOVES.values(), ids=MOVES)

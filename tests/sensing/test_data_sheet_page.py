@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import re
 
 import pytest
 import torch
 
 from support.pages import Page
-from torchtransient import sensing
 
 PAGE = Page("docs/data_sheet_to_chain.md")
-TEXT = PAGE.text
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +58,3 @@ def test_a_chain_as_a_device_measures_the_samples_of_a_recipe(page):
     z = (counts - mean).sum((0, 1)) / mean.sum((0, 1)).clamp_min(1).sqrt()
     assert float(z.abs().max()) < 5
     assert float(counts.sum()) > 1000
-
-
-def test_names_exist_and_pages_link():
-    named = set(re.findall(r"`(?:[a-z]+=)?([A-Z]\w+)\(", TEXT))
-    assert named and all(hasattr(sensing, n) or n == "TimeAxis" for n in named)
-    for page in ("README.md", "docs/sensors.md"):
-        assert "data_sheet_to_chain.md" in Page(page).text

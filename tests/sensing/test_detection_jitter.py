@@ -60,43 +60,6 @@ def test_mean_is_that_of_detections_with_delays_of_their_own(boundary):
     assert (drawn.sum() == number) == (boundary == "periodic") and np.array_equal(drawn, drawn.round())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("level", [0.05, 3.0, 400.0, 5e4])
-@pytest.mark.parametrize("boundary", ["periodic", "zero"])
-def test_draws_have_mean_and_covariance_of_moved_counts(level, boundary):
-    """Of 3000 draws of the same counts, few and many: every entry of both within 5.5 of its standard errors."""
-    bins, repeats = 12, 3000
-    x = torch.poisson(torch.full((1, bins, 1, 1), level, dtype=torch.float64), generator=generator(3))
-    if level < 1:
-        x[0, 3] = 1
-    module = jitter(boundary=boundary)
-    moves = module.moves(x)
-    table = torch.stack([moves.mean(e.view(bins, 1, 1)).flatten() for e in torch.eye(bins, dtype=torch.float64)], 1)
-    n = x.flatten()
-    covariance = torch.diag(table @ n) - table @ torch.diag(n) @ table.T
-    spread = ((covariance.square() + covariance.diag().outer(covariance.diag())) / repeats).sqrt()
-    # moved counts of few are far from normal: their fourth moments come on top
-    spread = spread + ((table @ n).max() / repeats) ** 0.5 * (level < 10)
-    for draw in (module.sample, module.gaussian):
-        y = draw(x.expand(repeats, 1, bins, 1, 1), generator()).flatten(1)
-        deviation = (y.mean(0) - table @ n).abs() / (covariance.diag() / repeats).sqrt().clamp_min(1e-9)
-        assert float(deviation.max()) < 5.5
-        assert bool(((y.T.cov() - covariance).abs() < 5.5 * spread + 0.01).all())
-
-
-@pytest.mark.slow
-def test_no_count_is_lost_or_halved_in_an_image():
-    """Sparse and dense blocks, both dtypes, an image of many columns and a batch."""
-    for shape, level in (((1, 40, 30, 70), 0.02), ((1, 40, 60, 40), 40.0), ((3, 2, 16, 2, 2), 1e5)):
-        for dtype in (torch.float32, torch.float64):
-            x = torch.poisson(torch.full(shape, level, dtype=dtype), generator=generator(1))
-            y = jitter().sample(x, generator(2))
-            assert y.dtype == dtype and torch.equal(y, y.round()) and float(y.min()) >= 0
-            assert torch.equal(y.sum(-3), x.sum(-3))
-            assert torch.equal(y, jitter().sample(x, generator(2)))
-            assert not torch.equal(y, jitter().sample(x, generator(3)))
-
-
 def test_means_and_rates_stay_means():
     x = column(torch.rand(16, dtype=torch.float64))
     for policy in ("expected", "straight_through", "score"):

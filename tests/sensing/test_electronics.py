@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchtransient import TimeAxis, sensing
+from torchtransient import sensing
 from torchtransient.errors import UnitError
 from torchtransient.sensing import PixelElectronics, ScoreFunction, fixed_pattern, ktc_noise
 from torchtransient.sensing.electronics import clipped_normal_mean, clipped_normal_variance
@@ -165,18 +165,3 @@ def test_gradients_through_a_converter(policy):
 
 
 # ---------------------------------------------------------------------------------------------------------- budgets
-
-AXIS = TimeAxis.from_seconds(0.0, 1e-9, 10)
-
-
-def budget(optics=None, **changes):
-    given = {"pulse_energy_j": 2e-9, "wavelength_m": 600e-9, "repetition_rate_hz": 20e6, "cycles": 3000, "axis": AXIS}
-    return sensing.PhotonBudget(optics or sensing.Optics(f_number=1.5), **(given | changes))
-
-
-def test_pile_up_is_said_above_five_percent():
-    model = budget(dark_count_rate_hz=1e6)
-    per_unit = float(model.detections_per_unit)
-    x = torch.zeros(1, 10, 1, 2, dtype=torch.float64)
-    x[:, 3] = torch.tensor([0.039, 0.041], dtype=torch.float64) / per_unit
-    assert flat(model.report(x).piles_up) == [False, True]

@@ -221,16 +221,6 @@ def test_state_of_a_converter_travels_whole():
     assert target.first == source.first
 
 
-def test_a_measured_response_has_bins_of_its_own():
-    """A response measured at 8 ps in a chain for 32 ps, behind a renderer."""
-    axis = tt.TimeAxis.from_seconds(0.0, 32 * PS, 40)
-    measured = sensing.MeasuredResponse(torch.tensor([0.0, 0, 3, 9, 5, 2, 1, 0, 0, 0, 0, 0]), 8 * PS)
-    chain = sensing.Compose([sensing.ImpulseResponse(measured, axis)])
-    chain.check_axis(axis)
-    with pytest.raises(UnitError, match="expected the axis"):
-        chain.check_axis(tt.TimeAxis.from_seconds(0.0, 8 * PS, 40))
-
-
 def test_transpose_can_be_trained_through():
     """Gradients of |A^T y|^2 in y and in the width of the response, against finite differences."""
     axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 16)

@@ -12,11 +12,9 @@ from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, nonparalyzabl
 from torchtransient.sensing.dead_time import free_running
 from torchtransient.sensing.dead_time.clocked_counts import StepProbabilities, draw_steps
 from torchtransient.sensing.dead_time.free_running import stationary_steps
-from torchtransient.sensing.dead_time.renewal import ConstantLight, RenewalChain, gmres
 from torchtransient.sensing.free_running import state_image
 
 BINS = 32
-FLUXES = [0.01, 0.3, 3.0, 30.0, 300.0, 1000.0, 3000.0]
 
 
 def slow(*values):
@@ -49,7 +47,7 @@ def rows_of(image_):
     return image_.flatten(2).squeeze(0).T
 
 
-@pytest.mark.parametrize("flux", FLUXES[::2])
+@pytest.mark.parametrize("flux", [0.01, 3.0, 300.0, 3000.0])
 @pytest.mark.parametrize("periods", [1, 3])
 def test_dead_time_of_whole_periods(flux, periods):
     """Armed or dead does not depend on the phase: detections are the light, R of them in 1 + periods R periods."""
@@ -58,27 +56,8 @@ def test_dead_time_of_whole_periods(flux, periods):
     torch.testing.assert_close(found, light / (1 + periods * flux), rtol=1e-9, atol=1e-12 * flux / (1 + flux))
 
 
-def test_bright_light_takes_few_steps():
-    """A thousand photons per period: the preconditioner leaves less than 40 steps where 80 without it do not do."""
-    light = 1000 * shapes(256)[:3]
-    chain = RenewalChain(light, 358, double(0.4))
-    steps = []
-
-    def operator(v):
-        steps.append(1)
-        return v - chain.step(v) + v[:, :256].sum(-1, keepdim=True) * u
-
-    u = torch.cat([light / 1000, 0 * light], -1)
-    for _ in range(4):
-        u = chain.step(u)
-    constant = ConstantLight(chain.waiting(u), 256, 358, chain.part)
-    assert float(gmres(operator, u, u, 1e-11, constant.solve)[1].max()) < 1e-10
-    assert len(steps) < 42
-    assert float(gmres(operator, u, u, 1e-11)[1].max()) > 1e-6
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("flux, bound", [(1.0, 1e-5), (10.0, 2e-3), (30.0, 5e-3), (100.0, 1e-2)])
+@pytest.mark.parametrize("flux, bound", [(1.0, 1e-5), (30.0, 5e-3), (100.0, 1e-2)])
 @pytest.mark.parametrize("dead", [12.8, 45.3])
 def test_against_the_dense_limit(flux, bound, dead):
     """Bins of 0.03 to 50 photons; the bounds are those of docs/photon_counting.md."""
@@ -103,9 +82,7 @@ def test_third_order_in_the_width_of_bins():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "which, flux, dead", [(0, 60.0, 12.8), (0, 1000.0, 45.3), (1, 60.0, 31.9), (2, 200.0, 31.9), (2, 3000.0, 20.25)]
-)
+@pytest.mark.parametrize("which, flux, dead", [(0, 1000.0, 45.3), (1, 60.0, 31.9), (2, 3000.0, 20.25)])
 def test_against_exponential_clocks(which, flux, dead):
     """Detectors that begin in the stationary state stay in it; a locked phase draws them in from anywhere."""
     row, rng, detectors = (flux * shapes()[which]).numpy(), np.random.default_rng(5), 20_000
@@ -135,18 +112,13 @@ def test_a_phase_locked_at_the_edge_of_a_bin(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flux, dead", [slow(100.0, 5.3), slow(100.0, 11.5), (40.0, 12.4)])
-def test_gradients_in_bright_light(flux, dead):
-    x = image(flux * shapes(12)[:3]).clone().requires_grad_()
-    d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
+def test_gradients_in_bright_light():
+    x = image(40.0 * shapes(12)[:3]).clone().requires_grad_()
+    d = torch.tensor(12.4, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(nonparalyzable_histogram, (x, d), rtol=1e-4, fast_mode=True, check_forward_ad=True)
 
 
-FANO_CASES = [
-    (3, 0.1, 20.3), (2, 10.0, 5.8),
-    *(slow(w, r, d) for w in (0, 2) for r in (1.0, 10.0) for d in (1.3, 20.3)),
-    slow(2, 100.0, 5.8), slow(2, 100.0, 32.0), slow(0, 30.0, 100.7),
-]  # fmt: skip
+FANO_CASES = [(3, 0.1, 20.3), (2, 10.0, 5.8), slow(0, 10.0, 1.3), slow(2, 100.0, 32.0), slow(0, 30.0, 100.7)]
 
 
 @pytest.mark.parametrize("which, flux, dead", FANO_CASES)
@@ -170,8 +142,7 @@ def test_draws_are_those_of_one_detector(which, flux, dead):
 
 RESONANT = [
     (10.0, 10.3, 10), (100.0, 31.68, 200), slow(5.0, 10.3, 3), slow(20.0, 30.4, 200),
-    *(slow(r, d, n) for r in (0.1, 1.0, 10.0, 100.0) for d in (9.6, 10.35, 15.7, 31.68, 63.0, 96.0)
-      for n in (1, 2, 10, 100, 2000) if not (r == 0.1 and n == 2000)),
+    *(slow(r, d, n) for r in (1.0, 100.0) for d in (15.7, 31.68, 96.0) for n in (1, 100, 2000)),
 ]  # fmt: skip
 
 
@@ -208,14 +179,6 @@ def test_a_phase_that_is_remembered():
 
 
 @pytest.mark.slow
-def test_more_detections_than_can_be_drawn(monkeypatch):
-    monkeypatch.setattr(free_running, "MOST_ONE_BY_ONE", 1100)
-    spad = FreeRunningSPAD(1200, 15.984e-10, bin_width_s=1e-10)
-    with pytest.raises(TorchTransientError, match="fewer cycles, or grad='gaussian'"):
-        spad.sample(torch.full((1, 16, 1, 1), 1000 / 16.0))
-
-
-@pytest.mark.slow
 def test_totals_in_saturation():
     """Renewal theory: a Fano factor of 1/(1 + n d)^2, 0.010 where independent periods have 0.41."""
     n, dead, periods = 1.5, 6.0, 10_000
@@ -229,9 +192,7 @@ def test_totals_in_saturation():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind, dead", [slow("non_paralyzable", 2.3), slow("non_paralyzable", 7.5), ("paralyzable", 2.3)]
-)
+@pytest.mark.parametrize("kind, dead", [("non_paralyzable", 7.5), ("paralyzable", 2.3)])
 def test_score_is_unbiased(kind, dead):
     """Two loss functions that no pathwise gradient sees; differences of their means over as many draws again."""
     shape = double([0.1, 0.2, 0.6, 0.3, 0.1, 0.1]).view(1, 6, 1, 1)

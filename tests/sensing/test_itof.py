@@ -193,20 +193,6 @@ def test_sine_taps_come_from_one_phasor():
     torch.testing.assert_close(z, 0.7 / 4 * phasor.conj() * start)
 
 
-def test_two_paths_give_the_phase_of_the_sum_of_phasors():
-    axis = TimeAxis(0.0, 0.01, 1000)
-    x = torch.zeros(1, 1000, 1, 1, dtype=torch.float64)
-    x[0, 200], x[0, 300] = 3.0, 1.0
-    taps = sensing.ItofCorrelation(sensing.sine_code(4), 50e6, axis).expected(x)
-    total = sum(
-        a * torch.exp(torch.tensor(2j * math.pi * 50e6 / SPEED_OF_LIGHT * (k + 0.5) * 0.01, dtype=torch.complex128))
-        for k, a in ((200, 3.0), (300, 1.0))
-    )
-    reading = sensing.read_itof(taps, 50e6, 4)
-    assert abs(float(reading.phase) - float(total.angle())) < 1e-9
-    assert 2.005 / 2 + 0.05 < float(reading.depth_m) < 3.005 / 2  # drawn from the first path to the second
-
-
 @pytest.mark.parametrize("num_taps, read_noise_e", [(3, 0.0), (4, 30.0), (5, 0.0)])
 def test_phase_noise_within_two_percent(num_taps, read_noise_e):
     """Standard deviation of the phase of 80 000 noisy pixels against sqrt(2 (B + N r^2)) / A."""
@@ -228,11 +214,6 @@ def test_phase_noise_within_two_percent(num_taps, read_noise_e):
     predicted = sensing.phase_noise_rad(clean.amplitude, clean.offset, num_taps, read_noise_e=read_noise_e)
     assert abs(float(predicted) / theory - 1) < 1e-5  # the delta stands in a bin of 1 / 4096 turn
     assert abs(float(clean.amplitude / clean.offset) - modulated / total) < 1e-5
-
-
-def test_the_checked_figure_of_the_phase_noise():
-    """B = 10 000, A = 2000 electrons in all: 0.0707 rad."""
-    assert abs(float(sensing.phase_noise_rad(torch.tensor(500.0), torch.tensor(2500.0), 4)) - 0.0707) < 1e-4
 
 
 @pytest.mark.parametrize("frequencies", [(20e6, 90e6), (60e6, 100e6), (16e6, 80e6, 120e6)])
@@ -300,18 +281,6 @@ def test_phase_and_amplitude_have_gradients():
     assert torch.autograd.gradcheck(lambda t: sensing.amplitude_of(sensing.tap_phasor(t, 4)), taps)
     other = sensing.tap_phasor(torch.rand(1, 8, 2, 2, dtype=torch.float64, generator=g), 4)
     assert torch.autograd.gradcheck(lambda t: sensing.phasor_loss(sensing.tap_phasor(t, 4), other), taps)
-
-
-def test_dark_pixels_have_value_and_gradient_zero():
-    taps = torch.zeros(1, 4, 1, 2, dtype=torch.float64)
-    taps[..., 1] = 3.0  # light without modulation
-    taps.requires_grad_()
-    reading = sensing.read_itof(taps, 20e6, 4)
-    assert bool(reading.depth_std_m.isinf().all())
-    (reading.depth_m.sum() + reading.depth_std_m.sum() + reading.amplitude.sum()).backward()
-    assert bool(torch.isfinite(taps.grad).all())
-    assert float(reading.depth_m.detach().abs().max()) == 0.0
-    assert float(sensing.decode_code(taps.detach(), CODES["hamiltonian4"]).abs().max()) == 0.0
 
 
 def test_phasor_loss_crosses_the_branch_cut():
@@ -430,17 +399,6 @@ def test_turns_that_are_added():
     for low, high in ((3.0, 3.0), (3.0, math.inf), (3.0, math.nan)):
         with pytest.raises(UnitError, match="expected min_depth_m < max_depth_m"):
             sensing.unwrap_depth(off, frequencies, min_depth_m=low, max_depth_m=high)
-
-
-def test_phases_of_shapes_are_below_a_turn():
-    """Whatever rounding leaves of light at phase zero; and what is found is near zero, from either side."""
-    loud = torch.linspace(1, 7, 500, dtype=torch.float64).view(1, 1, 1, -1)
-    for code in (sensing.sine_code(4), sensing.square_code(3), sensing.hamiltonian_code(3)):
-        steps = code.evaluate(torch.zeros(1, dtype=torch.float64)).reshape(1, -1, 1, 1)
-        for kind in (torch.float64, torch.float32):
-            phase = sensing.decode_code((steps * loud).to(kind), code)
-            assert bool(((phase >= 0) & (phase < TURN)).all())
-            assert float(torch.minimum(phase, TURN - phase).max()) < 1e-2
 
 
 def test_frames_of_less_than_numbers_hold_are_dark():

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 import torch
 
-from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import PhysicsWarning, UnitError
@@ -60,14 +57,6 @@ def test_a_converter_that_clips_differences_is_refused(how):
         sensing.Compose([two_tap(None, sensing.PixelElectronics(), sensing.TapDifference()), converter(**how)])
 
 
-def test_a_quarter_of_the_range_is_room_enough():
-    """4096 codes, of which 1024 are below the level."""
-    stages = sensing.PixelElectronics(), sensing.TapDifference()
-    two_tap(None, *stages, converter(black_level_dn=0.25 * 4095))
-    with pytest.raises(UnitError, match="room below zero"):
-        two_tap(None, *stages, converter(black_level_dn=0.25 * 4095 - 1))
-
-
 def test_no_shot_noise_of_a_difference():
     with pytest.raises(UnitError, match="no shot noise behind a TapDifference"):
         two_tap(None, sensing.TapDifference(), sensing.PixelElectronics())
@@ -111,23 +100,6 @@ def test_differences_that_are_read_as_taps_have_no_deviation():
     measured = right.depth_m.std()
     # 576 pixels know a deviation to 3 %
     assert right.depth_std_m.mean().item() == pytest.approx(measured.item(), rel=0.12)
-
-
-@pytest.mark.slow
-@together("electrons", [0.0, 3.0, 100.0, 2e4])
-@together("readout", ["single", "two_tap", "differential"])
-@together("code", [sensing.sine_code(4), sensing.square_code(3), sensing.square_code(4, 0.1, 0.3)])
-def test_frames_of_light_have_their_deviation(code, electrons, readout):
-    """Whatever light there is, and of every contrast: short pulses have twice the offset as amplitude, at most."""
-    gates = code if readout == "single" else sensing.TwoTapCode(code)
-    stages = [sensing.ItofCorrelation(gates, F, AXIS, background_e=1.0), sensing.PixelElectronics(read_noise_e=5.0)]
-    chain = sensing.Compose([*stages, *([sensing.TapDifference()] if readout == "differential" else [])])
-    frames = chain.sample(at(77, electrons, size=50)[0], torch.Generator().manual_seed(1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        known = sensing.ItofNoise(read_noise_e=5.0, offset_e=(electrons + 1.0) / code.num_taps)
-        found = sensing.read_itof(frames, F, code.num_taps, readout=readout, noise=known)
-    assert not bool(found.depth_std_m.isnan().any())
 
 
 def test_an_offset_that_its_amplitude_excludes():

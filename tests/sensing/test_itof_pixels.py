@@ -53,9 +53,9 @@ def measured(num_taps):
 
 
 CODES = {
-    **{f"sine{n}": sine_code(n) for n in range(2, 9)},
-    **{f"square{n}": square_code(n) for n in range(2, 9)},
-    **{f"measured{n}": measured(n) for n in range(2, 9)},
+    **{f"sine{n}": sine_code(n) for n in (2, 3, 4, 7)},
+    **{f"square{n}": square_code(n) for n in (2, 3, 4, 5)},
+    **{f"measured{n}": measured(n) for n in (2, 4, 5, 8)},
     "hamiltonian3": hamiltonian_code(3),
     "hamiltonian4": hamiltonian_code(4),
     "harmonics": FourierCode(5, {1: (0.8, 0.3), 3: (0.15, -1.0)}),
@@ -141,8 +141,8 @@ def test_two_quadrature_steps_of_two_taps_wiggle_as_four_taps():
 
 
 @pytest.mark.slow
-@together("dark_e, read_noise_e", [(0.0, 0.0), (150.0, 0.0), (40.0, 25.0)])
-@together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
+@together("dark_e, read_noise_e", [(0.0, 0.0), (40.0, 25.0)])
+@together("num_taps, readout", [(3, "single"), *pairs((2, 4), READOUTS[1:]), (8, "single")])
 def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
     """The deviation of 10 000 drawn pixels against the closed form and against `depth_std_m`.
 
@@ -182,8 +182,9 @@ def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("readout", READOUTS)
-@pytest.mark.parametrize("name", ["hamiltonian3", "hamiltonian4", "square4", "measured5"])
+@pytest.mark.parametrize(
+    "name, readout", [("hamiltonian3", "single"), ("square4", "differential"), ("measured5", "two_tap")]
+)
 def test_deviation_of_depth_decoded_by_shape(name, readout):
     """As above, for phases away from the corners of the code."""
     code, count = CODES[name], 2000
@@ -212,21 +213,6 @@ def test_deviation_of_an_unwrapped_depth():
     assert abs(float(reading.depth_m.mean()) - 300.5 * 0.005 / 2) < 1e-3
     ratio = float(reading.depth_std_m.mean()) / float(reading.depth_m.std())
     assert abs(ratio - 1) < 0.03
-
-
-def test_a_deviation_that_nobody_can_know_is_none():
-    turns = torch.tensor([0.2], dtype=torch.float64)
-    difference = frames(sine_code(4), turns, "differential")
-    assert read_itof(difference, F, 4, readout="differential").depth_std_m is None
-    raw = frames(sine_code(4), turns, "single").round().to(torch.int16)
-    assert read_itof(raw, F, 4).depth_std_m is None
-    assert read_itof(raw, F, 4, noise=ItofNoise(electrons_per_unit=2.0)).depth_std_m is not None
-    # 2 electrons a number: a variance of a half, in numbers.
-    in_units = read_itof(frames(sine_code(4), turns, "single") / 2, F, 4, noise=ItofNoise(electrons_per_unit=2.0))
-    torch.testing.assert_close(in_units.depth_std_m, read_itof(frames(sine_code(4), turns, "single"), F, 4).depth_std_m)
-    known = read_itof(difference, F, 4, readout="differential", noise=ItofNoise(std_e=10.0))
-    wanted = 10.0 * math.sqrt(2 / 4) / (700.0 / 4) * SPEED_OF_LIGHT / (2 * TURN * F)
-    assert abs(float(known.depth_std_m) - wanted) < 1e-12
 
 
 @pytest.mark.parametrize("readout", READOUTS)
@@ -317,8 +303,8 @@ def test_reversed_steps(direction):
 @together(
     "name, readout",
     [
-        *pairs(["sine3", "sine4", "square4", "hamiltonian4", "measured4"], READOUTS),
-        *pairs(["sine2", "square2"], READOUTS[1:]),
+        *pairs(["sine3", "square4", "hamiltonian4", "measured4"], READOUTS),
+        ("square2", "differential"),
     ],
 )
 @together("direction", [1, -1])
@@ -422,7 +408,7 @@ def test_raw_frames_of_whole_numbers(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("readout", ["two_tap", "differential", "single"])
+@pytest.mark.parametrize("readout", ["differential", "single"])
 def test_the_standard_deviation_at_the_corners_of_a_square_code(readout):
     """The slope has two values at a corner: one of them was claimed, up to 19 % too small."""
     axis = TimeAxis.from_seconds(0.0, 1e-10, 256)

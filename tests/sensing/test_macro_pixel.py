@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from support.marks import long, long_pairs, long_rows
+from support.marks import long_rows
 from support.sensing.event_driven import Events, compare, detect
 from torchtransient.errors import GradientError
 from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
     CoincidencePixel,
-    Compose,
-    Crosstalk,
     FreeRunningSPAD,
     MacroPixel,
     ScoreFunction,
     SynchronousSPAD,
     ZoneSum,
-    build_stage,
 )
 
 WIDTH = 1e-10  # of a bin
@@ -89,18 +86,6 @@ def test_sums_are_those_of_events(mode, dead, total):
     assert compare(events, detector(mode, dead).expected(image(rate)).numpy()).ratio > 10
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
-@pytest.mark.parametrize("total", [0.1, 1.0, 10.0, 100.0])
-@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("several", 1.4), ("free", 9.3), ("free", 41.2)])
-def test_sums_everywhere(mode, dead, total, kind):
-    rate, found = light(total, kind), []
-    for seed in range(3):
-        events = zone(np.random.default_rng(seed), mode, dead, rate, [1] * 8, 200)
-        found.append(compare(events, MacroPixel(detector(mode, dead), 8).expected(image(rate)).numpy()))
-    assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
-
-
 def test_a_hundred_spads_hardly_pile_up():
     """3 photons per cycle on 100 SPADs: each loses 1.5 % at the end of the cycle; one SPAD would lose 95 %."""
     x = image(light(3.0, "constant"))
@@ -123,15 +108,14 @@ def test_draws_of_equal_spads_are_one_draw_of_more_cycles():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", ["gaussian", "straight_through"])
-def test_totals_of_free_spads_vary_as_those_of_independent_ones(policy):
+def test_totals_of_free_spads_vary_as_those_of_independent_ones():
     """50 photons a period on each, dead for 33.7 of 32 bins: one train of N times the periods varies N times less.
 
     The logarithm of a ratio of two variances of n has the standard deviation 2 / sqrt(n - 1) of normal totals.
     """
     number, spads = 100, 4
     x = image(light(50.0, "constant")).expand(number, 1, BINS, 1, 1)
-    spad = detector("free", 33.7, 10, grad=policy)
+    spad = detector("free", 33.7, 10, grad="gaussian")
     with ScoreFunction():
         alone = [spad(x, generator=torch.Generator().manual_seed(s)) for s in range(spads)]
         whole = MacroPixel(spad, spads)(x * spads, generator=torch.Generator().manual_seed(spads))
@@ -177,16 +161,6 @@ def test_afterpulses_of_every_spad():
     assert one.detector.cycles == 7  # the one that was given stays what it was
 
 
-def test_in_chains_draws_are_drawn_and_policies_reach_the_detector():
-    chain = Compose([MacroPixel(SynchronousSPAD(20), 9), Crosstalk(0.01), ZoneSum(2, 2)], grad="straight_through")
-    assert chain.stages[0].detector.grad == "straight_through" == chain.stages[0].grad
-    x = torch.full((1, BINS, 4, 4), 0.1, dtype=torch.float64)
-    y = chain.sample(x, torch.Generator().manual_seed(0))
-    assert y.shape == (1, BINS, 2, 2) and torch.equal(y, y.round())
-    spec = {"kind": "MacroPixel", "detector": {"kind": "SynchronousSPAD", "cycles": 20}, "spads": 9}
-    torch.testing.assert_close(build_stage(spec)(x), MacroPixel(SynchronousSPAD(20), 9)(x))
-
-
 def test_zones_are_sums_of_their_pixels():
     x = torch.arange(2 * 3 * 4 * 6, dtype=torch.float32).view(2, 3, 4, 6)
     y = ZoneSum(2, 3)(x)
@@ -198,13 +172,10 @@ def test_zones_are_sums_of_their_pixels():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["constant", "pulse", "edges"])
-@pytest.mark.parametrize("total", [1.0, 10.0, 100.0])
-@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("several", 4.4), ("free", 9.3), ("free", 41.2)])
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_coincidences_everywhere(mode, dead, total, kind, k):
-    # of SPADs that fire several times a cycle, detections are even in a bin up to about one photon in it
-    rate, found = light(min(total, 30.0) if mode == "several" else total, kind), []
+@pytest.mark.parametrize("total, kind, k", [(10.0, "constant", 2), (30.0, "edges", 4), (30.0, "pulse", 1)])
+@pytest.mark.parametrize("mode, dead", [("first", 9.5), ("several", 4.4), ("free", 41.2)])
+def test_coincidences_of_events(mode, dead, total, kind, k):
+    rate, found = light(total, kind), []
     for seed in range(3):
         events = zone(np.random.default_rng(seed), mode, dead, rate, [1] * 16, 300)
         seen = coincidences(events, k, 3.4, in_step=mode != "free")
@@ -242,8 +213,7 @@ def test_totals_of_coincidences_vary_as_those_of_events(mode, dead, kind, total,
     assert (np.abs(drawn.mean(0) - seen.mean(0)) < 5 * np.sqrt(most / number + most / len(seen)) + 1e-3).all()
 
 
-@pytest.mark.parametrize("dead", [2.0, 2.4])
-@pytest.mark.parametrize("mode", ["several", "free"])
+@pytest.mark.parametrize("mode, dead", [("several", 2.4), ("free", 2.0)])
 def test_no_spad_coincides_with_itself(mode, dead):
     """A window of the whole dead time: the second SPAD is in the dark, then as bright; of 3e4 coincidences 3 %."""
     bright = image(np.full(BINS, 0.3))
@@ -290,15 +260,9 @@ def test_the_score_of_a_learnt_dead_time_is_refused():
         sensor(image(light(1.0)))
 
 
-WINDOWS = [("first", 1.6), ("first", 5.0), ("free", 0.7)]
-
-
-@pytest.mark.parametrize(
-    ("windows", "k"), long_pairs(WINDOWS, [1, 2, 3], [(one, 1 + n % 3) for n, one in enumerate(WINDOWS)])
-)
-def test_coincidences_of_three_spads_by_quadrature(windows, k):
+@pytest.mark.parametrize("mode, window, k", [("first", 1.6, 1), ("first", 5.0, 2), ("free", 0.7, 3)])
+def test_coincidences_of_three_spads_by_quadrature(mode, window, k):
     """One of them detects while k - 1 of the others have within the window: products, at each moment of each bin."""
-    mode, window = windows
     bins, weights, points = 5, [1.0, 2.0, 4.0], 1000
     rate = torch.tensor([[0.3, 2.5, 0.0, 1.2, 0.7], [1.1, 0.2, 0.9, 3.0, 0.1]], dtype=torch.float64)
     x = rate.T.reshape(1, bins, 1, 2)
@@ -352,7 +316,7 @@ def test_detectors_that_skip_periods_do_so_independently():
     assert abs(share - 1 / 16) < 4 * (1 / 4) * (1 / 4 * 3 / 4 / (cycles / 26)) ** 0.5 + 1e-3
 
 
-@pytest.mark.parametrize("k", [1, 2, 3, 5])
+@pytest.mark.parametrize("k", [1, 2, 5])
 def test_many_spads_in_constant_light_are_a_poisson_process(k):
     """r (r w)^(k-1) exp(-r w) / (k-1)!, with 100 000 SPADs so that none fires twice; constant round the period."""
     per_bin, window = 0.4, 3.7
@@ -364,15 +328,8 @@ def test_many_spads_in_constant_light_are_a_poisson_process(k):
     assert float(y.max() / y.min() - 1) < 1e-6
 
 
-def test_background_falls_faster_than_the_signal():
-    """Ten times the background in every bin makes a hundred times the twofold coincidences."""
-    sensor = CoincidencePixel(SynchronousSPAD(1), 16, coincidence=2, window_s=2 * WIDTH, bin_width_s=WIDTH)
-    weak, strong = (sensor(torch.full((1, BINS, 1, 1), r, dtype=torch.float64)).sum() for r in (1e-5, 1e-4))
-    assert float(strong / weak) == pytest.approx(100, rel=0.01)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("photons", long([1e-3, 40.0, 400.0, 1e12, 1e15], [1e-3, 40.0, 400.0]))
+@pytest.mark.parametrize("photons", [1e-3, 400.0, 1e15])
 def test_coincidences_of_a_bin_with_any_number_of_photons(photons):
     """All light in bin 0, first photons, a window of a bin: one as soon as k of n SPADs have fired, none after that.
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import pytest
 import torch
 
-from support.marks import long_rows
 from torchtransient import TimeAxis, sensing
 
 PS = 1e-12
@@ -35,11 +33,7 @@ def counts_of(response, truth, photons, background, seed=1):
     return torch.poisson(mean, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize(
-    ("shape", "background"), long_rows(
-        itertools.product(SHAPES, [0.0, 0.6]), [("tail of 2 bins", 0.6), ("rectangle", 0.0), ("wide", 0.6)]
-    )
-)
+@pytest.mark.parametrize(("shape", "background"), [("tail of 2 bins", 0.6), ("rectangle", 0.0), ("wide", 0.6)])
 def test_at_the_bound_in_any_shape(shape, background):
     """1000 photons. The ratio of 2000 draws has a deviation of 1.6 %: four of them, and 2 % above the bound."""
     response, truth, photons = SHAPES[shape], planes(), 1000.0
@@ -134,7 +128,7 @@ def test_flat_tops_and_ends_of_the_window():
             assert 0 <= float(sensing.ml_position(counts.detach(), response, AXIS)) <= 64
 
 
-@pytest.mark.parametrize("delay", [0.0, 370 * PS, -640 * PS])
+@pytest.mark.parametrize("delay", [370 * PS, -640 * PS])
 @pytest.mark.parametrize("shape", ["tail", "even", "narrow"])
 def test_few_photons_against_every_place(shape, delay):
     """The greatest likelihood of all places of the bins around the best one, looked at one by one, at both ends too."""

@@ -14,7 +14,6 @@ from torchtransient.sensing import (
     MacroPixel,
     PixelGroups,
     PixelSkew,
-    ScoreFunction,
     SynchronousSPAD,
     build_stage,
 )
@@ -58,22 +57,6 @@ def test_draws_have_the_mean_of_their_pixel():
     y, mean = sensor.sample(x, torch.Generator().manual_seed(0)), sensor.expected(x[:1])
     assert torch.equal(y, y.round())
     assert bool(((y.mean(0) - mean[0]).abs() < 5 * (y.var(0) / 3000).sqrt() + 2e-3).all())
-
-
-@pytest.mark.parametrize("policy", ["gaussian", "score"])
-def test_policies_of_losses_of_pixels(policy):
-    """One loss for each pixel: its gradient is that of its own light. Linear losses, for which all are unbiased."""
-    sensor = PixelGroups.by_value(DEAD * WIDTH, synchronous(100), grad=policy)
-    x = light(1).expand(400, 1, BINS, 2, 3).clone().requires_grad_()
-    with ScoreFunction() as score:
-        losses = sensor(x, generator=torch.Generator().manual_seed(0)).sum(2) / 100  # (400, 1, 2, 3)
-    if policy == "score":
-        losses = score.surrogate(losses, baseline="leave_one_out")
-    losses.sum().backward()
-    mean = light(1).requires_grad_()
-    (sensor.expected(mean).sum() / 100).backward()
-    found, spread = x.grad.sum(2).mean(0), x.grad.sum(2).std(0) / 400**0.5
-    assert bool(((found - mean.grad.sum(2)[0]).abs() <= 5 * spread + 1e-9).all())
 
 
 def test_score_outside_of_its_context():

@@ -65,17 +65,6 @@ def test_stokes_from_six_analysers(ratio):
     torch.testing.assert_close(sensor.stokes(sensor.expected(s)), s)
 
 
-def test_stokes_from_four_linear_analysers():
-    s = vectors(1, 2, 3, 3)
-    rows = linear_analyzers([0, 45, 90, 135])
-    i0, i45, i90, i135 = analyze(s, rows)
-    found = stokes_from(analyze(s, rows), rows)
-    torch.testing.assert_close(found[0], (i0 + i45 + i90 + i135) / 2)
-    torch.testing.assert_close(found[1], i0 - i90)
-    torch.testing.assert_close(found[2], i45 - i135)
-    assert float(found[3].abs().max()) == 0.0
-
-
 def test_mosaic_gathers_the_analyser_of_every_pixel():
     s = vectors(2, 3, 2, 5, 7)
     sensor = PolarizationMosaic.polarsens(extinction_ratio=250.0)

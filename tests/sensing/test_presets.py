@@ -78,29 +78,6 @@ def test_derived_numbers():
     assert gates["delays_s"][-1] + gates["widths_s"] < 600 * 50e-12
 
 
-@pytest.mark.parametrize(
-    ("name", "dead_time_s"), [("picoharp300_like", 95e-9), ("hydraharp400_like", 80e-9), ("mpd_spad_like", 75e-9)]
-)
-def test_one_detection_per_cycle_where_the_dead_time_is_longer_than_the_window(name, dead_time_s):
-    preset = device(name)
-    assert preset.bin_width_s * preset.num_bins < dead_time_s
-    assert "dead_time_s" not in stage(name, "SynchronousSPAD")
-
-
-@pytest.mark.slow
-def test_only_the_fast_counter_sees_a_second_photon():
-    """Two pulses of 9 expected detections, 3 ns apart: each is seen with a probability of 1 - exp(-9)."""
-    seen = {}
-    for name in ("hydraharp400_like", "multiharp150_like"):
-        axis = device(name).axis()
-        x = torch.zeros(1, axis.num_bins, 1, 1, dtype=torch.float64)
-        x[:, axis.num_bins // 2] = x[:, axis.num_bins // 2 + round(3e-9 / device(name).bin_width_s)] = 9.0
-        seen[name] = float(device(name).sensor().expected(x).sum()) / 100_000
-    assert abs(seen["hydraharp400_like"] - 1) < 1e-3
-    # A pulse has gone by, but for 1e-6 of it, before the input is armed again 650 ps (14 sigma) after its first photon.
-    assert abs(seen["multiharp150_like"] - 2) < 1e-3
-
-
 def test_gates_of_the_array_see_light_while_they_are_open():
     preset = device("spad512s_like").changed("PhotonBudget", ambient_rate_hz=0.0, dark_count_rate_hz=0.0)
     axis = preset.axis()

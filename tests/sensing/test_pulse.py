@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long
 from tools.small_room import make_room
 from torchtransient import plugins
 from torchtransient.sensing import apply_pulse, axis_with_margin
@@ -50,16 +49,6 @@ def _moment(pulse, power):
     return float((np.diff(pulse.cumulative(x)) * (0.5 * (x[1:] + x[:-1])) ** power).sum())
 
 
-@pytest.mark.parametrize("name", PULSES)
-def test_impulse_becomes_the_pulse(name):
-    first, kernel = pulse_kernel(0.02, *PULSES[name])
-    result = apply_pulse(impulse(), AXIS, *PULSES[name])
-    expected = torch.zeros(150, dtype=torch.float64)
-    expected[60 + first : 60 + first + kernel.numel()] = kernel
-    for c in range(2):
-        torch.testing.assert_close(result[c, :, 0, 1], expected, rtol=0, atol=1e-15)
-
-
 def test_short_and_long_kernels_agree():
     x = torch.rand(3, 400, 2, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     axis = tt.TimeAxis(0.0, 0.02, 400)
@@ -97,14 +86,6 @@ def test_gradients():
     assert torch.autograd.gradgradcheck(lambda v: apply_pulse(v, axis, MEASURED), (x,), fast_mode=True)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.complex64])
-def test_dtype_and_layout(dtype):
-    x = torch.rand(2, 150, 4, 3, dtype=torch.float32).to(dtype).transpose(-1, -2)
-    result = apply_pulse(x, AXIS, MEASURED)
-    assert result.dtype == dtype and result.shape == x.shape
-    torch.testing.assert_close(apply_pulse(x[None], AXIS, MEASURED)[0], result)
-
-
 @pytest.fixture(scope="module")
 def room():
     mi.set_variant(VARIANT)
@@ -112,10 +93,9 @@ def room():
     return tt.load(make_room(), variant=VARIANT)
 
 
-@pytest.mark.parametrize("name", long(PULSES, ["both"]))
-def test_render_time_and_torch_agree(room, name):
+def test_render_time_and_torch_agree(room):
     """Same seed, same paths: what differs is where in its bin an arrival is."""
-    pulses = PULSES[name]
+    pulses = PULSES["both"]
     axis = tt.TimeAxis(5.0, 0.02, 400)
     plain = tt.TransientRenderer(room, time_axis=axis, spp=64)(seed=3)
     spread = dict(zip(("pulse", "irf"), pulses, strict=False))
@@ -124,14 +104,14 @@ def test_render_time_and_torch_agree(room, name):
     applied = apply_pulse(plain.transient, axis, *pulses)
     error = (applied - rendered.transient).norm() / rendered.transient.norm()
     shift = (apply_pulse(plain.transient, axis, *(p.shifted(0.02) for p in pulses[:1]), *pulses[1:]) - applied).norm()
-    # far below an error of one bin in the pulse's position; the edges of a box are known to half a bin only
-    assert error < (0.2 if name == "late box" else 0.1) * shift / applied.norm()
+    # far below an error of one bin in the pulse's position
+    assert error < 0.1 * shift / applied.norm()
     coarse_axis = tt.TimeAxis(5.0, 0.04, 200)
     coarse = tt.TransientRenderer(room, time_axis=coarse_axis, spp=64)(seed=3).transient
     coarse_rendered = tt.TransientRenderer(room, time_axis=coarse_axis, spp=64, **spread)(seed=3).transient
     coarse_error = (apply_pulse(coarse, coarse_axis, *pulses) - coarse_rendered).norm() / coarse_rendered.norm()
-    # of second order in the bin's width, of order 1/2 at the edges of a box
-    assert coarse_error > (1.2 if name == "late box" else 2.0) * error
+    # of second order in the bin's width
+    assert coarse_error > 2.0 * error
 
 
 def test_energy_is_accounted_for(room):

@@ -11,7 +11,7 @@ import torch
 from torch.autograd import forward_ad
 
 from torchtransient.errors import TorchTransientError
-from torchtransient.sensing.dead_time import free_running, renewal
+from torchtransient.sensing.dead_time import renewal
 from torchtransient.sensing.dead_time.renewal import ConstantLight, RenewalChain, moments, second_moment, solve_banded
 from torchtransient.sensing.time_convolution import sum_before
 
@@ -152,37 +152,6 @@ def test_rows_that_do_not_converge_are_solved_directly(monkeypatch):
     monkeypatch.setattr(renewal, "gmres", stuck)
     with pytest.raises(TorchTransientError, match="relative residual"):
         torch.autograd.grad(pi[:, 0].sum(), leaf)
-
-
-def test_which_trains_are_drawn_with_their_memory(monkeypatch):
-    """A wait below half a period, and bins that three of the larger deviations would leave with too little."""
-    waits = [1.99, 0.5, 2.0, 1.0, 3.0]
-    per_bin = torch.tensor([[0.1, 0.2, 0.3, 0.4]], dtype=torch.float64).expand(5, -1)
-    per_bin = per_bin * 4 / (torch.tensor(waits).double() + 1.5).unsqueeze(1) / per_bin.sum(-1, keepdim=True)
-    asked, mean = [], 10 * per_bin
-    # by how much the first bin would fall short, as a share of all counts
-    short = torch.tensor([0.0101, 0.0099, 9.0, 0.02, 9.0], dtype=torch.float64)
-
-    class State:
-        def __init__(self):
-            self.per_bin = per_bin
-
-        def select(self, rows):
-            asked.append(rows.tolist())
-            return rows
-
-    def periods(rows, number, generator, *, normal):
-        assert number == 10 and normal
-        more = 0.1 * mean[rows]
-        half = rows.numel() // 2
-        more[half:, 0] = -(mean[:, 0] + short * mean.sum(-1))[rows[half:]] / 3
-        return None, more
-
-    monkeypatch.setattr(free_running, "_independent_periods", periods)
-    dead = torch.tensor(1.5, dtype=torch.float64)
-    wide = free_running._remembers_phase(State(), per_bin, dead, 10)
-    assert wide.tolist() == [True, False, False, True, False] and asked == [[0, 1, 3, 0, 1, 3]]
-    assert not bool(free_running._remembers_phase(State(), per_bin, dead, 1).any()) and len(asked) == 1
 
 
 BELOW = math.nextafter(1.0, 0.0)

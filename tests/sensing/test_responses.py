@@ -18,7 +18,6 @@ from torchtransient.sensing import (
     ItofCorrelation,
     Moves,
     UniformResponse,
-    crlb,
     emg_response,
     sine_code,
 )
@@ -142,33 +141,6 @@ def test_noise_of_moves_has_the_covariance_of_multinomials(lost):
 
 
 AXIS = TimeAxis.from_seconds(0.0, 1e-9, 40)
-
-
-@pytest.mark.parametrize("fwhm_s", [1e-12, 2e-11, 1e-9])
-def test_bound_of_normal_delays_one_after_another(fwhm_s):
-    """A return at the edge of a bin, where a response narrower than the bin is known best."""
-    edge = 20e-9 * 299792458.0 / 2
-    both = crlb(
-        ComposedResponse([GaussianResponse(fwhm_s / 2**0.5)] * 2), AXIS, distance_m=edge, signal=1000.0, background=0.1
-    )
-    one = crlb(GaussianResponse(fwhm_s), AXIS, distance_m=edge, signal=1000.0, background=0.1)
-    torch.testing.assert_close(both.distance_m, one.distance_m, rtol=1e-6, atol=0)
-    torch.testing.assert_close(both.signal, one.signal, rtol=1e-6, atol=0)
-
-
-def test_bound_of_a_response_from_a_table():
-    """A normal delay and a uniform one that is a hundredth as long: hardly wider than the normal one alone."""
-    edge = 20e-9 * 299792458.0 / 2
-    both = crlb(
-        ComposedResponse([GaussianResponse(1e-11), UniformResponse(1e-13)]),
-        AXIS,
-        distance_m=edge,
-        signal=1000.0,
-        background=0.1,
-    )
-    one = crlb(GaussianResponse(1e-11), AXIS, distance_m=edge, signal=1000.0, background=0.1)
-    # 1/12 of 1e-2^2 beside 1/2.35^2 of the variance, and as much for the table
-    torch.testing.assert_close(both.distance_m, one.distance_m, rtol=1e-3, atol=0)
 
 
 def test_distributions_of_composed_responses():

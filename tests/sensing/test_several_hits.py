@@ -9,7 +9,6 @@ from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.sensing import (
-    ScoreFunction,
     SynchronousSPAD,
     coates,
     detections_with_dead_time,
@@ -44,7 +43,7 @@ def slow(*values):
 
 CASES = [
     ("pulse", 1.0, 6.5), ("ends", 100.0, 0.6),
-    *(slow(s, r, d) for s in shapes() for r in (0.1, 1.0, 10.0, 100.0) for d in (0.83, 1.3, 23.7)),
+    *(slow(s, r, d) for s in ("ends", "spike") for r in (1.0, 100.0) for d in (0.83, 23.7)),
 ]  # fmt: skip
 
 
@@ -75,8 +74,7 @@ def test_means_and_draws_against_events(shape, total, dead, request):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shape, total", [("pulse", 3.0), ("pulse", 30.0), ("ends", 100.0), ("spike", 60.0)])
-@pytest.mark.parametrize("dead", [0.6, 1.3, 7.0])
+@pytest.mark.parametrize("shape, total, dead", [("pulse", 30.0, 7.0), ("ends", 100.0, 0.6), ("spike", 60.0, 1.3)])
 def test_bins_cut_or_not_give_the_same(shape, total, dead):
     """The solution with bins cut finer and finer, by hand."""
     row, pieces = total * shapes()[shape], 32
@@ -98,9 +96,8 @@ def test_closed_form_of_constant_light():
     torch.testing.assert_close(found, (once + twice + thrice).diff(), rtol=0, atol=2e-5)
 
 
-@pytest.mark.parametrize("dead", [slow(0.8), 1.3, slow(5.6)])
-def test_gaussian_has_the_covariance_of_the_cycles(dead):
-    rate, cycles, draws = 20 * shapes(10)["pulse"], 400, 6000
+def test_gaussian_has_the_covariance_of_the_cycles():
+    rate, cycles, draws, dead = 20 * shapes(10)["pulse"], 400, 6000, 1.3
     sensor = spad(dead, cycles, "gaussian")
     x = image(rate).unsqueeze(0).expand(draws, 1, 10, 1, 1)
     y = sensor(x, generator=torch.Generator().manual_seed(0)).view(draws, 10)
@@ -141,25 +138,6 @@ def test_pixels_of_all_levels():
 
 
 @pytest.mark.slow
-def test_batches_of_autograd_and_of_func():
-    """Jacobians and Hessians of every kind, one pixel."""
-    x = image(np.linspace(0.05, 0.3, 4))
-
-    def f(v):
-        return detections_with_dead_time(v, 1.3)
-
-    rows = torch.func.jacrev(f)(x)
-    torch.testing.assert_close(torch.func.jacfwd(f)(x), rows, rtol=1e-11, atol=1e-13)
-    leaf = x.clone().requires_grad_()
-    unit = torch.eye(4, dtype=torch.float64).view(4, *x.shape)
-    (together,) = torch.autograd.grad(f(leaf), leaf, unit, is_grads_batched=True)
-    torch.testing.assert_close(together.view(4, 4), rows.view(4, 4), rtol=1e-11, atol=1e-13)
-    bend = torch.func.hessian(lambda v: f(v).square().sum())(x)
-    numeric = torch.autograd.functional.hessian(lambda v: f(v).square().sum(), x)
-    torch.testing.assert_close(bend, numeric, rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.slow
 def test_forward_derivatives_where_no_graph_is_built():
     """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
     x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
@@ -174,8 +152,8 @@ def test_forward_derivatives_where_no_graph_is_built():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dead", [slow(0.7), 1.3])
-def test_gradients(dead):
+def test_gradients():
+    dead = 1.3
     x = mixed()[..., :2] + 0.01  # not cut, and cut
     x.requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
@@ -189,25 +167,7 @@ def test_gradients(dead):
 
 
 @pytest.mark.slow
-def test_score_of_draws_gives_the_gradient_of_the_mean():
-    rate, draws = 4 * shapes(6)["ends"], 10_000
-    brightness = torch.ones(draws, 1, 1, 1, 1, dtype=torch.float64, requires_grad=True)
-    sensor = spad(1.4, 5, "score")
-    weights = torch.linspace(-1, 2, 6, dtype=torch.float64)
-    with ScoreFunction() as score:
-        y = sensor(brightness * image(rate), generator=torch.Generator().manual_seed(2))
-        losses = score.surrogate((y.view(draws, 6) * weights).sum(-1), baseline="leave_one_out")
-    losses.sum().backward()
-    one = torch.ones((), dtype=torch.float64, requires_grad=True)
-    ((sensor.expected(one * image(rate)).flatten() * weights).sum()).backward()
-    found = brightness.grad.flatten()
-    assert abs(float(found.mean() - one.grad)) < 4.5 * float(found.std()) / draws**0.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "total, dead", [(1.0, 1.3), slow(2.0, 40.0), slow(30.0, 7.9), slow(30.0, 1.0), slow(100.0, 1.3), slow(100.0, 2.2)]
-)
+@pytest.mark.parametrize("total, dead", [(1.0, 1.3), (30.0, 7.9), (100.0, 2.2)])
 def test_coates_undoes_the_mean(total, dead):
     rate, cycles = image(total * shapes()["pulse"]), 10_000
     sensor = spad(dead, cycles)
@@ -230,17 +190,8 @@ def test_estimates_have_gradients_where_no_cycle_is_armed():
     assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
 
 
-@pytest.mark.slow
-def test_coates_of_draws_is_unbiased():
-    rate, repeats, cycles = image(5 * shapes()["pulse"]), 200, 20_000
-    h = spad(2.6, cycles).sample(rate.unsqueeze(0).expand(repeats, 1, BINS, 1, 1), torch.Generator().manual_seed(0))
-    found = coates(h, cycles, 2.6).rate
-    z = (found.mean(0) - rate).abs() / (found.std(0) / repeats**0.5)
-    assert float(z.max()) < 4.5
-
-
 @pytest.mark.parametrize(
-    "total, dead, error", [(1.0, 0.6, 2e-3), (1.0, 2.6, 2e-3), (5.0, 2.6, 0.03), (5.0, 7.0, 0.02), (20.0, 30.4, 2e-6)]
+    "total, dead, error", [(1.0, 0.6, 2e-3), (5.0, 2.6, 0.03), (20.0, 30.4, 2e-6)]
 )
 def test_the_likelihood_is_greatest_near_the_light(total, dead, error):
     """Newton's step from the truth, in counts without noise; second order in the photons of a bin.

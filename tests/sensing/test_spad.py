@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import mpmath
-import numpy as np
 import pytest
 import torch
 from scipy import stats
 
-from support.sensing.event_driven import chi2_per_dof, synchronous
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing import (
     BinaryFrames,
@@ -35,56 +33,12 @@ def as_image(row):
     return row.view(1, -1, 1, 1)
 
 
-def test_probabilities_add_up_to_one():
-    p, none = first_photon_probabilities(as_image(pulse(3.0)))
-    assert float(p.sum() + none) == pytest.approx(1, abs=1e-14)
+def test_probabilities_of_first_photons():
     row = pulse(3.0)
+    p, none = first_photon_probabilities(as_image(row))
+    assert float(p.sum() + none) == pytest.approx(1, abs=1e-14)
     by_hand = [(1 - torch.exp(-row[k])) * torch.exp(-row[:k].sum()) for k in range(BINS)]
     torch.testing.assert_close(p.flatten(), torch.stack(by_hand))
-
-
-@pytest.mark.parametrize("dead_bins", [None, 6.5, 11.2, 0.5])
-def test_expectation_against_photons(dead_bins):
-    rate, cycles = pulse(), 20_000
-    seen = synchronous(np.random.default_rng(3), rate.numpy(), cycles, dead_bins)
-    spad = SynchronousSPAD(cycles, dead_time_s=None if dead_bins is None else dead_bins * 1e-10, bin_width_s=1e-10)
-    expected = spad(as_image(rate)).flatten().numpy()
-    # 5 sigma of a chi2 over about 45 bins; cycles are independent, so the counts are multinomial or narrower
-    assert chi2_per_dof(seen, expected) < 1 + 5 * (2 / 40) ** 0.5
-    assert seen.sum() == pytest.approx(expected.sum(), rel=5 / expected.sum() ** 0.5)
-    if dead_bins is None:
-        raw = rate.numpy() / rate.numpy().sum() * expected.sum()
-        assert chi2_per_dof(seen, raw) > 20  # pile-up is there to be seen
-
-
-@pytest.mark.parametrize("dead_bins", [None, 6.5])
-def test_samples_have_the_moments_of_the_model(dead_bins):
-    rate, cycles, repeats = pulse(), 500, 4000
-    x = as_image(rate).unsqueeze(0).expand(repeats, 1, BINS, 1, 1)
-    h = sample_detections(x, cycles, dead_bins, generator=torch.Generator().manual_seed(0)).squeeze()
-    assert torch.equal(h, h.round())
-    spad = SynchronousSPAD(cycles, dead_time_s=None if dead_bins is None else dead_bins * 1e-10, bin_width_s=1e-10)
-    mean = spad.expected(as_image(rate)).flatten()
-    variance = spad.variance(as_image(rate)).flatten()
-    assert bool(((h.mean(0) - mean).abs() <= 5 * (variance / repeats).sqrt()).all())
-    if dead_bins is None:
-        assert bool(((h.var(0) - variance).abs() <= 6 * variance * (2 / repeats) ** 0.5 + 0.02).all())
-        p = mean / cycles
-        covariance = cycles * (torch.diag(p) - torch.outer(p, p))
-        bound = 6 * torch.sqrt(torch.outer(variance, variance) / repeats) + 0.02
-        assert bool(((torch.cov(h.T) - covariance).abs() <= bound).all())
-
-
-def test_samples_with_dead_time_have_the_correlations_of_photons():
-    """Variance of the total of 40 cycles: dead time makes it smaller than that of independent bins."""
-    rate, cycles = pulse(6.0), 40
-    rng = np.random.default_rng(0)
-    totals = np.array([synchronous(rng, rate.numpy(), cycles, 9.5).sum() for _ in range(400)])
-    x = as_image(rate).unsqueeze(0).expand(4000, 1, BINS, 1, 1)
-    ours = sample_detections(x, cycles, 9.5, generator=torch.Generator().manual_seed(1)).sum((1, 2, 3, 4))
-    assert float(ours.mean()) == pytest.approx(totals.mean(), abs=5 * totals.std() / 20)
-    assert float(ours.var()) == pytest.approx(totals.var(), rel=5 * (2 / 400) ** 0.5)
-    assert totals.var() < 0.5 * totals.mean()
 
 
 def test_gaussian_surrogate_has_the_covariance_of_the_multinomial():
@@ -180,22 +134,6 @@ def test_log_prob_is_that_of_the_multinomial():
     wanted = torch.distributions.Multinomial(cycles, probabilities).log_prob(torch.cat([h, (cycles - h.sum()).view(1)]))
     found = SynchronousSPAD(cycles).log_prob(as_image(h), as_image(rate))
     torch.testing.assert_close(found.squeeze(), wanted)
-
-
-@pytest.mark.parametrize("dead_bins", [None, 2.5])
-def test_the_score_has_mean_zero_and_coates_makes_it_vanish(dead_bins):
-    rate, cycles, repeats = pulse(1.5, 9), 50, 8000
-    spad = SynchronousSPAD(cycles, dead_time_s=None if dead_bins is None else dead_bins * 1e-10, bin_width_s=1e-10)
-    x = as_image(rate).unsqueeze(0).expand(repeats, 1, 9, 1, 1).clone().requires_grad_()
-    h = spad.sample(x, torch.Generator().manual_seed(0))
-    (score,) = torch.autograd.grad(spad.log_prob(h, x).sum(), x)
-    z = score.mean(0) / (score.std(0) / repeats**0.5)
-    assert float(z.abs().max()) < 4.5
-    mean = spad(as_image(rate))
-    best = coates(mean, cycles, spad.dead_bins).rate.requires_grad_()
-    (at_best,) = torch.autograd.grad(spad.log_prob(mean, best).sum(), best)
-    # with a dead time the likelihood is right to second order in the photons of a bin
-    assert float(at_best.abs().max()) < (1e-6 if dead_bins is None else 2e-3 * cycles)
 
 
 @pytest.mark.parametrize(

@@ -17,13 +17,6 @@ def point(height=15, width=15):
     return x
 
 
-def test_a_point_becomes_the_psf():
-    psf = torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    y = SpatialPSF(psf)(point())
-    torch.testing.assert_close(y[0, 0, 5:10, 6:9], psf / psf.sum())
-    assert float(y[0, 1].sum()) == pytest.approx(1)
-
-
 def test_gaussian_blur_has_its_width_and_keeps_energy():
     y = LensBlur(2.0, border="circular", size=13)(point())[0, 0]
     i = torch.arange(15, dtype=torch.float64) - 7

@@ -59,14 +59,6 @@ def test_noise_of_speckled_light_is_a_gamma_distribution(looks):
     follows(found, stats.gamma(looks, scale=(7.0 + 1) / looks))
 
 
-def test_field_of_one_look_is_the_sum_of_complex_numbers():
-    """Against |sqrt(n) + z|^2 itself, drawn otherwise: means of the first four powers agree."""
-    g = torch.Generator().manual_seed(3)
-    z = torch.randn(DRAWS, 2, generator=g, dtype=torch.float64) * 0.5**0.5
-    direct = ((2.0 + z[:, 0]).square() + z[:, 1].square()).numpy()
-    assert stats.ks_2samp(draws(BeatNoise(), 4.0, seed=4), direct).pvalue > 1e-3
-
-
 @pytest.mark.parametrize("policy", ["gaussian", "straight_through"])
 @pytest.mark.parametrize("sensor", [Speckle(2), BeatNoise(3.0, 2)], ids=lambda s: type(s).__name__)
 def test_gradients_with_the_same_draws(sensor, policy):
@@ -132,22 +124,6 @@ def test_scores_of_shot_noise():
     h = 0.05
     ahead, here, behind = (float(sensor.log_prob(y, n.detach() + s * h).mean()) for s in (1, 0, -1))
     assert float(slope.square().mean()) == pytest.approx(-(ahead - 2 * here + behind) / h**2, rel=0.05)
-
-
-def test_likelihood_finds_the_power():
-    """The most likely expectation of many spectra is their mean."""
-    drawn = torch.from_numpy(draws(Speckle(3), 2.0, seed=10)).reshape(1, -1, 1, 1)
-    power = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS([power], max_iter=50, line_search_fn="strong_wolfe")
-
-    def closure():
-        optimizer.zero_grad()
-        loss = -Speckle(3).log_prob(drawn, power.expand(drawn.shape)).mean() / DRAWS
-        loss.backward()
-        return loss
-
-    optimizer.step(closure)
-    assert power.item() == pytest.approx(drawn.mean().item(), rel=1e-5)
 
 
 @pytest.mark.parametrize("wrong", [-1e-3, float("nan"), float("inf")])

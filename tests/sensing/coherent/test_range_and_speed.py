@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from torchtransient import Chirps, TimeAxis
-from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.sensing import BeatNoise, Compose, Speckle, fold_beats, range_and_speed
 
 WINDOWS = ["rectangular", "hann", "hamming", "blackman", "blackmanharris", "nuttall"]
@@ -132,21 +131,3 @@ def test_folded_bins(start, bins, wanted, sums):
     folded, axis = fold_beats(torch.arange(1.0, bins + 1).reshape(1, -1, 1, 1), TimeAxis(start, 1.0, bins))
     assert axis == TimeAxis(wanted[0], 1.0, wanted[1])
     assert folded.flatten().tolist() == sums
-
-
-def test_what_is_refused():
-    chirps = chirps_of()
-    axis = chirps.time_axis((0.5, 4.0))
-    beats = torch.ones(2, axis.num_bins, 1, 1)
-    with pytest.raises(ShapeError, match="up and down"):
-        range_and_speed(beats[:1], chirps, axis)
-    with pytest.raises(ShapeError, match="up and down"):
-        range_and_speed(beats[:, 1:], chirps, axis)
-    with pytest.raises(ArgumentError, match="Chirps"):
-        range_and_speed(beats, axis, axis)
-    with pytest.raises(ArgumentError, match="sums, samples"):
-        range_and_speed(beats, chirps, axis, bins="averages")
-    with pytest.raises(ShapeError, match="T ="):
-        fold_beats(beats[:, 1:], axis)
-    with pytest.raises(ShapeError, match="zero at an edge"):
-        fold_beats(beats, TimeAxis(0.3, 1.0, axis.num_bins))
