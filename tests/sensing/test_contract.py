@@ -197,16 +197,6 @@ def test_conservation(entry):
     )
 
 
-@together(
-    "name, call, error",
-    [(f"{e.name} {i}", *pair) for e in ENTRIES for i, pair in enumerate(e.errors)],
-    lambda row: row[0],
-)
-def test_errors(name, call, error):
-    with pytest.raises(error, match=r"\w+: .*(expected|needs|not supported).*"):
-        call()
-
-
 @together("entry, policy", [(e, p) for e, p in EVERY_POLICY if p in ("gaussian", "straight_through")], named)
 def test_generator_reproduces(entry, policy):
     module, x = entry.module(grad=policy), entry.x()

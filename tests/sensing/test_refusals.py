@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from support.sweeps import together
-from torchtransient import FrequencyAxis, Pulse, TimeAxis, sensing
+from torchtransient import Chirps, FrequencyAxis, Pulse, TimeAxis, sensing
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, TorchTransientError, UnitError
 
 PS, F = 1e-12, 20e6
@@ -22,6 +22,7 @@ SINE, SQUARE = sensing.sine_code(4), sensing.square_code(4)
 LENS = sensing.Optics(f_number=2.0)
 ROWS = sensing.linear_analyzers([0.0, 45.0])
 SUN = {"spectral_irradiance_w_m2_nm": 0.9, "filter_bandwidth_m": 1e-8, "wavelength_m": 9e-7}
+CHIRPS = Chirps(1e9, 1e-5, 1550e-9)
 BOUND = {"distance_m": 0.05, "signal": 3.0}
 MAPS = [torch.full((1, 2, 3), v, dtype=torch.float64) for v in (0.05, 3.0)]
 PHASOR = torch.ones(1, 1, 2, 3, dtype=torch.complex64)
@@ -40,6 +41,19 @@ def ran_away(value):
 
 def mean(distance, signal):
     return sensing.return_rates(PULSE, AXIS, distance_m=distance, signal=signal).movedim(-1, -3)
+
+
+SPAD = sensing.SynchronousSPAD(5)
+FREE = sensing.FreeRunningSPAD(9, 200 * PS, **WIDTH)
+COUNTED = torch.tensor([5.0, 3.0, 1.0])
+
+
+def after(probability=0.05, tau_s=1e-9, dead_time_s=1e-10, **given):
+    return sensing.Afterpulsing(probability, tau_s, dead_time_s, **{**WIDTH, **given})
+
+
+def coincidence(detector=SPAD, spads=2, window_s=1e-10, k=2):
+    return sensing.CoincidencePixel(detector, spads, coincidence=k, window_s=window_s, **WIDTH)
 
 
 class Backward(torch.autograd.Function):
@@ -75,7 +89,6 @@ def other_state(camera, **changed):
 
 SHAPES = [
     lambda: sensing.crlb(PULSE, AXIS, distance_m=torch.ones(2), signal=torch.ones(3)),
-    lambda: sensing.covariance_bound(mean, []),
     lambda: sensing.covariance_bound(lambda *p: mean(*p)[0], MAPS),
     lambda: sensing.log_matched_filter(LIGHT, PULSE.kernel(100 * PS)),
     lambda: sensing.first_return(LIGHT, torch.ones(6)),
@@ -84,10 +97,7 @@ SHAPES = [
     lambda: sensing.peak_position(LIGHT[:, :0]),
     lambda: sensing.distance_to_points(torch.ones(4, 5), torch.ones(2, 3, 3)),
     lambda: sensing.distance_to_points(torch.ones(2, 4, 5), torch.ones(3, 4)),
-    lambda: sensing.ItofCorrelation(sensing.sine_code(2), F, AXIS),
-    lambda: sensing.hamiltonian_code(6),
     lambda: sensing.measured_code(torch.ones(10)),
-    lambda: sensing.measured_code([[0.0, 1.0, 2.0], [1.0, 2.0]]),
     lambda: sensing.PiecewiseLinearCode(torch.ones(2, 3), torch.ones(2, 4)),
     lambda: sensing.correlate(LIGHT, torch.ones(4, 5)),
     lambda: sensing.tap_phasor(FRAMES, 3),
@@ -106,38 +116,46 @@ SHAPES = [
     lambda: sensing.taps_from_phasor(LIGHT, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
     lambda: sensing.analyze(torch.ones(3, 1, 1, 2, 2), ROWS),
     lambda: sensing.analyze(STOKES, torch.ones(2, 3)),
-    lambda: sensing.stokes_from(torch.ones(3, 1, 1, 2, 2), ROWS),
     lambda: sensing.mosaic_rows([[0, 45], [90]]),
-    lambda: sensing.Analyzers(torch.ones(2, 2, 4)),
     lambda: sensing.PolarizationMosaic(torch.ones(2, 4)),
     lambda: sensing.demosaic(torch.ones(1, 1, 1, 5)),
     lambda: sensing.project_physical(torch.ones(3, 2)),
     lambda: sensing.blur_image(LIGHT, torch.ones(3, 4)),
-    lambda: sensing.blur_image(LIGHT, torch.ones(9, 9)),
-    lambda: sensing.SpatialPSF(torch.ones(3)),
     lambda: sensing.LensBlur(0.8, size=4),
     lambda: sensing.gate_profiles(torch.ones(2, 2), torch.ones(2), AXIS, rise_s=1e-10, fall_s=1e-10),
-    lambda: sensing.GatedIntegration([1e-10], [1e-10, 2e-10], AXIS),
     lambda: sensing.PixelElectronics(gain_map=torch.ones(3, 2))(LIGHT),
     lambda: sensing.apply_pulse(LIGHT[:, :5], AXIS, Pulse.gaussian(0.1)),
     lambda: sensing.apply_pulse(LIGHT, AXIS, Pulse.gaussian(0.1), keep=TimeAxis(0.01, AXIS.bin_width_opl, 3)),
     lambda: sensing.SynchronousSPAD(10, gate=torch.ones(2, 6)),
     lambda: sensing.SynchronousSPAD(10, gate=torch.ones(5))(LIGHT),
     lambda: sensing.TDC(torch.ones(5))(LIGHT),
-    lambda: sensing.TDC(torch.tensor(1.0)),
-    lambda: sensing.CodedHistogram(torch.ones(4)),
-    lambda: sensing.MeasuredResponse(torch.ones(1), PS),
     lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.1]),
     lambda: sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=4),
     lambda: sensing.convolve_time(LIGHT, torch.ones(2, 2)),
     lambda: sensing.PixelGroups.by_value(torch.ones(3), lambda value: sensing.SynchronousSPAD(7)),
     lambda: sensing.adjoint(sensing.ShotNoise(), LIGHT[:, :5], LIGHT.shape),
     lambda: sensing.ShotNoise()(LIGHT[0]),
+    lambda: after(period_s=2e-9, background=torch.ones(2, 2))(LIGHT),
+    lambda: sensing.MeasuredDelays(torch.ones(2, 2), 1e-9),
+    lambda: after([0.1, 0.1], [1e-9]),
+    lambda: sensing.TapDifference()(LIGHT[:, :5]),
+    lambda: sensing.GatedIntegration([], 1e-9, AXIS),
+    lambda: sensing.ComposedResponse([]),
+    lambda: budget(quantum_efficiency=torch.ones(2, 4))(LIGHT),
+    lambda: budget(ambient_rate_hz=torch.ones(3)),
+    lambda: sensing.PixelSkew(torch.ones(2, 2) * PS, **WIDTH)(LIGHT),
+    lambda: sensing.MacroPixel(SPAD, 3, weights=[1.0]),
+    lambda: sensing.PixelGroups([SPAD], torch.ones(2, 3)),
+    lambda: sensing.PixelGroups([SPAD], torch.zeros(3, 3))(LIGHT),
+    lambda: sensing.ZoneSum(2, 2)(LIGHT),
+    lambda: sensing.fourier_codes(4, 9),
+    lambda: sensing.range_and_speed(LIGHT[None, :1, :5], CHIRPS, AXIS),
+    lambda: sensing.fold_beats(LIGHT, TimeAxis(-0.7, 1.0, 6)),
+    lambda: sensing.heterodyne_speed(PHASOR[:, 0], PHASOR[:, 0], (60e6, 50e6, 40e6), duration_s=5e-3),
 ]  # fmt: skip
 UNITS = [
     lambda: sensing.crlb(PULSE, AXIS, distance_m=-0.6, signal=3.0),
     lambda: sensing.crlb(PULSE, AXIS, distance_m=0.6, signal=math.nan),
-    lambda: sensing.crlb(PULSE, AXIS, distance_m=0.6, signal=torch.ones(2) + 1j),
     lambda: sensing.covariance_bound(lambda *p: -mean(*p), MAPS),
     lambda: sensing.covariance_bound(mean, MAPS, cycles=2),
     lambda: sensing.log_matched_filter(LIGHT, -torch.ones(3)),
@@ -152,12 +170,10 @@ UNITS = [
     lambda: sensing.measured_code(torch.zeros(3, 10)),
     lambda: sensing.ReversedCode(sensing.hamiltonian_code(4)),
     lambda: sensing.tap_weights(SINE, 20.0, AXIS),
-    lambda: sensing.tap_weights(SINE, (), AXIS),
     lambda: sensing.tap_weights(SINE, F, AXIS, within_bin="left"),
     lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
     lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SQUARE, frequencies_hz=F),
     lambda: sensing.offset_of(FRAMES, 4, "differential"),
-    lambda: sensing.read_itof(FRAMES.short(), F, 4, noise=sensing.ItofNoise(read_noise_e=2.0)),
     lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=-1.0),
     lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=7000.0),
     lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), weights=(1, 0)),
@@ -165,15 +181,12 @@ UNITS = [
     lambda: calibrated(phase_offset_rad=90.0),
     lambda: calibrated(depth_map_m=torch.full((2, 3), 12.0)),
     lambda: calibrated(phase_map_rad=torch.full((2, 3), math.nan)),
-    lambda: calibrated(direction=2),
     lambda: other_state(calibrated(), weights=calibrated().weights + 1e-3),
     lambda: sensing.linear_analyzers([0.0], 0.01),
-    lambda: sensing.linear_analyzers([900.0]),
     lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, pixel_area_m2=1e-10),
     lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
     lambda: sensing.Optics(solid_angle_sr=6.3),
     lambda: sensing.ambient_photon_rate(LENS, 0.5, **{**SUN, "spectral_irradiance_w_m2_nm": 1300.0}),
-    lambda: sensing.ambient_photon_rate(LENS, 1.5, **SUN),
     lambda: budget(pulse_energy_j=0.2),
     lambda: budget(wavelength_m=0.94),
     lambda: budget(repetition_rate_hz=10.0, cycles=100_000),
@@ -185,16 +198,13 @@ UNITS = [
     lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9),
     lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT),
     lambda: sensing.PixelElectronics(gain_e_per_dn=2.0),
-    lambda: sensing.PixelElectronics(gain_e_per_dn=4.0, bits=4, black_level_dn=15.01),
     lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
     lambda: sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS),
-    lambda: sensing.SynchronousSPAD(True),
     lambda: sensing.FreeRunningSPAD(10, 50 * PS, **WIDTH),
     lambda: sensing.coates(LIGHT, 10, 0.7),
     lambda: sensing.paralyzable_histogram(LIGHT, -0.5),
     lambda: sensing.first_photon_log_prob(LIGHT + 9, LIGHT, 10),
     lambda: sensing.TDC(torch.full((6,), 100.0)),
-    lambda: sensing.TDC(torch.tensor([1.0, -1.0])),
     lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.6, 0.5]),
     lambda: ran_away(math.nan),
     lambda: ran_away(-2.0),
@@ -202,6 +212,34 @@ UNITS = [
     lambda: sensing.ShotNoise()(PHASOR),
     lambda: sensing.ShotNoise()(LIGHT.long()),
     lambda: sensing.phase_of(LIGHT),
+    lambda: after(5.0),
+    lambda: after([0.3, 0.3], [1e-9, 1e-8]),
+    lambda: after(background=-1.0),
+    lambda: after(period_s=1e-10)(LIGHT),
+    lambda: after(tau_s=None, dead_time_s=0.0, delays=sensing.PowerLawDelays(1.0, 1e-8)),
+    lambda: after(tau_s=None, delays=sensing.PowerLawDelays(1.0, 1e-8), counted_from="avalanche"),
+    lambda: after(tau_s=None, dead_time_s=9e-9, delays=sensing.MeasuredDelays(COUNTED, 1e-9)),
+    lambda: sensing.MeasuredDelays(COUNTED, 1e-9, floor=5.0),
+    lambda: sensing.AfterpulsingSPAD(sensing.ShotNoise(), after()),
+    lambda: sensing.AfterpulsingSPAD(FREE, after()),
+    lambda: sensing.Crosstalk(0.5),
+    lambda: sensing.Speckle(0.5),
+    lambda: sensing.BeatNoise(0.0),
+    lambda: sensing.Speckle().sample(-LIGHT),
+    lambda: sensing.CoherentReceiver(CHIRPS, TimeAxis(1.0, 0.1, 12)),
+    lambda: sensing.heterodyne_speed(LIGHT, LIGHT, F, duration_s=5e-3),
+    lambda: sensing.MacroPixel(sensing.ShotNoise(), 4),
+    lambda: sensing.MacroPixel(SPAD, 2, weights=[1.0, -1.0]),
+    lambda: sensing.MacroPixel(SPAD, 2, weights=[0.0, 0.0]),
+    lambda: coincidence(sensing.ShotNoise()),
+    lambda: coincidence(k=3),
+    lambda: coincidence(FREE, window_s=3e-10),
+    lambda: coincidence(window_s=7e-10).expected(LIGHT),
+    lambda: sensing.PixelGroups([sensing.ShotNoise(), SPAD], torch.zeros(2, 3)),
+    lambda: sensing.PixelGroups.by_value(torch.rand(20, 20), lambda d: SPAD),
+    lambda: sensing.MeasuredResponse(torch.ones(4), PS),
+    lambda: sensing.hot_pixel_rates(2, 2, median_hz=1.0, hot_fraction=2.0),
+    lambda: sensing.equi_depth_edges(-LIGHT, 4),
 ]  # fmt: skip
 OTHERS = [
     (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ArgumentError),
@@ -212,6 +250,13 @@ OTHERS = [
     (lambda: sensing.decode_code(FRAMES, sensing.TwoTapCode(sensing.sine_code(2))), ArgumentError),
     (lambda: sensing.crlb(PULSE, AXIS, **BOUND, unknown=["distance", "albedo"]), ArgumentError),
     (lambda: sensing.Compose(sensing.ShotNoise()), ArgumentError),
+    (lambda: sensing.CoherentReceiver(AXIS, AXIS), ArgumentError),
+    (lambda: sensing.TDC(torch.ones(4), acts_on="light"), ArgumentError),
+    (lambda: sensing.DetectionJitter(PULSE, **WIDTH, boundary="open"), ArgumentError),
+    (lambda: sensing.FreeRunningSPAD(500, 75 * PS), ArgumentError),
+    (lambda: sensing.PixelGroups([], torch.zeros(2, 3)), ArgumentError),
+    (lambda: budget(cycles=None), ArgumentError),
+    (lambda: sensing.Optics(), ArgumentError),
     (lambda: sensing.Compose([torch.relu]), ArgumentError),
     (lambda: sensing.covariance_bound(one_backward, MAPS), GradientError),
     (lambda: sensing.adjoint(Cut(), LIGHT, LIGHT.shape), GradientError),
@@ -220,21 +265,9 @@ OTHERS = [
 ]  # fmt: skip
 
 
-@together("call", SHAPES)
-def test_shapes(call):
-    with pytest.raises(ShapeError, match="expected"):
-        call()
-
-
-@together("call", UNITS)
-def test_units(call):
-    with pytest.raises(UnitError, match=r"expected|overlap"):
-        call()
-
-
-@together("call, error", OTHERS)
-def test_other_objects(call, error):
-    with pytest.raises(error, match="expected"):
+@together("call, error", [*((call, ShapeError) for call in SHAPES), *((call, UnitError) for call in UNITS), *OTHERS])
+def test_wrong_arguments(call, error):
+    with pytest.raises(error, match=r"expected|overlap|needs"):
         call()
 
 

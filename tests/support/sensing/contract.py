@@ -33,7 +33,7 @@ class Entry:
 
     `make()` builds it; `shape` is a small input for gradcheck, whose first dimension is a batch; `input(shape, seed)`
     makes inputs.
-    `conserves`: `f(output) - f(input)` has to vanish (sum of energy or counts). `errors`: (callable, exception type).
+    `conserves`: `f(output) - f(input)` has to vanish (sum of energy or counts).
     `dtypes`: those the expectation keeps. `random`: forward draws, with every policy in `policies`.
     `call`: (arguments that hold real numbers, the others) of a good call of the class, for the sweep of gradients.
     """
@@ -43,7 +43,6 @@ class Entry:
     shape: tuple[int, ...] = (2, 1, 12, 2, 3)
     input: Callable[..., Tensor] = counts_like
     conserves: Callable[[Tensor], Tensor] | None = None
-    errors: tuple[tuple[Callable[[], Any], type[Exception]], ...] = ()
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     random: bool = False
     call: tuple[dict[str, Tensor], dict[str, Any]] | None = None

@@ -6,7 +6,6 @@ import torch
 
 from support.sensing.contract import Entry
 from torchtransient import sensing
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 PS = 1e-12
 WIDTH = {"bin_width_s": 20 * PS}
@@ -41,52 +40,21 @@ ENTRIES = [
         "Afterpulsing-background",
         lambda **k: several(period_s=600 * PS, background=torch.linspace(0.0, 0.5, 6).view(2, 3), **k),
         random=True,
-        errors=(
-            (lambda: several(background=-1.0), UnitError),
-            (lambda: several(period_s=600 * PS, background=torch.ones(2, 2))(torch.ones(1, 12, 2, 3)), ShapeError),
-        ),
     ),
     Entry(
         "Afterpulsing-power-law",
         power_law,
         random=True,
-        errors=(
-            (lambda: sensing.Afterpulsing(0.05, dead_time_s=0.0, delays=sensing.PowerLawDelays(1.0, 1e-8), **WIDTH),
-             UnitError),
-            (lambda: power_law(counted_from="avalanche"), UnitError),
-            (lambda: power_law(counted_from="photon"), ArgumentError),
-            (lambda: sensing.PowerLawDelays(-1.0, 1e-8), UnitError),
-            (lambda: sensing.PowerLawDelays(1.0, 10.0), UnitError),
-        ),
     ),
     Entry(
         "Afterpulsing-measured",
         measured,
         random=True,
-        errors=(
-            (lambda: sensing.MeasuredDelays(torch.ones(2, 2), 1e-9), ShapeError),
-            (lambda: sensing.MeasuredDelays("delays.csv", 1e-9), ShapeError),
-            (lambda: sensing.MeasuredDelays(torch.ones(3), 1e-9, floor=2.0), UnitError),
-            (lambda: sensing.MeasuredDelays(-torch.ones(3), 1e-9), UnitError),
-            (lambda: sensing.Afterpulsing([0.1, 0.1], [1e-9], 0.0, **WIDTH), ShapeError),
-            (lambda: sensing.Afterpulsing([0.3, 0.3], [1e-9, 1e-8], 0.0, **WIDTH), UnitError),
-            (lambda: sensing.Afterpulsing([], [], 0.0, **WIDTH), UnitError),
-            (lambda: sensing.Afterpulsing(0.1, 1e-9, **WIDTH), UnitError),
-            (lambda: sensing.Afterpulsing(0.1, dead_time_s=1e-9, **WIDTH), UnitError),
-            (lambda: sensing.Afterpulsing(
-                0.1, dead_time_s=9e-9, delays=sensing.MeasuredDelays(torch.ones(3), 1e-9), counted_from="avalanche",
-                **WIDTH), UnitError),
-        ),
     ),
     Entry(
         "AfterpulsingSPAD",
         obeyed(lambda: sensing.SynchronousSPAD(500)),
         random=True,
-        errors=(
-            (lambda: sensing.AfterpulsingSPAD(sensing.ShotNoise(), several()), UnitError),
-            (lambda: sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(5), 0.1), UnitError),
-            (lambda: sensing.AfterpulsingSPAD(sensing.FreeRunningSPAD(5, 75 * PS, **WIDTH), several()), UnitError),
-        ),
     ),
     Entry(
         "AfterpulsingSPAD-dead-time",

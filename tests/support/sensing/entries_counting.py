@@ -6,7 +6,6 @@ import torch
 
 from support.sensing.contract import Entry, counts_like
 from torchtransient import sensing
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 PS = 1e-12
 
@@ -46,12 +45,6 @@ ENTRIES = [
         "ImpulseResponse-composed",
         impulse(composed, boundary="periodic", method="fft"),
         conserves=lambda y: y.sum(-3),
-        errors=(
-            (lambda: sensing.ImpulseResponse(tails(), bin_width_s=20.0), UnitError),
-            (lambda: sensing.TailedResponse(50 * PS, [30 * PS], [1.2]), UnitError),
-            (lambda: sensing.MeasuredResponse(torch.ones(4), 1 * PS), UnitError),
-            (lambda: sensing.ComposedResponse([]), ShapeError),
-        ),
     ),
     Entry(
         "LensBlur",
@@ -94,28 +87,16 @@ ENTRIES = [
         "FreeRunningSPAD-paralyzable",
         lambda **k: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="paralyzable", learnable=True, **k),
         random=True,
-        errors=(
-            (lambda: sensing.FreeRunningSPAD(500, 75.0, bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.FreeRunningSPAD(500, 75 * PS), ArgumentError),
-            (lambda: sensing.FreeRunningSPAD(500, 75 * PS, bin_width_s=20 * PS, kind="strange"), ArgumentError),
-            (lambda: sensing.SynchronousSPAD(2.5), UnitError),
-            (lambda: sensing.SynchronousSPAD(5, dead_time_s=75.0, bin_width_s=20 * PS), UnitError),
-        ),
     ),
     Entry(
         "Afterpulsing",
         lambda **k: sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, bin_width_s=20 * PS, learnable=True, **k),
         random=True,
-        errors=(
-            (lambda: sensing.Afterpulsing(5.0, 90 * PS, 50 * PS, bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.Afterpulsing(0.05, 90.0, 50 * PS, bin_width_s=20 * PS), UnitError),
-        ),
     ),
     Entry(
         "Crosstalk",
         lambda **k: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True, **k),
         random=True,
-        errors=((lambda: sensing.Crosstalk(0.5), UnitError),),
     ),
     Entry(
         "TDC",
@@ -133,10 +114,6 @@ ENTRIES = [
         conserves=lambda y: y.sum(-3),
         random=True,
         policies=("expected", "gaussian", "straight_through"),
-        errors=(
-            (lambda: sensing.TDC(torch.ones(4), acts_on="light"), ArgumentError),
-            (lambda: sensing.TDC(torch.ones(4), boundary="open"), ArgumentError),
-        ),
     ),
     Entry("TDC-rates", lambda: sensing.TDC(torch.ones(12), dither=True, acts_on="rates", boundary="zero")),
     Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True),
@@ -146,11 +123,6 @@ ENTRIES = [
         jitter(composed, within_bin="center"),
         input=whole_counts,
         random=True,
-        errors=(
-            (lambda: sensing.DetectionJitter(torch.ones(3), bin_width_s=20 * PS), ArgumentError),
-            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20 * PS, boundary="open"), ArgumentError),
-            (lambda: sensing.DetectionJitter(tails(), bin_width_s=20.0), UnitError),
-        ),
     ),
     Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True),
     Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
@@ -160,11 +132,5 @@ ENTRIES = [
         sensing.ShotNoise,
         random=True,
         conserves=lambda y: y.sum(),
-        errors=(
-            (lambda: sensing.ShotNoise(grad="magic"), ArgumentError),
-            (lambda: sensing.ShotNoise()(torch.ones(3)), ShapeError),
-            (lambda: sensing.ShotNoise()(torch.ones(1, 4, 1, 1, dtype=torch.int64)), UnitError),
-            (lambda: sensing.poisson(torch.tensor([-1.0])), UnitError),
-        ),
     ),
 ]

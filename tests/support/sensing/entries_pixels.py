@@ -6,7 +6,6 @@ import torch
 
 from support.sensing.contract import Entry, counts_like
 from torchtransient import sensing
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 PS = 1e-12
 MAP = torch.linspace(0.1, 0.9, 6, dtype=torch.float64).view(2, 3)  # one number for each pixel of the contract's input
@@ -52,19 +51,6 @@ ENTRIES = [
     Entry(
         "PhotonBudget-maps",
         budget,
-        errors=(
-            (lambda: budget()(torch.ones(1, 12, 2, 4)), ShapeError),
-            (lambda: budget(ambient_rate_hz=MAP[0]), ShapeError),
-            (lambda: budget(quantum_efficiency=2 * MAP), UnitError),
-            (lambda: budget(quantum_efficiency=MAP / 0), UnitError),
-            (lambda: sensing.ambient_photon_rate(
-                2.0, 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=1e-8, wavelength_m=9e-7
-            ), UnitError),
-            (lambda: sensing.ambient_photon_rate(
-                sensing.Optics(f_number=2.0), 0.5, spectral_irradiance_w_m2_nm=1.0, filter_bandwidth_m=10.0,
-                    wavelength_m=9e-7
-            ), UnitError),
-        ),
     ),
     Entry("PhotonBudget-learnt", lambda: budget(learnt=True)),
     Entry("PixelSkew", skew(sensing.PixelSkew), conserves=lambda y: y.sum(-3)),
@@ -75,12 +61,6 @@ ENTRIES = [
         conserves=lambda y: y.sum(-3),
         input=whole_counts,
         random=True,
-        errors=(
-            (lambda: sensing.DetectionSkew(50.0, bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.PixelSkew(50 * PS), ArgumentError),
-            (lambda: sensing.PixelSkew(50 * PS, bin_width_s=20 * PS, boundary="open"), ArgumentError),
-            (lambda: skew(sensing.PixelSkew)()(torch.ones(1, 12, 3, 3)), ShapeError),
-        ),
     ),
     Entry("MacroPixel", lambda **k: sensing.MacroPixel(sensing.SynchronousSPAD(50), 9, **k), random=True),
     Entry(
@@ -89,13 +69,6 @@ ENTRIES = [
             sensing.SynchronousSPAD(200, dead_time_s=70 * PS, bin_width_s=20 * PS), 4, weights=[1, 3, 1, 0], **k
         ),
         random=True,
-        errors=(
-            (lambda: sensing.MacroPixel(sensing.ShotNoise(), 4), UnitError),
-            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 0), UnitError),
-            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 3, weights=[1.0]), ShapeError),
-            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 2, weights=[1.0, -1.0]), UnitError),
-            (lambda: sensing.MacroPixel(sensing.SynchronousSPAD(5), 2, weights=torch.zeros(2)), UnitError),
-        ),
     ),
     Entry(
         "MacroPixel-free",
@@ -109,21 +82,6 @@ ENTRIES = [
             bin_width_s=20 * PS, **k),
         shape=(2, 1, 8, 1, 2),
         random=True,
-        errors=(
-            (lambda: sensing.CoincidencePixel(sensing.ShotNoise(), 6, coincidence=2, window_s=50 * PS,
-             bin_width_s=20 * PS), UnitError),
-            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, coincidence=3, window_s=5e-11,
-             bin_width_s=2e-11), UnitError),
-            (lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(3), 2, coincidence=2, window_s=50.0,
-             bin_width_s=2e-11), UnitError),
-            (lambda: sensing.CoincidencePixel(
-                sensing.FreeRunningSPAD(9, 70 * PS, bin_width_s=20 * PS), 2, coincidence=2, window_s=80 * PS,
-                    bin_width_s=20 * PS
-            ), UnitError),
-            (lambda: sensing.CoincidencePixel(
-                sensing.SynchronousSPAD(9), 2, coincidence=2, window_s=80 * PS, bin_width_s=20 * PS
-            )(torch.ones(1, 2, 1, 1)), UnitError),
-        ),
     ),
     Entry(
         "CoincidencePixel-weights",
@@ -137,22 +95,10 @@ ENTRIES = [
         "PixelGroups",
         dead_times,
         random=True,
-        errors=(
-            (lambda: sensing.PixelGroups([], MAP), ArgumentError),
-            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.ones(2, 3)), ShapeError),
-            (lambda: sensing.PixelGroups([sensing.ShotNoise()], torch.zeros(3)), ShapeError),
-            (lambda: sensing.PixelGroups([sensing.ShotNoise(), sensing.SynchronousSPAD(3)], 0 * MAP), UnitError),
-            (lambda: dead_times()(torch.ones(1, 12, 3, 3)), ShapeError),
-            (lambda: sensing.PixelGroups.by_value(torch.rand(20, 20), lambda d: sensing.ShotNoise()), UnitError),
-        ),
     ),
     Entry(
         "ZoneSum",
         lambda: sensing.ZoneSum(2, 3),
         conserves=lambda y: y.sum((-1, -2)),
-        errors=(
-            (lambda: sensing.ZoneSum(0, 1), UnitError),
-            (lambda: sensing.ZoneSum(2, 2)(torch.ones(1, 3, 4, 3)), ShapeError),
-        ),
     ),
 ]  # fmt: skip
