@@ -280,27 +280,6 @@ def test_frequent_afterpulses(mode, dead, tau):
             assert found.within(1.5), (total, kind, found)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("total, probability", [(0.3, 0.3), (30.0, 0.3)])
-def test_totals_of_draws_vary_less_than_those_of_events(total, probability):
-    """By no more than twice the probability, in dim light; bright light has no room for clusters."""
-    dead, tau, periods = 12.3, 20.0, 200
-    rate = light(total, "constant")
-    events = detect(
-        np.random.default_rng(0), rate, 600, periods, dead, free_running=True,
-        afterpulses=[Afterpulse(probability, exponential_delays(tau, after=dead))], warm_up=15,
-    )  # fmt: skip
-    sensor = AfterpulsingSPAD(detector("free", dead, cycles=periods), exponentials(dead, (probability, tau)))
-    x = torch.as_tensor(rate).view(1, -1, 1, 1).expand(1, -1, 30, 20)
-    drawn = sensor.sample(x, torch.Generator().manual_seed(0)).sum(-3).flatten()
-    short = events.fano() - float(drawn.var() / drawn.mean())
-    # each of the two is known to 6 %
-    noise = 3 * (2 / 600) ** 0.5 * 1.5 * events.fano()
-    assert -noise < short < 2 * probability + noise
-    if total < 1:
-        assert short > noise
-
-
 @pytest.mark.parametrize(
     "dead, total, p", [(12.3, 0.1, 0.3), (55.7, 1.0, 0.04), (12.3, 10.0, 0.04), (55.7, 100.0, 0.3)]
 )

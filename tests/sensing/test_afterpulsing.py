@@ -71,14 +71,6 @@ def test_long_periods_are_wrapped_round_the_window():
         torch.testing.assert_close(add_afterpulses(x, 0.3, kernel), whole[:, :16])
 
 
-def test_float32_keeps_the_faint_bins():
-    x = torch.zeros(1, 1024, 1, 1)
-    x[0, 100] = 1e6
-    x[0, 500] = 1e-3
-    ap = Afterpulsing(0.001, 10e-10, 20e-10, bin_width_s=1e-10)
-    assert float(ap(x)[0, 500]) == pytest.approx(float(ap(x.double())[0, 500]), abs=1e-3)
-
-
 def test_crosstalk_against_loops():
     x = torch.rand(2, 1, 3, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     wanted = x.clone()
@@ -218,11 +210,6 @@ def spad(axis=AXIS, gate=None, cycles=100):
     return sensing.SynchronousSPAD(cycles, gate=gate, dead_time_s=150e-12, axis=axis)
 
 
-def test_a_gate_that_is_open_is_none():
-    x = light()
-    torch.testing.assert_close(obeyed(spad(gate=torch.ones(PART_BINS)))(x), obeyed(spad())(x), rtol=1e-10, atol=1e-12)
-
-
 def test_a_gate_dims_photons_and_carriers_alike():
     """Nothing where it is shut; half open it sees half of each, as of half the light and half the carriers."""
     x = light()
@@ -256,19 +243,6 @@ def test_bins_in_parts_are_finer_bins(kind):
     torch.testing.assert_close(coarse.probabilities(x) * 100, coarse(x), rtol=1e-10, atol=0)
     drawn = coarse.sample(x.expand(1, PART_BINS, 20, 1), torch.Generator().manual_seed(0)).mean(2, keepdim=True)
     assert bool(((drawn - coarse(x)).abs() < 5 * (coarse(x) / 20).sqrt() + 0.5).all())
-
-
-@pytest.mark.slow
-def test_pixels_of_several_levels_are_those_of_each():
-    """Dim and bright ones together, in a batch, mapped by torch.func, and their derivatives."""
-    module = obeyed(spad())
-    x = torch.cat([light(0.1, 1), light(6.0, 1), light(0.3, 1)], -1)
-    together = module(x)
-    for i in range(3):
-        torch.testing.assert_close(together[..., i : i + 1], module(x[..., i : i + 1]), rtol=1e-9, atol=1e-10)
-    items = x.movedim(-1, 0).unsqueeze(-1)
-    mapped = torch.func.vmap(module.expected)(items)
-    torch.testing.assert_close(mapped.squeeze(-1).movedim(0, -1), together, rtol=1e-9, atol=1e-10)
 
 
 LIGHT, CYCLES = 4e-3, 1000

@@ -47,10 +47,6 @@ def halves(make):
 # every way to put sensors into one another, and the same sensors without it
 NESTED = {
     "Sequential": (lambda: Compose([nn.Sequential(spad(), jitter())]), lambda: Compose([spad(), jitter()])),
-    "Sequential in a chain in a list": (
-        lambda: Compose([nn.ModuleList([Compose([nn.Sequential(nn.Identity(), spad())])]), nn.Sequential(jitter())]),
-        lambda: Compose([spad(), jitter()]),
-    ),
     "groups of sensors": (lambda: halves(spad), spad),
     "groups of chains": (lambda: halves(lambda: Compose([spad(), jitter()])), lambda: Compose([spad(), jitter()])),
     "groups in a chain": (
@@ -61,10 +57,6 @@ NESTED = {
     "groups of macro-pixels": (
         lambda: halves(lambda: sensing.MacroPixel(pulsing(), 3)),
         lambda: sensing.MacroPixel(pulsing(), 3),
-    ),
-    "groups of coincidences": (
-        lambda: halves(lambda: sensing.CoincidencePixel(spad(), 4, coincidence=2, window_s=3e-10, axis=AXIS)),
-        lambda: sensing.CoincidencePixel(spad(), 4, coincidence=2, window_s=3e-10, axis=AXIS),
     ),
     "groups that add": (
         lambda: Compose([spad(), halves(lambda: sensing.Afterpulsing(0.05, 1e-9, 3e-10, axis=AXIS))]),

@@ -138,17 +138,3 @@ def test_gates_that_leave_the_window_see_less_ambient_light():
         with pytest.raises(UnitError, match=r"gates inside the window.*gate 1"):
             Compose([budget(), leaving])
         assert Compose([budget(ambient_rate_hz=0.0), leaving]).expected(x).shape == (1, 2, 1, 1)
-
-
-@pytest.mark.parametrize("name", ["mpd_spad_like", "vl53l8_like", "tmf882x_like"])
-def test_a_longer_window_changes_nothing_inside(name):
-    """A pulse and ambient light in a window that is longer on both sides: the same counts but for what wraps around."""
-    preset = faint(device(name))
-    bins, width_s = preset.num_bins, preset.bin_width_s
-    x = torch.zeros(1, bins, 1, 1, dtype=torch.float64)
-    x[:, bins // 4] = 1e-9
-    longer = torch.nn.functional.pad(x, (0, 0, 0, 0, 40, 40))
-    stages = preset.sensor(TimeAxis.from_seconds(0.0, width_s, bins + 80)).stages
-    long = Compose([s for s in stages if type(s).__name__ != "Afterpulsing"]).expected(longer)[:, 40:-40]
-    short = Compose([s for s in preset.sensor().stages if type(s).__name__ != "Afterpulsing"]).expected(x)
-    torch.testing.assert_close(short, long, rtol=1e-6, atol=1e-6 * float(short.max()))

@@ -9,45 +9,7 @@ from scipy import stats
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.sensing import counts as moved_counts
-from torchtransient.sensing import draws
 from torchtransient.sensing.draws import LagTable, halve, thin
-
-
-def fits(found, expected, draws_of_each):
-    """Chi square of numbers whose expectation is known, by its degrees of freedom."""
-    live = expected > 0
-    assert bool((found[~live] == 0).all())
-    chi = ((found - expected)[live].square() / expected[live]).sum()
-    degrees = float(live.sum())
-    assert abs(float(chi) - degrees) < 5 * (2 * degrees) ** 0.5 + 0.02 * draws_of_each**0.5
-
-
-@pytest.mark.parametrize("few", [True, False])
-@pytest.mark.parametrize("kind", ["multinomial", "first photons"])
-def test_first_photons_of_few_and_of_many_counts(monkeypatch, few, kind):
-    monkeypatch.setattr(draws, "_FEW_COUNTS", 1 << 30 if few else 0)
-    g = torch.Generator().manual_seed(3)
-    weights = torch.rand(1, 9, 1, 4, generator=g, dtype=torch.float64) * 0.15
-    weights[:, 3:5, :, 1] = 0.0
-    weights[:, -2:, :, 2] = 0.0
-    weights[..., 3] = 0.0
-    trials, repeats = 40, 400
-    images = weights.repeat(repeats, 1, 1, 1).unsqueeze(1)
-    if kind == "multinomial":
-        weights, images = weights / 2, images / 2
-        counts, p = draws.sample_multinomial(trials, images, g), weights
-    else:
-        counts = draws.sample_first_photons(trials, images, g)
-        p = -torch.expm1(-weights) * torch.exp(weights - weights.cumsum(1))
-    assert torch.equal(counts, counts.round())
-    assert float(counts.sum(-3).max()) <= trials
-    fits(counts.sum((0, 1))[..., 0, :], trials * repeats * p[0, :, 0], repeats)
-    # neighbours take counts from each other
-    pair = counts[:, 0, :2, 0, 0]
-    covariance = float(torch.cov(pair.T)[0, 1])
-    expected = -trials * float(p[0, 0, 0, 0] * p[0, 1, 0, 0])
-    assert abs(covariance - expected) < 5 * float(pair.var(0).prod().sqrt()) / repeats**0.5
-
 
 DRAWS = 25_000
 
@@ -229,16 +191,3 @@ def test_draws_at_the_end_of_single_precision_are_those_of_double(make):
     single, double = (make().sample(v, generator()) for v in (x, x.double()))
     assert torch.equal(double.sum(2), x.double().sum(2))
     assert torch.equal(single, double.float())
-
-
-def test_a_skew_is_drawn_with_the_first_photon():
-    """One distribution: covariance between bins of the cycles, which a separate draw has as well."""
-    x = torch.full((600, 1, BINS, 1, 1), 0.1, dtype=torch.float64)
-    stages = [sensing.SynchronousSPAD(50), sensing.DetectionSkew(130e-12, AXIS)]
-    together = sensing.Compose(stages).sample(x, generator())
-    apart = stages[1].sample(stages[0].sample(x, generator(1)), generator(2))
-    assert torch.equal(together, together.round())
-    close = 6 * (2 * 2 / len(x)) ** 0.5
-    for of in (lambda y: y.sum(2), lambda y: y[:, :, 4] - y[:, :, 5], lambda y: y[:, :, 2]):
-        torch.testing.assert_close(of(together).mean(0), of(apart).mean(0), rtol=0.03, atol=0.3)
-        torch.testing.assert_close(of(together).var(0), of(apart).var(0), rtol=close, atol=0)

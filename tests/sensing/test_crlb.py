@@ -231,15 +231,11 @@ def test_of_chains():
     wanted = crlb(NORMAL, AXIS, **named(counts)).covariance
     torch.testing.assert_close(covariance_bound(light, counts), wanted, rtol=1e-9, atol=0)
     blur = sensing.DetectionJitter(sensing.GaussianResponse(300 * PS), AXIS, within_bin="center")
-    wider = covariance_bound(lambda *p: blur.expected(spad.expected(light(*p))), given, cycles=300)
-    assert bool((wider.diagonal(dim1=-2, dim2=-1) > direct.diagonal(dim1=-2, dim2=-1)).all())
     # as if the response had been wider, where no pile-up is
     dim = [given[0], 1e-3 * given[1], 1e-3 * given[2]]
-    both = sensing.GaussianResponse(500 * PS)
     wider = covariance_bound(lambda *p: blur.expected(spad.expected(light(*p))), dim, cycles=300)[..., 0, 0]
-    torch.testing.assert_close(
-        wider, crlb(both, AXIS, **named(dim), cycles=300).covariance[..., 0, 0], rtol=0.02, atol=0
-    )
+    both = crlb(sensing.GaussianResponse(500 * PS), AXIS, **named(dim), cycles=300).covariance[..., 0, 0]
+    torch.testing.assert_close(wider, both, rtol=0.02, atol=0)
     leaves = [g.clone().requires_grad_() for g in given]
     value = covariance_bound(lambda *p: spad.expected(light(*p)), leaves, cycles=300)[..., 0, 0].sum()
     slopes = torch.autograd.grad(value, leaves)
@@ -294,39 +290,3 @@ def test_first_photons_reach_the_bound():
     ratio = (error / wanted).square().mean(0).sqrt()
     assert bool((ratio < 1.1).all()) and bool((ratio > 0.9).all()), ratio
     assert bool((((error / wanted).mean(0)).abs() < 4 / pixels**0.5).all())
-
-
-def test_a_counter_of_the_presets_reaches_its_own_bound():
-    """Detector, jitter and unequal codes: one step of scoring by the bound's covariance, from the truth, on draws.
-
-    At the bound that step is as good as the estimate of maximum likelihood: `C J^T (n - m) / m` has the covariance C.
-    """
-    device = sensing.DEVICES["picoharp300_like"]
-    chain, axis, cycles = device.sensor(), device.axis(), 100_000
-    draws = 300
-
-    def mean(d, s):
-        return chain.expected(
-            return_rates(sensing.GaussianResponse(500 * PS), axis, distance_m=d, signal=s, background=1e-5).movedim(
-                -1, -3
-            )
-        )
-
-    given = [torch.full((1, 1, 1), v, dtype=torch.float64) for v in (5.0, 0.01)]
-    covariance = covariance_bound(mean, given, cycles=cycles)[0, 0, 0]
-    pulse = sensing.GaussianResponse(500 * PS)
-    ideal = crlb(
-        pulse, axis, distance_m=5.0, signal=0.01, background=1e-5, cycles=cycles, unknown=["distance", "signal"]
-    )
-    assert 1.0 < float(covariance[0, 0].sqrt() / ideal.distance_m) < 1.05  # the counter's own jitter and its bins
-    slopes = torch.stack([torch.func.jvp(mean, tuple(given), tuple(torch.ones_like(g) * (i == k) for i, g in
-                          enumerate(given)))[1].flatten() for k in range(2)])  # fmt: skip
-    expected = mean(*given).flatten()
-    light = return_rates(
-        sensing.GaussianResponse(500 * PS), axis, distance_m=given[0].expand(1, 1, draws), signal=0.01, background=1e-5
-    )
-    counts = chain.sample(light.movedim(-1, -3), seeded(3))[0, :, 0].T
-    steps = (counts - expected) / expected.clamp_min(1e-12) @ slopes.T @ covariance
-    found = steps.std(0) / covariance.diagonal().sqrt()
-    assert bool(((found - 1).abs() < 4 / (2 * draws) ** 0.5).all()), found
-    assert bool((steps.mean(0).abs() < 4 * covariance.diagonal().sqrt() / draws**0.5).all())

@@ -87,21 +87,6 @@ def test_gradients():
     assert abs(float(slope) - 1) < 1e-6
 
 
-def test_empty_histograms():
-    x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64, requires_grad=True)
-    total = (
-        depth.peak_position(x).sum()
-        + depth.center_of_mass(x).sum()
-        + depth.center_of_mass(x, half_width_bins=3).sum()
-        + depth.soft_argmax(x).sum()
-    )
-    total.backward()
-    assert bool(torch.isfinite(x.grad).all())
-    assert float(depth.center_of_mass(x.detach())) == BINS / 2
-    for returns in (depth.first_return(x, 0.5), depth.multi_return(x, 3, threshold=0.5)):
-        assert not bool(returns.valid.any()) and float(returns.position.detach().abs().max()) == 0.0
-
-
 def test_first_return_is_the_leading_edge():
     x = torch.zeros(1, 10, 1, 2, dtype=torch.float64)
     x[0, 3:6, 0, 0] = torch.tensor([2.0, 6.0, 1.0])

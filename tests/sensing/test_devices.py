@@ -8,17 +8,13 @@ import sys
 
 import pytest
 import torch
-from torch import nn
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError, UnitError
 from torchtransient.sensing import (
     DEVICES,
-    Compose,
     Device,
-    PixelElectronics,
     build_stage,
-    deepinv_physics,
     device,
     read_itof,
 )
@@ -88,21 +84,6 @@ def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingPackageError, match="PyYAML"):
         device("kinect_v2_like").to_yaml()
-    monkeypatch.delitem(sys.modules, "torchtransient.sensing.deepinverse", raising=False)
-    monkeypatch.setitem(sys.modules, "deepinv", None)
-    monkeypatch.setitem(sys.modules, "deepinv.physics", None)
-    with pytest.raises(MissingPackageError, match="deepinv"):
-        deepinv_physics(Compose([PixelElectronics()]))
-
-
-def test_axis_of_the_renderer():
-    preset = device("mpd_spad_like")
-    axis = TimeAxis(0.5, 0.01, 200)
-    sensor = preset.sensor(axis)
-    assert sensor.expected(torch.rand(1, 200, 2, 2)).shape == (1, 200, 2, 2)
-    sensor.check_axis(axis)
-    with pytest.raises(UnitError, match="axis of stage"):
-        sensor.check_axis(TimeAxis(0.5, 0.02, 200))
 
 
 def test_changes():
@@ -192,11 +173,6 @@ def tensor(values):
     return {"kind": "tensor", "values": values}
 
 
-def budget(rate_hz=1e6, **given):
-    numbers = {"pulse_energy_j": 1e-10, "wavelength_m": 9e-7, "repetition_rate_hz": rate_hz, "cycles": 1000}
-    return sensing.PhotonBudget(sensing.Optics(f_number=2.0), axis=AXIS, **numbers, **given)
-
-
 # ------------------------------------------------------------------------------------------------------ kinds
 
 
@@ -213,7 +189,6 @@ BUILT = {
     "gaussian_psf": ({"kind": "gaussian_psf", "fwhm_px": 1.5, "size": 5}, (5, 5)),
     "defocus_psf": ({"kind": "defocus_psf", "radius_px": 1.2}, (3, 3)),
     "hot_pixel_rates": ({"kind": "hot_pixel_rates", "height": 3, "width": 4, "median_hz": 50.0, "seed": 3}, (3, 4)),
-    "circular_analyzers": ({"kind": "circular_analyzers", "transmission": 0.9}, (2, 4)),
     "ambient_photon_rate": (
         {
             "kind": "ambient_photon_rate",
@@ -292,33 +267,4 @@ def test_a_stage_that_is_not_there(stage):
 # ------------------------------------------------------------------------------------------------------ parts
 
 
-def test_lists_of_parts():
-    spad, x = sensing.SynchronousSPAD(1000), torch.full((1, 32, 4, 4), 1e-3)
-    plain = sensing.counting_chain(budget(), spad, optics=None, readout=None)
-    for parts in ([sensing.LensBlur(1.0)], nn.ModuleList([sensing.LensBlur(1.0)]), (sensing.LensBlur(1.0),)):
-        blurred = sensing.counting_chain(budget(), spad, optics=parts)
-        torch.testing.assert_close(blurred.expected(x), plain.expected(x))
-    with pytest.raises(UnitError, match="average counts"):
-        sensing.counting_chain(budget(), spad, readout=[sensing.LensBlur(1.0)])
-
-
 # ---------------------------------------------------------------------------------------------------- numbers
-
-
-class Twice(sensing.MovedCounts):
-    """A plug-in: half of the counts come one bin later."""
-
-    def expected(self, x):
-        return self.moves(x).mean(x)
-
-    def moves(self, x):
-        return sensing.Moves(0, torch.tensor([0.5, 0.5], dtype=torch.float64), "periodic")
-
-
-def test_bases_for_plug_ins():
-    x = torch.full((1, 8, 1, 1), 4.0)
-    y = sensing.Compose([Twice(grad="straight_through")])(x, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(y, y.round()) and float(y.sum()) == 32 and not torch.equal(y, x)
-    assert issubclass(sensing.Crosstalk, sensing.AddedCounts)
-    p = sensing.detections_with_dead_time(torch.full((1, 8, 1, 1), 0.1), 2.0)
-    assert p.shape == (1, 8, 1, 1)

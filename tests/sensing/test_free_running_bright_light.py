@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.sensing.event_driven import compare, dense_limit, detect, last_phases, total_variation
+from support.sensing.event_driven import compare, dense_limit, detect, total_variation
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing import FreeRunningSPAD, ScoreFunction, nonparalyzable_histogram
 from torchtransient.sensing.dead_time import free_running
@@ -79,22 +79,6 @@ def test_third_order_in_the_width_of_bins():
     limit = cut(16)
     errors = [float((cut(pieces) - limit).abs().sum()) for pieces in (1, 2, 4)]
     assert errors[0] > 6 * errors[1] > 36 * errors[2] > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("which, flux, dead", [(0, 1000.0, 45.3), (1, 60.0, 31.9), (2, 3000.0, 20.25)])
-def test_against_exponential_clocks(which, flux, dead):
-    """Detectors that begin in the stationary state stay in it; a locked phase draws them in from anywhere."""
-    row, rng, detectors = (flux * shapes()[which]).numpy(), np.random.default_rng(5), 20_000
-    expected = nonparalyzable_histogram(image(double(row)[None]), dead).flatten().numpy()
-    p = expected / expected.sum()
-    phases = rng.choice(BINS, detectors, p=p) + rng.random(detectors)
-    if which == 1:
-        phases = rng.random(detectors) * BINS
-    seen = np.bincount(last_phases(rng, row, dead, phases, 200).astype(int) % BINS, minlength=BINS)
-    noise = 0.5 * np.sqrt(2 * p * (1 - p) / (np.pi * detectors)).sum()
-    assert total_variation(seen, expected) < 1.6 * noise + 2e-3
-    assert total_variation(seen, row) > 0.05  # the light itself is no answer
 
 
 def test_a_phase_locked_at_the_edge_of_a_bin(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from support.sensing.arguments import CALLS, COUNTS, DECIDE, OTHERS, PHASOR
+from support.sensing.arguments import CALLS, DECIDE, OTHERS
 from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.axes import TimeAxis
@@ -194,20 +194,3 @@ def test_calibrations_are_learnt(name):
     known = sensing.ItofCalibration(**{name: learnt})
     with pytest.raises(GradientError, match="sine code"):
         sensing.ItofCorrelation(sensing.square_code(4), 20e6, axis, calibration=known)
-
-
-def test_whole_numbers_and_truth_values_are_numbers():
-    """Of the default dtype; histograms that are measured with all their digits."""
-    whole, some = COUNTS.long(), COUNTS > 5
-    for function in (sensing.poisson_log_prob, sensing.wrapped_difference):
-        for given in (whole, some):
-            torch.testing.assert_close(function(given, given), function(given.float(), given.float()), rtol=0, atol=0)
-    exact = sensing.frames_to_rate(whole.float(), 100)
-    torch.testing.assert_close(sensing.frames_to_rate(whole, 100), exact, rtol=0, atol=0)
-    stokes = torch.tensor([3, 2, 2, 2]).reshape(4, 1, 1, 1, 1)
-    torch.testing.assert_close(sensing.project_physical(stokes), sensing.project_physical(stokes.float()))
-    assert sensing.poisson(some, torch.Generator().manual_seed(0)).dtype == torch.float32
-    many = torch.tensor([2**24 + 1, 2**25 + 1])
-    found = sensing.resample_counts(many, 1.0, torch.tensor([0.0, 1.0, 2.0]).double())
-    assert found.tolist() == many.tolist()
-    assert sensing.amplitude_of(PHASOR).dtype == torch.float64

@@ -72,17 +72,6 @@ def test_central_gaussian_kernel_is_the_difference_of_error_functions():
     )
 
 
-def test_a_narrow_response_over_wide_bins_keeps_what_evenly_spread_photons_keep():
-    """28 ps over 64 ps: 85.2 % stay in the bin, where light in its middle would keep 99.3 %."""
-    first, weights = GaussianResponse(28 * PS).kernel(64 * PS)
-    sigma = 28 / FWHM_PER_SIGMA / 64
-    # 1 - E|delay| / bin, up to delays of more than a bin (5.4 sigma)
-    assert float(weights[-first]) == pytest.approx(1 - sigma * np.sqrt(2 / np.pi), abs=1e-7)
-    assert float(weights[-first]) == pytest.approx(0.852, abs=5e-4)
-    first, central = GaussianResponse(28 * PS).kernel(64 * PS, within_bin="center")
-    assert float(central[-first]) == pytest.approx(0.993, abs=5e-4)
-
-
 SHAPES = {
     "gaussian": GaussianResponse(60 * PS, 13 * PS),
     "narrow": GaussianResponse(1 * PS, 5 * PS),
@@ -169,38 +158,6 @@ def test_very_long_responses_lose_no_digits():
     sigma = 1e5 / FWHM_PER_SIGMA
     t = np.arange(first, first + weights.numel())
     np.testing.assert_allclose(weights.numpy(), stats.norm(0, sigma).pdf(t), rtol=1e-8)
-
-
-@pytest.mark.parametrize(
-    "response, mean, variance",
-    [
-        (GaussianResponse(60 * PS, 5 * PS), 5, (60 / FWHM_PER_SIGMA) ** 2),
-        (emg_response(40 * PS, 70 * PS), 70, (40 / FWHM_PER_SIGMA) ** 2 + 70**2),
-        (UniformResponse(50 * PS, 100 * PS), 100, 50**2 / 12),
-        (
-            TailedResponse(40 * PS, [50 * PS, 300 * PS], [0.3, 0.1]),
-            0.3 * 50 + 0.1 * 300,
-            (40 / FWHM_PER_SIGMA) ** 2 + 0.3 * 2 * 50**2 + 0.1 * 2 * 300**2 - 45**2,
-        ),
-        (
-            ComposedResponse([GaussianResponse(30 * PS), emg_response(20 * PS, 50 * PS), UniformResponse(8 * PS)]),
-            50,
-            (30**2 + 20**2) / FWHM_PER_SIGMA**2 + 50**2 + 8**2 / 12,
-        ),
-    ],
-    ids=["gaussian", "emg", "uniform", "two tails", "composed"],
-)
-def test_moments(response, mean, variance):
-    width = 4.0
-    first, weights = response.kernel(width * PS)
-    assert float(weights.sum()) == pytest.approx(1, abs=1e-12)
-    found_mean, found_variance = moments(first, weights, width)
-    assert found_mean == pytest.approx(mean, abs=1e-3 * max(1.0, mean))
-    # the places in both bins add width^2/12 each, as do those of the fine grids of a composed response
-    grids = 1 + (3 / 81 if isinstance(response, ComposedResponse) else 0)
-    # (that of a split between two bins averages to width^2/6 over all places, not where a box ends inside a bin)
-    box = isinstance(response, (UniformResponse, ComposedResponse))
-    assert found_variance - width**2 / 6 * grids == pytest.approx(variance, rel=2e-3 if box else 1e-5)
 
 
 def test_composition_of_gaussians_is_a_gaussian():

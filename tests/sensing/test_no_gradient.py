@@ -10,7 +10,6 @@ from support.sensing.all_entries import each
 from support.sensing.contract import nothing_with_a_gradient_as_a_number, parts
 from torchtransient import TimeAxis, sensing
 from torchtransient.sensing import straight_through
-from torchtransient.sensing.chain.compose import multinomial_log_prob
 
 PS = 1e-12
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 12)
@@ -112,20 +111,6 @@ def test_a_baseline_has_no_gradient():
 
 
 # ------------------------------------------------------------------------------------ what a likelihood is asked for
-
-
-def test_likelihoods_have_no_gradient_by_what_was_measured():
-    """Of added counts and of moved first photons the measurement is a number."""
-    x, n = counts_of(6.0).requires_grad_(), (counts_of(6.0) + 2).requires_grad_()
-    module = sensing.Crosstalk(0.05)
-    found = torch.autograd.grad(module.log_prob(n, x).sum(), [x, n], allow_unused=True)
-    assert found[1] is None
-    extra = module.extra(x)
-    exact = torch.distributions.Poisson(extra, validate_args=False).log_prob((n - x).detach().clamp_min(0)).sum()
-    torch.testing.assert_close(found[0], torch.autograd.grad(exact, x)[0])
-    p = (light() / 10).detach().requires_grad_()
-    value = multinomial_log_prob(n, p, 500).sum()
-    assert torch.autograd.grad(value, n, allow_unused=True)[0] is None
 
 
 @pytest.mark.parametrize("dead_bins", [None, 1.5])

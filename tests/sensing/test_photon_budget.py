@@ -251,15 +251,6 @@ def test_by_hand():
     assert bool(report.piles_up.all()) == (25 * per_unit > 0.05)
 
 
-def test_a_lens_gathers_as_its_cone_does():
-    """On the pixel: the integral of cos over a cone of half angle atan(1 / 2F)."""
-    optics = Optics.from_aperture(0.05, 0.0125, pixel_area_m2=1e-10)
-    assert optics.f_number == pytest.approx(4)
-    theta = torch.linspace(0, math.atan(1 / 8), 20001, dtype=torch.float64)
-    cone = torch.trapezoid(2 * math.pi * theta.sin() * theta.cos(), theta)
-    assert optics.etendue_m2_sr == pytest.approx(float(cone) * 1e-10, rel=1e-6)
-
-
 def test_window_longer_than_a_period():
     with pytest.raises(UnitError, match="laser period"):
         lidar(repetition_rate_hz=1e9)(torch.zeros(1, 100, 1, 1))

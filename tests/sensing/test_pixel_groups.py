@@ -5,17 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchtransient.errors import ArgumentError, GradientError, ShapeError
+from torchtransient.errors import ShapeError
 from torchtransient.sensing import (
     Afterpulsing,
     AfterpulsingSPAD,
-    Compose,
     FreeRunningSPAD,
     MacroPixel,
     PixelGroups,
     PixelSkew,
     SynchronousSPAD,
-    build_stage,
 )
 
 WIDTH, BINS = 1e-10, 20
@@ -59,36 +57,12 @@ def test_draws_have_the_mean_of_their_pixel():
     assert bool(((y.mean(0) - mean[0]).abs() < 5 * (y.var(0) / 3000).sqrt() + 2e-3).all())
 
 
-def test_score_outside_of_its_context():
-    sensor = PixelGroups.by_value(DEAD * WIDTH, synchronous(), grad="score")
-    with pytest.raises(GradientError, match="ScoreFunction"):
-        sensor(light().requires_grad_())
-    assert sensor(light()).shape == light().shape
-
-
 def test_probability_of_a_measurement():
     sensor, x = PixelGroups.by_value((DEAD + 0.5).floor() * WIDTH, synchronous(50)), light(1)
     counts = sensor.sample(x, torch.Generator().manual_seed(0))
     found = sensor.log_prob(counts, x)
     alone = synchronous(50)(30.0 * WIDTH).log_prob(counts[..., 1:, :1], x[..., 1:, :1])
     torch.testing.assert_close(found[..., 1, 0], alone[..., 0, 0])
-
-
-def test_in_chains_and_as_a_device():
-    stage = PixelGroups.by_value(DEAD * WIDTH, synchronous())
-    chain = Compose([stage], grad="straight_through")
-    assert stage.grad == "straight_through" == stage.sensors[0].grad
-    y = chain.sample(light(), torch.Generator().manual_seed(0))
-    assert torch.equal(y, y.round())
-    spec = {
-        "kind": "PixelGroups",
-        "sensors": [{"kind": "SynchronousSPAD", "cycles": 300}, {"kind": "SynchronousSPAD", "cycles": 300}],
-        "which": {"kind": "tensor", "values": [[0, 1, 0], [1, 1, 0]]},
-    }
-    torch.testing.assert_close(build_stage(spec)(light()), SynchronousSPAD(300)(light()))
-    stage.sensors[0].grad = "score"
-    with pytest.raises(ArgumentError, match="one policy"):
-        _ = stage.grad
 
 
 def test_sensors_that_are_not_random():

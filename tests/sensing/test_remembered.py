@@ -51,39 +51,6 @@ def test_what_is_remembered_follows_the_numbers(change):
     torch.testing.assert_close(after, fresh(response), rtol=0, atol=0)
 
 
-def test_derivatives_are_there():
-    response = sensing.GaussianResponse(200e-12, learnable=True)
-    with torch.no_grad():
-        assert not kept(response).requires_grad
-    place = torch.arange(kept(response).numel(), dtype=torch.float64)
-    for value in (kept(response), fresh(response)):
-        response.zero_grad()
-        (value * place**2).sum().backward()
-        assert float(response.log_fwhm_s.grad.abs()) > 0
-    plain = sensing.GaussianResponse(200e-12)
-
-    def second_moment(log_fwhm):
-        value = torch.func.functional_call(_Kernel(plain), {"response.log_fwhm_s": log_fwhm}, ())
-        return (value * torch.arange(value.numel(), dtype=torch.float64) ** 2).sum()
-
-    log_fwhm = plain.log_fwhm_s.clone()
-    second_moment(log_fwhm)
-    slope = torch.func.grad(second_moment)(log_fwhm)
-    tangent = torch.func.jvp(second_moment, (log_fwhm,), (torch.ones_like(log_fwhm),))[1]
-    assert float(slope) != 0
-    torch.testing.assert_close(slope, tangent)
-    assert float(second_moment(log_fwhm + 0.1)) != float(second_moment(log_fwhm))
-
-
-class _Kernel(torch.nn.Module):
-    def __init__(self, response):
-        super().__init__()
-        self.response = response
-
-    def forward(self):
-        return kept(self.response)
-
-
 def test_copies_and_pickles_know_nothing_of_it():
     sensor = sensing.Afterpulsing(0.05, 30e-9, 75e-9, bin_width_s=WIDTH, period_s=100e-9, background=1.0)
     x = torch.rand(1, 400, 2, 2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from torch.autograd import forward_ad
 
 from support.sensing.event_driven import compare, detect
 from torchtransient.sensing import (
@@ -135,20 +134,6 @@ def test_pixels_of_all_levels():
     torch.testing.assert_close(by_func, leaf.grad, rtol=1e-10, atol=1e-12)
     assert detections_with_dead_time(torch.zeros(0, 1, 8, 2, 2), 1.3).shape == (0, 1, 8, 2, 2)
     assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
-
-
-@pytest.mark.slow
-def test_forward_derivatives_where_no_graph_is_built():
-    """`no_grad` is about graphs: tangents of the light and of the dead time go on."""
-    x, d = mixed()[..., :2] + 0.01, torch.tensor(1.3, dtype=torch.float64)
-    for of in (lambda t: (x + t * x, d), lambda t: (x, d + t)):
-        found = []
-        for grad in (True, False):
-            with forward_ad.dual_level(), torch.set_grad_enabled(grad):
-                t = forward_ad.make_dual(torch.zeros_like(d), torch.ones_like(d))
-                found.append(forward_ad.unpack_dual(detections_with_dead_time(*of(t))).tangent.clone())
-        assert float(found[0].abs().max()) > 0.1
-        torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.slow

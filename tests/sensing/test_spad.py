@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import mpmath
@@ -16,7 +17,6 @@ from torchtransient.sensing import (
     SynchronousSPAD,
     coates,
     first_photon_probabilities,
-    sample_detections,
 )
 from torchtransient.sensing.draws import sample_first_photons, sample_multinomial
 
@@ -69,11 +69,12 @@ def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
     """Chi-square over bins and "none", for weak light, strong light and a flood, without any running sum."""
     g, cycles = torch.Generator().manual_seed(4), 200
     shape = torch.rand(1, bins, 1, 1, dtype=torch.float64, generator=g) ** 4
-    for total in (0.01, 1.0, 6.0, 80.0):
-        rate = (total * shape / shape.sum()).expand(1, bins, 60, 60)
+    # large images by a tree of bins, few counts each by itself
+    for total, side in itertools.product((0.01, 1.0, 6.0, 80.0), (60, 5)):
+        rate = (total * shape / shape.sum()).expand(1, bins, side, side)
         p, none = first_photon_probabilities(rate[..., :1, :1])
         seen = sample_first_photons(cycles, rate, g).sum((-2, -1)).flatten()
-        trials = 3600 * cycles
+        trials = side**2 * cycles
         expected = trials * torch.cat([p.flatten(), none.flatten()])
         seen = torch.cat([seen, trials - seen.sum(0, keepdim=True)])
         often = expected > 8
@@ -93,17 +94,6 @@ def test_coates_undoes_the_expectation(dead_bins):
     estimate = spad.inverse(spad(as_image(rate)))
     torch.testing.assert_close(estimate.rate, as_image(rate), rtol=1e-10, atol=1e-12)
     assert bool(estimate.valid.all())
-
-
-def test_coates_on_samples_is_unbiased_within_noise():
-    rate, cycles = pulse(2.0), 200_000
-    x = as_image(rate).unsqueeze(0).expand(200, 1, BINS, 1, 1)
-    h = sample_detections(x, cycles, generator=torch.Generator().manual_seed(5))
-    found = coates(h, cycles).rate
-    error = (found.mean(0) - as_image(rate)).abs() / (found.std(0) / 200**0.5)
-    assert float(error.max()) < 4.5
-    raw = (h.mean(0) / cycles - as_image(rate)).abs() / as_image(rate)
-    assert float(raw.max()) > 0.5  # what Coates takes away
 
 
 def test_gate():
@@ -201,15 +191,6 @@ def test_likelihood_of_certain_detections_keeps_its_digits(make):
     assert x.grad.flatten().tolist() == pytest.approx([cycles * v for v in slopes], rel=1e-14, abs=0)
     none = make(cycles).log_prob(torch.zeros_like(x), torch.zeros_like(x))
     assert none.tolist() == torch.zeros_like(none).tolist()
-
-
-def test_counts_behind_a_shut_gate_say_nothing():
-    """The rate there is 0 and not valid, whatever was counted; half open, it is twice that of the counts."""
-    spad = SynchronousSPAD(10, gate=torch.tensor([1.0, 0.0, 0.5]))
-    found = spad.inverse(torch.tensor([2.0, 3.0, 1.0], dtype=torch.float64).reshape(1, 3, 1, 1))
-    wanted = [-math.log(1 - 2 / 10), 0.0, -2 * math.log(1 - 1 / 5)]
-    assert found.rate.flatten().tolist() == pytest.approx(wanted)
-    assert found.valid.flatten().tolist() == [True, False, True]
 
 
 @pytest.mark.slow
