@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from support.sensing.event_driven import compare, detect, gaussian_delays, photon_by_photon
+from support.sensing.event_driven import compare, detect, photon_by_photon
 from torchtransient.sensing import (
     TDC,
     Compose,
@@ -36,10 +36,6 @@ def jitter():
     return DetectionJitter(GaussianResponse(SIGMA * 2 * (2 * np.log(2)) ** 0.5 * WIDTH_S), bin_width_s=WIDTH_S)
 
 
-def jittered(rng, events):
-    return events.jittered(rng, gaussian_delays(SIGMA))
-
-
 # name: (stages for one cycle, events); light is even inside a bin in both
 CHAINS = {
     "first photon": (lambda: [SynchronousSPAD(1)], lambda rng, rate, n: detect(rng, rate, n)),
@@ -53,11 +49,11 @@ CHAINS = {
     ),
     "several hits, gate, jitter": (
         lambda: [SynchronousSPAD(1, gate=torch.tensor(GATE), **seconds(7.6)), jitter()],
-        lambda rng, rate, n: jittered(rng, detect(rng, rate, n, 1, 7.6, gate=GATE)),
+        lambda rng, rate, n: detect(rng, rate, n, 1, 7.6, gate=GATE).jittered(rng, SIGMA),
     ),
     "several hits, jitter, codes": (
         lambda: [SynchronousSPAD(1, **seconds(2.4)), jitter(), TDC(WIDTHS)],
-        lambda rng, rate, n: jittered(rng, detect(rng, rate, n, 1, 2.4)).coded(rng, WIDTHS.numpy()),
+        lambda rng, rate, n: detect(rng, rate, n, 1, 2.4).jittered(rng, SIGMA).coded(WIDTHS.numpy()),
     ),
     "free-running": (
         lambda: [FreeRunningSPAD(1, **seconds(20.3))],
@@ -65,7 +61,7 @@ CHAINS = {
     ),
     "free-running, jitter": (
         lambda: [FreeRunningSPAD(1, **seconds(45.7)), jitter()],
-        lambda rng, rate, n: jittered(rng, detect(rng, rate, n // 20, 20, 45.7, free_running=True, warm_up=30)),
+        lambda rng, rate, n: detect(rng, rate, n // 20, 20, 45.7, free_running=True, warm_up=30).jittered(rng, SIGMA),
     ),
     "paralyzable": (
         lambda: [FreeRunningSPAD(1, kind="paralyzable", **seconds(5.7))],

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
+
 import pytest
 import torch
 
 from support.marks import long
 from support.sensing.all_entries import each
-from support.sensing.contract import nothing_with_a_gradient_as_a_number, parts
+from support.sensing.contract import parts
 from torchtransient import TimeAxis, sensing
 from torchtransient.sensing import straight_through
 
@@ -28,6 +31,18 @@ def counts_of(mean, seed=0):
 
 
 # --------------------------------------------------------------------------------------------------- plain numbers
+
+
+@contextlib.contextmanager
+def nothing_with_a_gradient_as_a_number():
+    """torch's warning of a tensor that requires a gradient and is made a plain number, as an error, each time."""
+    torch.set_warn_always(True)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Converting a tensor with requires_grad=True")
+            yield
+    finally:
+        torch.set_warn_always(False)
 
 
 @pytest.mark.slow

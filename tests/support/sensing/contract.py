@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
@@ -78,15 +76,3 @@ def through_state_dict(entry: Entry, module: nn.Module) -> nn.Module:
             tensor.data.zero_()
     other.load_state_dict(torch.load(buffer, weights_only=True))
     return other
-
-
-@contextmanager
-def nothing_with_a_gradient_as_a_number() -> Iterator[None]:
-    """torch's warning of a tensor that requires a gradient and is made a plain number, as an error, each time."""
-    torch.set_warn_always(True)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("error", message="Converting a tensor with requires_grad=True")
-            yield
-    finally:
-        torch.set_warn_always(False)

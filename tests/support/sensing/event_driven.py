@@ -55,28 +55,17 @@ class Events:
     def chosen(self, which):
         return replace(self, times=self.times[which], run=self.run[which])
 
-    def jittered(self, rng, delays, boundary="periodic"):
-        """Every event `delays(rng, number)` bins later; "zero" drops those that leave their period."""
+    def jittered(self, rng, sigma):
+        """Every event later by a normal delay, round its period."""
         period = np.floor(self.times / self.bins)
-        moved = self.times + delays(rng, len(self))
-        if boundary == "zero":
-            return replace(self, times=moved).chosen(np.floor(moved / self.bins) == period)
+        moved = self.times + rng.normal(0.0, sigma, len(self))
         return replace(self, times=moved % self.bins + period * self.bins)
 
-    def coded(self, rng, widths, *, dither=False, sliding_scale=1, offset_bins=0.0):
-        """Codes of unequal `widths` (bins,) instead of times; dither adds an unknown time of up to one bin before.
-
-        One of `sliding_scale` offsets of 0, 1, 2, ... mean widths is added to every event and taken off its code.
-        Beyond the last code the widths begin again; codes outside of the window are lost.
-        """
+    def coded(self, widths):
+        """Codes of unequal `widths` (bins,), whose sum is that of the bins, instead of times."""
         inside, period = self.times % self.bins, np.floor(self.times / self.bins)
-        if dither:
-            inside = inside + rng.random(len(self))
-        shift = rng.integers(0, sliding_scale, len(self))
-        edges = offset_bins + np.concatenate([[0.0], np.cumsum(np.tile(widths, 3))])
-        code = np.searchsorted(edges, inside + shift * np.mean(widths), side="right") - 1 - shift
-        kept = (code >= 0) & (code < self.bins)
-        return replace(self, times=code + 0.5 + period * self.bins).chosen(kept)
+        code = np.searchsorted(np.cumsum(widths), inside, side="right").clip(0, self.bins - 1)
+        return replace(self, times=code + 0.5 + period * self.bins)
 
 
 class Afterpulse(NamedTuple):
@@ -84,10 +73,6 @@ class Afterpulse(NamedTuple):
 
     probability: float
     delays: object
-
-
-def gaussian_delays(sigma, mean=0.0):
-    return lambda rng, n: rng.normal(mean, sigma, n)
 
 
 def exponential_delays(tau, after=0.0):
@@ -262,26 +247,11 @@ def detections(times, dead_bins, kind="non_paralyzable"):
     return times[_armed(times, times + dead_bins)]
 
 
-def histogram(times, bins):
-    return np.bincount(np.floor(times % bins).astype(int) % bins, minlength=bins).astype(float)
-
-
-def synchronous(rng, rate, cycles, dead_bins=None):
-    """Histogram of `cycles` independent cycles; dead_bins None: the first photon only."""
-    return photon_by_photon(rng, rate, cycles, 1, dead_bins).histogram
-
-
 # --- histograms -----------------------------------------------------------------------------------------------------
 
 
 def total_variation(counts, expected):
     return 0.5 * np.abs(counts / counts.sum() - expected / expected.sum()).sum()
-
-
-def chi2_per_dof(counts, expected):
-    """Pearson's statistic over bins that expect 5 counts or more."""
-    use = expected >= 5
-    return (((counts - expected) ** 2 / expected)[use]).sum() / use.sum()
 
 
 def dense_histogram(rate, dead_bins, pieces):
@@ -312,13 +282,3 @@ def dense_limit(rate, dead_bins, pieces):
     coarse, fine = dense_histogram(rate, dead_bins, pieces), dense_histogram(rate, dead_bins, 2 * pieces)
     return (4 * fine - coarse) / 3, np.abs(fine - coarse).max() / 3
 
-
-def last_phases(rng, rate, dead_bins, phases, steps):
-    """Phases of independent detectors `steps` detections after `phases`, by exponential waits in units of flux."""
-    bins, flux = len(rate), np.concatenate([[0.0], np.cumsum(rate)])
-    edges = np.arange(bins + 1.0)
-    for _ in range(steps):
-        armed = (phases + dead_bins) % bins
-        target = np.interp(armed, edges, flux) + rng.exponential(size=armed.shape)
-        phases = np.interp(target % flux[-1], flux, edges)
-    return phases
