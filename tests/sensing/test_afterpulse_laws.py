@@ -17,15 +17,6 @@ from support.sensing.event_driven import Afterpulse, compare, detect, exponentia
 from support.sweeps import together
 from torchtransient import sensing
 from torchtransient.errors import UnitError
-from torchtransient.sensing import (
-    AfterpulseDelays,
-    Afterpulsing,
-    AfterpulsingSPAD,
-    FreeRunningSPAD,
-    MeasuredDelays,
-    PowerLawDelays,
-    SynchronousSPAD,
-)
 
 WIDTH = 1e-10  # of a bin
 BINS = 40
@@ -34,14 +25,14 @@ BINS = 40
 def exponentials(dead, *parts, **keywords):
     """`parts`: (probability, mean delay in bins)."""
     p, tau = [q for q, _ in parts], [t * WIDTH for _, t in parts]
-    return Afterpulsing(p, tau, dead * WIDTH, bin_width_s=WIDTH, **keywords)
+    return sensing.Afterpulsing(p, tau, dead * WIDTH, bin_width_s=WIDTH, **keywords)
 
 
 @dataclass(frozen=True)
 class Delays:
     """A law, the dead time in bins, and the formula of carriers that are left after t bins, in any scale."""
 
-    law: Callable[[], AfterpulseDelays]
+    law: Callable[[], sensing.AfterpulseDelays]
     dead: float
     left: Callable[[np.ndarray], np.ndarray]
     infinite: bool = False  # at delay 0
@@ -52,13 +43,15 @@ def power_law(dead, exponent, longest):
         a = 1 - exponent
         return -np.log(t) if a == 0 else -np.expm1(a * np.log(t)) / a
 
-    return Delays(lambda: PowerLawDelays(exponent, longest * WIDTH), dead, left, infinite=True)
+    return Delays(lambda: sensing.PowerLawDelays(exponent, longest * WIDTH), dead, left, infinite=True)
 
 
 def measured(dead, start=0.7):
     counts, width = [9.0, 40, 22, 13, 9, 6, 5], 5.3  # 4 of them are no afterpulses
     edges, sums = start + width * np.arange(8), np.cumsum([0, *(n - 4 for n in counts)])
-    law = functools.partial(MeasuredDelays, torch.tensor(counts), width * WIDTH, start_s=start * WIDTH, floor=4.0)
+    law = functools.partial(
+        sensing.MeasuredDelays, torch.tensor(counts), width * WIDTH, start_s=start * WIDTH, floor=4.0
+    )
     return Delays(law, dead, lambda t: sums[-1] - np.interp(t, edges, sums))
 
 
@@ -77,7 +70,7 @@ DELAYS = {
 
 def of_delays(name):
     delays = DELAYS[name]
-    return Afterpulsing(0.2, dead_time_s=delays.dead * WIDTH, delays=delays.law(), bin_width_s=WIDTH)
+    return sensing.Afterpulsing(0.2, dead_time_s=delays.dead * WIDTH, delays=delays.law(), bin_width_s=WIDTH)
 
 
 LAWS = {
@@ -92,8 +85,10 @@ each_law = pytest.mark.parametrize("name", LAWS)
 
 
 def test_every_law_of_delays_is_compared():
-    public = {law for law in vars(sensing).values() if isinstance(law, type) and issubclass(law, AfterpulseDelays)}
-    laws = public - {AfterpulseDelays}
+    public = {
+        law for law in vars(sensing).values() if isinstance(law, type) and issubclass(law, sensing.AfterpulseDelays)
+    }
+    laws = public - {sensing.AfterpulseDelays}
     here = {type(delays.law()) for delays in DELAYS.values()}
     assert here == laws, f"enter {laws - here} in DELAYS of tests/sensing/test_afterpulse_laws.py"
     in_contract = {type(delays) for entry in ENTRIES if (delays := getattr(entry.make(), "delays", None)) is not None}
@@ -191,10 +186,10 @@ def test_a_measured_exponential_is_an_exponential():
     tau, dead, width = 20.0, 13.7, 0.1
     edges = torch.arange(0, 4001, dtype=torch.float64) * width
     counts = torch.exp(-edges[:-1] / tau) - torch.exp(-edges[1:] / tau)
-    law = MeasuredDelays(counts, width * WIDTH)
+    law = sensing.MeasuredDelays(counts, width * WIDTH)
     given = {"dead_time_s": dead * WIDTH, "bin_width_s": WIDTH, "counted_from": "avalanche"}
-    found = Afterpulsing(0.3, delays=law, **given).kernel(BINS)
-    wanted = Afterpulsing(0.3, tau * WIDTH, **given).kernel(BINS)
+    found = sensing.Afterpulsing(0.3, delays=law, **given).kernel(BINS)
+    wanted = sensing.Afterpulsing(0.3, tau * WIDTH, **given).kernel(BINS)
     assert float(wanted.sum()) == pytest.approx(0.3 * math.exp(-dead / tau), rel=1e-9)
     # straight lines instead of a curve within bins of width/tau = 1/200: (1/200)^2 / 8 of what is yet to come
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0.3 / 200**2 / 8)
@@ -205,10 +200,10 @@ def test_a_measured_exponential_is_an_exponential():
 
 def detector(mode, dead, cycles=1, **keywords):
     if mode == "free":
-        return FreeRunningSPAD(cycles, dead * WIDTH, bin_width_s=WIDTH, **keywords)
+        return sensing.FreeRunningSPAD(cycles, dead * WIDTH, bin_width_s=WIDTH, **keywords)
     if mode == "first":
-        return SynchronousSPAD(cycles, **keywords)
-    return SynchronousSPAD(cycles, dead_time_s=dead * WIDTH, bin_width_s=WIDTH, **keywords)
+        return sensing.SynchronousSPAD(cycles, **keywords)
+    return sensing.SynchronousSPAD(cycles, dead_time_s=dead * WIDTH, bin_width_s=WIDTH, **keywords)
 
 
 def light(total, kind):
@@ -225,7 +220,7 @@ def agreement(mode, dead, total, kind, parts, laws, seed=0, runs=300, periods=20
         np.random.default_rng(seed), rate, runs, periods, None if mode == "first" else dead,
         free_running=mode == "free", afterpulses=laws, warm_up=warm_up,
     )  # fmt: skip
-    sensor = AfterpulsingSPAD(detector(mode, dead), parts)
+    sensor = sensing.AfterpulsingSPAD(detector(mode, dead), parts)
     return compare(events, sensor.expected(torch.as_tensor(rate).view(1, -1, 1, 1)).numpy())
 
 
@@ -260,8 +255,10 @@ def test_events_everywhere(mode, dead, total, kind):
 def test_events_of_measured_delays():
     """Carriers that are set free while the detector is dead are lost, and counted as such."""
     counts, own, dead = [20.0, 30, 11, 7, 5, 4, 2, 1], 9.7, 12.3
-    law = MeasuredDelays(torch.tensor(counts), own * WIDTH)
-    parts = Afterpulsing(0.06, dead_time_s=dead * WIDTH, delays=law, counted_from="avalanche", bin_width_s=WIDTH)
+    law = sensing.MeasuredDelays(torch.tensor(counts), own * WIDTH)
+    parts = sensing.Afterpulsing(
+        0.06, dead_time_s=dead * WIDTH, delays=law, counted_from="avalanche", bin_width_s=WIDTH
+    )
     laws = [Afterpulse(0.06, measured_delays(np.arange(9) * own, counts))]
     found = [agreement("free", dead, 30.0, "pulse", parts, laws, seed=s) for s in range(3)]
     assert sum(a.total_variation for a in found) < 1.5 * sum(a.noise for a in found)
@@ -284,13 +281,12 @@ def test_frequent_afterpulses(mode, dead, tau):
     "dead, total, p", [(12.3, 0.1, 0.3), (55.7, 1.0, 0.04), (12.3, 10.0, 0.04), (55.7, 100.0, 0.3)]
 )
 def test_constant_light_stays_constant(dead, total, p):
-    """Free-running, of photons at a rate n: 1/m = dead + (1 - p)/n + p/(n + 1/tau) of carriers gone with a dead time.
-    """
+    """Free-running, at n photons: 1/m = dead + (1 - p)/n + p/(n + 1/tau) of carriers gone with a dead time."""
     n, tau = total / BINS, 1.0
     light_ = torch.full((1, BINS, 1, 1), n, dtype=torch.float64)
-    y = AfterpulsingSPAD(detector("free", dead), two(dead)[0])(light_)
+    y = sensing.AfterpulsingSPAD(detector("free", dead), two(dead)[0])(light_)
     assert float(y.max() / y.min() - 1) < 1e-6
-    y = AfterpulsingSPAD(detector("free", dead), exponentials(dead, (p, tau)))(light_)
+    y = sensing.AfterpulsingSPAD(detector("free", dead), exponentials(dead, (p, tau)))(light_)
     assert float(y.mean()) == pytest.approx(1 / (dead + (1 - p) / n + p / (n + 1 / tau)), rel=3e-6)
 
 
@@ -298,19 +294,19 @@ def test_dim_light_is_the_linear_stage():
     rate = torch.full((1, BINS, 1, 1), 1e-7, dtype=torch.float64)
     rate[0, 10] = 1e-6
     spad, parts = detector("free", 12.3), two(12.3)[0]
-    torch.testing.assert_close(AfterpulsingSPAD(spad, parts)(rate), parts(spad(rate)), rtol=1e-4, atol=0)
+    torch.testing.assert_close(sensing.AfterpulsingSPAD(spad, parts)(rate), parts(spad(rate)), rtol=1e-4, atol=0)
 
 
 def test_one_detection_a_cycle_has_afterpulses_in_later_cycles_only():
     """All light in the first bin: in its own cycle the detector is dead, the next is reached by what is late enough."""
     x = torch.zeros(1, BINS, 1, 1, dtype=torch.float64)
     x[0, 0] = 1e-4
-    sensor = AfterpulsingSPAD(SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0)))
+    sensor = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0)))
     # of delays beyond 39 to 40 bins, the mean over the place in bin 0; none else
     late = 0.1 * 5 * math.exp(-(39 - 2) / 5) * (1 - math.exp(-1 / 5))
-    alone = SynchronousSPAD(1)(x).sum()
+    alone = sensing.SynchronousSPAD(1)(x).sum()
     assert float(sensor(x).sum() / alone - 1) == pytest.approx(late, rel=1e-3)
-    longer = AfterpulsingSPAD(SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0), period_s=400 * WIDTH))
+    longer = sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(1), exponentials(2.0, (0.1, 5.0), period_s=400 * WIDTH))
     assert float(longer(x).sum() / alone - 1) < 1e-12
 
 
@@ -318,7 +314,7 @@ def test_a_detector_in_a_window_of_a_longer_period():
     """Constant light that goes on outside: as dim light in a window of the whole period, constant to 1e-6."""
     level, period, cycles = 1e-8, 90, 1000
     parts = exponentials(12.3, (0.1, 30.0), period_s=period * WIDTH, background=level * cycles)
-    sensor = AfterpulsingSPAD(detector("several", 12.3, cycles=cycles), parts)
+    sensor = sensing.AfterpulsingSPAD(detector("several", 12.3, cycles=cycles), parts)
     y = sensor(torch.full((1, BINS, 1, 1), level, dtype=torch.float64))
     assert float(y.max() / y.min() - 1) < 1e-6
     # the cycle's own pile-up is 4e-7 of it

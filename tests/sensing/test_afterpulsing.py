@@ -9,25 +9,13 @@ import torch
 from support.marks import long
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import UnitError
-from torchtransient.sensing import (
-    Afterpulsing,
-    AfterpulsingSPAD,
-    CoincidencePixel,
-    Crosstalk,
-    MacroPixel,
-    ScoreFunction,
-    SynchronousSPAD,
-    add_afterpulses,
-    add_crosstalk,
-    hot_pixel_rates,
-)
 
 BINS = 40
 
 
 def kernel_of(tau, dead, period=BINS):
     """Delays of one afterpulse, in bins."""
-    return Afterpulsing(0.5, tau * 1e-10, dead * 1e-10, bin_width_s=1e-10).kernel(period) / 0.5
+    return sensing.Afterpulsing(0.5, tau * 1e-10, dead * 1e-10, bin_width_s=1e-10).kernel(period) / 0.5
 
 
 @pytest.mark.parametrize("tau, dead", [(7.0, 3.2), (300.0, 55.0), (0.01, 2.0), (25.0, 0.0)])
@@ -56,7 +44,7 @@ def test_geometric_sum_against_a_branching_process():
         times = times + rng.random(times.size) + dead + rng.exponential(tau, times.size)
         total += np.bincount(np.floor(times).astype(int) % BINS, minlength=BINS)
     kernel = kernel_of(tau, dead)
-    found = add_afterpulses(torch.as_tensor(h).view(1, -1, 1, 1), p, kernel).flatten().numpy()
+    found = sensing.add_afterpulses(torch.as_tensor(h).view(1, -1, 1, 1), p, kernel).flatten().numpy()
     assert found.sum() == pytest.approx(counts / (1 - p), rel=1e-12)
     z = (total - found)[found < counts] / np.sqrt(found[found < counts])
     assert np.abs(z).max() < 5
@@ -67,8 +55,8 @@ def test_long_periods_are_wrapped_round_the_window():
     x = torch.rand(1, 16, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for period in (16, 32, 33, 40, 100):
         kernel = kernel_of(70, 20, period)
-        whole = add_afterpulses(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, period - 16)), 0.3, kernel)
-        torch.testing.assert_close(add_afterpulses(x, 0.3, kernel), whole[:, :16])
+        whole = sensing.add_afterpulses(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, period - 16)), 0.3, kernel)
+        torch.testing.assert_close(sensing.add_afterpulses(x, 0.3, kernel), whole[:, :16])
 
 
 def test_crosstalk_against_loops():
@@ -81,14 +69,14 @@ def test_crosstalk_against_loops():
                     weight = (0, 0.03, 0.01)[abs(di) + abs(dj)]
                     if 0 <= i + di < 4 and 0 <= j + dj < 5 and (di or dj):
                         wanted[..., i, j] += weight * x[..., i + di, j + dj]
-    torch.testing.assert_close(add_crosstalk(x, 0.03, 0.01), wanted)
+    torch.testing.assert_close(sensing.add_crosstalk(x, 0.03, 0.01), wanted)
 
 
 @pytest.mark.parametrize(
     "make, policy",
     [
-        (lambda **k: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k), "gaussian"),
-        (lambda **k: Crosstalk(0.05, learnable=True, **k), "score"),
+        (lambda **k: sensing.Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10, learnable=True, **k), "gaussian"),
+        (lambda **k: sensing.Crosstalk(0.05, learnable=True, **k), "score"),
     ],
     ids=["afterpulsing", "crosstalk"],
 )
@@ -96,7 +84,7 @@ def test_policies_keep_the_gradient_of_what_passes(make, policy):
     """Loss: square of one bin. Exact: 2 y + (variance of what is added)', in the probability's logit."""
     module, draws = make(grad=policy), 30_000
     x = torch.full((draws, 1, 4, 2, 2), 40.0, dtype=torch.float64, requires_grad=True)
-    with ScoreFunction() as score:
+    with sensing.ScoreFunction() as score:
         y = module(x, generator=torch.Generator().manual_seed(0))
         losses = y[:, 0, 1, 0, 0] ** 2
     total = score.surrogate(losses, baseline="leave_one_out") if policy == "score" else losses
@@ -110,11 +98,13 @@ def test_policies_keep_the_gradient_of_what_passes(make, policy):
 
 
 def test_hot_pixels():
-    rates = hot_pixel_rates(200, 200, median_hz=50.0, hot_fraction=0.02, generator=torch.Generator().manual_seed(0))
+    rates = sensing.hot_pixel_rates(
+        200, 200, median_hz=50.0, hot_fraction=0.02, generator=torch.Generator().manual_seed(0)
+    )
     assert float(rates.median()) == pytest.approx(50.0, rel=0.03)
     assert float((rates > 1000).double().mean()) == pytest.approx(0.02, abs=0.004)
     with pytest.raises(UnitError, match="hot_fraction"):
-        hot_pixel_rates(2, 2, median_hz=1.0, hot_fraction=2.0)
+        sensing.hot_pixel_rates(2, 2, median_hz=1.0, hot_fraction=2.0)
 
 
 def test_crosstalk_is_a_binomial_number_of_every_neighbour():
@@ -123,7 +113,7 @@ def test_crosstalk_is_a_binomial_number_of_every_neighbour():
     x = torch.zeros(images, 1, 1, 3, 3)
     x[..., 1, 1] = n
     x[..., 0, 2] = 7
-    module = Crosstalk(p, diagonal_ratio=ratio)
+    module = sensing.Crosstalk(p, diagonal_ratio=ratio)
     added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double().view(images, 9)
     edges = {1: (n, 7), 5: (n, 7), 3: (n, 0), 7: (n, 0)}
     for pixel, (near, other) in edges.items():
@@ -144,7 +134,7 @@ def test_afterpulses_are_followed_one_by_one():
     x = torch.zeros(1, BINS, 128, 128)
     x[:, 5] = n
     x[:, 20] = 50
-    module = Afterpulsing(p, 6e-10, 4e-10, bin_width_s=1e-10, period_s=BINS * 1e-10)
+    module = sensing.Afterpulsing(p, 6e-10, 4e-10, bin_width_s=1e-10, period_s=BINS * 1e-10)
     added = (module.sample(x, torch.Generator().manual_seed(0)) - x).double()
     assert float(added.min()) >= 0
     mean = module.extra(x.double()).mean((0, 2, 3)).clamp_min(0)
@@ -158,7 +148,7 @@ def test_long_periods_are_placed_exactly():
     """Periods too long for single precision, and delays of many periods."""
     x = torch.zeros(1, 8, 64, 64)
     x[:, 0] = 100
-    module = Afterpulsing(0.2, 1e-6, 1e-8, bin_width_s=1e-12, period_s=3e-7)
+    module = sensing.Afterpulsing(0.2, 1e-6, 1e-8, bin_width_s=1e-12, period_s=3e-7)
     added = module.sample(x, torch.Generator().manual_seed(0)) - x
     assert float(added.sum()) == pytest.approx(
         float(module.extra(x).sum()), abs=5 * float(module.extra(x).sum()) ** 0.5
@@ -166,7 +156,9 @@ def test_long_periods_are_placed_exactly():
     assert torch.equal(added, added.round())
 
 
-@pytest.mark.parametrize("make", [lambda: Crosstalk(0.05), lambda: Afterpulsing(0.05, 30e-10, 0.0, bin_width_s=1e-10)])
+@pytest.mark.parametrize(
+    "make", [lambda: sensing.Crosstalk(0.05), lambda: sensing.Afterpulsing(0.05, 30e-10, 0.0, bin_width_s=1e-10)]
+)
 def test_means_and_floods_take_poisson_numbers(make):
     """Counts that are not whole, and too many to follow, still get whole numbers of the right mean."""
     for level in (0.7, 1e6):
@@ -178,7 +170,7 @@ def test_means_and_floods_take_poisson_numbers(make):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "make", [lambda: Crosstalk(0.02), lambda: Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10)]
+    "make", [lambda: sensing.Crosstalk(0.02), lambda: sensing.Afterpulsing(0.05, 30e-10, 20e-10, bin_width_s=1e-10)]
 )
 def test_draws_do_not_depend_on_the_number_of_threads(make):
     x = torch.poisson(torch.full((1, BINS, 64, 64), 5.0), generator=torch.Generator().manual_seed(1))
@@ -250,8 +242,8 @@ LIGHT, CYCLES = 4e-3, 1000
 
 def one(background=LIGHT * CYCLES):
     """Window of 16 bins in a period of 160, constant even_light outside of it."""
-    afterpulsing = Afterpulsing(0.1, 30e-9, 5e-9, bin_width_s=1e-9, period_s=160e-9, background=background)
-    return AfterpulsingSPAD(SynchronousSPAD(CYCLES, dead_time_s=5e-9, bin_width_s=1e-9), afterpulsing)
+    afterpulsing = sensing.Afterpulsing(0.1, 30e-9, 5e-9, bin_width_s=1e-9, period_s=160e-9, background=background)
+    return sensing.AfterpulsingSPAD(sensing.SynchronousSPAD(CYCLES, dead_time_s=5e-9, bin_width_s=1e-9), afterpulsing)
 
 
 def even_light():
@@ -262,24 +254,28 @@ def even_light():
 def test_background_of_a_pixel_is_shared():
     """SPADs whose shares hardly differ count what equal ones do."""
     weights = [1.0] * 50 + [1.001] * 50
-    equal = MacroPixel(one(), 100).expected(even_light())
-    torch.testing.assert_close(MacroPixel(one(), 100, weights=weights).expected(even_light()), equal, rtol=1e-4, atol=0)
+    equal = sensing.MacroPixel(one(), 100).expected(even_light())
+    torch.testing.assert_close(
+        sensing.MacroPixel(one(), 100, weights=weights).expected(even_light()), equal, rtol=1e-4, atol=0
+    )
     assert float(equal.mean()) / (LIGHT * CYCLES) == pytest.approx(1 / 0.9, rel=2e-3)
 
 
 def test_background_of_a_coincidence_pixel_is_shared():
     """One SPAD is enough, windows short: the counts of the macro-pixel."""
-    found = CoincidencePixel(one(), 100, coincidence=1, window_s=1e-11, bin_width_s=1e-9).expected(even_light())
-    torch.testing.assert_close(found, MacroPixel(one(), 100).expected(even_light()), rtol=1e-3, atol=0)
+    found = sensing.CoincidencePixel(one(), 100, coincidence=1, window_s=1e-11, bin_width_s=1e-9).expected(even_light())
+    torch.testing.assert_close(found, sensing.MacroPixel(one(), 100).expected(even_light()), rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("tau_s", [1e-9, (1e-9, 2e-9)])
 def test_all_carriers_are_set_free_during_the_dead_time(tau_s):
     p = 0.1 if isinstance(tau_s, float) else (0.1, 0.1)
-    spad = SynchronousSPAD(100, dead_time_s=1.6e-6, bin_width_s=1e-7)
-    afterpulsing = Afterpulsing(p, tau_s, 1.6e-6, counted_from="avalanche", bin_width_s=1e-7)
+    spad = sensing.SynchronousSPAD(100, dead_time_s=1.6e-6, bin_width_s=1e-7)
+    afterpulsing = sensing.Afterpulsing(p, tau_s, 1.6e-6, counted_from="avalanche", bin_width_s=1e-7)
     x = torch.full((1, 16, 2, 2), 0.1, dtype=torch.float64)
-    torch.testing.assert_close(AfterpulsingSPAD(spad, afterpulsing).expected(x), spad.expected(x), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        sensing.AfterpulsingSPAD(spad, afterpulsing).expected(x), spad.expected(x), rtol=1e-12, atol=0
+    )
     counts = spad.sample(x, torch.Generator().manual_seed(0))
     afterpulsing.grad = "straight_through"
     assert torch.equal(afterpulsing(counts, generator=torch.Generator().manual_seed(0)), counts)

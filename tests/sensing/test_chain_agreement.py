@@ -36,8 +36,9 @@ ON_AN_AXIS = {
     "DetectionJitter": lambda axis: sensing.DetectionJitter(sensing.GaussianResponse(300 * PS), axis),
     "PixelSkew": lambda axis: sensing.PixelSkew(50 * PS, axis),
     "DetectionSkew": lambda axis: sensing.DetectionSkew(50 * PS, axis),
-    "CoincidencePixel": lambda axis: sensing.CoincidencePixel(sensing.SynchronousSPAD(9), 4, coincidence=2,
-        window_s=1 * NS, axis=axis),
+    "CoincidencePixel": lambda axis: sensing.CoincidencePixel(
+        sensing.SynchronousSPAD(9), 4, coincidence=2, window_s=1 * NS, axis=axis
+    ),
     "CoherentReceiver": lambda axis: sensing.CoherentReceiver(Chirps(1e9, 1e-5, 1550e-9), axis),
     "SweepJitter": lambda axis: sensing.SweepJitter(300 * PS, axis),
     "StreakCamera": lambda axis: sensing.StreakCamera(axis, time_fwhm_s=300 * PS, jitter_fwhm_s=300 * PS),

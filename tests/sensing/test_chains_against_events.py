@@ -7,20 +7,12 @@ import pytest
 import torch
 
 from support.sensing.event_driven import compare, detect, photon_by_photon
-from torchtransient.sensing import (
-    TDC,
-    Compose,
-    DetectionJitter,
-    FreeRunningSPAD,
-    GaussianResponse,
-    SynchronousSPAD,
-    random_code_widths,
-)
+from torchtransient import sensing
 
 BINS, WIDTH_S, SIGMA = 32, 1e-10, 0.8
 T = np.arange(BINS)
 GATE = np.clip((T - 3) / 4, 0, 1)
-WIDTHS = random_code_widths(BINS, 0.2, torch.Generator().manual_seed(0))
+WIDTHS = sensing.random_code_widths(BINS, 0.2, torch.Generator().manual_seed(0))
 SHAPES = {
     "pulse": 0.4 / BINS + np.exp(-0.5 * ((T - 11.3) / 1.5) ** 2) / 6,
     "ends": 0.4 / BINS + 0.1 * np.exp(-0.5 * (np.minimum(T + 0.5, BINS - T - 0.5) / 2.5) ** 2),
@@ -33,38 +25,40 @@ def seconds(bins):
 
 
 def jitter():
-    return DetectionJitter(GaussianResponse(SIGMA * 2 * (2 * np.log(2)) ** 0.5 * WIDTH_S), bin_width_s=WIDTH_S)
+    return sensing.DetectionJitter(
+        sensing.GaussianResponse(SIGMA * 2 * (2 * np.log(2)) ** 0.5 * WIDTH_S), bin_width_s=WIDTH_S
+    )
 
 
 # name: (stages for one cycle, events); light is even inside a bin in both
 CHAINS = {
-    "first photon": (lambda: [SynchronousSPAD(1)], lambda rng, rate, n: detect(rng, rate, n)),
+    "first photon": (lambda: [sensing.SynchronousSPAD(1)], lambda rng, rate, n: detect(rng, rate, n)),
     "first photon, gate": (
-        lambda: [SynchronousSPAD(1, gate=torch.tensor(GATE))],
+        lambda: [sensing.SynchronousSPAD(1, gate=torch.tensor(GATE))],
         lambda rng, rate, n: detect(rng, rate, n, gate=GATE),
     ),
     "several hits": (
-        lambda: [SynchronousSPAD(1, **seconds(1.3))],
+        lambda: [sensing.SynchronousSPAD(1, **seconds(1.3))],
         lambda rng, rate, n: detect(rng, rate, n, 1, 1.3),
     ),
     "several hits, gate, jitter": (
-        lambda: [SynchronousSPAD(1, gate=torch.tensor(GATE), **seconds(7.6)), jitter()],
+        lambda: [sensing.SynchronousSPAD(1, gate=torch.tensor(GATE), **seconds(7.6)), jitter()],
         lambda rng, rate, n: detect(rng, rate, n, 1, 7.6, gate=GATE).jittered(rng, SIGMA),
     ),
     "several hits, jitter, codes": (
-        lambda: [SynchronousSPAD(1, **seconds(2.4)), jitter(), TDC(WIDTHS)],
+        lambda: [sensing.SynchronousSPAD(1, **seconds(2.4)), jitter(), sensing.TDC(WIDTHS)],
         lambda rng, rate, n: detect(rng, rate, n, 1, 2.4).jittered(rng, SIGMA).coded(WIDTHS.numpy()),
     ),
     "free-running": (
-        lambda: [FreeRunningSPAD(1, **seconds(20.3))],
+        lambda: [sensing.FreeRunningSPAD(1, **seconds(20.3))],
         lambda rng, rate, n: detect(rng, rate, n // 20, 20, 20.3, free_running=True, warm_up=30),
     ),
     "free-running, jitter": (
-        lambda: [FreeRunningSPAD(1, **seconds(45.7)), jitter()],
+        lambda: [sensing.FreeRunningSPAD(1, **seconds(45.7)), jitter()],
         lambda rng, rate, n: detect(rng, rate, n // 20, 20, 45.7, free_running=True, warm_up=30).jittered(rng, SIGMA),
     ),
     "paralyzable": (
-        lambda: [FreeRunningSPAD(1, kind="paralyzable", **seconds(5.7))],
+        lambda: [sensing.FreeRunningSPAD(1, kind="paralyzable", **seconds(5.7))],
         lambda rng, rate, n: photon_by_photon(
             rng, rate, n // 20, 20, 5.7, kind="paralyzable", free_running=True
         ),
@@ -94,7 +88,7 @@ def test_mean_against_events(chain, shape, total):
     stages, events = CHAINS[chain]
     rate = total * SHAPES[shape] / SHAPES[shape].sum()
     seen = events(np.random.default_rng(11), rate, 20_000 if total < 50 else 6000)
-    mean = Compose(stages()).expected(torch.tensor(rate).view(1, BINS, 1, 1)).flatten().numpy()
+    mean = sensing.Compose(stages()).expected(torch.tensor(rate).view(1, BINS, 1, 1)).flatten().numpy()
     # a paralyzable detector in a flood sees almost nothing, and does not move detections
     alone = len(stages()) == 1 and "running" not in chain
     agreement = compare(seen, mean)

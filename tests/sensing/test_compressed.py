@@ -7,21 +7,15 @@ import math
 import pytest
 import torch
 
+from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import (
-    BinaryFrames,
-    CodedHistogram,
-    equi_depth_edges,
-    fourier_codes,
-    frames_to_rate,
-)
 
 
 def test_binary_frames_and_their_inverse():
     rate = torch.tensor([0.0, 0.1, 1.0, 3.0], dtype=torch.float64).view(1, 4, 1, 1)
-    sensor = BinaryFrames(1000)
-    torch.testing.assert_close(frames_to_rate(sensor(rate), 1000), rate, atol=1e-12, rtol=1e-9)
-    full = frames_to_rate(torch.tensor(1000.0), 1000)
+    sensor = sensing.BinaryFrames(1000)
+    torch.testing.assert_close(sensing.frames_to_rate(sensor(rate), 1000), rate, atol=1e-12, rtol=1e-9)
+    full = sensing.frames_to_rate(torch.tensor(1000.0), 1000)
     assert bool(torch.isfinite(full))
     h = sensor.sample(rate.expand(1, 4, 100, 100), torch.Generator().manual_seed(0))
     p = -torch.expm1(-rate)
@@ -31,30 +25,30 @@ def test_binary_frames_and_their_inverse():
 
 def test_equi_depth_edges_cut_equal_shares():
     h = torch.rand(1, 1, 50, 3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) ** 4
-    edges = equi_depth_edges(h, 8)
+    edges = sensing.equi_depth_edges(h, 8)
     assert edges.shape == (1, 1, 7, 3, 4)
     cumulative = torch.nn.functional.pad(h.cumsum(2), (0, 0, 0, 0, 1, 0))
     low = edges.floor().long()
     at = cumulative.gather(2, low) + (edges - low) * h.gather(2, low)
     shares = torch.arange(1, 8, dtype=torch.float64).view(-1, 1, 1) / 8
     torch.testing.assert_close(at / h.sum(2, keepdim=True), shares.expand_as(at))
-    assert torch.autograd.gradcheck(lambda v: equi_depth_edges(v, 4), (h[..., :1, :1] + 0.1).requires_grad_())
-    empty = equi_depth_edges(torch.zeros(1, 8, 1, 1), 4)
+    assert torch.autograd.gradcheck(lambda v: sensing.equi_depth_edges(v, 4), (h[..., :1, :1] + 0.1).requires_grad_())
+    empty = sensing.equi_depth_edges(torch.zeros(1, 8, 1, 1), 4)
     torch.testing.assert_close(empty.flatten(), torch.tensor([2.0, 4.0, 6.0]))
     with pytest.raises(UnitError, match="counts >= 0"):
-        equi_depth_edges(-torch.ones(1, 8, 1, 1), 4)
+        sensing.equi_depth_edges(-torch.ones(1, 8, 1, 1), 4)
 
 
 def test_a_pixel_with_nan_has_no_edges():
     counts = torch.tensor([[1.0, 2.0, math.nan, 1.0], [3.0, 1.0, 1.0, 3.0]], dtype=torch.float64).T.reshape(1, 4, 1, 2)
-    found = equi_depth_edges(counts, 4).squeeze()
+    found = sensing.equi_depth_edges(counts, 4).squeeze()
     assert bool(found[:, 0].isnan().all()) and found[:, 1].tolist() == pytest.approx([2 / 3, 2.0, 10 / 3])
 
 
 def test_probabilities_of_binary_frames():
     """Binomials of independent bins: mean, variance, and logarithms that add up to one over all counts."""
     rate = torch.tensor([[0.0, 2.5], [0.4, 1e-3]], dtype=torch.float64).reshape(1, 2, 1, 2)
-    sensor, p = BinaryFrames(5), 1 - torch.exp(-rate)
+    sensor, p = sensing.BinaryFrames(5), 1 - torch.exp(-rate)
     torch.testing.assert_close(sensor.expected(rate), 5 * p)
     torch.testing.assert_close(sensor.variance(rate), 5 * p * (1 - p))
     k = torch.arange(6, dtype=torch.float64).reshape(6, 1, 1, 1, 1).expand(6, 1, 1, 1, 2)
@@ -72,9 +66,9 @@ def test_probabilities_of_binary_frames():
 
 
 def test_coded_histograms():
-    codes = fourier_codes(64, 8)
+    codes = sensing.fourier_codes(64, 8)
     torch.testing.assert_close(codes @ codes.T, torch.eye(8, dtype=torch.float64), atol=1e-12, rtol=0)
-    sensor = CodedHistogram(codes)
+    sensor = sensing.CodedHistogram(codes)
     g = torch.Generator().manual_seed(0)
     x = torch.rand(2, 1, 64, 3, 2, dtype=torch.float64, generator=g)
     y = torch.rand(2, 1, 8, 3, 2, dtype=torch.float64, generator=g)
@@ -86,6 +80,6 @@ def test_coded_histograms():
     phase = torch.atan2(sensor(delta)[0, 1], sensor(delta)[0, 0]).item()
     assert phase / (2 * torch.pi) * 64 == pytest.approx(20.5)
     with pytest.raises(ShapeError, match="at most"):
-        fourier_codes(4, 9)
+        sensing.fourier_codes(4, 9)
     with pytest.raises(ShapeError, match="dimension -3"):
         sensor(torch.ones(1, 3, 1, 1))

@@ -7,30 +7,19 @@ import pytest
 import torch
 from scipy import stats
 
+from torchtransient import sensing
 from torchtransient.errors import GradientError
-from torchtransient.sensing import (
-    TDC,
-    Compose,
-    DetectionJitter,
-    GaussianResponse,
-    ImpulseResponse,
-    ScoreFunction,
-    ShotNoise,
-    SynchronousSPAD,
-    TailedResponse,
-    random_code_widths,
-)
 from torchtransient.sensing.chain.compose import multinomial_log_prob
 
 PS, WIDTH = 1e-12, 20e-12
 
 
 def tails(**keywords):
-    return TailedResponse(50 * PS, [90 * PS], [0.3], delay_s=7 * PS, **keywords)
+    return sensing.TailedResponse(50 * PS, [90 * PS], [0.3], delay_s=7 * PS, **keywords)
 
 
 def jitter(**keywords):
-    return DetectionJitter(tails(), bin_width_s=WIDTH, **keywords)
+    return sensing.DetectionJitter(tails(), bin_width_s=WIDTH, **keywords)
 
 
 def column(values):
@@ -71,7 +60,7 @@ def test_means_and_rates_stay_means():
 def test_score_of_a_learnable_response():
     """Gradient of E sum(y^2) in the width of the response: score of drawn delays against the closed form."""
     counts = column([0, 0, 3, 0, 0, 0, 0, 0])
-    module = DetectionJitter(GaussianResponse(40 * PS, learnable=True), bin_width_s=WIDTH)
+    module = sensing.DetectionJitter(sensing.GaussianResponse(40 * PS, learnable=True), bin_width_s=WIDTH)
     _, kernel = module.response.kernel(WIDTH)
     # of n counts of one bin: E sum y^2 = n + n (n - 1) sum p^2
     exact = torch.autograd.grad(3 + 6 * kernel.square().sum(), module.response.log_fwhm_s)[0]
@@ -79,7 +68,7 @@ def test_score_of_a_learnable_response():
     repeats = 20_000
     found = []
     for seed in range(4):
-        with ScoreFunction() as score:
+        with sensing.ScoreFunction() as score:
             y = module(counts.expand(repeats // 4, 1, 8, 1, 1), generator=generator(seed))
             losses = y.square().sum((-4, -3, -2, -1))
         surrogate = score.surrogate(losses, baseline="leave_one_out").mean()
@@ -92,7 +81,7 @@ def test_score_of_a_learnable_response():
 def test_straight_through_and_gaussian_reach_the_response():
     x = column(torch.poisson(torch.full((20,), 9.0), generator=generator())).requires_grad_()
     for policy in ("straight_through", "gaussian"):
-        module = DetectionJitter(tails(learnable=True), bin_width_s=WIDTH, grad=policy)
+        module = sensing.DetectionJitter(tails(learnable=True), bin_width_s=WIDTH, grad=policy)
         y = module(x, generator=generator())
         weights = torch.linspace(0, 1, 20, dtype=torch.float64).view(-1, 1, 1).square()
         gradients = torch.autograd.grad((y * weights).sum(), [x, *module.parameters()])
@@ -113,8 +102,8 @@ def bright(bins=40, total=6.0):
 
 
 def counter(grad="straight_through", **keywords):
-    converter = TDC(random_code_widths(40, 0.2, generator(4)))
-    return Compose([SynchronousSPAD(500, **keywords), jitter(), converter], grad=grad)
+    converter = sensing.TDC(sensing.random_code_widths(40, 0.2, generator(4)))
+    return sensing.Compose([sensing.SynchronousSPAD(500, **keywords), jitter(), converter], grad=grad)
 
 
 def test_jitter_behind_pile_up_is_where_the_detections_are():
@@ -126,10 +115,10 @@ def test_jitter_behind_pile_up_is_where_the_detections_are():
     def centre(y):
         return float((y * place).sum() / y.sum())
 
-    spad = SynchronousSPAD(500)
-    right = Compose([spad, jitter()]).expected(x)
+    spad = sensing.SynchronousSPAD(500)
+    right = sensing.Compose([spad, jitter()]).expected(x)
     assert centre(right) == pytest.approx(centre(spad.expected(x)) + (7 + 0.3 * 90) / 20, abs=1e-3)
-    early = Compose([ImpulseResponse(tails(), bin_width_s=WIDTH), spad]).expected(x)
+    early = sensing.Compose([sensing.ImpulseResponse(tails(), bin_width_s=WIDTH), spad]).expected(x)
     assert centre(right) - centre(early) > 1.0
 
 
@@ -164,7 +153,7 @@ def test_gradients_of_what_is_drawn_at_once():
         assert not chain(x, generator=generator()).requires_grad
     # score: E of the loss's gradient, for a loss that is not linear
     scale = torch.ones(4000, dtype=torch.float64, requires_grad=True)
-    with ScoreFunction() as score:
+    with sensing.ScoreFunction() as score:
         counts = counter("score")(bright(total=1.0) * scale.view(-1, 1, 1, 1, 1), generator=generator(1))
         losses = counts[..., 18:22, :, :].sum((-4, -3, -2, -1)).square()
     score.surrogate(losses, baseline="leave_one_out").sum().backward()
@@ -192,13 +181,18 @@ def test_likelihood_of_a_chain():
     counts = chain.sample(x.expand(200, 1, 40, 1, 1), generator())
     found = [float(chain.log_prob(counts, f * x).mean()) for f in (0.9, 1.0, 1.1)]
     assert found[1] > max(found[0], found[2])
-    whole = Compose([ImpulseResponse(GaussianResponse(30 * PS), bin_width_s=WIDTH), Compose(list(chain.stages))])
+    whole = sensing.Compose(
+        [
+            sensing.ImpulseResponse(sensing.GaussianResponse(30 * PS), bin_width_s=WIDTH),
+            sensing.Compose(list(chain.stages)),
+        ]
+    )
     assert whole.log_prob(counts, x).shape == (200, 1, 1, 1)
-    alone = Compose([SynchronousSPAD(500)])
-    assert torch.equal(alone.log_prob(counts, x), SynchronousSPAD(500).log_prob(counts, x))
+    alone = sensing.Compose([sensing.SynchronousSPAD(500)])
+    assert torch.equal(alone.log_prob(counts, x), sensing.SynchronousSPAD(500).log_prob(counts, x))
     leaf = x.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda v: chain.log_prob(counts[0], v), leaf, fast_mode=True)
     with pytest.raises(GradientError, match="one detector that draws"):
-        Compose([ShotNoise(), jitter()]).log_prob(counts, x)
+        sensing.Compose([sensing.ShotNoise(), jitter()]).log_prob(counts, x)
     with pytest.raises(GradientError, match="one detector that draws"):
         counter(dead_time_s=100 * PS, bin_width_s=WIDTH).log_prob(counts, x)

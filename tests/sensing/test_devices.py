@@ -11,13 +11,7 @@ import torch
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, MissingPackageError, StorageError, UnitError
-from torchtransient.sensing import (
-    DEVICES,
-    Device,
-    build_stage,
-    device,
-    read_itof,
-)
+from torchtransient.sensing import DEVICES, Device, build_stage, device, read_itof
 from torchtransient.sensing.devices import KINDS
 
 each = pytest.mark.parametrize("name", sorted(DEVICES))
@@ -132,15 +126,18 @@ def test_kinect_sees_the_depth_of_a_wall():
         lambda: Device("x", description="", sources=(), stages=()),
         lambda: Device("x", description="", sources=(), stages=({"kind": "os.system"},)),
         lambda: Device("x", description="", sources=(), stages=("ShotNoise",)),
-        lambda: Device("x", description="", sources=(), stages=({"kind": "PixelElectronics",
-            "full_well_e": float("inf")},)),
-        lambda: Device("x", description="", sources=(), stages=({"kind": "ImpulseResponse",
-            "response": {"kind": "nothing"}},)),
+        lambda: Device(
+            "x", description="", sources=(), stages=({"kind": "PixelElectronics", "full_well_e": float("inf")},)
+        ),
+        lambda: Device(
+            "x", description="", sources=(), stages=({"kind": "ImpulseResponse", "response": {"kind": "nothing"}},)
+        ),
         lambda: Device("x", description="", sources=(), stages=({"kind": "sine_code"},)).sensor(),
         lambda: Device("x", description="", sources=(), stages=({"kind": "ShotNoise", "colour": 3},)).sensor(),
         lambda: Device("x", description="", sources=(), stages=({"kind": "ShotNoise"},)).axis(),
-        lambda: Device("x", description="", sources=(), stages=({"kind": "ShotNoise",
-            "grad": torch.ones(1)},)).to_json(),
+        lambda: Device(
+            "x", description="", sources=(), stages=({"kind": "ShotNoise", "grad": torch.ones(1)},)
+        ).to_json(),
         lambda: Device.from_dict({"name": "x"}),
         lambda: Device.from_dict({**device("imx250mzr_like").to_dict(), "more": 1}),
         lambda: Device.from_json("{"),

@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from support.sensing.event_driven import (
-    Afterpulse,
-    compare,
-    detect,
-    measured_delays,
-    photon_by_photon,
-)
+from support.sensing.event_driven import Afterpulse, compare, detect, measured_delays, photon_by_photon
 
 BINS = 16
 RUNS = 4000

@@ -38,8 +38,9 @@ SATURATING = {
     "free": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS),
     "paralyzable": lambda: sensing.FreeRunningSPAD(50, 70 * PS, bin_width_s=20 * PS, kind="paralyzable"),
     "frames": lambda: sensing.BinaryFrames(50),
-    "coincidence": lambda: sensing.CoincidencePixel(sensing.SynchronousSPAD(50), 4, coincidence=2, window_s=70 * PS,
-        bin_width_s=20 * PS),
+    "coincidence": lambda: sensing.CoincidencePixel(
+        sensing.SynchronousSPAD(50), 4, coincidence=2, window_s=70 * PS, bin_width_s=20 * PS
+    ),
     "macro-pixel": lambda: sensing.MacroPixel(sensing.SynchronousSPAD(50), 3),
     "afterpulses": lambda: sensing.AfterpulsingSPAD(
         sensing.SynchronousSPAD(50, dead_time_s=70 * PS, bin_width_s=20 * PS),

@@ -8,11 +8,7 @@ import torch
 
 from support.marks import long_rows
 from support.sensing.event_driven import dense_limit
-from torchtransient.sensing import (
-    free_running_rate,
-    nonparalyzable_histogram,
-    paralyzable_histogram,
-)
+from torchtransient.sensing import free_running_rate, nonparalyzable_histogram, paralyzable_histogram
 
 BINS = 64
 

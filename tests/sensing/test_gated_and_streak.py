@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchtransient.axes import TimeAxis
-from torchtransient.sensing import GatedIntegration, StreakCamera, SweepJitter, gate_profiles
+from torchtransient.sensing import GatedIntegration, SweepJitter, gate_profiles
 from torchtransient.units import SPEED_OF_LIGHT
 
 RISE_PER_SIGMA = 2 * 1.2815515655446004  # from 10 % to 90 % of a normal distribution
@@ -85,29 +85,6 @@ def test_gradient_through_the_jitter_is_that_of_the_draw(policy):
     jitter = SweepJitter(3e-12, bin_width_s=1e-12, sweeps=2, grad=policy)
     x = torch.rand(2, 1, 20, 1, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda v: jitter(v, torch.Generator().manual_seed(3)), x, fast_mode=True)
-
-
-@pytest.mark.slow
-def test_streak_camera_moments():
-    """Mean and variance of a flat field: gain noise and read noise; neighbours are correlated by the phosphor."""
-    axis = TimeAxis.from_seconds(0.0, 1e-12, 24)
-    camera = StreakCamera(
-        axis, jitter_fwhm_s=0.0, time_fwhm_s=2e-12, excess_noise=2.0, read_noise_e=3.0, phosphor_fwhm_px=2.0,
-        spatial_fwhm_px=1.5,
-    )  # fmt: skip
-    x = torch.full((400, 1, 24, 3, 16), 50.0, dtype=torch.float64)
-    y = camera.sample(x, torch.Generator().manual_seed(0))[:, 0, 8:16, 1, 4:12]
-    assert abs(float(y.mean()) / 50 - 1) < 0.005
-    clean = StreakCamera(axis, jitter_fwhm_s=0.0, excess_noise=2.0, read_noise_e=3.0)
-    z = clean.sample(x, torch.Generator().manual_seed(0))[:, 0, 8:16, 1, 4:12]
-    assert abs(float(z.var()) / (2 * 50 + 9) - 1) < 0.03
-    assert float(y.var()) < 0.5 * float(z.var())
-
-    def neighbours(v):
-        v = v - v.mean()
-        return float((v[..., 1:] * v[..., :-1]).mean() / v.var())
-
-    assert neighbours(y) > 0.4 and abs(neighbours(z)) < 0.02
 
 
 def test_arrival_in_metres_agrees_with_gates_in_seconds():

@@ -9,19 +9,7 @@ import torch
 from scipy import stats
 
 from support.sweeps import together
-from torchtransient.sensing import (
-    ComposedResponse,
-    GaussianResponse,
-    MeasuredResponse,
-    Response,
-    TailedResponse,
-    UniformResponse,
-    convolve_time,
-    emg_cdf,
-    emg_response,
-    emg_survival,
-    resample_counts,
-)
+from torchtransient import sensing
 
 FWHM_PER_SIGMA = 2.3548200450309493  # 2 sqrt(2 log 2)
 PS = 1e-12
@@ -48,21 +36,21 @@ def test_emg_against_fifty_digits(sigma, tau):
             float(mpmath.ncdf(-x / s) + mpmath.exp(s * s / (2 * e * e) - mpmath.mpf(x) / e) * mpmath.erfc(v) / 2)
             for x, v in zip(t.tolist(), z, strict=True)
         ]
-    np.testing.assert_allclose(emg_survival(t, *f64(0.0, sigma, tau)).numpy(), exact, rtol=1e-11, atol=1e-300)
+    np.testing.assert_allclose(sensing.emg_survival(t, *f64(0.0, sigma, tau)).numpy(), exact, rtol=1e-11, atol=1e-300)
 
 
 def test_emg_derivatives_are_finite_and_right():
     t = torch.linspace(-200.0, 900.0, 23, dtype=torch.float64)
     args = [a.requires_grad_() for a in f64(3.0, 30.0, 39.0)]
-    assert torch.autograd.gradcheck(lambda *a: emg_cdf(t, *a), args)
-    assert torch.autograd.gradcheck(lambda *a: emg_survival(t, *a), args)
+    assert torch.autograd.gradcheck(lambda *a: sensing.emg_cdf(t, *a), args)
+    assert torch.autograd.gradcheck(lambda *a: sensing.emg_survival(t, *a), args)
     args = [a.requires_grad_() for a in f64(0.0, 30.0, 0.02)]
-    for value in torch.autograd.grad(emg_cdf(t, *args).sum(), args):
+    for value in torch.autograd.grad(sensing.emg_cdf(t, *args).sum(), args):
         assert bool(torch.isfinite(value))
 
 
 def test_central_gaussian_kernel_is_the_difference_of_error_functions():
-    first, weights = GaussianResponse(60 * PS, delay_s=13 * PS).kernel(16 * PS, within_bin="center")
+    first, weights = sensing.GaussianResponse(60 * PS, delay_s=13 * PS).kernel(16 * PS, within_bin="center")
     edges = (np.arange(first, first + weights.numel() + 1) - 0.5) * 16
     wanted = np.diff(stats.norm(13, 60 / FWHM_PER_SIGMA).cdf(edges))
     np.testing.assert_allclose(weights.numpy(), wanted / wanted.sum(), atol=1e-13)
@@ -73,13 +61,15 @@ def test_central_gaussian_kernel_is_the_difference_of_error_functions():
 
 
 SHAPES = {
-    "gaussian": GaussianResponse(60 * PS, 13 * PS),
-    "narrow": GaussianResponse(1 * PS, 5 * PS),
-    "emg": emg_response(40 * PS, 70 * PS, -9 * PS),
-    "tails": TailedResponse(27 * PS, [60 * PS, 200 * PS], [0.3, 0.05]),
-    "uniform": UniformResponse(50 * PS, 3 * PS),
-    "measured": MeasuredResponse(torch.tensor([0.0, 2, 9, 30, 12, 5, 3, 1, 0, 0, 0, 0, 0]), 7 * PS, 4 * PS),
-    "composed": ComposedResponse([GaussianResponse(30 * PS), emg_response(20 * PS, 50 * PS, 6 * PS)]),
+    "gaussian": sensing.GaussianResponse(60 * PS, 13 * PS),
+    "narrow": sensing.GaussianResponse(1 * PS, 5 * PS),
+    "emg": sensing.emg_response(40 * PS, 70 * PS, -9 * PS),
+    "tails": sensing.TailedResponse(27 * PS, [60 * PS, 200 * PS], [0.3, 0.05]),
+    "uniform": sensing.UniformResponse(50 * PS, 3 * PS),
+    "measured": sensing.MeasuredResponse(torch.tensor([0.0, 2, 9, 30, 12, 5, 3, 1, 0, 0, 0, 0, 0]), 7 * PS, 4 * PS),
+    "composed": sensing.ComposedResponse(
+        [sensing.GaussianResponse(30 * PS), sensing.emg_response(20 * PS, 50 * PS, 6 * PS)]
+    ),
 }
 
 
@@ -90,11 +80,11 @@ def test_kernels_against_photons_anywhere_in_their_bin(name):
     first, weights = response.kernel(width * PS)
     lags = torch.arange(first, first + weights.numel() + 1, dtype=torch.float64)
     place = (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024
-    single = ComposedResponse([response]) if name != "composed" else None
+    single = sensing.ComposedResponse([response]) if name != "composed" else None
     edges = (lags.unsqueeze(1) - place) * width * PS
     if single is None:  # normal cores add up to one
         core = (30**2 + 20**2) ** 0.5
-        response = emg_response(core * PS, 50 * PS, 6 * PS)
+        response = sensing.emg_response(core * PS, 50 * PS, 6 * PS)
     else:
         assert torch.equal(single.kernel(width * PS)[1], weights)
     shares = response.cdf(edges.flatten()).view(edges.shape).mean(1).diff()
@@ -106,7 +96,7 @@ def test_kernels_against_photons_anywhere_in_their_bin(name):
 def test_late_and_early_tails_keep_their_digits():
     """Against 40 digits, where the share is below 1e-7: normal on one side, exponential on the other."""
     sigma, tau, width = 27 / FWHM_PER_SIGMA, 60.0, 16.0
-    first, weights = emg_response(27 * PS, tau * PS).kernel(width * PS)
+    first, weights = sensing.emg_response(27 * PS, tau * PS).kernel(width * PS)
     with mpmath.workdps(40):
         s, e = mpmath.mpf(sigma), mpmath.mpf(tau)
 
@@ -123,7 +113,7 @@ def test_late_and_early_tails_keep_their_digits():
             assert float(weights[k]) == pytest.approx(float(exact), rel=1e-8)
 
 
-class Triangle(Response):
+class Triangle(sensing.Response):
     """A user's own: nothing but the cumulative of a triangle, 2 h wide, around 20 ps."""
 
     def __init__(self, half_s):
@@ -154,18 +144,20 @@ def test_a_response_that_gives_its_cumulative_alone(half, error):
 
 def test_very_long_responses_lose_no_digits():
     """100 000 bins of width: second differences would leave 1e-4 of noise on every share."""
-    first, weights = GaussianResponse(1e5 * PS).kernel(1 * PS)
+    first, weights = sensing.GaussianResponse(1e5 * PS).kernel(1 * PS)
     sigma = 1e5 / FWHM_PER_SIGMA
     t = np.arange(first, first + weights.numel())
     np.testing.assert_allclose(weights.numpy(), stats.norm(0, sigma).pdf(t), rtol=1e-8)
 
 
 def test_composition_of_gaussians_is_a_gaussian():
-    together = ComposedResponse([GaussianResponse(30 * PS), GaussianResponse(40 * PS)], oversampling=33)
+    together = sensing.ComposedResponse(
+        [sensing.GaussianResponse(30 * PS), sensing.GaussianResponse(40 * PS)], oversampling=33
+    )
     # (10/33)^2/12 of variance twice on the grid; none in the closed form
     for within, error in (("center", 2e-5), ("uniform", 1e-8)):
         first, weights = together.kernel(10 * PS, within)
-        begin, wanted = GaussianResponse(50 * PS).kernel(10 * PS, within)
+        begin, wanted = sensing.GaussianResponse(50 * PS).kernel(10 * PS, within)
         inner = weights[begin - first :][: wanted.numel()]
         assert float((inner - wanted).abs().max()) < error
 
@@ -176,7 +168,7 @@ def test_measured_response_keeps_counts_and_centre():
     truth = torch.from_numpy(stats.exponnorm.pdf(t.numpy(), K=9.0 / 4.0, loc=120.0, scale=4.0))
     counts = torch.poisson(truth * 1e8 + 50, generator=g)
     for width in (8 * PS, 3 * PS, 5.5 * PS, 31 * PS):
-        first, weights = MeasuredResponse(counts, 8 * PS, delay_s=40 * PS).kernel(width)
+        first, weights = sensing.MeasuredResponse(counts, 8 * PS, delay_s=40 * PS).kernel(width)
         mean, variance = moments(first, weights, width / PS)
         assert float(weights.sum()) == pytest.approx(1, abs=1e-12)
         assert mean == pytest.approx(40, abs=0.02 * width / PS)
@@ -191,11 +183,11 @@ def test_measured_response_keeps_counts_and_centre():
 def test_resampling_conserves_counts():
     counts = torch.rand(57, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
     edges = torch.tensor([-3.0, 0.0, 0.3, 7.77, 20.0, 56.0, 60.0], dtype=torch.float64)
-    out = resample_counts(counts, 1.0, edges)
+    out = sensing.resample_counts(counts, 1.0, edges)
     assert out.sum().item() == pytest.approx(counts.sum().item(), abs=1e-12)
     assert float(out[0]) == 0.0
     assert float(out[1]) == pytest.approx(0.3 * float(counts[0]))
-    assert torch.autograd.gradcheck(lambda c: resample_counts(c, 1.0, edges), (counts,))
+    assert torch.autograd.gradcheck(lambda c: sensing.resample_counts(c, 1.0, edges), (counts,))
 
 
 def numpy_convolution(x, kernel, first, boundary):
@@ -214,14 +206,12 @@ def numpy_convolution(x, kernel, first, boundary):
 
 @together("method", ["direct", "fft"])
 @together("boundary", ["zero", "periodic"])
-@together(
-    "taps, first", [(1, 0), (5, -2), (5, 3), (5, -9), (20, -7), (20, 4), (40, -20), (3, 15), (3, -15)]
-)
+@together("taps, first", [(1, 0), (5, -2), (5, 3), (5, -9), (20, -7), (20, 4), (40, -20), (3, 15), (3, -15)])
 def test_convolution_against_plain_loops(method, boundary, taps, first):
     g = torch.Generator().manual_seed(taps)
     x = torch.rand(2, 1, 16, 2, 2, dtype=torch.float64, generator=g)
     kernel = torch.rand(taps, dtype=torch.float64, generator=g)
-    found = convolve_time(x, kernel, first, boundary=boundary, method=method)
+    found = sensing.convolve_time(x, kernel, first, boundary=boundary, method=method)
     np.testing.assert_allclose(found.numpy(), numpy_convolution(x.numpy(), kernel.numpy(), first, boundary), atol=1e-12)
 
 
@@ -232,35 +222,5 @@ def test_convolution_gradients(method, boundary):
     x = torch.rand(1, 1, 9, 1, 2, dtype=torch.float64, generator=g, requires_grad=True)
     kernel = torch.rand(4, dtype=torch.float64, generator=g, requires_grad=True)
     assert torch.autograd.gradcheck(
-        lambda x, k: convolve_time(x, k, -1, boundary=boundary, method=method), (x, kernel), fast_mode=True
+        lambda x, k: sensing.convolve_time(x, k, -1, boundary=boundary, method=method), (x, kernel), fast_mode=True
     )
-
-
-@pytest.mark.parametrize(
-    "response",
-    [
-        GaussianResponse(30 * PS, 4 * PS, learnable=True),
-        TailedResponse(30 * PS, [40 * PS, 90 * PS], [0.3, 0.2], learnable=True),
-        UniformResponse(37 * PS, 1 * PS, learnable=True),
-    ],
-    ids=["gaussian", "tails", "uniform"],
-)
-def test_gradients_in_the_parameters(response):
-    """Kernels as functions of the learnt numbers; the number of taps is held, so steps are small."""
-    parameters = list(response.parameters())
-    shares = torch.linspace(0, 1, 400, dtype=torch.float64) ** 2
-
-    def value():
-        first, weights = response.kernel(10 * PS)
-        return (weights * shares[first + 60 :][: weights.numel()]).sum()
-
-    value().backward()
-    for p in parameters:
-        for i in range(p.numel()):
-            flat, h = p.data.view(-1), 1e-4
-            flat[i] += h
-            up = value().item()
-            flat[i] -= 2 * h
-            down = value().item()
-            flat[i] += h
-            assert float(p.grad.view(-1)[i]) == pytest.approx((up - down) / (2 * h), rel=1e-4, abs=1e-9)

@@ -12,32 +12,9 @@ import pytest
 import torch
 
 from support.sweeps import together
+from torchtransient import sensing
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing import (
-    Compose,
-    FourierCode,
-    ItofCalibration,
-    ItofCorrelation,
-    ItofNoise,
-    PixelElectronics,
-    ReversedCode,
-    TapDifference,
-    TwoTapCode,
-    amplitude_of,
-    decode_code,
-    hamiltonian_code,
-    measured_code,
-    offset_of,
-    phase_noise_rad,
-    phase_of,
-    read_itof,
-    sine_code,
-    square_code,
-    tap_phasor,
-    tap_weights,
-    wrapped_difference,
-)
 from torchtransient.units import SPEED_OF_LIGHT
 
 TURN = 2 * math.pi
@@ -49,16 +26,16 @@ READOUTS = ("single", "two_tap", "differential")
 def measured(num_taps):
     """Samples of a function that is neither even nor of few harmonics, moved along."""
     x = TURN * (torch.arange(60) / 60 - torch.arange(num_taps)[:, None] / (num_taps if num_taps > 2 else 4))
-    return measured_code(torch.cos(x + 0.4) + 0.2 * torch.cos(3 * x - 1.0) + 0.05)
+    return sensing.measured_code(torch.cos(x + 0.4) + 0.2 * torch.cos(3 * x - 1.0) + 0.05)
 
 
 CODES = {
-    **{f"sine{n}": sine_code(n) for n in (2, 3, 4, 7)},
-    **{f"square{n}": square_code(n) for n in (2, 3, 4, 5)},
+    **{f"sine{n}": sensing.sine_code(n) for n in (2, 3, 4, 7)},
+    **{f"square{n}": sensing.square_code(n) for n in (2, 3, 4, 5)},
     **{f"measured{n}": measured(n) for n in (2, 4, 5, 8)},
-    "hamiltonian3": hamiltonian_code(3),
-    "hamiltonian4": hamiltonian_code(4),
-    "harmonics": FourierCode(5, {1: (0.8, 0.3), 3: (0.15, -1.0)}),
+    "hamiltonian3": sensing.hamiltonian_code(3),
+    "hamiltonian4": sensing.hamiltonian_code(4),
+    "harmonics": sensing.FourierCode(5, {1: (0.8, 0.3), 3: (0.15, -1.0)}),
 }
 
 
@@ -75,7 +52,9 @@ def frames(code, turns, readout, light=1000.0, contrast=0.7, background=300.0):
     return found[None, :, None]
 
 
-@pytest.mark.parametrize("name, readout", [
+@pytest.mark.parametrize(
+    "name, readout",
+    [
         (name, readout)
         for n, name in enumerate(CODES)
         for readout in (READOUTS if CODES[name].num_taps in (2, 4) else READOUTS[n % 3 :][:1])
@@ -88,24 +67,24 @@ def test_every_code_and_readout_gives_the_phase(name, readout):
     index = (turns * 4096).long()
     x[0, index, 0, torch.arange(101)] = 1000.0
     turns = (index.double() + 0.5) / 4096
-    gates = code if readout == "single" else TwoTapCode(code)
+    gates = code if readout == "single" else sensing.TwoTapCode(code)
     if code.num_taps == 2 and readout == "single":
         with pytest.raises(ShapeError, match="TwoTapCode"):
-            ItofCorrelation(gates, F, PERIOD)
+            sensing.ItofCorrelation(gates, F, PERIOD)
         with pytest.raises(ShapeError, match="N = 2 >= 3"):
-            decode_code(torch.ones(1, 2, 1, 1), code)
+            sensing.decode_code(torch.ones(1, 2, 1, 1), code)
         return
-    camera = ItofCorrelation(gates, F, PERIOD, contrast=0.7, background_e=300.0)
+    camera = sensing.ItofCorrelation(gates, F, PERIOD, contrast=0.7, background_e=300.0)
     taps = camera.expected(x)
     if readout != "single":
         torch.testing.assert_close(taps.sum(-3), x.sum(-3) + 300.0)  # every electron goes to A or to B
-    taps = TapDifference().expected(taps) if readout == "differential" else taps
+    taps = sensing.TapDifference().expected(taps) if readout == "differential" else taps
     # The mean of a code over 1 / 4096 turn is its value in the middle, but within its corners.
     slope = 1000.0 * 0.7 * 40 / 4096
     torch.testing.assert_close(taps, frames(code, turns, readout), rtol=0, atol=slope)
-    reading = read_itof(taps, F, code.num_taps, readout=readout, code=gates)
+    reading = sensing.read_itof(taps, F, code.num_taps, readout=readout, code=gates)
     # Corners that lie between two of the 1024 phases of the decoder.
-    assert float(wrapped_difference(reading.phase.flatten(), TURN * turns).abs().max()) < TURN / 1024
+    assert float(sensing.wrapped_difference(reading.phase.flatten(), TURN * turns).abs().max()) < TURN / 1024
     assert (reading.offset is None) == (readout == "differential")
     if readout == "two_tap" or (readout == "single" and "sine" in name):  # others leave harmonics in it
         torch.testing.assert_close(reading.offset, torch.full_like(reading.offset, 1300.0 / code.num_taps))
@@ -114,71 +93,32 @@ def test_every_code_and_readout_gives_the_phase(name, readout):
 @together("num_taps, readout", [p for p in pairs(range(2, 9), READOUTS) if p != (2, "single")])
 def test_the_fourier_sum_means_the_same_in_every_readout(num_taps, readout):
     turns = torch.linspace(0, 0.99, 50, dtype=torch.float64)
-    taps = frames(sine_code(num_taps), turns, readout)
-    z = tap_phasor(taps, num_taps, readout)
-    torch.testing.assert_close(amplitude_of(z), torch.full_like(z.real, 700.0 / num_taps))
-    assert float(wrapped_difference(phase_of(z).flatten(), TURN * turns).abs().max()) < 1e-12
+    taps = frames(sensing.sine_code(num_taps), turns, readout)
+    z = sensing.tap_phasor(taps, num_taps, readout)
+    torch.testing.assert_close(sensing.amplitude_of(z), torch.full_like(z.real, 700.0 / num_taps))
+    assert float(sensing.wrapped_difference(sensing.phase_of(z).flatten(), TURN * turns).abs().max()) < 1e-12
     if readout == "differential":
         with pytest.raises(UnitError, match="cancelled"):
-            offset_of(taps, num_taps, readout)
+            sensing.offset_of(taps, num_taps, readout)
     else:
-        torch.testing.assert_close(offset_of(taps, num_taps, readout), torch.full_like(z.real, 1300.0 / num_taps))
+        torch.testing.assert_close(
+            sensing.offset_of(taps, num_taps, readout), torch.full_like(z.real, 1300.0 / num_taps)
+        )
 
 
 def test_two_quadrature_steps_of_two_taps_wiggle_as_four_taps():
     """A_0, A_1, B_0, B_1 are the four taps a quarter of a turn apart: 71.11 mrad at most for square codes."""
     turns = torch.arange(0, 1, 1 / 5000, dtype=torch.float64)
     for readout in ("two_tap", "differential"):
-        z = tap_phasor(frames(square_code(2), turns, readout), 2, readout)
-        error = wrapped_difference(phase_of(z).flatten(), TURN * turns)
+        z = sensing.tap_phasor(frames(sensing.square_code(2), turns, readout), 2, readout)
+        error = sensing.wrapped_difference(sensing.phase_of(z).flatten(), TURN * turns)
         assert abs(float(error.abs().max()) - 0.07111) < 1e-4
-    four = frames(square_code(4), turns, "single")
-    two = frames(square_code(2), turns, "two_tap")
+    four = frames(sensing.square_code(4), turns, "single")
+    two = frames(sensing.square_code(2), turns, "two_tap")
     torch.testing.assert_close(two[:, [0, 2, 1, 3]], four)
 
 
 # ------------------------------------------------------------------------------------------------------------- noise
-
-
-@pytest.mark.slow
-@together("dark_e, read_noise_e", [(0.0, 0.0), (40.0, 25.0)])
-@together("num_taps, readout", [(3, "single"), *pairs((2, 4), READOUTS[1:]), (8, "single")])
-def test_variance_of_phase_and_depth(num_taps, readout, dark_e, read_noise_e):
-    """The deviation of 10 000 drawn pixels against the closed form and against `depth_std_m`.
-
-    A deviation of n draws is known to 1 / sqrt(2 n) = 0.7 %; 4 of those, and the second order in the noise of the
-    phase, below 3 sigma^2 = 0.5 % for sigma = 0.04 rad.
-    """
-    count, light, contrast, turn = 10_000, 20_000.0, 0.7, 0.23
-    x = torch.zeros(1, 4096, 1, 1, dtype=torch.float64)
-    x[0, int(turn * 4096)] = light
-    code = sine_code(num_taps)
-    camera = ItofCorrelation(
-        code if readout == "single" else TwoTapCode(code), F, PERIOD, contrast=contrast, background_e=5000.0
-    )
-    stages = [PixelElectronics(read_noise_e=read_noise_e, dark_e=dark_e)]
-    stages += [TapDifference()] if readout == "differential" else []
-    taps = camera.expected(x).expand(1, -1, 1, count)
-    noisy = Compose(stages).sample(taps, torch.Generator().manual_seed(7))
-    each = 1 if readout == "single" else 2
-    offset = (light + 5000.0) / num_taps + each * dark_e
-    noise = ItofNoise(read_noise_e=read_noise_e, offset_e=offset if readout == "differential" else None)
-    reading = read_itof(noisy, F, num_taps, readout=readout, noise=noise)
-    amplitude = torch.tensor(light * contrast / num_taps, dtype=torch.float64)
-    theory = phase_noise_rad(
-        amplitude, torch.tensor(offset, dtype=torch.float64), num_taps, read_noise_e=read_noise_e, readout=readout
-    )
-    # Three single taps: the variance follows cos 3 phi of the light.
-    middle = TURN * (int(turn * 4096) + 0.5) / 4096
-    swing = math.cos(3 * middle) / (num_taps * float(amplitude)) if (num_taps, readout) == (3, "single") else 0.0
-    exact = math.sqrt(float(theory) ** 2 - swing)
-    assert exact < 0.045
-    assert abs(float(reading.phase.std()) / exact - 1) < 4 / math.sqrt(2 * count) + 3 * exact**2
-    metres = exact * SPEED_OF_LIGHT / (2 * TURN * F)
-    assert abs(float(reading.depth_m.std()) / metres - 1) < 4 / math.sqrt(2 * count) + 3 * exact**2
-    # What a pixel says of itself scatters with its own taps, and on the average is right.
-    assert abs(float(reading.depth_std_m.square().mean().sqrt()) / metres - 1) < 0.01
-    assert abs(float(reading.depth_std_m.std()) / metres) < 0.1
 
 
 def test_deviation_of_an_unwrapped_depth():
@@ -186,10 +126,10 @@ def test_deviation_of_an_unwrapped_depth():
     axis = TimeAxis(0.0, 0.005, 800)
     x = torch.zeros(1, 800, 1, 1, dtype=torch.float64)
     x[0, 300] = 1e5
-    camera = ItofCorrelation(TwoTapCode(sine_code(3)), frequencies, axis, contrast=0.5)
+    camera = sensing.ItofCorrelation(sensing.TwoTapCode(sensing.sine_code(3)), frequencies, axis, contrast=0.5)
     taps = camera.expected(x).expand(1, -1, 1, count)
-    noisy = PixelElectronics().sample(taps, torch.Generator().manual_seed(1))
-    reading = read_itof(noisy, frequencies, 3, readout="two_tap", min_depth_m=-0.2)
+    noisy = sensing.PixelElectronics().sample(taps, torch.Generator().manual_seed(1))
+    reading = sensing.read_itof(noisy, frequencies, 3, readout="two_tap", min_depth_m=-0.2)
     assert abs(float(reading.depth_m.mean()) - 300.5 * 0.005 / 2) < 1e-3
     ratio = float(reading.depth_std_m.mean()) / float(reading.depth_m.std())
     assert abs(ratio - 1) < 0.03
@@ -201,8 +141,10 @@ def test_dark_pixels(readout):
     taps = torch.zeros(1, 8 if readout == "two_tap" else 4, 1, 2, dtype=torch.float64)
     taps[..., 1] = 3.0 if readout != "differential" else 0.0
     taps.requires_grad_()
-    for code in (None, sine_code(4)):
-        reading = read_itof(taps, F, 4, readout=readout, code=code, noise=ItofNoise(read_noise_e=2.0, offset_e=5.0))
+    for code in (None, sensing.sine_code(4)):
+        reading = sensing.read_itof(
+            taps, F, 4, readout=readout, code=code, noise=sensing.ItofNoise(read_noise_e=2.0, offset_e=5.0)
+        )
         assert bool(reading.depth_std_m.isinf().all()) and bool((reading.depth_m == 0).all())
         (slope,) = torch.autograd.grad(reading.depth_std_m.sum() + reading.depth_m.sum(), taps)
         assert bool(torch.isfinite(slope).all())
@@ -213,16 +155,16 @@ def test_readings_have_gradients(readout):
     g = torch.Generator().manual_seed(2)
     size = (1, 8 if readout == "two_tap" else 4, 2, 2)
     taps = (1 + torch.rand(size, dtype=torch.float64, generator=g)).requires_grad_()
-    known = ItofCalibration(
+    known = sensing.ItofCalibration(
         phase_offset_rad=0.3,
         direction=-1,
         phase_map_rad=torch.rand(2, 2, generator=g),
         depth_map_m=torch.rand(2, 2, generator=g),
     )
-    noise = ItofNoise(read_noise_e=0.5, offset_e=3.0)
+    noise = sensing.ItofNoise(read_noise_e=0.5, offset_e=3.0)
 
     def read(taps):
-        found = read_itof(taps, F, 4, readout=readout, calibration=known, noise=noise)
+        found = sensing.read_itof(taps, F, 4, readout=readout, calibration=known, noise=noise)
         return found.depth_m, found.amplitude, found.depth_std_m
 
     assert torch.autograd.gradcheck(read, taps, fast_mode=True)
@@ -245,22 +187,22 @@ LIGHT = torch.rand(2, 1, 70, 3, 4, generator=torch.Generator().manual_seed(4), d
 def test_maps_are_delays_of_the_light(name, direction, within_bin):
     """Taps of every pixel against weights made for that pixel alone, on an axis that begins later by its delay."""
     code = CODES[name]
-    gates = TwoTapCode(code) if code.num_taps == 2 or name == "measured4" else code
-    known = ItofCalibration(
+    gates = sensing.TwoTapCode(code) if code.num_taps == 2 or name == "measured4" else code
+    known = sensing.ItofCalibration(
         phase_offset_rad=(0.2, -1.1), direction=direction, phase_map_rad=torch.stack([MAP, 2 * MAP]), depth_map_m=DEPTHS
     )
-    camera = ItofCorrelation(
+    camera = sensing.ItofCorrelation(
         gates, FREQUENCIES, AXIS, contrast=0.8, background_e=3.0, within_bin=within_bin, calibration=known
     )
     found = camera.expected(LIGHT)
-    turned = ReversedCode(code) if direction < 0 else code
-    turned = TwoTapCode(turned) if isinstance(gates, TwoTapCode) else turned
+    turned = sensing.ReversedCode(code) if direction < 0 else code
+    turned = sensing.TwoTapCode(turned) if isinstance(gates, sensing.TwoTapCode) else turned
     for i, j in ((0, 0), (2, 3), (1, 2)):
         rows = []
         for k, f in enumerate(FREQUENCIES):
             phase = (0.2, -1.1)[k] + (k + 1) * float(MAP[i, j]) + 4 * math.pi * f * float(DEPTHS[i, j]) / SPEED_OF_LIGHT
             later = TimeAxis(AXIS.start_opl + phase / TURN * SPEED_OF_LIGHT / f, AXIS.bin_width_opl, AXIS.num_bins)
-            rows.append(tap_weights(turned, f, later, contrast=0.8, within_bin=within_bin))
+            rows.append(sensing.tap_weights(turned, f, later, contrast=0.8, within_bin=within_bin))
         wanted = torch.einsum("mt,bct->bcm", torch.cat(rows), LIGHT[..., i, j]) + 3.0 / gates.num_taps
         torch.testing.assert_close(found[..., i, j], wanted, rtol=1e-9, atol=1e-9)
 
@@ -269,7 +211,7 @@ def test_reversed_steps():
     """Step n of a reversed code is the function at x + n / N."""
     code = CODES["harmonics"]
     x = torch.linspace(-1, 2, 31, dtype=torch.float64)
-    back = ReversedCode(code)
+    back = sensing.ReversedCode(code)
     for n in range(5):
         torch.testing.assert_close(back.evaluate(x)[n], code.evaluate(x + n / 5)[0])
         torch.testing.assert_close(back.bin_means(x)[n], code.bin_means(x + n / 5)[0])
@@ -290,24 +232,26 @@ def test_reversed_steps():
 def test_what_a_calibration_puts_in_a_reading_takes_off(name, readout, direction):
     """A camera with offsets, reversed steps and maps reads the depths of one without; both through a transient."""
     code = CODES[name]
-    known = ItofCalibration(phase_offset_rad=[0.7, 2.9], direction=direction, phase_map_rad=MAP, depth_map_m=DEPTHS)
-    gates = code if readout == "single" else TwoTapCode(code)
+    known = sensing.ItofCalibration(
+        phase_offset_rad=[0.7, 2.9], direction=direction, phase_map_rad=MAP, depth_map_m=DEPTHS
+    )
+    gates = code if readout == "single" else sensing.TwoTapCode(code)
     axis = TimeAxis(0.0, 0.002, 1500)
     x = torch.zeros(1, 1500, 3, 4, dtype=torch.float64)
     at = torch.randint(100, 1400, (3, 4), generator=torch.Generator().manual_seed(1))
     x.scatter_(1, at[None, None], 1e4)
     if direction < 0 and code.shifts is None:
         with pytest.raises(UnitError, match="one function moved along"):
-            ItofCorrelation(gates, FREQUENCIES, axis, calibration=known)
+            sensing.ItofCorrelation(gates, FREQUENCIES, axis, calibration=known)
         return
-    camera = Compose(
+    camera = sensing.Compose(
         [
-            ItofCorrelation(gates, FREQUENCIES, axis, contrast=0.8, background_e=50.0, calibration=known),
-            *([TapDifference()] if readout == "differential" else []),
+            sensing.ItofCorrelation(gates, FREQUENCIES, axis, contrast=0.8, background_e=50.0, calibration=known),
+            *([sensing.TapDifference()] if readout == "differential" else []),
         ]
     )
     decoder = None if name.startswith("sine") else gates
-    reading = read_itof(
+    reading = sensing.read_itof(
         camera.expected(x), FREQUENCIES, code.num_taps, readout=readout, code=decoder, calibration=known,
         max_depth_m=1.6, min_depth_m=-0.1,
     )  # fmt: skip
@@ -318,11 +262,13 @@ def test_what_a_calibration_puts_in_a_reading_takes_off(name, readout, direction
 
 
 def test_maps_through_a_phasor_image():
-    known = ItofCalibration(phase_offset_rad=0.4, direction=-1, phase_map_rad=MAP, depth_map_m=DEPTHS)
+    known = sensing.ItofCalibration(phase_offset_rad=0.4, direction=-1, phase_map_rad=MAP, depth_map_m=DEPTHS)
     axis_f = FrequencyAxis.from_hertz([0.0, *FREQUENCIES], start_opl=0.3)
     angle = -TURN * axis_f.per_metre[:, None] * (AXIS.centers_opl - 0.3)
     phasor = torch.einsum("ft,bcthw->bcfhw", torch.exp(1j * angle), LIGHT.to(torch.complex128))
-    camera = ItofCorrelation(TwoTapCode(sine_code(2)), FREQUENCIES, AXIS, within_bin="center", calibration=known)
+    camera = sensing.ItofCorrelation(
+        sensing.TwoTapCode(sensing.sine_code(2)), FREQUENCIES, AXIS, within_bin="center", calibration=known
+    )
     torch.testing.assert_close(camera.expected_from_phasor(phasor, axis_f), camera.expected(LIGHT))
     with pytest.raises(ShapeError, match=r"\(3, 4\) pixels"):
         camera.expected_from_phasor(phasor[..., :2], axis_f)
@@ -338,10 +284,10 @@ def error_of_measured(samples, readout, kind):
     assert count % 7 == 0
     a, b = raw[0::2, ::7].double(), raw[1::2, ::7].double()
     frames = raw if readout == "two_tap" else raw[0::2] - raw[1::2]
-    code = TwoTapCode(measured_code(a - b))
-    reading = read_itof(frames[None, :, None], 2e6, len(a), readout=readout, code=code)
+    code = sensing.TwoTapCode(sensing.measured_code(a - b))
+    reading = sensing.read_itof(frames[None, :, None], 2e6, len(a), readout=readout, code=code)
     truth = TURN * torch.arange(count, dtype=torch.float64) / count
-    error = wrapped_difference(reading.phase.flatten().double(), truth)[torch.arange(count) % 7 > 0]
+    error = sensing.wrapped_difference(reading.phase.flatten().double(), truth)[torch.arange(count) % 7 > 0]
     return float(error.square().mean().sqrt())
 
 
@@ -374,16 +320,16 @@ def test_frames_of_measured_cameras(taps, limit):
 def test_raw_frames_of_whole_numbers(kind):
     """As arrays and as tensors; differences of unsigned numbers do not wrap."""
     turns = torch.linspace(0, 0.95, 20, dtype=torch.float64)
-    exact = frames(sine_code(4), turns, "two_tap", light=900.0, background=100.0).round()
-    wanted = read_itof(exact, F, 4, readout="two_tap")
+    exact = frames(sensing.sine_code(4), turns, "two_tap", light=900.0, background=100.0).round()
+    wanted = sensing.read_itof(exact, F, 4, readout="two_tap")
     array = exact.numpy().astype(kind)
     for given in (array, torch.from_numpy(array)):
-        found = read_itof(given, F, 4, readout="two_tap")
+        found = sensing.read_itof(given, F, 4, readout="two_tap")
         assert found.phase.dtype in (torch.float32, torch.float64)
-        assert float(wrapped_difference(found.phase.double(), wanted.phase).abs().max()) < 1e-5
+        assert float(sensing.wrapped_difference(found.phase.double(), wanted.phase).abs().max()) < 1e-5
         torch.testing.assert_close(found.offset.double(), wanted.offset)
     full = torch.full((1, 4, 1, 1), 65535, dtype=torch.uint16)
-    assert float(offset_of(full, 2, "two_tap")) == 2 * 65535
+    assert float(sensing.offset_of(full, 2, "two_tap")) == 2 * 65535
 
 
 @pytest.mark.slow
@@ -391,18 +337,18 @@ def test_raw_frames_of_whole_numbers(kind):
 def test_the_standard_deviation_at_the_corners_of_a_square_code(readout):
     """The slope has two values at a corner: one of them was claimed, up to 19 % too small."""
     axis = TimeAxis.from_seconds(0.0, 1e-10, 256)
-    code = square_code(5)
-    pixel = code if readout == "single" else TwoTapCode(code)
+    code = sensing.square_code(5)
+    pixel = code if readout == "single" else sensing.TwoTapCode(code)
     x = torch.full((1, 256, 1, 1), 2.0, dtype=torch.float64)
     x[0, 150] = 4000.0
-    mean = ItofCorrelation(pixel, [20e6], axis).expected(x)
+    mean = sensing.ItofCorrelation(pixel, [20e6], axis).expected(x)
     number = 4000
     many = mean.expand(number, *mean.shape[-4:]).contiguous()
     frames = torch.poisson(many, generator=torch.Generator().manual_seed(1))
     noise = None
     if readout == "differential":
-        frames, noise = TapDifference()(frames), ItofNoise(offset_e=float(x.sum()) / 5)
-    reading = read_itof(frames, [20e6], 5, readout=readout, code=pixel, noise=noise)
+        frames, noise = sensing.TapDifference()(frames), sensing.ItofNoise(offset_e=float(x.sum()) / 5)
+    reading = sensing.read_itof(frames, [20e6], 5, readout=readout, code=pixel, noise=noise)
     claimed = float(reading.depth_std_m.square().mean().sqrt())
     # four deviations of a standard deviation of so many, and what second order leaves of the average
     assert float(reading.depth_m.std()) == pytest.approx(claimed, rel=4 / (2 * number) ** 0.5 + 0.01)

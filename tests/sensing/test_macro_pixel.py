@@ -86,13 +86,6 @@ def test_sums_are_those_of_events(mode, dead, total):
     assert compare(events, detector(mode, dead).expected(image(rate)).numpy()).ratio > 10
 
 
-def test_a_hundred_spads_hardly_pile_up():
-    """3 photons per cycle on 100 SPADs: each loses 1.5 % at the end of the cycle; one SPAD would lose 95 %."""
-    x = image(light(3.0, "constant"))
-    y = MacroPixel(SynchronousSPAD(1), 100)(x).flatten()
-    assert float(y[-1] / y[0]) == pytest.approx(math.exp(-0.03 * 31 / 32), rel=1e-9)
-
-
 def test_draws_of_equal_spads_are_one_draw_of_more_cycles():
     x = image(light(5.0)).expand(10_000, 1, BINS, 1, 1)
     y = MacroPixel(SynchronousSPAD(3), 4).sample(x, torch.Generator().manual_seed(0))

@@ -143,24 +143,6 @@ def test_armed_cycles_are_counted_without_gradient(dead_bins):
 # ------------------------------------------------------------------------------------- derivatives that are to stay
 
 
-def test_moves_under_a_score_have_no_gradient_of_their_mean():
-    """What is learnt pulls by the score alone, the light by the mean: of jitter and of skew."""
-    counts = counts_of(5.0).requires_grad_()
-    weight = torch.arange(12.0).square().view(-1, 1, 1)
-    for module in (
-        sensing.DetectionJitter(sensing.GaussianResponse(300 * PS, learnable=True), AXIS, grad="score"),
-        sensing.DetectionSkew(130 * PS, AXIS, learnable=True, grad="score"),
-    ):
-        with sensing.ScoreFunction() as score:
-            y = module(counts, generator=generator())
-        (own,) = torch.autograd.grad((module.expected(counts) * weight).sum(), counts)
-        learnt = [p for p in module.parameters() if p.requires_grad]
-        found = torch.autograd.grad((y * weight).sum(), [counts, *learnt], allow_unused=True, retain_graph=True)
-        torch.testing.assert_close(found[0], own)
-        assert all(slope is None for slope in found[1:])
-        assert all(bool((g != 0).any()) for g in torch.autograd.grad(score.log_prob(()), learnt))
-
-
 def test_the_normal_surrogate_of_a_free_running_detector():
     """Its derivative is that of the mean, and of the size of what is beside it as of independent bins."""
     spad = sensing.FreeRunningSPAD(400, 150 * PS, axis=AXIS, grad="gaussian")

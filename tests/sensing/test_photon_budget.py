@@ -8,31 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient import TimeAxis
+from torchtransient import TimeAxis, sensing
 from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.sensing import (
-    Afterpulsing,
-    Compose,
-    Crosstalk,
-    DetectionSkew,
-    Optics,
-    PhotonBudget,
-    PixelSkew,
-    ScoreFunction,
-    SynchronousSPAD,
-    ambient_photon_rate,
-    photon_energy_j,
-    shift_time,
-)
 
 AXIS = TimeAxis.from_seconds(0.0, 100e-12, 32)
 AXIS_4 = TimeAxis.from_seconds(0.0, 100e-12, 4)
-LENS = Optics(f_number=2.0, pixel_area_m2=1e-10, transmission=0.8)
+LENS = sensing.Optics(f_number=2.0, pixel_area_m2=1e-10, transmission=0.8)
 
 
 def budget(**changes):
     light = {"pulse_energy_j": 1e-9, "wavelength_m": 905e-9, "repetition_rate_hz": 10e6}
-    return PhotonBudget(LENS, **({**light, "cycles": 1000, "axis": AXIS} | changes))
+    return sensing.PhotonBudget(LENS, **({**light, "cycles": 1000, "axis": AXIS} | changes))
 
 
 def uniform(*shape, seed=0):
@@ -77,23 +63,23 @@ def test_maps_are_learnt_and_handed_in():
 def test_ambient_light_in_closed_form():
     """Radiance E B albedo / pi through pi A / (4 F^2 + 1), in photons: pi cancels."""
     given = {"spectral_irradiance_w_m2_nm": 0.9, "filter_bandwidth_m": 20e-9, "wavelength_m": 905e-9}
-    wanted = 0.9 * 20 * 0.5 * 1e-10 * 0.8 / 17 / photon_energy_j(905e-9)
-    assert ambient_photon_rate(LENS, 0.5, **given) == pytest.approx(wanted, rel=1e-12)
+    wanted = 0.9 * 20 * 0.5 * 1e-10 * 0.8 / 17 / sensing.photon_energy_j(905e-9)
+    assert sensing.ambient_photon_rate(LENS, 0.5, **given) == pytest.approx(wanted, rel=1e-12)
     albedo = uniform(2, 3).requires_grad_()
-    rate = ambient_photon_rate(LENS, albedo, illumination=torch.full((2, 3), 0.25).double(), **given)
+    rate = sensing.ambient_photon_rate(LENS, albedo, illumination=torch.full((2, 3), 0.25).double(), **given)
     torch.testing.assert_close(rate, albedo * wanted / 2)
     # an integral over the cone of the lens: L cos over solid angle, times area
     theta = torch.linspace(0, math.atan(1 / 4), 20001, dtype=torch.float64)
     cone = torch.trapezoid(2 * math.pi * theta.sin() * theta.cos(), theta)
     radiance = 0.9 * 20 * 0.5 / math.pi
-    assert wanted == pytest.approx(radiance * float(cone) * 1e-10 * 0.8 / photon_energy_j(905e-9), rel=1e-6)
+    assert wanted == pytest.approx(radiance * float(cone) * 1e-10 * 0.8 / sensing.photon_energy_j(905e-9), rel=1e-6)
     sensor = budget(ambient_rate_hz=torch.nn.Parameter(rate.detach()))
     counts = sensor(torch.zeros(1, 32, 2, 3)).detach()
     torch.testing.assert_close(counts[0, 0].double(), rate.detach() * 1e-10, rtol=1e-6, atol=0)
     with pytest.raises(UnitError, match="filter_bandwidth_m"):
-        ambient_photon_rate(LENS, 0.5, **(given | {"filter_bandwidth_m": 20.0}))
+        sensing.ambient_photon_rate(LENS, 0.5, **(given | {"filter_bandwidth_m": 20.0}))
     with pytest.raises(UnitError, match="albedo"):
-        ambient_photon_rate(LENS, 1.5, **given)
+        sensing.ambient_photon_rate(LENS, 1.5, **given)
 
 
 # --- delays ---------------------------------------------------------------------------------------------------------
@@ -108,17 +94,17 @@ def test_light_that_is_spread_evenly_moves_as_photons_do(boundary, delay):
     periods = np.tile(light, 50) if boundary == "periodic" else np.pad(light, (32 * 20, 32 * 29))
     sums = np.concatenate([[0.0], np.cumsum(periods)])
     at = np.interp(np.arange(33) - delay + 32 * 20, np.arange(sums.size), sums)
-    found = shift_time(x, delay, boundary=boundary).flatten().numpy()
+    found = sensing.shift_time(x, delay, boundary=boundary).flatten().numpy()
     np.testing.assert_allclose(found, np.diff(at), rtol=1e-11, atol=1e-12)
 
 
 def test_every_pixel_has_its_own_delay_and_keeps_its_counts():
     delay_s = (uniform(2, 3, 4, seed=1) - 0.5) * 5e-9
     x = uniform(6, 2, 32, 3, 4)
-    y = PixelSkew(delay_s, AXIS)(x)
+    y = sensing.PixelSkew(delay_s, AXIS)(x)
     torch.testing.assert_close(y.sum(-3), x.sum(-3))
     for c, i, j in [(0, 0, 0), (1, 2, 3), (1, 0, 2)]:
-        one = shift_time(x[:, c : c + 1, :, i : i + 1, j : j + 1], float(delay_s[c, i, j]) / 100e-12)
+        one = sensing.shift_time(x[:, c : c + 1, :, i : i + 1, j : j + 1], float(delay_s[c, i, j]) / 100e-12)
         torch.testing.assert_close(y[:, c, :, i, j], one.flatten(1))
 
 
@@ -127,7 +113,7 @@ def test_draws_move_whole_counts_one_by_one():
     x = torch.zeros(images, 1, 6, 1, 1)
     x[:, :, 5] = n  # the late ones come round
     x[:, :, 2] = 3
-    y = DetectionSkew(part * 100e-12, bin_width_s=100e-12).sample(x, torch.Generator().manual_seed(0))
+    y = sensing.DetectionSkew(part * 100e-12, bin_width_s=100e-12).sample(x, torch.Generator().manual_seed(0))
     assert torch.equal(y, y.round()) and torch.equal(y.sum(2), x.sum(2))
     late = y[:, 0, 0, 0, 0].double()
     assert float(late.mean()) == pytest.approx(n * part, abs=5 * (n * part * (1 - part) / images) ** 0.5)
@@ -139,7 +125,7 @@ def test_draws_move_whole_counts_one_by_one():
 def test_gaussian_policy_has_the_covariance_of_the_draws():
     images = 40_000
     x = torch.full((images, 1, 5, 1, 1), 20.0, dtype=torch.float64)
-    sensor = DetectionSkew(140e-12, bin_width_s=100e-12, grad="gaussian")
+    sensor = sensing.DetectionSkew(140e-12, bin_width_s=100e-12, grad="gaussian")
     drawn = sensor.sample(x, torch.Generator().manual_seed(0)).view(images, 5)
     normal = sensor(x, torch.Generator().manual_seed(1)).view(images, 5)
     # entries of a covariance of variance 9.6 are known to 9.6 sqrt(2 / images) and better
@@ -151,16 +137,16 @@ def test_scores_of_moved_counts():
     """Behind a SPAD under "score", with a delay that is learnt: d/d delay of E (counts of a bin)^2."""
     draws = 60_000
     x = torch.full((draws, 1, 4, 1, 1), 6.0, dtype=torch.float64)
-    sensor = DetectionSkew(130e-12, AXIS_4, learnable=True, grad="score")
-    with ScoreFunction() as score:
+    sensor = sensing.DetectionSkew(130e-12, AXIS_4, learnable=True, grad="score")
+    with sensing.ScoreFunction() as score:
         losses = sensor(x, torch.Generator().manual_seed(0))[:, 0, 1, 0, 0].sub(6).square()
     score.surrogate(losses, baseline="leave_one_out").mean().backward()
     # the mean stays 6, the variance is 2 * 6 f (1 - f) at f = 0.3; its slope in picoseconds, with an error of 0.0014
     wanted = 12 * (1 - 2 * 0.3) / 100
     assert float(sensor.delays.delay_ps.grad) == pytest.approx(wanted, abs=0.006)
     rate = (0.05 * uniform(300, 1, 32, 1, 1)).requires_grad_()
-    chain = Compose([SynchronousSPAD(100), DetectionSkew(30e-12, AXIS)], grad="score")
-    with ScoreFunction() as score:
+    chain = sensing.Compose([sensing.SynchronousSPAD(100), sensing.DetectionSkew(30e-12, AXIS)], grad="score")
+    with sensing.ScoreFunction() as score:
         loss = chain(rate, torch.Generator().manual_seed(0)).sum((1, 2, 3, 4))
     score.surrogate(loss, baseline="leave_one_out").sum().backward()
     mean = rate.detach().requires_grad_()
@@ -196,8 +182,8 @@ def test_a_learnt_number_that_left_its_range_is_told(name, value, shape):
 def test_learnt_probabilities_keep_their_range():
     """Above a sum of 1 afterpulses of afterpulses have no end, and the mean went below zero."""
     x = uniform(1, 32, 2, 3)
-    after = Afterpulsing([0.2, 0.2], [1e-9, 3e-9], 1e-9, bin_width_s=1e-9, learnable=True)
-    across = Crosstalk(0.2, learnable=True)
+    after = sensing.Afterpulsing([0.2, 0.2], [1e-9, 3e-9], 1e-9, bin_width_s=1e-9, learnable=True)
+    across = sensing.Crosstalk(0.2, learnable=True)
     for stage, logit in ((after, 0.0), (across, -1.0)):
         assert stage.expected(x).isfinite().all()
         with torch.no_grad():
@@ -205,7 +191,7 @@ def test_learnt_probabilities_keep_their_range():
         for call in (stage.expected, stage.forward, lambda v, s=stage: s.sample(v.round())):
             with pytest.raises(UnitError, match=r"expected .*probability in .*learnt"):
                 call(x)
-    period = Afterpulsing(
+    period = sensing.Afterpulsing(
         0.2, 1e-9, 1e-9, bin_width_s=1e-9, period_s=1e-7, background=torch.nn.Parameter(torch.ones(2, 3))
     )
     assert period.expected(x).requires_grad
@@ -229,7 +215,9 @@ def lidar(**changes):
         "dark_count_rate_hz": 100.0,
         "axis": LIDAR_AXIS,
     }
-    return PhotonBudget(Optics(f_number=2.0, pixel_area_m2=1e-10, transmission=0.8), **(arguments | changes))
+    return sensing.PhotonBudget(
+        sensing.Optics(f_number=2.0, pixel_area_m2=1e-10, transmission=0.8), **(arguments | changes)
+    )
 
 
 def test_by_hand():
@@ -255,4 +243,4 @@ def test_window_longer_than_a_period():
     with pytest.raises(UnitError, match="laser period"):
         lidar(repetition_rate_hz=1e9)(torch.zeros(1, 100, 1, 1))
     with pytest.raises(ArgumentError, match="either f_number"):
-        Optics()
+        sensing.Optics()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 
 import pytest
 import torch
 
-from torchtransient.sensing import DEVICES, TailedResponse, device, frames_to_rate
+from torchtransient.sensing import DEVICES, device, frames_to_rate
 
 each = pytest.mark.parametrize("name", sorted(DEVICES))
 
@@ -69,24 +68,3 @@ def test_gates_of_the_array_see_light_while_they_are_open():
     assert float(rate[outside].abs().max()) < 1e-4 * per_frame
     bright = sensor.expected(1e6 * x).flatten()
     assert float(bright.max()) <= 255 and float(bright[inside].min()) > 254.999
-
-
-def test_the_fine_chip_has_the_shape_of_its_frames():
-    """Half a narrow core and a slow tail: rise within two bins, one in ten photons more than 0.88 ns late."""
-    preset = device("tmf882x_like").changed("PhotonBudget", ambient_rate_hz=0.0, dark_count_rate_hz=0.0)
-    x = torch.zeros(1, 128, 1, 1, dtype=torch.float64)
-    x[:, 40] = 1e-4
-    sensor = preset.sensor()
-    shape = sensor.expected(x * 1e-3).flatten()  # far from pile-up
-    shape = shape / shape.sum()
-    assert int(shape.argmax()) in (40, 41)
-    assert float(shape[:39].sum()) < 0.01
-    # pulse and jitter together are the measured response, but for the places in the bins between the two: 88^2/6 ps^2
-    # more than its variance of 129^2/2.35^2 and 88^2/6, which takes a seventh off the top
-    measured = TailedResponse(129e-12, [103e-12, 549e-12], [0.75, 0.24])
-    first, kernel = measured.kernel(88e-12)
-    wanted = torch.nn.functional.pad(kernel, (40 + first, 0))[:128]
-    assert float((shape - wanted).abs().max()) < float(kernel.max()) / 7
-    # Late by 10 bins: 0.24 exp(-880 / 549) and nearly nothing of the fast tail, to the width of a bin.
-    late = float(shape[51:].sum())
-    assert 0.24 * math.exp(-968 / 549) < late < 0.24 * math.exp(-792 / 549)

@@ -71,9 +71,7 @@ def test_copies_and_pickles_know_nothing_of_it():
 LIGHT = torch.linspace(0.1, 1, 32).view(1, -1, 1, 1)
 STAGES = {
     "response": lambda: sensing.ImpulseResponse(sensing.GaussianResponse(200e-12), bin_width_s=WIDTH),
-    "afterpulses": lambda: sensing.Afterpulsing(
-        0.1, 1e-9, 0, bin_width_s=WIDTH, period_s=100 * WIDTH, background=3.0
-    ),
+    "afterpulses": lambda: sensing.Afterpulsing(0.1, 1e-9, 0, bin_width_s=WIDTH, period_s=100 * WIDTH, background=3.0),
 }
 TRANSFORMS = {
     "grad": lambda f: torch.func.grad(lambda v: f(v).sum())(LIGHT),

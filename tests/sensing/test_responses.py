@@ -11,16 +11,6 @@ from scipy import stats
 
 from torchtransient import TimeAxis, sensing
 from torchtransient.axes import FrequencyAxis
-from torchtransient.sensing import (
-    ComposedResponse,
-    GaussianResponse,
-    ItofCalibration,
-    ItofCorrelation,
-    Moves,
-    UniformResponse,
-    emg_response,
-    sine_code,
-)
 from torchtransient.sensing.counts import move_counts
 
 NS = 1e-9
@@ -100,7 +90,7 @@ def test_responses_of_tails_against_scipy():
 def test_counts_that_move_add_up(boundary, many, whole):
     """By single counts, by halves and by rare lags: the mean, its spread, and how many took each way."""
     shares = number(0.1, 0.0, 0.55, 0.002, 0.348) if whole else number(0.1, 0.0, 0.45, 0.002, 0.248)
-    moves, pixels = Moves(-1, shares, boundary), 600
+    moves, pixels = sensing.Moves(-1, shares, boundary), 600
     x = (number(3, 0, 1, 2) * many).reshape(1, 4, 1, 1).expand(1, 4, 1, pixels).contiguous()
     mean = moves.mean(x[..., :1])[0, :, 0, 0]
     for tally in (False, True):
@@ -126,7 +116,7 @@ def test_counts_that_move_add_up(boundary, many, whole):
 def test_noise_of_moves_has_the_covariance_of_multinomials(lost):
     """n (diag p - p p^T) of each bin, put where its counts go: 40 000 draws know a variance to 0.7 %."""
     shares = number(0.3, 0.2, 0.4) if lost else number(0.3, 0.2, 0.5)
-    moves, pixels = Moves(1, shares, "periodic"), 40_000
+    moves, pixels = sensing.Moves(1, shares, "periodic"), 40_000
     x = number(90.0, 0.0, 40.0, 0.0, 0.0).reshape(1, 5, 1, 1).expand(1, 5, 1, pixels)
     noise = moves.noise(x, torch.Generator().manual_seed(0))[0, :, 0]
     found = noise @ noise.T / pixels
@@ -145,32 +135,39 @@ AXIS = TimeAxis.from_seconds(0.0, 1e-9, 40)
 
 def test_distributions_of_composed_responses():
     time = torch.linspace(-3e-9, 3e-9, 61, dtype=torch.float64)
-    triangle = ComposedResponse([UniformResponse(1e-9), UniformResponse(1e-9)])
+    triangle = sensing.ComposedResponse([sensing.UniformResponse(1e-9), sensing.UniformResponse(1e-9)])
     u = (time / 1e-9).clamp(-1, 1)
     wanted = 0.5 + u - 0.5 * u * u.abs()
     torch.testing.assert_close(triangle.cdf(time), wanted, rtol=0, atol=2e-6)
     torch.testing.assert_close(triangle.survival(time), 1 - wanted, rtol=0, atol=2e-6)
     torch.testing.assert_close(triangle.mass(time), wanted.diff(), rtol=0, atol=4e-6)
-    tailed = ComposedResponse([emg_response(3e-10, 4e-10, 1e-10), GaussianResponse(4e-10)])
-    torch.testing.assert_close(tailed.cdf(time), emg_response(5e-10, 4e-10, 1e-10).cdf(time), rtol=1e-12, atol=1e-15)
+    tailed = sensing.ComposedResponse([sensing.emg_response(3e-10, 4e-10, 1e-10), sensing.GaussianResponse(4e-10)])
+    torch.testing.assert_close(
+        tailed.cdf(time), sensing.emg_response(5e-10, 4e-10, 1e-10).cdf(time), rtol=1e-12, atol=1e-15
+    )
     torch.testing.assert_close(tailed.cdf(time) + tailed.survival(time), torch.ones(61).double(), rtol=1e-12, atol=0)
-    alone = ComposedResponse([UniformResponse(1e-9)])
-    assert torch.equal(alone.cdf(time), UniformResponse(1e-9).cdf(time))
+    alone = sensing.ComposedResponse([sensing.UniformResponse(1e-9)])
+    assert torch.equal(alone.cdf(time), sensing.UniformResponse(1e-9).cdf(time))
 
 
 def camera(calibration=None, **others):
-    return ItofCorrelation(sine_code(4), 20e6, AXIS, calibration=calibration, **others)
+    return sensing.ItofCorrelation(sensing.sine_code(4), 20e6, AXIS, calibration=calibration, **others)
 
 
 @pytest.mark.parametrize(
     "own, loaded",
     [
-        (None, ItofCalibration(phase_offset_rad=0.7)),
-        (ItofCalibration(phase_offset_rad=0.1), ItofCalibration(phase_map_rad=torch.rand(2, 3))),
-        (ItofCalibration(phase_map_rad=torch.rand(2, 3)), ItofCalibration(phase_map_rad=torch.rand(2, 3))),
-        (ItofCalibration(phase_map_rad=torch.rand(4, 3)), None),
-        (ItofCalibration(direction=-1), ItofCalibration(phase_offset_rad=0.4, direction=-1, depth_map_m=torch.rand(2,
-         3))),
+        (None, sensing.ItofCalibration(phase_offset_rad=0.7)),
+        (sensing.ItofCalibration(phase_offset_rad=0.1), sensing.ItofCalibration(phase_map_rad=torch.rand(2, 3))),
+        (
+            sensing.ItofCalibration(phase_map_rad=torch.rand(2, 3)),
+            sensing.ItofCalibration(phase_map_rad=torch.rand(2, 3)),
+        ),
+        (sensing.ItofCalibration(phase_map_rad=torch.rand(4, 3)), None),
+        (
+            sensing.ItofCalibration(direction=-1),
+            sensing.ItofCalibration(phase_offset_rad=0.4, direction=-1, depth_map_m=torch.rand(2, 3)),
+        ),
     ],
 )
 def test_the_calibration_comes_with_the_state(own, loaded):

@@ -7,13 +7,7 @@ import pytest
 import torch
 
 from support.sensing.event_driven import compare, detect
-from torchtransient.sensing import (
-    SynchronousSPAD,
-    coates,
-    detections_with_dead_time,
-    first_photon_log_prob,
-    sample_detections,
-)
+from torchtransient import sensing
 
 BINS = 24
 WIDTH_S = 1e-10
@@ -33,7 +27,7 @@ def image(row):
 
 
 def spad(dead, cycles=50, grad="expected"):
-    return SynchronousSPAD(cycles, dead_time_s=dead * WIDTH_S, bin_width_s=WIDTH_S, grad=grad)
+    return sensing.SynchronousSPAD(cycles, dead_time_s=dead * WIDTH_S, bin_width_s=WIDTH_S, grad=grad)
 
 
 def slow(*values):
@@ -77,15 +71,19 @@ def test_means_and_draws_against_events(shape, total, dead, request):
 def test_bins_cut_or_not_give_the_same(shape, total, dead):
     """The solution with bins cut finer and finer, by hand."""
     row, pieces = total * shapes()[shape], 32
-    fine = detections_with_dead_time(image(np.repeat(row / pieces, pieces)), dead * pieces).view(BINS, pieces).sum(-1)
-    found = detections_with_dead_time(image(row), dead).flatten()
+    fine = (
+        sensing.detections_with_dead_time(image(np.repeat(row / pieces, pieces)), dead * pieces)
+        .view(BINS, pieces)
+        .sum(-1)
+    )
+    found = sensing.detections_with_dead_time(image(row), dead).flatten()
     assert float((found - fine).abs().sum() / fine.sum()) < 1e-5
 
 
 def test_closed_form_of_constant_light():
     """Expected detections before the second can happen, and after it, are integrals that one can do by hand."""
     n, dead = 0.7, 3.4
-    found = detections_with_dead_time(image(np.full(8, n)), dead).flatten().double()
+    found = sensing.detections_with_dead_time(image(np.full(8, n)), dead).flatten().double()
     t = torch.arange(9, dtype=torch.float64)
     late = (t - dead).clamp_min(0)
     once = 1 - torch.exp(-n * t)
@@ -118,22 +116,22 @@ def mixed(requires_grad=False):
 
 def test_pixels_of_all_levels():
     x = mixed()
-    together = detections_with_dead_time(x, 1.3)
+    together = sensing.detections_with_dead_time(x, 1.3)
     for k in range(4):
         torch.testing.assert_close(
-            together[..., k : k + 1], detections_with_dead_time(x[..., k : k + 1], 1.3), rtol=1e-12, atol=1e-14
+            together[..., k : k + 1], sensing.detections_with_dead_time(x[..., k : k + 1], 1.3), rtol=1e-12, atol=1e-14
         )
     stacked = torch.stack([x, x.flip(-1)])
-    mapped = torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked)
-    torch.testing.assert_close(mapped, detections_with_dead_time(stacked, 1.3), rtol=1e-12, atol=1e-14)
+    mapped = torch.func.vmap(lambda v: sensing.detections_with_dead_time(v, 1.3))(stacked)
+    torch.testing.assert_close(mapped, sensing.detections_with_dead_time(stacked, 1.3), rtol=1e-12, atol=1e-14)
     with torch.no_grad():
-        assert torch.equal(torch.func.vmap(lambda v: detections_with_dead_time(v, 1.3))(stacked), mapped)
-    by_func = torch.func.grad(lambda v: detections_with_dead_time(v, 1.3).square().sum())(x)
+        assert torch.equal(torch.func.vmap(lambda v: sensing.detections_with_dead_time(v, 1.3))(stacked), mapped)
+    by_func = torch.func.grad(lambda v: sensing.detections_with_dead_time(v, 1.3).square().sum())(x)
     leaf = mixed(True)
-    detections_with_dead_time(leaf, 1.3).square().sum().backward()
+    sensing.detections_with_dead_time(leaf, 1.3).square().sum().backward()
     torch.testing.assert_close(by_func, leaf.grad, rtol=1e-10, atol=1e-12)
-    assert detections_with_dead_time(torch.zeros(0, 1, 8, 2, 2), 1.3).shape == (0, 1, 8, 2, 2)
-    assert sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
+    assert sensing.detections_with_dead_time(torch.zeros(0, 1, 8, 2, 2), 1.3).shape == (0, 1, 8, 2, 2)
+    assert sensing.sample_detections(torch.zeros(0, 1, 8, 2, 2), 10, 1.3).shape == (0, 1, 8, 2, 2)
 
 
 @pytest.mark.slow
@@ -142,8 +140,8 @@ def test_gradients():
     x = mixed()[..., :2] + 0.01  # not cut, and cut
     x.requires_grad_()
     d = torch.tensor(dead, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(detections_with_dead_time, (x, d), check_forward_ad=True, fast_mode=True)
-    assert torch.autograd.gradgradcheck(lambda v: detections_with_dead_time(v, dead), (x,), fast_mode=True)
+    assert torch.autograd.gradcheck(sensing.detections_with_dead_time, (x, d), check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradgradcheck(lambda v: sensing.detections_with_dead_time(v, dead), (x,), fast_mode=True)
 
     def noisy(v):
         return spad(dead, 50, "gaussian")(v, generator=torch.Generator().manual_seed(0))
@@ -162,22 +160,22 @@ def test_coates_undoes_the_mean(total, dead):
     assert bool(estimate.valid[certain].all())
     if total == 1.0:  # nothing to put right: the gradient is that of the estimate
         counts = sensor(rate).requires_grad_()
-        assert torch.autograd.gradcheck(lambda c: coates(c, cycles, dead).rate, (counts,), eps=1e-3, fast_mode=True)
+        assert torch.autograd.gradcheck(
+            lambda c: sensing.coates(c, cycles, dead).rate, (counts,), eps=1e-3, fast_mode=True
+        )
 
 
 def test_estimates_have_gradients_where_no_cycle_is_armed():
     """All ten are dead for three bins: nothing is known of these, and nothing is infinite."""
     counts = image([10.0, 0.4, 0.0, 6.0, 1.0]).requires_grad_()
-    rate, valid = coates(counts, 10, 3.0)
+    rate, valid = sensing.coates(counts, 10, 3.0)
     assert valid.flatten().tolist() == [False, False, False, True, True] and rate.flatten()[1:3].tolist() == [0.0, 0.0]
     assert bool(rate.isfinite().all())
     (slope,) = torch.autograd.grad(rate.sum(), counts)
     assert bool(slope.isfinite().all()) and bool((slope[:, 3:] != 0).all())
 
 
-@pytest.mark.parametrize(
-    "total, dead, error", [(1.0, 0.6, 2e-3), (5.0, 2.6, 0.03), (20.0, 30.4, 2e-6)]
-)
+@pytest.mark.parametrize("total, dead, error", [(1.0, 0.6, 2e-3), (5.0, 2.6, 0.03), (20.0, 30.4, 2e-6)])
 def test_the_likelihood_is_greatest_near_the_light(total, dead, error):
     """Newton's step from the truth, in counts without noise; second order in the photons of a bin.
 
@@ -187,7 +185,7 @@ def test_the_likelihood_is_greatest_near_the_light(total, dead, error):
     rate = image(total * shapes()["pulse"]).requires_grad_()
     counts = spad(dead, 10_000)(rate).detach()
     (slope,) = torch.autograd.grad(
-        first_photon_log_prob(counts, rate, 10_000, dead_bins=dead).sum(), rate, create_graph=True
+        sensing.first_photon_log_prob(counts, rate, 10_000, dead_bins=dead).sum(), rate, create_graph=True
     )
     (bend,) = torch.autograd.grad(slope.sum(), rate)
     step = (slope / bend / rate).detach().abs()
@@ -197,9 +195,11 @@ def test_the_likelihood_is_greatest_near_the_light(total, dead, error):
 
 def test_log_prob_at_the_ends():
     """Nothing seen in the dark, and everything where all fire; nothing else is certain."""
-    dark = first_photon_log_prob(torch.zeros(1, 6, 1, 1), torch.zeros(1, 6, 1, 1), 10, dead_bins=1.5)
+    dark = sensing.first_photon_log_prob(torch.zeros(1, 6, 1, 1), torch.zeros(1, 6, 1, 1), 10, dead_bins=1.5)
     assert not dark.any()
-    impossible = first_photon_log_prob(image([0, 1.0, 0, 0]), image([0, 0.0, 0, 0]), 10, dead_bins=1.5).flatten()
+    impossible = sensing.first_photon_log_prob(
+        image([0, 1.0, 0, 0]), image([0, 0.0, 0, 0]), 10, dead_bins=1.5
+    ).flatten()
     assert impossible[1] == -torch.inf
-    sure = first_photon_log_prob(image([10.0, 0, 0, 0]), image([50.0, 0, 0, 0]), 10, dead_bins=2.0)
+    sure = sensing.first_photon_log_prob(image([10.0, 0, 0, 0]), image([50.0, 0, 0, 0]), 10, dead_bins=2.0)
     assert abs(float(sure.flatten()[0])) < 1e-12

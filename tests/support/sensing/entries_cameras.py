@@ -91,7 +91,7 @@ ENTRIES: list[Entry] = [
             AXIS,
             calibration=sensing.ItofCalibration(
                 phase_offset_rad=torch.nn.Parameter(torch.tensor([0.1, 0.2])),
-                    depth_map_m=torch.nn.Parameter(MAP_M.clone())
+                depth_map_m=torch.nn.Parameter(MAP_M.clone()),
             ),
         ),
         conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),

@@ -39,6 +39,7 @@ def composed():
 
 ENTRIES = [
     Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True))),
+    Entry("ImpulseResponse-even", impulse(lambda: sensing.UniformResponse(47 * PS, 3 * PS, learnable=True))),
     Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
     Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
     Entry(

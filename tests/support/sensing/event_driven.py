@@ -281,4 +281,3 @@ def dense_limit(rate, dead_bins, pieces):
     """The limit of many pieces by Richardson's extrapolation, and a bound of its error (that of the finer of two)."""
     coarse, fine = dense_histogram(rate, dead_bins, pieces), dense_histogram(rate, dead_bins, 2 * pieces)
     return (4 * fine - coarse) / 3, np.abs(fine - coarse).max() / 3
-
