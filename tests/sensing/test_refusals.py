@@ -183,7 +183,6 @@ UNITS = [
     lambda: calibrated(phase_map_rad=torch.full((2, 3), math.nan)),
     lambda: other_state(calibrated(), weights=calibrated().weights + 1e-3),
     lambda: sensing.linear_analyzers([0.0], 0.01),
-    lambda: sensing.Optics.from_aperture(25.0, 12.5e-3, pixel_area_m2=1e-10),
     lambda: sensing.Optics(f_number=2.0, pixel_area_m2=100.0),
     lambda: sensing.Optics(solid_angle_sr=6.3),
     lambda: sensing.ambient_photon_rate(LENS, 0.5, **{**SUN, "spectral_irradiance_w_m2_nm": 1300.0}),

@@ -80,8 +80,6 @@ def test_ideal_converter_changes_nothing_and_widths_show_in_even_light():
     w = widths()
     converter = TDC(w)
     torch.testing.assert_close(converter(image(torch.ones(24))).flatten(), w)
-    assert float(converter.integral_nonlinearity[-1]) == pytest.approx(0, abs=1e-12)
-    torch.testing.assert_close(converter.differential_nonlinearity, w - 1)
     evened = TDC(w, sliding_scale=24)(image(torch.ones(24))).flatten()[4:-4]
     assert float((evened - 1).abs().max()) < 0.1 * float((w - 1).abs().max())
 

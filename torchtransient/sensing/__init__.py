@@ -77,6 +77,7 @@ from torchtransient.sensing.itof.correlation import tap_weights as tap_weights
 from torchtransient.sensing.itof.correlation import taps_from_phasor as taps_from_phasor
 from torchtransient.sensing.itof.depth import amplitude_of as amplitude_of
 from torchtransient.sensing.itof.depth import depth_of_phase as depth_of_phase
+from torchtransient.sensing.itof.depth import heterodyne_speed as heterodyne_speed
 from torchtransient.sensing.itof.depth import offset_of as offset_of
 from torchtransient.sensing.itof.depth import phase_of as phase_of
 from torchtransient.sensing.itof.depth import phasor_loss as phasor_loss
@@ -84,7 +85,6 @@ from torchtransient.sensing.itof.depth import tap_phasor as tap_phasor
 from torchtransient.sensing.itof.depth import unambiguous_range_m as unambiguous_range_m
 from torchtransient.sensing.itof.depth import unwrap_depth as unwrap_depth
 from torchtransient.sensing.itof.depth import wrapped_difference as wrapped_difference
-from torchtransient.sensing.itof.heterodyne import heterodyne_speed as heterodyne_speed
 from torchtransient.sensing.itof.reading import ItofNoise as ItofNoise
 from torchtransient.sensing.itof.reading import ItofReading as ItofReading
 from torchtransient.sensing.itof.reading import decode_code as decode_code

@@ -23,7 +23,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single, number_tensor
 from torchtransient.sensing.checks import (
     TIME,
-    bin_width_of,
+    bins_from,
     check_choice,
     check_number,
     check_seconds,
@@ -493,8 +493,7 @@ class Afterpulsing(AddedCounts):
             raise UnitError(f"{where}: expected delays to be an AfterpulseDelays (PowerLawDelays), got {delays!r}.")
         check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
-        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
         self.period_s: float | None = None
         self.period_bins: int | None = None
         self.window_is_period = period_s is None

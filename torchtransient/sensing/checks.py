@@ -174,21 +174,6 @@ def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
             raise GradientError(_cut_off_message(name, where))
 
 
-def refuse_gradients(record: object) -> None:
-    """Refuse fields of a dataclass that require a gradient, where records are taken by their values.
-
-    Args:
-        record: a dataclass.
-
-    Raises:
-        GradientError: for a field that requires a gradient.
-    """
-    where = type(record).__name__
-    for field in fields(record):  # type: ignore[arg-type]
-        for tensor in _tensors(getattr(record, field.name)):
-            refuse_cut_off(tensor, field.name, where)
-
-
 def _tensors(value: Any) -> Iterator[Tensor]:
     """The tensors of an argument and of the containers in it; modules keep their own."""
     if isinstance(value, Tensor):
@@ -546,6 +531,21 @@ def bin_width_of(axis: TimeAxis | None, bin_width_s: float | None, where: str) -
         return check_time_axis(axis, where).bin_width_s
     width = bin_width_s if bin_width_s is not None else 0.0
     return check_seconds(width, "bin_width_s", where, open_low=True, high=WIDEST_BIN_S)
+
+
+def bins_from(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> tuple[float, int | None]:
+    """Return width in seconds and number of the bins of a sensor, from an axis or a width.
+
+    Args:
+        axis: time axis, or None.
+        bin_width_s: width in seconds, which goes with any number of bins, or None.
+        where: name of the caller, for errors.
+
+    Raises:
+        ArgumentError: unless exactly one is given.
+        UnitError: for widths out of range.
+    """
+    return bin_width_of(axis, bin_width_s, where), None if axis is None else axis.num_bins
 
 
 def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, where: str) -> int:

@@ -93,12 +93,7 @@ class MeasuredResponse(Response):
 
     def cdf(self, time_s: Tensor) -> Tensor:
         shares = self._shares()
-        start = self._start_s(shares)
-        flat = time_s.reshape(-1)
-        # resample_counts from far before the response to each time, as one running sum
-        edges = torch.cat([(start - self.bin_width_s).reshape(1), flat])
-        total = resample_counts(shares, self.bin_width_s, edges, start_s=start).cumsum(0)
-        return total.reshape(time_s.shape)
+        return _below(shares, self.bin_width_s, self._start_s(shares), time_s)
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
         shares = self._shares()
@@ -221,10 +216,11 @@ class ComposedResponse(Response):
         return coarse, shares / shares.sum()
 
 
-def _below(shares: Tensor, width_s: float, start_s: float, time_s: Tensor) -> Tensor:
+def _below(shares: Tensor, width_s: float, start_s: float | Tensor, time_s: Tensor) -> Tensor:
     """Sum of a histogram before each time, even within its bins."""
-    times = time_s.reshape(-1)
-    edges = torch.cat([times.new_full((1,), start_s - width_s), times])
+    # from before the first bin to each time, as one running sum
+    start = torch.as_tensor(start_s - width_s, dtype=torch.float64, device=time_s.device)
+    edges = torch.cat([start.reshape(1), time_s.reshape(-1)])
     return resample_counts(shares, width_s, edges, start_s=start_s).cumsum(0).reshape(time_s.shape)
 
 

@@ -21,7 +21,7 @@ from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import (
     TIME,
-    bin_width_of,
+    bins_from,
     bins_of_period,
     check_bins,
     check_choice,
@@ -228,8 +228,7 @@ class FreeRunningSPAD(RandomSensor):
         self.trains = 1  # detectors alike that share the cycles, of a pixel of several: see `several_of`
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
-        self.bin_width_s = bin_width_of(axis, bin_width_s, "FreeRunningSPAD")
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "FreeRunningSPAD")
         if period_s is not None:
             self.num_bins = bins_of_period(period_s, self.bin_width_s, self.num_bins, "FreeRunningSPAD")
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)

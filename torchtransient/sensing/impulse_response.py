@@ -16,7 +16,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import without_autocast
 from torchtransient.pulses import Pulse, cumulative_of_sum
-from torchtransient.sensing.checks import bin_width_of, check_choice, check_tensor, check_time_axis
+from torchtransient.sensing.checks import bins_from, check_choice, check_tensor, check_time_axis
 from torchtransient.sensing.responses import Response, WithinBin, kernel_of
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.sensing.time_convolution import Boundary, Method, convolve_time, filter_rows
@@ -79,8 +79,7 @@ class ImpulseResponse(Sensor):
         check_choice(method, Method, "method", "ImpulseResponse")
         check_choice(within_bin, WithinBin, "within_bin", "ImpulseResponse")
         self.response = check_response(response, "ImpulseResponse")
-        self.bin_width_s = bin_width_of(axis, bin_width_s, "ImpulseResponse")
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "ImpulseResponse")
         self.boundary: Boundary = boundary
         self.method: Method = method
         self.within_bin: WithinBin = within_bin

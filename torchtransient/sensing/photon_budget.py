@@ -14,7 +14,7 @@ from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import (
     TIME,
-    bin_width_of,
+    bins_from,
     check_broadcast,
     check_count,
     check_number,
@@ -82,30 +82,6 @@ class Optics:
         # a pixel larger than 1 cm^2 is most likely given in square micrometres
         check_number(self.pixel_area_m2, "pixel_area_m2", "Optics", high=1e-4, open_low=True)
         check_number(self.transmission, "transmission", "Optics", high=1.0)
-
-    @classmethod
-    def from_aperture(
-        cls, focal_length_m: float, aperture_diameter_m: float, *, pixel_area_m2: float, transmission: float = 1.0
-    ) -> Optics:
-        """Make the optics of a lens of a focal length and aperture.
-
-        Args:
-            focal_length_m: in metres.
-            aperture_diameter_m: in metres.
-            pixel_area_m2: active area of a pixel in m^2.
-            transmission: share of light that filters and lenses let through.
-
-        Raises:
-            UnitError: for f-numbers that no lens has (two units?).
-        """
-        focal = check_number(focal_length_m, "focal_length_m", "Optics", open_low=True)
-        diameter = check_number(aperture_diameter_m, "aperture_diameter_m", "Optics", open_low=True)
-        if not 0.1 <= focal / diameter <= _DARKEST:
-            raise UnitError(
-                f"Optics: expected focal_length_m and aperture_diameter_m in one unit, metres, got {focal!r} and "
-                f"{diameter!r}, which is f/{focal / diameter:g}. 25 mm are 25e-3."
-            )
-        return cls(f_number=focal / diameter, pixel_area_m2=pixel_area_m2, transmission=transmission)
 
     @property
     def etendue_m2_sr(self) -> float:
@@ -283,8 +259,7 @@ class PhotonBudget(Sensor):
         keep_map(self, "ambient_rate_hz", check_map(ambient_rate_hz, "ambient_rate_hz", where))
         dark = check_map(dark_count_rate_hz, "dark_count_rate_hz", where)
         keep_map(self, "dark_count_rate_hz", dark if isinstance(dark, Tensor) else torch.tensor(dark).double())
-        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
         check_one_of(where, {"cycles=": cycles, "exposure_s=": exposure_s})
         if exposure_s is not None:
             cycles = self._cycles_of(check_number(exposure_s, "exposure_s", where))

@@ -512,8 +512,8 @@ def common_bins(sensors: Iterable[Sensor], where: str, own: Bins = (None, None))
         other_width = width and its_width and abs(width - its_width) * most > SAME_BIN * width
         if other_width or (number and its_number and number != its_number):
             raise UnitError(
-                f"{where}: expected one time axis for all parts, got {_bins_text(width, number)} in {owner} and "
-                f"{_bins_text(its_width, its_number)} in {name}. Make them with the axis of the light."
+                f"{where}: expected one time axis for all parts, got {bins_text(width, number)} in {owner} and "
+                f"{bins_text(its_width, its_number)} in {name}. Make them with the axis of the light."
             )
         if (width is None and its_width) or (number is None and its_number):
             owner = name
@@ -521,7 +521,13 @@ def common_bins(sensors: Iterable[Sensor], where: str, own: Bins = (None, None))
     return width, number
 
 
-def _bins_text(width: float | None, number: int | None) -> str:
+def bins_text(width: float | None, number: int | None) -> str:
+    """Describe bins for a message.
+
+    Args:
+        width: in seconds, None where any fits.
+        number: of bins, None where any fits.
+    """
     many = "bins" if number is None else f"{number} bins"
     return many if width is None else f"{many} of {width:g} s"
 

@@ -19,6 +19,7 @@ from torchtransient.floating import holds, in_single
 from torchtransient.sensing.checks import (
     TIME,
     bin_width_of,
+    bins_from,
     check_bins,
     check_broadcast,
     check_count,
@@ -250,8 +251,7 @@ class SynchronousSPAD(RandomSensor):
         self.cycles = check_count(cycles, "cycles", "SynchronousSPAD")
         self.bin_width_s: float | None = None
         if axis is not None or bin_width_s is not None:
-            self.bin_width_s = bin_width_of(axis, bin_width_s, "SynchronousSPAD")
-        self.num_bins = None if axis is None else axis.num_bins
+            self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "SynchronousSPAD")
         self.dead_time_s: float | None = None
         self.dead_bins: float | None = None
         if dead_time_s is not None:

@@ -21,7 +21,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import (
     TIME,
-    bin_width_of,
+    bins_from,
     check_choice,
     check_count,
     check_number,
@@ -82,8 +82,7 @@ class DetectionJitter(MovedCounts):
         check_choice(boundary, Boundary, "boundary", "DetectionJitter")
         check_choice(within_bin, WithinBin, "within_bin", "DetectionJitter")
         self.response = check_response(response, "DetectionJitter")
-        self.bin_width_s = bin_width_of(axis, bin_width_s, "DetectionJitter")
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "DetectionJitter")
         self.boundary: Boundary = boundary
         self.within_bin: WithinBin = within_bin
 
@@ -140,8 +139,7 @@ class SweepJitter(RandomSensor):
         check_choice(boundary, Boundary, "boundary", me)
         self.boundary: Boundary = boundary
         self.jitter_fwhm_s = check_seconds(jitter_fwhm_s, "jitter_fwhm_s", me)
-        self.bin_width_s = bin_width_of(axis, bin_width_s, me)
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, me)
         self.sweeps = check_count(sweeps, "sweeps", me)
 
     @property
@@ -347,8 +345,7 @@ class PixelSkew(Sensor):
         where = "PixelSkew"
         check_choice(boundary, Boundary, "boundary", where)
         self.boundary: Boundary = boundary
-        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
         self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
 
     def expected(self, x: Tensor) -> Tensor:
@@ -391,8 +388,7 @@ class DetectionSkew(MovedCounts):
         where = "DetectionSkew"
         check_choice(boundary, Boundary, "boundary", where)
         self.boundary: Boundary = boundary
-        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        self.num_bins = None if axis is None else axis.num_bins
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
         self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
 
     def _delay_bins(self, x: Tensor) -> Tensor:
@@ -586,16 +582,6 @@ class TDC(MovedCounts):
         for first, band in parts:
             total[:, first - low : first - low + band.shape[1]] += band / self.sliding_scale
         return low, total
-
-    @property
-    def differential_nonlinearity(self) -> Tensor:
-        """Deviation of each code's width from the bin, (T,), in bins."""
-        return self.code_widths - 1
-
-    @property
-    def integral_nonlinearity(self) -> Tensor:
-        """Deviation of each code's end from its nominal place, (T,), in bins."""
-        return self.differential_nonlinearity.cumsum(0)
 
     def check_bins(self, x: object) -> None:
         if isinstance(x, Tensor) and x.ndim >= 4 and x.shape[TIME] != self.num_bins:

@@ -8,7 +8,7 @@ counts whose detections move by themselves are multinomial again, with the moved
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -214,7 +214,7 @@ class Compose(Sensor):
         Args:
             x: light, or a renderer's output.
         """
-        return self._run(x, mean_of)
+        return self._run(x, lambda stage, y, _: mean_of(stage, y))
 
     def forward(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """Measure light, every random stage under its own policy and with the same generator in turn.
@@ -223,15 +223,7 @@ class Compose(Sensor):
             x: light, or a renderer's output.
             generator: source of randomness.
         """
-
-        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
-            found = moving_together(stages, policy=True)
-            if found is None:
-                return y, 0
-            spad, moves = found
-            return moved_first_photons(spad, moves, y, generator, spad.grad), 1 + len(moves)
-
-        return self._run(x, lambda stage, y: measurement_of(stage, y, generator), at_once)
+        return self._run(x, measurement_of, generator, "own")
 
     def gaussian(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """Draw the normal surrogates of all random stages in turn, whatever their policies; differentiable.
@@ -240,15 +232,7 @@ class Compose(Sensor):
             x: light, or a renderer's output.
             generator: source of randomness.
         """
-
-        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
-            found = moving_together(stages, policy=False)
-            if found is None:
-                return y, 0
-            spad, moves = found
-            return moved_first_photons(spad, moves, y, generator, "gaussian"), 1 + len(moves)
-
-        return self._run(x, lambda stage, y: normal_of(stage, y, generator), at_once)
+        return self._run(x, normal_of, generator, "gaussian")
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """Draw every random stage, whatever its policy, without gradient.
@@ -257,16 +241,8 @@ class Compose(Sensor):
             x: light, or a renderer's output.
             generator: source of randomness.
         """
-
-        def at_once(stages: list[nn.Module], y: Tensor) -> tuple[Tensor, int]:
-            found = moving_together(stages, policy=False)
-            if found is None:
-                return y, 0
-            spad, moves = found
-            return moved_first_photons(spad, moves, y, generator), 1 + len(moves)
-
         with torch.no_grad():
-            return self._run(x, lambda stage, y: draw_of(stage, y, generator), at_once)
+            return self._run(x, draw_of, generator, "draw")
 
     def variance(self, x: Any) -> Tensor:
         """Variance of every entry, for chains whose last stage alone draws.
@@ -332,23 +308,23 @@ class Compose(Sensor):
     def _run(
         self,
         x: Any,
-        step: Callable[[nn.Module, Tensor], Any],
-        at_once: Callable[[list[nn.Module], Tensor], tuple[Tensor, int]] | None = None,
+        step: Callable[[nn.Module, Tensor, torch.Generator | None], Tensor],
+        generator: torch.Generator | None = None,
+        at_once: Literal["own", "gaussian", "draw"] | None = None,
     ) -> Tensor:
-        """Call `step` for one stage after another; `at_once` takes several where it can, and returns their number."""
-        stages = unrolled(self.stages)
-        if isinstance(x, Tensor):
-            y = x
-        else:
-            y, used = self._opened(x)
-            stages = stages[used:]
+        """Call `step` for one stage after another; first photons and their moves are measured `at_once`."""
+        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
+        stages = unrolled(self.stages)[used:]
         if self._window_is_open and y.ndim >= 4:
             check_window(self, y.shape[TIME])
         while stages:
-            y, used = at_once(stages, y) if at_once is not None else (y, 0)
-            if not used:
-                y, used = step(stages[0], y), 1
-            stages = stages[used:]
+            found = moving_together(stages, policy=at_once == "own") if at_once is not None else None
+            if found is None:
+                y, stages = step(stages[0], y, generator), stages[1:]
+                continue
+            spad, moves = found
+            policy = spad.grad if at_once == "own" else "gaussian" if at_once == "gaussian" else None
+            y, stages = moved_first_photons(spad, moves, y, generator, policy), stages[1 + len(moves) :]
         return y
 
     def _opened(self, output: Any) -> tuple[Tensor, int]:

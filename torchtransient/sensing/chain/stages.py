@@ -24,7 +24,7 @@ from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.itof.correlation import TapDifference
 from torchtransient.sensing.photon_budget import PhotonBudget
-from torchtransient.sensing.sensor import SAME_BIN, GradPolicy, Quantity, RandomSensor, Sensor
+from torchtransient.sensing.sensor import SAME_BIN, GradPolicy, Quantity, RandomSensor, Sensor, bins_text
 from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF
 from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, PixelSkew, SweepJitter
 
@@ -351,8 +351,8 @@ def _same_bins(light: _Light, stage: Stage) -> _Light:
             other = light.width
     if other is not None:
         raise UnitError(
-            f"Compose: expected one time axis for all stages, got {_shown(_bins(other))} in {other} and "
-            f"{_shown((width, number))} in {stage}. Make both with the axis of the light."
+            f"Compose: expected one time axis for all stages, got {bins_text(*_bins(other))} in {other} and "
+            f"{bins_text(width, number)} in {stage}. Make both with the axis of the light."
         )
     return replace(
         light, width=light.width if width is None else stage, number=light.number if number is None else stage
@@ -365,13 +365,6 @@ def _bins(stage: Stage) -> tuple[float | None, int | None]:
     if isinstance(axis, TimeAxis):
         return axis.bin_width_s, axis.num_bins
     return width, stage.sensor.num_bins
-
-
-def _shown(bins: tuple[float | None, int | None]) -> str:
-    width, number = bins
-    if width is None:
-        return f"{number} bins"
-    return f"bins of {width:g} s" if number is None else f"{number} bins of {width:g} s"
 
 
 # ------------------------------------------------------------------------------------------------------- quantities

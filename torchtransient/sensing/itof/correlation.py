@@ -103,11 +103,6 @@ class ItofCalibration:
         values = {name: getattr(self, name) for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m")}
         return tuple(name for name, v in values.items() if isinstance(v, Tensor) and v.requires_grad)
 
-    @property
-    def has_map(self) -> bool:
-        """True if pixels differ."""
-        return self.phase_map_rad is not None or self.depth_map_m is not None
-
     def phases_rad(self, frequencies_hz: Numbers) -> Tensor:
         """Sum offset and maps, with their gradients.
 

@@ -1,4 +1,4 @@
-"""Phase, amplitude and depth from the taps of an indirect time-of-flight camera.
+"""Phase, amplitude, depth and speed from the taps of an indirect time-of-flight camera.
 
 With taps ``I_n = (B + A cos(phi - 2 pi n / N)) / N`` the sum ``(2 / N) sum_n I_n exp(2 pi i n / N)`` is the *tap
 phasor* ``(A / N) exp(i phi)`` (its phase is minus that of a phasor image, whose exponent is negative). The differences
@@ -11,7 +11,7 @@ pixel without modulated light has phase and derivative zero.
 
 Sources: Lange & Seitz (2001); Payne, Dorrington & Cree, "Illumination waveform optimization for time-of-flight range
 imaging cameras" (SPIE 2011); Jongenelen et al., "Analysis of errors in ToF range imaging with dual-frequency
-modulation" (IEEE TIM 2011).
+modulation" (IEEE TIM 2011); Heide et al., "Doppler time-of-flight imaging" (ACM TOG 34, 2015).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from torchtransient.sensing.checks import (
     check_broadcast,
     check_count,
     check_dense,
+    check_number,
     complex_tensor,
     going_together,
     number_or_tensor,
@@ -211,11 +212,8 @@ def phase_of(phasor: Tensor) -> Tensor:
         Shape of ``phasor``, radians.
     """
     phasor = complex_tensor("phase_of", phasor=phasor)
-    real, imag = phasor.real, phasor.imag
+    real, imag, there, scale = _scaled(phasor)
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
-    largest = torch.maximum(real.abs(), imag.abs()).detach()
-    there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
-    scale = torch.where(there, largest, 1.0)
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
     # Not where(..., turn, 0.0): two plain numbers make a float32 of the turn.
     return below_a_turn(angle + _TURN * (angle < 0).to(angle))
@@ -237,12 +235,17 @@ def amplitude_of(phasor: Tensor) -> Tensor:
         phasor: complex, any shape.
     """
     phasor = complex_tensor("amplitude_of", phasor=phasor)
+    real, imag, there, scale = _scaled(phasor)
+    square = (real / scale).square() + (imag / scale).square()
+    return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
+
+
+def _scaled(phasor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Real and imaginary part, a mask of the pixels with light, and the size of their larger part, else one."""
     real, imag = phasor.real, phasor.imag
     largest = torch.maximum(real.abs(), imag.abs()).detach()
     there = ~(largest <= torch.finfo(real.dtype).tiny)  # NaN is not darkness
-    scale = torch.where(there, largest, 1.0)
-    square = (real / scale).square() + (imag / scale).square()
-    return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
+    return real, imag, there, torch.where(there, largest, 1.0)
 
 
 @in_single
@@ -454,3 +457,48 @@ def _search(
         best = torch.where(better, residual, best)
         whole = torch.where(better.unsqueeze(-3), candidate, whole)
     return best, whole
+
+
+# -------------------------------------------------------------------------------------------------- heterodyne cameras
+
+
+def heterodyne_speed(
+    beat: Tensor, plain: Tensor, frequencies_hz: Frequencies, *, duration_s: float, beats: int = 1
+) -> Tensor:
+    """Find the speed of approach by an exposure with a beat and one without.
+
+    If all light goes there and back at one speed v, the phase turns by ``e = 2 v f T / c`` turns in an exposure of T
+    seconds. A beat of m turns leaves ``sinc(m + e)`` of the light, no beat ``sinc(e)``, whose ratio
+    ``(-1)^m e / (m + e)`` is solved for v. Brightness that changes evenly is in the imaginary part of the ratio,
+    which is left out. Detours of light over other things that move are not told apart: fit those with `tt.over_time`.
+
+    Args:
+        beat: complex phasors (..., F, H, W) of ``tt.Exposure(duration_s, beat_hz=beats / duration_s)``, or of its taps
+            (`tap_phasor`).
+        plain: those of ``tt.Exposure(duration_s)`` around the same middle, of a shape that broadcasts.
+        frequencies_hz: modulation frequency of the F phasors, hertz.
+        duration_s: exposure T, seconds.
+        beats: whole turns m of the beat in an exposure, one and more.
+
+    Returns:
+        m/s, (..., F, H, W), positive for what comes nearer, with gradients; NaN without light. Unique for speeds above
+        ``- m c / (2 f T)``, at which the light follows the sensor and does not beat: -500 m/s at 60 MHz and 5 ms.
+
+    Raises:
+        UnitError: for numbers out of range, and real tensors.
+        ShapeError: for shapes that do not go together.
+    """
+    me = "heterodyne_speed"
+    beat, plain = complex_tensor(me, beat=beat), complex_tensor(me, plain=plain)
+    check_broadcast(me, beat=beat, plain=plain)
+    values, turns = check_frequencies(frequencies_hz, me), check_count(beats, "beats", me)
+    seconds = check_number(duration_s, "duration_s", me, open_low=True)
+    dark = plain == 0
+    # Masked before the division, so that dark pixels have no gradient in place of NaN.
+    real = torch.where(dark, torch.nan, (beat / torch.where(dark, 1, plain)).real)
+    ratio = -real if turns % 2 else real
+    hertz = torch.tensor(values, dtype=ratio.dtype, device=ratio.device)
+    if len(values) > 1:
+        hertz = hertz[:, None, None]
+        check_broadcast(me, beat=beat, frequencies_hz=hertz)
+    return turns * ratio / (1 - ratio) * (SPEED_OF_LIGHT / (2 * seconds)) / hertz
