@@ -151,7 +151,7 @@ SHAPES = [
     lambda: sensing.fourier_codes(4, 9),
     lambda: sensing.range_and_speed(LIGHT[None, :1, :5], CHIRPS, AXIS),
     lambda: sensing.fold_beats(LIGHT, TimeAxis(-0.7, 1.0, 6)),
-    lambda: sensing.heterodyne_speed(PHASOR[:, 0], PHASOR[:, 0], (60e6, 50e6, 40e6), duration_s=5e-3),
+    lambda: sensing.heterodyne_speed(PHASOR.expand(1, 2, 2, 3), PHASOR, (60e6, 50e6, 40e6), duration_s=5e-3),
 ]  # fmt: skip
 UNITS = [
     lambda: sensing.crlb(PULSE, AXIS, distance_m=-0.6, signal=3.0),
@@ -200,7 +200,7 @@ UNITS = [
     lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
     lambda: sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS),
     lambda: sensing.FreeRunningSPAD(10, 50 * PS, **WIDTH),
-    lambda: sensing.FreeRunningSPAD(10, 1e-9, AXIS, period_s=7e-10),
+    lambda: sensing.FreeRunningSPAD(10, 1e-9, axis=AXIS, period_s=7e-10),
     lambda: sensing.coates(LIGHT, 10, 0.7),
     lambda: sensing.paralyzable_histogram(LIGHT, -0.5),
     lambda: sensing.first_photon_log_prob(LIGHT + 9, LIGHT, 10),

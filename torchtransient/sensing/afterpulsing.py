@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import Numbers
@@ -34,7 +34,7 @@ from torchtransient.sensing.checks import (
 )
 from torchtransient.sensing.counts import AddedCounts
 from torchtransient.sensing.draws import LagTable, by_pieces, sixteen_bits, thin
-from torchtransient.sensing.parameters import check_map, keep_map, kept_map, over_time, remembered
+from torchtransient.sensing.parameters import check_map, keep_map, keep_number, kept_map, over_time, remembered
 from torchtransient.sensing.responses import above_floor
 from torchtransient.sensing.sensor import GradPolicy, PhysicalModule
 from torchtransient.sensing.time_convolution import filter_rows
@@ -237,10 +237,7 @@ class PowerLawDelays(AfterpulseDelays):
         value = check_number(exponent, "exponent", "PowerLawDelays", high=10.0, open_low=True)
         self.longest_s = check_seconds(longest_s, "longest_s", "PowerLawDelays", open_low=True)
         tensor = torch.tensor(math.log(value), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("log_exponent", nn.Parameter(tensor))
-        else:
-            self.register_buffer("log_exponent", tensor)
+        keep_number(self, "log_exponent", tensor, learnable)
 
     def end_s(self) -> float:
         return self.longest_s
@@ -528,10 +525,7 @@ class Afterpulsing(AddedCounts):
         for name, values in numbers.items():
             tensor = torch.tensor(values, dtype=torch.float64)
             tensor = tensor if several else tensor[0].clone()
-            if learnable:
-                self.register_parameter(name, nn.Parameter(tensor))
-            else:
-                self.register_buffer(name, tensor)
+            keep_number(self, name, tensor, learnable)
 
     @property
     def probability(self) -> Tensor:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.errors import UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import check_number, check_transient, one_number
 from torchtransient.sensing.counts import AddedCounts
 from torchtransient.sensing.draws import add_passing, by_pieces
+from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.sensor import GradPolicy
 
 _EDGES = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -82,10 +83,7 @@ class Crosstalk(AddedCounts):
         p = check_number(probability, "probability", "Crosstalk", high=_MOST, open_low=True)
         self.diagonal_ratio = check_number(diagonal_ratio, "diagonal_ratio", "Crosstalk", high=1.0)
         tensor = torch.tensor(math.log(p / (1 - p)), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("logit_probability", nn.Parameter(tensor))
-        else:
-            self.register_buffer("logit_probability", tensor)
+        keep_number(self, "logit_probability", tensor, learnable)
 
     @property
     def probability(self) -> Tensor:

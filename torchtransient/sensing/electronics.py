@@ -23,6 +23,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import check_count, check_generator, check_number, check_transient, reals
 from torchtransient.sensing.counts import poisson, poisson_log_prob
+from torchtransient.sensing.responses import normal_cdf, normal_integral
 from torchtransient.sensing.sensor import (
     VARIANCE_FLOOR,
     GradPolicy,
@@ -71,9 +72,9 @@ def clipped_normal_mean(mean: Tensor, variance: Tensor, low: float = -math.inf, 
     scale = (variance.clamp_min(0) + VARIANCE_FLOOR).sqrt()
     result = mean
     if math.isfinite(high):
-        result = result - scale * _normal_loss((high - mean) / scale)
+        result = result - scale * normal_integral((mean - high) / scale)
     if math.isfinite(low):
-        result = result + scale * _normal_loss((mean - low) / scale)
+        result = result + scale * normal_integral((low - mean) / scale)
     return result
 
 
@@ -88,7 +89,7 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
     variance = variance.clamp_min(0)
     # Beyond 12 standard deviations the answer is the variance or nothing, and the squares below would cancel.
     t = ((high - mean) / (variance + VARIANCE_FLOOR).sqrt()).clamp(-12, 12)
-    density, below = _density(t), 0.5 * torch.erfc(-t / math.sqrt(2))
+    density, below = torch.exp(-0.5 * t * t) / math.sqrt(2 * math.pi), normal_cdf(t)
     first, second = density + t * below, (1 + t * t) * below + t * density
     return variance * (second - first * first)
 
@@ -306,12 +307,3 @@ class PixelElectronics(RandomSensor):
                 f"{type(self).__name__}: expected {name} to broadcast to {tuple(x.shape)}, got {tuple(values.shape)}."
             )
         return values.to(x.dtype)
-
-
-def _density(t: Tensor) -> Tensor:
-    return torch.exp(-0.5 * t * t) / math.sqrt(2 * math.pi)
-
-
-def _normal_loss(t: Tensor) -> Tensor:
-    """``E max(Z - t, 0)`` of a standard normal Z."""
-    return _density(t) - t * 0.5 * torch.erfc(t / math.sqrt(2))

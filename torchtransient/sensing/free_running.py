@@ -14,7 +14,7 @@ import math
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import GradientError, UnitError
@@ -40,6 +40,7 @@ from torchtransient.sensing.dead_time.free_running import (
 )
 from torchtransient.sensing.dead_time.renewal import check_dead_bins, split_dead_time
 from torchtransient.sensing.draws import check_rates
+from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.sensor import VARIANCE_FLOOR, GradPolicy, RandomSensor, record_score
 
 DeadTime = Literal["non_paralyzable", "paralyzable"]
@@ -235,10 +236,7 @@ class FreeRunningSPAD(RandomSensor):
         if kind == "non_paralyzable":
             self._check_dead_time(dead)
         value = torch.tensor(math.log(dead), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("log_dead_time_s", nn.Parameter(value))
-        else:
-            self.register_buffer("log_dead_time_s", value)
+        keep_number(self, "log_dead_time_s", value, learnable)
 
     @property
     def dead_time_s(self) -> Tensor:

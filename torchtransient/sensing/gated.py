@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_number, check_seconds, check_time_axis, numbers_of, reals
 from torchtransient.sensing.itof.correlation import correlate
+from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.responses import normal_integral
 from torchtransient.sensing.sensor import Sensor
 
@@ -139,10 +140,7 @@ class GatedIntegration(Sensor):
             "log_width_s": torch.tensor(widths, dtype=torch.float64).log(),
         }
         for name, value in values.items():
-            if learnable:
-                self.register_parameter(name, nn.Parameter(value))
-            else:
-                self.register_buffer(name, value)
+            keep_number(self, name, value, learnable)
 
     @property
     def delays_s(self) -> Tensor:

@@ -75,6 +75,21 @@ def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
         setattr(module, name, value)
 
 
+def keep_number(module: nn.Module, name: str, value: Tensor, learnable: bool) -> None:
+    """Keep a tensor as a parameter, or as a buffer where it is not learnt.
+
+    Args:
+        module: module that keeps it.
+        name: name of the attribute.
+        value: the tensor.
+        learnable: make it a parameter.
+    """
+    if learnable:
+        module.register_parameter(name, nn.Parameter(value))
+    else:
+        module.register_buffer(name, value)
+
+
 def kept_map(module: nn.Module, name: str, *, high: float = math.inf) -> float | Tensor:
     """Return a number or map that a sensor keeps, in float64, for a measurement.
 

@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.checks import Numbers, several
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_number, check_seconds, going_together, one_number, reals
-from torchtransient.sensing.parameters import remembered
+from torchtransient.sensing.parameters import keep_number, remembered
 from torchtransient.sensing.sensor import PhysicalModule
 
 # --------------------------------------------------------------------------------------------------------- closed forms
@@ -257,10 +257,7 @@ class Response(PhysicalModule):
         self._hold("delay_ps", torch.tensor(delay * 1e12, dtype=torch.float64))
 
     def _hold(self, name: str, value: Tensor) -> None:
-        if self.learnable:
-            self.register_parameter(name, nn.Parameter(value))
-        else:
-            self.register_buffer(name, value)
+        keep_number(self, name, value, self.learnable)
 
     def _hold_log(self, name: str, value_s: float) -> None:
         value = check_seconds(value_s, name, type(self).__name__, open_low=True)

@@ -12,6 +12,7 @@ from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import without_autocast
 from torchtransient.sensing.checks import check_choice, check_count, check_number, check_transient, reals
+from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.responses import FWHM_PER_SIGMA
 from torchtransient.sensing.sensor import Sensor
 
@@ -179,10 +180,7 @@ class LensBlur(Sensor):
         if self.size < 1 or self.size % 2 == 0:
             raise ShapeError(f"LensBlur: expected an odd size, got {size!r}.")
         value = torch.tensor(math.log(fwhm), dtype=torch.float64)
-        if learnable:
-            self.register_parameter("log_fwhm_px", nn.Parameter(value))
-        else:
-            self.register_buffer("log_fwhm_px", value)
+        keep_number(self, "log_fwhm_px", value, learnable)
 
     @property
     def fwhm_px(self) -> Tensor:

@@ -33,7 +33,7 @@ from torchtransient.sensing.checks import (
 from torchtransient.sensing.counts import MovedCounts, Moves, shifted
 from torchtransient.sensing.draws import halve
 from torchtransient.sensing.impulse_response import check_response
-from torchtransient.sensing.parameters import check_map, pixels_of
+from torchtransient.sensing.parameters import check_map, keep_number, pixels_of
 from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response, WithinBin, kernel_of, normal_integral
 from torchtransient.sensing.sensor import GradPolicy, PhysicalModule, RandomSensor, Sensor, gaussian_noise
 from torchtransient.sensing.time_convolution import Boundary, convolve_time, window_lags
@@ -255,10 +255,7 @@ class _Delays(PhysicalModule):
         if delay.numel():
             check_seconds(float(delay.abs().max()), "delay_s", where)
         self.bin_width_s = bin_width_s
-        if learnable:
-            self.register_parameter("delay_ps", nn.Parameter(delay * 1e12))
-        else:
-            self.register_buffer("delay_ps", delay * 1e12)
+        keep_number(self, "delay_ps", delay * 1e12, learnable)
 
     @property
     def delay_s(self) -> Tensor:
