@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,6 @@ from scipy import stats
 
 from torchtransient import sensing
 from torchtransient.errors import GradientError
-from torchtransient.sensing.chain.compose import multinomial_log_prob
 
 PS, WIDTH = 1e-12, 20e-12
 
@@ -164,14 +165,15 @@ def test_gradients_of_what_is_drawn_at_once():
 
 
 def test_log_probability_of_multinomial_counts():
-    p = torch.tensor([0.2, 0.0, 0.3], dtype=torch.float64).view(-1, 1, 1).requires_grad_()
-    n = torch.tensor([3.0, 0.0, 5.0], dtype=torch.float64).view(-1, 1, 1)
-    value = multinomial_log_prob(n, p, 12)
+    """First photons that a converter moves nowhere: shares 0.2, 0 and 0.3 of twelve cycles."""
+    chain = sensing.Compose([sensing.SynchronousSPAD(12), sensing.TDC(torch.ones(3))])
+    x = column([-math.log(0.8), 0.0, math.log(0.8 / 0.5)]).requires_grad_()
+    value = chain.log_prob(column([3, 0, 5]), x)
     exact = stats.multinomial(12, [0.2, 0.0, 0.3, 0.5]).logpmf([3, 0, 5, 4])
-    assert float(value) == pytest.approx(float(exact), rel=1e-12)
+    assert float(value.detach()) == pytest.approx(float(exact), rel=1e-12)
     value.sum().backward()
-    assert bool(torch.isfinite(p.grad).all())
-    assert float(multinomial_log_prob(n + 1, p, 12)) == -float("inf")
+    assert bool(torch.isfinite(x.grad).all())
+    assert float(chain.log_prob(column([4, 1, 6]), x)) == -float("inf")
 
 
 def test_likelihood_of_a_chain():

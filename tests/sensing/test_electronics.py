@@ -10,7 +10,6 @@ import torch
 from torchtransient import sensing
 from torchtransient.errors import UnitError
 from torchtransient.sensing import PixelElectronics, ScoreFunction, fixed_pattern, ktc_noise
-from torchtransient.sensing.electronics import clipped_normal_mean, clipped_normal_variance
 
 COUNT = 200_000
 
@@ -31,25 +30,18 @@ def test_ktc_noise():
 
 @pytest.mark.parametrize("m", [-4.0, 0.0, 3.0, 9.0, 14.0, 40.0])
 def test_clipped_normal(m):
-    """Against quadrature over the density."""
-    v, low, high = 4.0, 1.0, 10.0
+    """A charge with read noise of 2 electrons in a converter from 0 to 15, against quadrature over the density."""
     x = torch.linspace(-12, 12, 400_001, dtype=torch.float64)
     p = torch.exp(-0.5 * x * x)
-    p = p / p.sum()
-    scale = math.sqrt(v + 1e-4)
-    values = (m + scale * x).clamp(low, high)
-    mean, variance = torch.tensor(m, dtype=torch.float64), torch.tensor(v, dtype=torch.float64)
-    assert abs(float(clipped_normal_mean(mean, variance, low, high)) - float((values * p).sum())) < 1e-9
-    upper = (m + 2.0 * x).clamp_max(high)
-    exact = float((upper**2 * p).sum() - (upper * p).sum() ** 2)
-    assert abs(float(clipped_normal_variance(mean, variance, high)) - exact) < 1e-3
+    values = (m + math.sqrt(4 + 1e-4) * x).clamp(0, 15)
+    pixel = PixelElectronics(shot_noise=False, read_noise_e=2.0, gain_e_per_dn=1.0, bits=4)
+    assert float(pixel.expected(light(m))) == pytest.approx(float((values * p).sum() / p.sum()), abs=1e-9)
 
 
-def test_clipped_normal_has_gradients():
-    m = torch.tensor([-3.0, 0.0, 9.9, 30.0], dtype=torch.float64, requires_grad=True)
-    v = torch.tensor([1.0, 2.0, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_mean(m, v, 0.0, 10.0), (m, v))
-    assert torch.autograd.gradcheck(lambda m, v: clipped_normal_variance(m, v, 10.0), (m, v))
+def test_means_have_gradients_at_every_limit():
+    pixel = PixelElectronics(full_well_e=12.0, read_noise_e=1.5, excess_noise=1.2, gain_e_per_dn=0.5, bits=4)
+    assert torch.autograd.gradcheck(pixel.expected, light(0.3, 7.4, 9.9, 11.9, 30.0).requires_grad_())
+    assert torch.autograd.gradcheck(pixel.variance, light(0.3, 7.4, 9.9, 11.9, 30.0).requires_grad_())
 
 
 @pytest.mark.parametrize(

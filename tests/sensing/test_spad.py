@@ -12,7 +12,6 @@ from scipy import stats
 
 from torchtransient import sensing
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.draws import sample_first_photons, sample_multinomial
 
 BINS = 48
 
@@ -47,27 +46,29 @@ def test_gaussian_surrogate_has_the_covariance_of_the_multinomial():
 
 
 def test_multinomial_of_many_trials():
-    """1e8 trials and odd numbers of bins; totals never exceed the trials."""
-    p = torch.tensor([0.5, 0.25, 0.0, 0.2, 0.05], dtype=torch.float64).view(1, 5, 1, 1).expand(1, 5, 40, 40)
-    h = sample_multinomial(10**8, p, torch.Generator().manual_seed(0))
-    assert torch.equal(h.sum(1), torch.full((1, 40, 40), 1e8, dtype=torch.float64))
-    z = (h - 1e8 * p) / (1e8 * p * (1 - p)).clamp_min(1).sqrt()
-    assert float(z.abs().max()) < 5.5
-    assert float(h[:, 2].max()) == 0
-    single = sample_multinomial(10**8, p.float(), torch.Generator().manual_seed(0))
-    assert single.dtype == torch.float32
+    """1e8 cycles and odd numbers of bins, first photons alone and moved; totals never exceed the cycles."""
+    rate = torch.tensor([0.7, 0.6, 0.0, 1.5, 0.3], dtype=torch.float64).view(1, 5, 1, 1).expand(1, 5, 40, 40)
+    spad = sensing.SynchronousSPAD(10**8)
+    p = spad.probabilities(rate)
+    for sensor in (spad, sensing.Compose([spad, sensing.TDC(torch.ones(5))])):
+        h = sensor.sample(rate, torch.Generator().manual_seed(0))
+        z = (h - 1e8 * p) / (1e8 * p * (1 - p)).clamp_min(1).sqrt()
+        assert float(z.abs().max()) < 5.5
+        assert float(h[:, 2].max()) == 0 and float(h.sum(1).max()) <= 1e8
+        assert sensor.sample(rate.float(), torch.Generator().manual_seed(0)).dtype == torch.float32
 
 
 @pytest.mark.parametrize("bins", [1, 5, 97])
 def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
     """Chi-square over bins and "none", for weak light, strong light and a flood, without any running sum."""
     g, cycles = torch.Generator().manual_seed(4), 200
+    spad = sensing.SynchronousSPAD(cycles)
     shape = torch.rand(1, bins, 1, 1, dtype=torch.float64, generator=g) ** 4
     # large images by a tree of bins, few counts each by itself
     for total, side in itertools.product((0.01, 1.0, 6.0, 80.0), (60, 5)):
         rate = (total * shape / shape.sum()).expand(1, bins, side, side)
         p, none = sensing.first_photon_probabilities(rate[..., :1, :1])
-        seen = sample_first_photons(cycles, rate, g).sum((-2, -1)).flatten()
+        seen = spad.sample(rate, g).sum((-2, -1)).flatten()
         trials = side**2 * cycles
         expected = trials * torch.cat([p.flatten(), none.flatten()])
         seen = torch.cat([seen, trials - seen.sum(0, keepdim=True)])
@@ -77,7 +78,7 @@ def test_first_photons_are_the_multinomial_of_their_probabilities(bins):
         dof = int(often.sum()) - 1
         if dof > 0:
             assert chi2 < stats.chi2.isf(1e-7, dof), f"{total} photons: chi2/dof = {chi2 / dof:.2f}"
-    dark = sample_first_photons(cycles, torch.zeros(1, bins, 4, 4), g)
+    dark = spad.sample(torch.zeros(1, bins, 4, 4), g)
     assert float(dark.sum()) == 0
 
 
