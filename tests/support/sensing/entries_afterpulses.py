@@ -41,21 +41,9 @@ ENTRIES = [
         lambda **k: several(period_s=600 * PS, background=torch.linspace(0.0, 0.5, 6).view(2, 3), **k),
         random=True,
     ),
-    Entry(
-        "Afterpulsing-power-law",
-        power_law,
-        random=True,
-    ),
-    Entry(
-        "Afterpulsing-measured",
-        measured,
-        random=True,
-    ),
-    Entry(
-        "AfterpulsingSPAD",
-        obeyed(lambda: sensing.SynchronousSPAD(500)),
-        random=True,
-    ),
+    Entry("Afterpulsing-power-law", power_law, random=True),
+    Entry("Afterpulsing-measured", measured, random=True),
+    Entry("AfterpulsingSPAD", obeyed(lambda: sensing.SynchronousSPAD(500)), random=True),
     Entry(
         "AfterpulsingSPAD-dead-time",
         obeyed(lambda: sensing.SynchronousSPAD(500, dead_time_s=70 * PS, **WIDTH)),
@@ -67,4 +55,4 @@ ENTRIES = [
         shape=(2, 1, 8, 1, 2),
         random=True,
     ),
-]  # fmt: skip
+]

@@ -26,9 +26,17 @@ def two_tap_camera():
 
 def pixel_electronics(grad="expected"):
     return sensing.PixelElectronics(
-        full_well_e=1e4, read_noise_e=3.0, ktc_noise_e=2.0, excess_noise=1.2, gain_e_per_dn=0.5, bits=14,
-        black_level_dn=100.0, offset_map_e=torch.tensor(0.25), gain_map=torch.tensor(1.1), grad=grad,
-    )  # fmt: skip
+        full_well_e=1e4,
+        read_noise_e=3.0,
+        ktc_noise_e=2.0,
+        excess_noise=1.2,
+        gain_e_per_dn=0.5,
+        bits=14,
+        black_level_dn=100.0,
+        offset_map_e=torch.tensor(0.25),
+        gain_map=torch.tensor(1.1),
+        grad=grad,
+    )
 
 
 def chain(grad=None):
@@ -70,11 +78,7 @@ def stokes_like(shape, seed):
 
 
 ENTRIES: list[Entry] = [
-    Entry(
-        "ItofCorrelation",
-        itof_correlation,
-        conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
-    ),
+    Entry("ItofCorrelation", itof_correlation, conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1)),
     Entry("ItofCorrelation-two-tap", two_tap_camera, conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1)),
     Entry(
         "ItofCorrelation-map",
@@ -96,15 +100,8 @@ ENTRIES: list[Entry] = [
         ),
         conserves=lambda y: y.sum() / (2 if y.shape[-3] == 8 else 1),
     ),
-    Entry(
-        "TapDifference",
-        sensing.TapDifference,
-    ),
-    Entry(
-        "PixelElectronics",
-        pixel_electronics,
-        random=True,
-    ),
+    Entry("TapDifference", sensing.TapDifference),
+    Entry("PixelElectronics", pixel_electronics, random=True),
     Entry("Compose", chain, random=True),
     Entry("Compose-differences", differences, random=True),
     Entry("StreakCamera", streak, random=True),

@@ -43,9 +43,7 @@ ENTRIES = [
     Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
     Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
     Entry(
-        "ImpulseResponse-composed",
-        impulse(composed, boundary="periodic", method="fft"),
-        conserves=lambda y: y.sum(-3),
+        "ImpulseResponse-composed", impulse(composed, boundary="periodic", method="fft"), conserves=lambda y: y.sum(-3)
     ),
     Entry(
         "LensBlur",
@@ -94,11 +92,7 @@ ENTRIES = [
         lambda **k: sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, bin_width_s=20 * PS, learnable=True, **k),
         random=True,
     ),
-    Entry(
-        "Crosstalk",
-        lambda **k: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True, **k),
-        random=True,
-    ),
+    Entry("Crosstalk", lambda **k: sensing.Crosstalk(0.05, diagonal_ratio=0.3, learnable=True, **k), random=True),
     Entry(
         "TDC",
         lambda **k: sensing.TDC(sensing.random_code_widths(12, 0.2, torch.Generator().manual_seed(0)), **k),
@@ -119,19 +113,9 @@ ENTRIES = [
     Entry("TDC-rates", lambda: sensing.TDC(torch.ones(12), dither=True, acts_on="rates", boundary="zero")),
     Entry("DetectionJitter", jitter(tails), input=whole_counts, conserves=lambda y: y.sum(-3), random=True),
     Entry("DetectionJitter-zero", jitter(measured, boundary="zero"), input=whole_counts, random=True),
-    Entry(
-        "DetectionJitter-composed",
-        jitter(composed, within_bin="center"),
-        input=whole_counts,
-        random=True,
-    ),
+    Entry("DetectionJitter-composed", jitter(composed, within_bin="center"), input=whole_counts, random=True),
     Entry("BinaryFrames", lambda **k: sensing.BinaryFrames(50, **k), random=True),
     Entry("EquiDepthHistogram", lambda: sensing.EquiDepthHistogram(5)),
     Entry("CodedHistogram", lambda: sensing.CodedHistogram(sensing.fourier_codes(12, 4), learnable=True)),
-    Entry(
-        "ShotNoise",
-        sensing.ShotNoise,
-        random=True,
-        conserves=lambda y: y.sum(),
-    ),
+    Entry("ShotNoise", sensing.ShotNoise, random=True, conserves=lambda y: y.sum()),
 ]

@@ -19,9 +19,14 @@ def budget(learnt=False, **changes):
         "dark_count_rate_hz": 1e8 * MAP.unsqueeze(0),
     }
     return sensing.PhotonBudget(
-        sensing.Optics(f_number=2.0), pulse_energy_j=1e-9, wavelength_m=532e-9, repetition_rate_hz=1e7, cycles=1000,
-        bin_width_s=20 * PS, **arguments | changes,
-    )  # fmt: skip
+        sensing.Optics(f_number=2.0),
+        pulse_energy_j=1e-9,
+        wavelength_m=532e-9,
+        repetition_rate_hz=1e7,
+        cycles=1000,
+        bin_width_s=20 * PS,
+        **arguments | changes,
+    )
 
 
 def whole_counts(shape, seed=0):
@@ -48,20 +53,11 @@ def dead_times(**keywords):
 
 
 ENTRIES = [
-    Entry(
-        "PhotonBudget-maps",
-        budget,
-    ),
+    Entry("PhotonBudget-maps", budget),
     Entry("PhotonBudget-learnt", lambda: budget(learnt=True)),
     Entry("PixelSkew", skew(sensing.PixelSkew), conserves=lambda y: y.sum(-3)),
     Entry("PixelSkew-zero", skew(sensing.PixelSkew, boundary="zero")),
-    Entry(
-        "DetectionSkew",
-        skew(sensing.DetectionSkew),
-        conserves=lambda y: y.sum(-3),
-        input=whole_counts,
-        random=True,
-    ),
+    Entry("DetectionSkew", skew(sensing.DetectionSkew), conserves=lambda y: y.sum(-3), input=whole_counts, random=True),
     Entry("MacroPixel", lambda **k: sensing.MacroPixel(sensing.SynchronousSPAD(50), 9, **k), random=True),
     Entry(
         "MacroPixel-weights",
@@ -71,15 +67,13 @@ ENTRIES = [
         random=True,
     ),
     Entry(
-        "MacroPixel-free",
-        lambda **k: sensing.MacroPixel(paralyzable(100), 4, **k),
-        shape=(2, 1, 8, 1, 2),
-        random=True,
+        "MacroPixel-free", lambda **k: sensing.MacroPixel(paralyzable(100), 4, **k), shape=(2, 1, 8, 1, 2), random=True
     ),
     Entry(
         "CoincidencePixel",
-        lambda **k: sensing.CoincidencePixel(sensing.SynchronousSPAD(60), 6, coincidence=2, window_s=50 * PS,
-            bin_width_s=20 * PS, **k),
+        lambda **k: sensing.CoincidencePixel(
+            sensing.SynchronousSPAD(60), 6, coincidence=2, window_s=50 * PS, bin_width_s=20 * PS, **k
+        ),
         shape=(2, 1, 8, 1, 2),
         random=True,
     ),
@@ -91,14 +85,6 @@ ENTRIES = [
         shape=(2, 1, 8, 1, 2),
         random=True,
     ),
-    Entry(
-        "PixelGroups",
-        dead_times,
-        random=True,
-    ),
-    Entry(
-        "ZoneSum",
-        lambda: sensing.ZoneSum(2, 3),
-        conserves=lambda y: y.sum((-1, -2)),
-    ),
-]  # fmt: skip
+    Entry("PixelGroups", dead_times, random=True),
+    Entry("ZoneSum", lambda: sensing.ZoneSum(2, 3), conserves=lambda y: y.sum((-1, -2))),
+]

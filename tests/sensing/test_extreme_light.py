@@ -1,4 +1,4 @@
-"""What the first users of the sensors met: broken numbers, extreme light, states that travel, losses on batches."""
+"""Broken numbers, extreme light, states that travel, and half precision."""
 
 from __future__ import annotations
 
