@@ -215,7 +215,7 @@ def test_generator_reproduces(entry, policy):
         assert all(torch.equal(a, b) for a, b in zip(first, parts(module(x)), strict=True))
 
 
-# a train of detections takes long to draw; test_bright_light and test_several_hits hold its means to events
+# a train of detections takes long to draw; files of its own hold its means to events
 TRAINS = ("FreeRunningSPAD", "AfterpulsingSPAD-dead-time")
 
 
