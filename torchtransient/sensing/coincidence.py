@@ -27,7 +27,7 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.checks import (
     TIME,
-    bin_width_of,
+    bins_from,
     check_count,
     check_generator,
     check_seconds,
@@ -35,7 +35,7 @@ from torchtransient.sensing.checks import (
     check_transient,
 )
 from torchtransient.sensing.dead_time.clocked import highest_level
-from torchtransient.sensing.dead_time.clocked_counts import safe_xlogy
+from torchtransient.sensing.dead_time.clocked_counts import binomial_log_prob, safe_xlogy
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.macro_pixel import checked_detector, groups_of
@@ -369,9 +369,8 @@ class CoincidencePixel(RandomSensor):
         self.coincidence = check_count(coincidence, "coincidence", where)
         if self.coincidence > sum(number for _, number in self.groups):
             raise UnitError(f"{where}: expected a coincidence of at most {spads} SPADs with light, got {coincidence}.")
-        self.bin_width_s = bin_width_of(axis, bin_width_s, where)
-        given = None if axis is None else axis.num_bins
-        self.num_bins = common_bins([detector], where, (self.bin_width_s, given))[1]
+        own = bins_from(axis, bin_width_s, where)
+        self.bin_width_s, self.num_bins = own[0], common_bins([detector], where, own)[1]
         self.window_s = check_seconds(window_s, "window_s", where, open_low=True)
         self.periodic = isinstance(self._inner, FreeRunningSPAD)
         self._check_dead_time()
@@ -583,11 +582,8 @@ class CoincidencePixel(RandomSensor):
             measurement: counts (..., C, T, H, W).
             x: rate of the pixel per cycle and bin, (..., C, T, H, W).
         """
-        p, n = self.probabilities(x.double()).clamp_max(1), measurement.double()
-        quiet = self.cycles - n
-        value = safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p)
-        ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
-        return (value + ways).sum(TIME).to(x.dtype)
+        p = self.probabilities(x.double()).clamp_max(1)
+        return binomial_log_prob(measurement.double(), self.cycles, p).sum(TIME).to(x.dtype)
 
 
 def _binomials(q: Tensor, number: int, most: int) -> list[Tensor]:

@@ -93,7 +93,7 @@ class MeasuredResponse(Response):
 
     def cdf(self, time_s: Tensor) -> Tensor:
         shares = self._shares()
-        return _below(shares, self.bin_width_s, self._start_s(shares), time_s)
+        return counts_before(shares, self.bin_width_s, self._start_s(shares), time_s)
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
         shares = self._shares()
@@ -156,7 +156,7 @@ class ComposedResponse(Response):
         found = self._normal_part()
         if found is None:
             shares, width_s, start_s = self._table()
-            return _below(shares, width_s, start_s, time_s)
+            return counts_before(shares, width_s, start_s, time_s)
         tailed, delay, sigma = found
         return normal_cdf((time_s - delay) / sigma) if tailed is None else tailed.widened_cdf(time_s, delay, sigma)
 
@@ -167,7 +167,7 @@ class ComposedResponse(Response):
         if found is None:
             shares, width_s, start_s = self._table()
             # seen from its end, the response runs the other way
-            return _below(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
+            return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
         tailed, delay, sigma = found
         if tailed is None:
             return normal_cdf((delay - time_s) / sigma)
@@ -216,12 +216,19 @@ class ComposedResponse(Response):
         return coarse, shares / shares.sum()
 
 
-def _below(shares: Tensor, width_s: float, start_s: float | Tensor, time_s: Tensor) -> Tensor:
-    """Sum of a histogram before each time, even within its bins."""
+def counts_before(counts: Tensor, bin_width_s: float, start_s: float | Tensor, time_s: Tensor) -> Tensor:
+    """Sum of a histogram before each time, even within its bins.
+
+    Args:
+        counts: (T,).
+        bin_width_s: width of the bins.
+        start_s: where the first bin begins.
+        time_s: any shape, which the result has.
+    """
     # from before the first bin to each time, as one running sum
-    start = torch.as_tensor(start_s - width_s, dtype=torch.float64, device=time_s.device)
+    start = torch.as_tensor(start_s - bin_width_s, dtype=torch.float64, device=time_s.device)
     edges = torch.cat([start.reshape(1), time_s.reshape(-1)])
-    return resample_counts(shares, width_s, edges, start_s=start_s).cumsum(0).reshape(time_s.shape)
+    return resample_counts(counts, bin_width_s, edges, start_s=start_s).cumsum(0).reshape(time_s.shape)
 
 
 def _gathered(fine_shares: Tensor, before: int, fine: int, bins: int) -> Tensor:

@@ -23,7 +23,9 @@ from torchtransient.axes import TimeAxis
 from torchtransient.checks import function
 from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
 from torchtransient.sensing.checks import TIME, check_count, check_dense, check_time_axis, no_arrays
-from torchtransient.sensing.responses import Response, resample_counts
+from torchtransient.sensing.composed_responses import counts_before
+from torchtransient.sensing.impulse_response import check_response
+from torchtransient.sensing.responses import Response
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -81,7 +83,7 @@ def return_rates(
         UnitError: for negative numbers.
     """
     where = "return_rates"
-    _check_response(response, where)
+    check_response(response, where)
     check_time_axis(axis, where)
     distance, light, dark = _pixels((distance_m, signal, background), response, where)
     return light.unsqueeze(-1) * _shares(response, axis, distance) + dark.unsqueeze(-1)
@@ -123,7 +125,7 @@ def crlb(
         DeviceError: for tensors on another device than the response.
     """
     where = "crlb"
-    _check_response(response, where)
+    check_response(response, where)
     check_time_axis(axis, where)
     names = _check_unknown(unknown, where)
     number = None if cycles is None else check_count(cycles, "cycles", where)
@@ -140,7 +142,7 @@ def crlb(
         weights = number * torch.exp(-before - rates) / -torch.expm1(-rates)
     dtype = _floating((distance_m, signal, background))
     covariance = _inverse(torch.einsum("...ti,...t,...tj->...ij", each, weights, each))
-    deviations = _deviations(covariance)
+    deviations = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     found = {name: deviations[..., i].to(dtype) for i, name in enumerate(names)}
     return CramerRaoBound(
         distance_m=found["distance"],
@@ -233,22 +235,15 @@ def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> T
         (..., K).
     """
     if type(response).cdf is Response.cdf:
-        found = _by_kernel(response, bin_width_s / _FINE, edges_s)
+        width = bin_width_s / _FINE
+        first, kernel = response.kernel(width)
+        found = counts_before(kernel, width, (first - 0.5) * width, edges_s).diff(dim=-1)
     else:
         below, above = response.cdf(edges_s), response.survival(edges_s)
         # differences of what is small: tails keep their relative precision
         late = (below > 0.5)[..., :-1]
         found = torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
     return found.clamp_min(0)  # rounding
-
-
-def _by_kernel(response: Response, width_s: float, edges_s: Tensor) -> Tensor:
-    """Shares between edges of a response without a distribution function, from its kernel in fine bins."""
-    first, kernel = response.kernel(width_s)
-    start = (first - 0.5) * width_s
-    flat = torch.cat([edges_s.new_full((1,), start - width_s), edges_s.reshape(-1)])
-    below = resample_counts(kernel, width_s, flat, start_s=start).cumsum(0).reshape(edges_s.shape)
-    return below.diff(dim=-1)
 
 
 def _inverse(information: Tensor) -> Tensor:
@@ -268,10 +263,6 @@ def _inverse(information: Tensor) -> Tensor:
     inverse = inverse / size.unsqueeze(-1) / size.unsqueeze(-2)
     without = torch.diag_embed((~known | ~told.unsqueeze(-1)).to(own)) > 0
     return torch.where(without, torch.inf, inverse)
-
-
-def _deviations(covariance: Tensor) -> Tensor:
-    return covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
 def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) -> tuple[Tensor, ...]:
@@ -312,14 +303,6 @@ def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:
     if not dtypes:
         return torch.get_default_dtype()
     return torch.float64 if torch.float64 in dtypes else torch.float32
-
-
-def _check_response(response: object, where: str) -> None:
-    if not isinstance(response, Response):
-        raise ArgumentError(
-            f"{where}: expected a response such as GaussianResponse first, got {type(response).__name__}. A measured "
-            "histogram goes into MeasuredResponse(counts, bin_width_s)."
-        )
 
 
 def _check_unknown(unknown: Sequence[str], where: str) -> list[str]:

@@ -31,7 +31,7 @@ from torchtransient.sensing.checks import (
     one_number,
     reals,
 )
-from torchtransient.sensing.dead_time.clocked_counts import StepCounts, draw_steps, safe_xlogy, steps_log_prob
+from torchtransient.sensing.dead_time.clocked_counts import StepCounts, binomial_log_prob, draw_steps, steps_log_prob
 from torchtransient.sensing.dead_time.free_running import (
     FreeRunningState,
     sample_trains,
@@ -317,10 +317,8 @@ class FreeRunningSPAD(RandomSensor):
                 "FreeRunningSPAD.log_prob: expected kind 'paralyzable'; a histogram does not tell which detectors were "
                 "dead when the period began. Use grad='score', which scores the draws themselves."
             )
-        p, n = self.probabilities(x.double()), measurement.double()
-        quiet = self.cycles - n
-        ways = math.lgamma(self.cycles + 1) - torch.lgamma(n + 1) - torch.lgamma(quiet + 1)
-        return (safe_xlogy(n, p) + safe_xlogy(quiet, 1 - p) + ways).sum(TIME)
+        p = self.probabilities(x.double())
+        return binomial_log_prob(measurement.double(), self.cycles, p).sum(TIME)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.kind == "paralyzable":

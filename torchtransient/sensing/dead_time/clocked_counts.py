@@ -12,6 +12,7 @@ are corrected by the difference of that mean to the mean of cut bins.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -209,6 +210,19 @@ def safe_xlogy(count: Tensor, chance: Tensor) -> Tensor:
         chance: of a shape that broadcasts.
     """
     return count * torch.log(torch.where(count != 0, chance, 1.0))
+
+
+def binomial_log_prob(count: Tensor, trials: int, chance: Tensor) -> Tensor:
+    """Log-probability of counts out of a number of trials.
+
+    Args:
+        count: float64, any shape.
+        trials: number of trials.
+        chance: of the same shape.
+    """
+    quiet = trials - count
+    ways = math.lgamma(trials + 1) - torch.lgamma(count + 1) - torch.lgamma(quiet + 1)
+    return safe_xlogy(count, chance) + safe_xlogy(quiet, 1 - chance) + ways
 
 
 def steps_log_prob(path: StepCounts, chances: StepProbabilities, periods: int) -> Tensor:
