@@ -32,15 +32,6 @@ def test_phasors_are_the_sum_of_oscillations():
     torch.testing.assert_close(found[:, :, 0].real, record.sum(2))
 
 
-def test_phasors_of_exhaustive_captures_and_of_points():
-    record = torch.rand(1, 64, 2, 2, 3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    found = losses.transient_phasors(record, AXIS, BAND, dim=-5)
-    assert found.shape == (1, 4, 2, 2, 3, 2)
-    torch.testing.assert_close(found, losses.transient_phasors(record.reshape(1, 64, 4, 6), AXIS, BAND).view_as(found))
-    points = losses.transient_phasors(record.reshape(1, 64, 24), AXIS, BAND, dim=1)
-    torch.testing.assert_close(points, found.reshape(1, 4, 24))
-
-
 def test_phases_keep_their_digits_far_away():
     """At 1 km a float32 length is 6e-5 m off, which is 0.4 rad at 1 cm."""
     far, band = TimeAxis(1000.0, 0.002, 64), FrequencyAxis((100.0, 97.3))
@@ -113,15 +104,12 @@ def test_a_window_of_time_by_a_mask():
 def test_frequencies_above_half_of_one_over_the_bin(sign):
     """10 per metre for bins of 5 cm: above, records of whole bins have the phasors of lower frequencies."""
     record = pulse(3, 20)
-    calls = [
+    for call in (
         lambda band: losses.transient_phasors(record, AXIS, band),
         lambda band: losses.transient_phasor_loss(record, record, axis=AXIS, frequencies=band),
-        lambda band: losses.TransientPhasorLoss(AXIS, band)(record, record),
-    ]
-    for call in calls:
-        for frequency in (10.001, 20.5, 1e6):
-            with pytest.raises(UnitError, match="two bins at least, frequencies of 10 per metre"):
-                call(FrequencyAxis((1.0, sign * frequency)))
+    ):
+        with pytest.raises(UnitError, match="two bins at least, frequencies of 10 per metre"):
+            call(FrequencyAxis((1.0, sign * 10.001)))
         call(FrequencyAxis((sign * 10.0,)))
     # of a discrete transform, however it is computed
     for bins, width in ((64, 0.05), (30, 0.1), (7, 0.3), (1000, 0.0299792458 / 3)):
@@ -141,13 +129,5 @@ def test_errors():
         losses.transient_phasors(torch.zeros(1, 60, 2, 2), AXIS, BAND)
     with pytest.raises(ArgumentError, match="TimeAxis and a FrequencyAxis"):
         losses.transient_phasors(torch.zeros(1, 64, 2, 2), AXIS, [1.0])
-    with pytest.raises(ShapeError, match="dim="):
-        losses.transient_phasors(torch.zeros(64, 2), AXIS, BAND)
     with pytest.raises(UnitError, match="complex phasors"):
         losses.phasor_loss(torch.zeros(3), torch.zeros(3))
-    with pytest.raises(UnitError, match="greater than zero"):
-        losses.phasor_loss(torch.zeros(3) + 0j, torch.zeros(3) + 0j, phase_only=True, floor=0.0)
-    with pytest.raises(UnitError, match="real numbers"):
-        losses.transient_phasor_loss(
-            torch.zeros(1, 64, 1, 1) + 0j, torch.zeros(1, 64, 1, 1) + 0j, axis=AXIS, frequencies=BAND
-        )

@@ -1,4 +1,4 @@
-"""Losses of results: renders, captures and what methods found, by their attributes, in place of tensors."""
+"""Losses of results in place of tensors: renders, captures, reconstructions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
-    **dict.fromkeys((losses.phasor_loss,), "phasor"),
+    losses.phasor_loss: "phasor",
     **dict.fromkeys((losses.depth_loss, losses.scale_invariant_depth_loss), "depth_m"),
     losses.ssim_loss: "steady",
     **dict.fromkeys((losses.projection_ssim_loss, losses.total_variation), "values"),
@@ -120,8 +120,6 @@ def test_results_on_two_axes(case):
     with pytest.raises(UnitError, match="results on one axis") as caught:
         bare(case)(a, result(y, axis=other))
     assert str(caught.value).startswith(case.function.__name__ + ":")
-    rounded = TimeAxis(AXIS.start_opl * (1 + 1e-9), AXIS.bin_width_opl * (1 + 1e-9), BINS)
-    assert bool(torch.isfinite(bare(case)(a, result(y, axis=rounded))))
 
 
 def test_rates_and_beats_of_a_film():
@@ -164,16 +162,6 @@ def test_distances_between_results_over_rates():
     torch.testing.assert_close(found, losses.wasserstein_loss(*beats, AXIS.bin_width_opl))
 
 
-def test_frequencies_are_an_axis():
-    x = torch.randn(1, 5, 2, 2, dtype=torch.complex64)
-    bands = BAND, dataclasses.replace(BAND, start_opl=3)
-    one, other = (result(x, "phasor", None, frequencies=band) for band in bands)
-    assert float(losses.phasor_loss(one, one)) == 0
-    for loss in (losses.phasor_loss, losses.squared_loss):
-        with pytest.raises(UnitError, match="one axis"):
-            loss(one, other)
-
-
 def test_where_time_is_comes_from_the_scan():
     """An exhaustive capture and a list, which ask for `dim` as tensors."""
     exhaustive, points = torch.rand(2, BINS, 2, 2, 3, 3), torch.rand(2, BINS, 7)
@@ -196,9 +184,8 @@ def test_what_is_given_counts_more_than_what_a_result_knows():
     found = losses.cumulative_loss(result(x), result(y), 1.0)
     torch.testing.assert_close(found, losses.cumulative_loss(x, y, 1.0))
     torch.testing.assert_close(losses.cumulative_loss(result(x), y), losses.cumulative_loss(x, y, 0.05))
-    for loss in (losses.cumulative_loss, losses.wasserstein_loss):
-        with pytest.raises(UnitError, match="bin_width_opl, metres of optical path, with tensors"):
-            loss(x, y)
+    with pytest.raises(UnitError, match="bin_width_opl"):
+        losses.cumulative_loss(x, y)
     with pytest.raises(ArgumentError, match="expected a TimeAxis"):
         losses.transient_phasor_loss(x, y, frequencies=BAND)
     torch.testing.assert_close(
@@ -219,10 +206,9 @@ def test_a_capture_with_transient_and_phasor_beside_a_phasor():
 
 
 def test_renders_of_the_library():
-    """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
+    """A rendered result, a `Capture` and an `ItofReading`; volumes are tested with the total variation."""
     from torchtransient.capture import Capture, Scan, Wall
     from torchtransient.files import Result
-    from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
     from torchtransient.sensing import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)
@@ -234,58 +220,42 @@ def test_renders_of_the_library():
     phase, amplitude, offset, deviation = torch.rand(4, 1, 2, 3, 3)
     reading = ItofReading(phase, amplitude, offset=offset, depth_std_m=deviation, depth_m=torch.rand(1, 3, 3))
     torch.testing.assert_close(losses.depth_loss(reading, reading.depth_m + 1), torch.tensor(1.0))
-    grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 1.5]], (4, 3, 5))
-    volume = HiddenVolume(torch.rand(1, 5, 3, 4), grid, "f-k migration")
-    wanted = losses.total_variation(volume.values, spacing=(0.2, 2 / 3, 0.5))
-    torch.testing.assert_close(losses.total_variation(volume), wanted)
-    uneven = dataclasses.replace(grid, depths=grid.depths**2)
-    with pytest.raises(ShapeError, match="evenly spaced planes"):
-        losses.total_variation(dataclasses.replace(volume, grid=uneven))
     torch.testing.assert_close(
         functools.partial(losses.ssim_loss, window=3)(rendered, rendered.steady), torch.tensor(0.0)
     )
 
 
-def phasors(frequencies, start):
-    axis = FrequencyAxis(frequencies, start)
-    return SimpleNamespace(
-        transient=None, gated=None, steady=None, axis=None, frequencies=axis, phasor=torch.ones(1, 2, 2, 2) + 0j
-    )
-
-
-@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
-def test_starts_of_frequency_axes_are_told_apart_by_phase(frequencies, shift, one):
-    """What a start turns is the start times the highest frequency, in cycles."""
-    a, b = phasors(frequencies, 1.0), phasors(frequencies, 1.0 + shift)
-    if one:
-        assert losses.phasor_loss(a, b).item() == 0
-        return
-    with pytest.raises(UnitError, match="one axis"):
-        losses.phasor_loss(a, b)
-
-
 @pytest.mark.parametrize(
     ("other", "one"),
     [
-        (TimeAxis(1.0, 0.1, 10), True),
         (TimeAxis(1.00005, 0.1, 10), True),
         (TimeAxis(1.0, 0.101, 10), False),  # ends later
         (TimeAxis(0.99, 0.101, 10), False),  # begins sooner, ends alike
-        (TimeAxis(1.01, 0.1, 10), False),
         (TimeAxis(1.0005, 0.1, 10), False),
-        (TimeAxis(1.0, 0.1, 11), False),
         (TimeAxis(1.0, 1.0 / 11, 11), False),  # as long, in other bins
     ],
 )
-def test_axes_that_are_one(other, one):
+def test_time_axes_that_are_one(other, one):
     """Start, end and number of bins, each to a thousandth of a bin."""
-    cubes = [torch.rand(1, axis.num_bins, 2, 2) for axis in (TimeAxis(1.0, 0.1, 10), other)]
-    a, b = (
-        SimpleNamespace(transient=cube, phasor=None, gated=None, steady=None, frequencies=None, gates=None, axis=axis)
-        for cube, axis in zip(cubes, (TimeAxis(1.0, 0.1, 10), other), strict=True)
-    )
+    axis = TimeAxis(1.0, 0.1, 10)
+    a, b = (result(torch.rand(1, each.num_bins, 2, 2), axis=each) for each in (axis, other))
     if one:
         assert losses.wasserstein_loss(a, b).item() > 0
     else:
         with pytest.raises((UnitError, ShapeError), match=r"one axis|shape"):
             losses.wasserstein_loss(a, b)
+
+
+@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
+def test_frequency_axes_that_are_one(frequencies, shift, one):
+    """Two starts differ by the phase that they turn, the start times the highest frequency in cycles."""
+    x = torch.ones(1, 2, 2, 2) + 0j
+    a, b = (
+        result(x, "phasor", None, frequencies=FrequencyAxis(frequencies, start)) for start in (1.0, 1.0 + shift)
+    )
+    if one:
+        assert losses.phasor_loss(a, b).item() == 0
+        return
+    for loss in (losses.phasor_loss, losses.squared_loss):
+        with pytest.raises(UnitError, match="one axis"):
+            loss(a, b)

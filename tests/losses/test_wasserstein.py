@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 
 import pytest
 import torch
 from scipy import stats
 
-from torchtransient import RateAxis, losses
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient import losses
 
 WIDTH = 0.03
 
@@ -27,8 +25,7 @@ def draw(bins, seed):
     return torch.rand(1, bins, 2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("shift", [0, 1, 17, 39])
-@pytest.mark.parametrize("height", [1e-20, 1.0, 3e8])
+@pytest.mark.parametrize(("shift", "height"), [(0, 1.0), (1, 1e-20), (39, 3e8)])
 def test_a_shift_in_metres(shift, height):
     found = losses.wasserstein_loss(delta(0), delta(shift, height), WIDTH)
     assert float(found) == pytest.approx(WIDTH * shift, rel=1e-12)
@@ -42,34 +39,6 @@ def test_agrees_with_scipy():
     for y, x in itertools.product(range(2), range(3)):
         wanted = stats.wasserstein_distance(places, places, a[0, :, y, x].numpy(), b[0, :, y, x].numpy())
         assert float(found[0, y, x]) == pytest.approx(wanted, rel=1e-10)
-
-
-def test_triangle_inequality_and_time_anywhere():
-    a, b, c = (draw(25, seed) for seed in range(3))
-    distance = [losses.wasserstein_loss(*pair, WIDTH, reduction="none") for pair in ((a, b), (b, c), (a, c))]
-    assert bool((distance[2] <= distance[0] + distance[1]).all())
-    moved = losses.wasserstein_loss(a.movedim(1, -1), b.movedim(1, -1), WIDTH, dim=-1, reduction="none")
-    torch.testing.assert_close(moved, distance[0])
-    exhaustive = (x.reshape(1, 25, 1, 2, 3, 1) for x in (a, b))
-    found = losses.wasserstein_loss(*exhaustive, WIDTH, dim=-5)
-    torch.testing.assert_close(found, distance[0].mean())
-
-
-def test_over_rates():
-    """Light (C, R, T, Y, X) whose rates are two bins higher, at each arrival and of all of them: in m/s."""
-    rates = RateAxis(-2.0, 0.25, 12)
-    light = torch.zeros(1, 12, 6, 2, 3, dtype=torch.float64)
-    light[0, 3:5, 1:4] = 1.0 + torch.rand(2, 3, 2, 3, generator=torch.Generator().manual_seed(4))
-    faster = light.roll(2, 1)
-    compare = functools.partial(losses.wasserstein_loss, bin_width_opl=rates.bin_width, dim=-4, reduction="none")
-    found = compare(light, faster)
-    assert found.shape == (1, 6, 2, 3)
-    torch.testing.assert_close(found[0, 1:4], torch.full((3, 2, 3), 0.5, dtype=torch.float64))
-    assert float(found[0, 4:].abs().max()) < 1e-12
-    spectra = losses.wasserstein_loss(light.sum(2), faster.sum(2), rates.bin_width)
-    assert float(spectra) == pytest.approx(0.5)
-    total = losses.cumulative_loss(light, faster, rates.bin_width, dim=-4, reduction="sum")
-    assert float(total) == pytest.approx(0.5 * float(light.sum()))
 
 
 def test_the_gradient_sees_pulses_that_do_not_overlap():
@@ -127,14 +96,3 @@ def test_single_precision_over_a_long_record():
     # a cumulative sum of n roundings of 6e-8 of at most one wanders by sqrt(n) of them
     found = losses.wasserstein_loss(a.float(), b.float(), WIDTH)
     assert abs(float(found) - float(wanted)) < 6e-8 * bins**0.5 * bins * WIDTH
-
-
-def test_errors():
-    with pytest.raises(UnitError, match="bin_width_opl"):
-        losses.wasserstein_loss(delta(0), delta(1), 0.0)
-    with pytest.raises(UnitError, match="creation_cost_opl"):
-        losses.wasserstein_loss(delta(0), delta(1), WIDTH, creation_cost_opl=-1.0)
-    with pytest.raises(UnitError, match="floor"):
-        losses.wasserstein_loss(delta(0), delta(1), WIDTH, floor=0.0)
-    with pytest.raises(ShapeError, match="dimension -5"):
-        losses.wasserstein_loss(delta(0), delta(1), WIDTH, dim=-5)
