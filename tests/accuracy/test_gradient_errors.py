@@ -77,5 +77,3 @@ def test_wrong_requests():
         gradient_errors(own, late, ["no such key"])
     with pytest.raises(ArgumentError, match="one number"):
         gradient_errors(own, lambda out: out.transient, progress=False)
-    with pytest.raises(ArgumentError, match="parameters"):
-        gradient_errors(tt.TransientRenderer(tt.load(make_room(), variant=VARIANT)), late)
