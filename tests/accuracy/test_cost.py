@@ -107,16 +107,6 @@ def test_gradients_of_a_heavy_tailed_loss_have_no_error():
     assert f"d loss / d {ALBEDO} [independent, tent]  heavy tailed: no error" in report.table()
 
 
-def test_sample_counts_are_those_that_were_drawn():
-    renderer = wall_renderer()
-    assert renderer.variation(sampler="independent").samples_drawn(10) == 10
-    assert renderer.variation(sampler="multijitter").samples_drawn(10) >= 10
-    drawn = renderer.variation(sampler="stratified").samples_drawn(10)
-    assert drawn == 16  # the next square
-    report = tt.cost_of_accuracy(renderer, spp=(10,), repeats=2, samplers=("stratified",), progress=False)
-    assert report.points[0].spp == 16
-
-
 def test_the_renderer_and_the_variant_are_left_as_they_were():
     renderer = wall_renderer(spp=4)
     before = renderer(seed=3).transient.clone()
@@ -215,6 +205,16 @@ def test_a_setting_is_recommended_for_a_depth_that_suffices(settings_report):
         report.recommend(1e-9, quantity="energy")
 
 
+def test_quantities_that_cannot_be_compared():
+    given, settings = {"bins": lambda out: out.transient.sum((0, -2, -1))}, {"bin_widths": (0.05, 0.1), "repeats": 2}
+    with pytest.raises(ShapeError, match=r"'bins': .* got \(64,\) .* and \(32,\)"):
+        tt.cost_of_accuracy(
+            wall_renderer(), spp=(4,), samplers=("independent",), quantities=given, progress=False, **settings
+        )
+    with pytest.raises(ArgumentError, match="'transient' is measured in any case"):
+        tt.cost_of_accuracy(wall_renderer(), quantities={"transient": lambda out: out.steady}, progress=False)
+
+
 def test_complex_quantities_and_samplers_alone():
     """A unit phasor: its relative error is that of the phase in radians."""
 
@@ -233,7 +233,10 @@ def test_complex_quantities_and_samplers_alone():
     assert found.relative_error == pytest.approx(expected, rel=0.25)
     assert found.total_error == pytest.approx(expected, rel=0.25)
     assert str(report) == report.table()
-    alone = tt.cost_of_accuracy(renderer, spp=(4,), repeats=2, progress=False)
+    alone = tt.cost_of_accuracy(
+        renderer.variation(sampler="stratified"), spp=(10,), repeats=2, samplers=("stratified",), progress=False
+    )
+    assert alone.points[0].spp == 16  # the next square
     assert all(np.isnan(p.total_error) for p in alone.points) and alone.settings["finest"] == {}
 
 
@@ -248,17 +251,3 @@ def test_gradients_are_compared_with_the_finest_that_has_some():
         values, spp=(4,), repeats=2, samplers=("independent", "owen"), max_depths=(1, 2, -1), progress=False
     )
     assert report.settings["finest"] == {"values": "owen, box, any depth"}
-
-
-@pytest.mark.parametrize(
-    "given, error, message",
-    [
-        ({"transient": lambda out: out.steady}, ArgumentError, "'transient' is measured in any case"),
-        ({"empty": lambda out: out.transient[:, :0]}, ShapeError, "'empty': expected one number at least"),
-        ({"bins": lambda out: out.transient.sum((0, -2, -1))}, ShapeError, r"'bins': .* got \(64,\) .* and \(32,\)"),
-    ],
-)
-def test_quantities_that_cannot_be_compared(given, error, message):
-    settings = {"gradients": [ALBEDO], "bin_widths": (0.05, 0.1), "samplers": ("owen",), "repeats": 2}
-    with pytest.raises(error, match=f"^quantities.*{message}"):
-        tt.cost_of_accuracy(wall_renderer(), spp=(4,), quantities=given, progress=False, **settings)

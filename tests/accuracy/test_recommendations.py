@@ -62,13 +62,6 @@ def test_samplers_that_spread_points_get_powers_of_two(error, spp):
     assert found.spp == spp and found.error == pytest.approx(spp**-0.5) and found.seconds == pytest.approx(spp / 1e3)
 
 
-def test_two_points_of_as_many_samples():
-    """As of samplers that round them."""
-    points = [point(SLOW, 4, 0.004, 0.8), point(SLOW, 16, 0.016, 0.6), point(SLOW, 16, 0.016, 0.4)]
-    found = AccuracyReport(points, "").recommend(0.5)
-    assert (found.spp, found.error) == (16, 0.4)
-
-
 def test_what_no_setting_reaches(report):
     with pytest.raises(ArgumentError, match=r"got 1\.00%; the least is 6\.25%, of 256 spp \[independent, box\]\."):
         report.recommend(0.01)
@@ -91,13 +84,6 @@ def test_the_front_is_what_nothing_beats(seed):
     front = AccuracyReport(points, "").pareto()
     beaten = [any(q.seconds < p.seconds and q.total_error < p.total_error for q in points) for p in points]
     assert [p.seconds for p in front] == sorted(p.seconds for p, held in zip(points, beaten, strict=True) if not held)
-
-
-def test_the_front_goes_by_the_noise_where_no_bias_was_measured():
-    figures = [(SLOW, 4, 1.0, 0.5), (SLOW, 16, 4.0, 0.6), (BIASED, 4, 2.0, 0.3), (BIASED, 8, 2.0, 0.2)]
-    report = AccuracyReport([point(*each) for each in figures], "")
-    assert [p.error for p in report.pareto("transient")] == [0.5, 0.2]
-    assert "Pareto front of transient" in report.table() and "total" not in report.table()
 
 
 def test_the_error_is_at_least_that_of_the_noise():
@@ -184,11 +170,6 @@ def test_the_total_error_is_noise_and_bias():
         assert p.error == max(p.total_error, p.relative_error)
         assert p.relative_error == pytest.approx(math.sqrt(VARIANCE / p.spp) / 3, rel=0.1)
         assert p.bias == pytest.approx(bias / 3, rel=0.1)
-
-
-def test_without_a_finest_setting_there_is_no_total_error():
-    (only,) = measure({SLOW: candidate()}, (16,), repeats=4, progress=False).points
-    assert math.isnan(only.total_error) and math.isnan(only.bias) and only.error == only.relative_error
 
 
 def test_time_of_the_processor_is_told_apart():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from support.loss_cases import AXIS, BAND, CASES
+from support.loss_cases import CASES
 from support.sweeps import together
 from torchtransient import losses
 from torchtransient.errors import ShapeError, UnitError
@@ -86,17 +86,6 @@ def test_another_layout_is_never_taken_for_images(case):
                 assert "dim=" in found
             else:
                 torch.testing.assert_close(found, case(a[part], b[part], dim=dim))
-
-
-def test_a_shift_of_a_list_of_points():
-    """Three points whose light is two bins late: two bins of path, wherever time is."""
-    a, b = torch.zeros(1, 20, 3), torch.zeros(1, 20, 3)
-    a[:, 4], b[:, 6] = 1.0, 1.0
-    with pytest.raises(ShapeError, match=r"-2 of lists"):
-        losses.wasserstein_loss(a, b, 0.05)
-    assert float(losses.wasserstein_loss(a, b, 0.05, dim=-2)) == pytest.approx(0.1)
-    phases = losses.transient_phasors(a[:, 4:12], AXIS, BAND, dim=-2)
-    torch.testing.assert_close(phases[..., None], losses.transient_phasors(a[:, 4:12, :, None], AXIS, BAND, dim=1))
 
 
 @over(of_time)

@@ -20,24 +20,13 @@ def test_depth_in_metres_where_there_is_a_surface():
     found = torch.tensor([[1.1, 1.8, 7.0], [3.0, 0.5, 9.0]], requires_grad=True)
     mask = torch.tensor([[True, True, True], [True, True, False]])
     value = losses.depth_loss(found, truth, mask=mask)
-    assert float(value) == pytest.approx((0.1 + 0.2 + 0) / 3, rel=1e-6)
+    assert value.item() == pytest.approx((0.1 + 0.2 + 0) / 3, rel=1e-6)
     value.backward()
     torch.testing.assert_close(found.grad, torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.0, 0.0]]) / 3)
     nowhere = losses.depth_loss(found, torch.full_like(truth, float("nan")))
     assert float(nowhere) == 0
     # a network that gives NaN where there is a surface is not passed over
     assert torch.isnan(losses.depth_loss(torch.full((2, 3), float("nan")), truth))
-
-
-def test_similarity_of_flat_pictures_is_that_of_their_brightness():
-    """`(2 a b + c1) / (a^2 + b^2 + c1)`, c1 = (0.01 L)^2."""
-    a, b = torch.full((1, 12, 12), 0.3, dtype=torch.float64), torch.full((1, 12, 12), 0.6, dtype=torch.float64)
-    for scale, value_range in ((1.0, 1.0), (50.0, 50.0), (1.0, 3.0)):
-        c1 = (0.01 * value_range) ** 2
-        x, y = 0.3 * scale, 0.6 * scale
-        wanted = 1 - (2 * x * y + c1) / (x**2 + y**2 + c1)
-        found = losses.ssim_loss(scale * a, scale * b, value_range=value_range, reduction="none")
-        torch.testing.assert_close(found, torch.full_like(found, wanted), rtol=1e-6, atol=1e-9)
 
 
 def test_similarity_against_its_definition():
@@ -50,8 +39,9 @@ def test_similarity_against_its_definition():
     va, vb, cov = (w * a * a).sum() - ma**2, (w * b * b).sum() - mb**2, (w * a * b).sum() - ma * mb
     c1, c2 = 0.01**2, 0.03**2
     wanted = 1 - (2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
-    found = losses.ssim_loss(a, b, value_range=1.0, reduction="none")[0, 5, 5]
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
+    for scale in (1.0, 50.0):
+        found = losses.ssim_loss(scale * a, scale * b, value_range=scale, reduction="none")[0, 5, 5]
+        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
 
 
 def test_the_default_range_knows_the_scale():
@@ -86,8 +76,6 @@ def test_pictures_that_are_too_small():
         losses.ssim_loss(a, a, window=17)
     with pytest.raises(ShapeError, match="real volume"):
         losses.maximum_projections(a + 0j)
-    with pytest.raises(ShapeError, match="volumes"):
-        losses.projection_ssim_loss(a, a)
 
 
 def test_the_range_of_a_target_has_no_gradient():

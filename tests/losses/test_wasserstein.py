@@ -1,8 +1,9 @@
-"""The Wasserstein distance over time: shifts in metres, other ways to compute it, missing light, empty pixels."""
+"""Wasserstein distances and running sums over time: shifts in metres, missing light, empty pixels."""
 
 from __future__ import annotations
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -96,3 +97,34 @@ def test_single_precision_over_a_long_record():
     # a cumulative sum of n roundings of 6e-8 of at most one wanders by sqrt(n) of them
     found = losses.wasserstein_loss(a.float(), b.float(), WIDTH)
     assert abs(float(found) - float(wanted)) < 6e-8 * bins**0.5 * bins * WIDTH
+
+
+# --------------------------------------------------------------------------------------------------------- running sums
+
+
+def test_the_area_between_running_sums():
+    """Light that is late costs its delay, light that is missing its way to the end of the window."""
+    a, b = torch.zeros(1, 1, 10, 1, 1), torch.zeros(1, 1, 10, 1, 1)
+    a[0, 0, 2], b[0, 0, 5] = 3.0, 3.0
+    assert float(losses.cumulative_loss(a, b, 0.02)) == pytest.approx(3 * 3 * 0.02)
+    assert float(losses.cumulative_loss(a, 0 * b, 0.02)) == pytest.approx(3 * 8 * 0.02)
+    assert float(losses.cumulative_loss(a, 2 * a, 0.02)) == pytest.approx(3 * 8 * 0.02)
+    assert float(losses.cumulative_loss(a, b, 0.02, per_root_count=True)) == pytest.approx(9 * 0.02 / math.sqrt(3))
+    assert float(losses.cumulative_loss(a, 0 * b, 0.02, per_root_count=True)) == pytest.approx(24 * 0.02)
+    # of equal sums the Wasserstein distance times the light
+    torch.testing.assert_close(losses.cumulative_loss(a, b, 0.02), 3 * losses.wasserstein_loss(a, b, 0.02))
+
+
+def test_running_sums_pull_from_any_distance():
+    """The slope of a pulse that is 90 bins off is that of one at 10 bins, and that of a squared difference none."""
+    t = torch.arange(100, dtype=torch.float64)
+
+    def pulse(at):
+        return torch.exp(-0.5 * (t - at) ** 2).reshape(1, 100, 1, 1)
+
+    for offset in (10.0, 40.0, 85.0):
+        at = torch.tensor(5.0 + offset, dtype=torch.float64, requires_grad=True)
+        (pull,) = torch.autograd.grad(losses.cumulative_loss(pulse(at), pulse(5.0), 0.02), at)
+        assert float(pull) == pytest.approx(0.02 * math.sqrt(2 * math.pi), rel=1e-6)
+        (none,) = torch.autograd.grad(losses.squared_loss(pulse(at), pulse(5.0), reduction="sum"), at)
+        assert abs(float(none)) < 1e-8

@@ -1,4 +1,4 @@
-"""Scenes with nothing to see: zeros where zeros belong, and never a NaN."""
+"""Scenes with nothing to see, and albedos of zero: zeros where zeros belong, slopes where they are, never a NaN."""
 
 from __future__ import annotations
 
@@ -7,31 +7,18 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from support.gradient_cases.problem import Case, Problem
+from support.gradient_cases.scenes import room
+from support.gradient_cases.unknowns import set_color
 from support.marks import long
+from support.media_scenes import camera, film, load
 
 VARIANT = "llvm_ad_mono"
 
 
-def load(objects, target=(0, 0, 0)):
-    film = {
-        "type": "transient_hdr_film",
-        "width": 3,
-        "height": 2,
-        "rfilter": {"type": "gaussian"},
-        "temporal_bins": 20,
-        "bin_width_opl": 0.5,
-        "start_opl": 0.0,
-        "temporal_filter": "tent",
-    }
-    view = {
-        "type": "perspective",
-        "fov": 30,
-        "film": film,
-        "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], list(target), [0, 1, 0]),
-    }
-    return mi.load_dict(
-        {"type": "scene", "integrator": {"type": "transient_path", "max_depth": 4}, "sensor": view, **objects}
-    )
+def scene_of(objects, target=(0, 0, 0)):
+    smooth = film(3, 2, bins=20, bin_width=0.5, filter="tent") | {"rfilter": {"type": "gaussian"}}
+    return load(objects, camera(target=target, fov=30) | {"film": smooth}, "transient_path", max_depth=4)
 
 
 def wall(reflectance=0.5):
@@ -44,10 +31,7 @@ DARK = {
     "no light": ({"wall": wall()}, (0, 0, 0)),
     "black wall": ({"wall": wall(0.0), "light": LIGHT}, (0, 0, 0)),
     "camera looks away": ({"wall": wall(), "light": LIGHT}, (0, 0, 9)),
-    "light of no intensity": (
-        {"wall": wall(), "light": LIGHT | {"intensity": {"type": "uniform", "value": 0.0}}},
-        (0, 0, 0),
-    ),
+    "light of no intensity": ({"wall": wall(), "light": LIGHT | {"intensity": 0.0}}, (0, 0, 0)),
     "light behind the wall": ({"wall": wall(), "light": LIGHT | {"position": [0.0, 0.0, -1.0]}}, (0, 0, 0)),
 }
 
@@ -86,7 +70,7 @@ def both_modes(scene, scale=1.0, spp=64):
 @pytest.mark.parametrize("name", long(DARK, ["black wall"]))
 def test_dark_scenes(name):
     """Guards against 0 / 0 in weights of paths that carry nothing, and against null pointers to shapes and emitters."""
-    scene = load(*DARK[name])
+    scene = scene_of(*DARK[name])
     for tensor in scene.integrator().render(scene, spp=64):
         assert not np.array(tensor).any()
     reverse, forward = both_modes(scene)
@@ -98,7 +82,7 @@ def test_dark_scenes(name):
 
 
 def test_adjoint_of_zeros():
-    scene = load({"wall": wall(), "light": LIGHT})
+    scene = scene_of({"wall": wall(), "light": LIGHT})
     reverse, forward = both_modes(scene, scale=0.0)
     assert reverse.size > 1 and not reverse.any()
     assert all(np.isfinite(f).all() for f in forward) and forward[1].any()
@@ -107,7 +91,45 @@ def test_adjoint_of_zeros():
 
 
 def test_no_adjoint_is_no_gradient():
-    scene = load({"wall": wall(), "light": LIGHT})
+    scene = scene_of({"wall": wall(), "light": LIGHT})
     params, keys = attached(scene)
     scene.integrator().render_backward(scene, params, (None, None), spp=4)
     assert not any(flat(dr.grad(params[key])).any() for key in keys)
+
+
+# --------------------------------------------------------------------------------------------------- albedos of zero
+
+SIDE, WALL = "side.bsdf.reflectance.value", "wall.bsdf.reflectance.value"
+
+
+def problem(key, value, scene):
+    return Problem(Case("albedo", "", scene, set_color(key), value, 0.05, spp=512, fd_spp=512))
+
+
+@pytest.mark.parametrize(("key", "albedo"), [(SIDE, 0.0), (SIDE, 1e-8), (WALL, 0.0)])
+def test_gradient_by_an_albedo_of_zero(key, albedo):
+    """Guards against dividing the light beyond a vertex by its BSDF value: at zero that gives 0 (or 0 / 0) although the
+    derivative is not zero, and just above it an amplification by up to 1e8.
+
+    Same seed, same paths, and a polynomial in the albedo: central differences with Richardson's correction are exact to
+    rounding.
+    """
+    scene = (
+        (lambda: room(side_reflectance=albedo))
+        if key == SIDE
+        else (lambda: room(bsdf={"type": "diffuse", "reflectance": albedo}, side_reflectance=0.8))
+    )
+    p = problem(key, albedo, scene)
+    h = p.case.step
+    for seed in (1, 2):
+        near, far = ((p.loss(albedo + s, seed) - p.loss(albedo - s, seed)) / (2 * s) for s in (h / 2, h))
+        expected = (4 * near - far) / 3
+        assert abs(expected) > 1e-3
+        assert p.reverse(seed) == pytest.approx(expected, rel=2e-3)
+        assert p.forward(seed) == pytest.approx(expected, rel=2e-3)
+
+
+def test_two_black_surfaces():
+    """With the wall black too, no light comes by way of the side: its derivative is zero, and finite."""
+    black = problem(SIDE, 0.0, lambda: room(bsdf={"type": "diffuse", "reflectance": 0.0}, side_reflectance=0.0))
+    assert black.reverse(1) == 0.0
