@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.accuracy.cost import cosine_over_the_window
 from torchtransient.accuracy.report import AccuracyReport, Choice, CostPoint
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 
@@ -92,19 +91,6 @@ def test_gradients_against_a_reference():
     )
     assert abs(coarse.squared_error / fine.squared_error / 4 - 1) < 4 * error
     assert "reference of 4096" in report.method
-
-
-def test_gradients_of_a_heavy_tailed_loss_have_no_error():
-    def loss(out):
-        return cosine_over_the_window(out) * float(np.random.default_rng(out.stats.seeds[0]).standard_cauchy())
-
-    report = tt.cost_of_accuracy(
-        wall_renderer(), spp=(4,), gradients=[ALBEDO], samplers=("independent",), loss=loss, progress=False
-    )
-    transient, gradient = report.points
-    assert transient.relative_error > 0 and transient.tail is None
-    assert np.isnan(gradient.relative_error) and gradient.tail.heavy
-    assert f"d loss / d {ALBEDO} [independent, tent]  heavy tailed: no error" in report.table()
 
 
 def test_the_renderer_and_the_variant_are_left_as_they_were():

@@ -1,7 +1,5 @@
 """Gradients with an error: calibrated, and without one where the tail is heavy."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Bands, fronts and recommended settings of reports whose errors are known in closed form."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

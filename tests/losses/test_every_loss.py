@@ -1,7 +1,5 @@
 """The contract of every loss: batches, masks, reductions, precision, derivatives, pickling, errors."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

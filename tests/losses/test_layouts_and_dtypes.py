@@ -1,7 +1,5 @@
 """Layouts, dtypes, empty batches and levels, over the list of all losses."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Likelihoods against torch.distributions, photons one by one, and their own minima; values and gradients at zero."""
 
-from __future__ import annotations
-
 import inspect
 import warnings
 

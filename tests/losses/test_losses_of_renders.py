@@ -1,7 +1,5 @@
 """Losses of what a renderer returns, and two renders of one scene in one call for `two_render_loss`."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -70,16 +68,6 @@ def test_of_pictures_volumes_and_a_second_render(renderer, shared):
     found = losses.two_render_loss(out, second, target)
     torch.testing.assert_close(found, losses.two_render_loss(out.transient, second.transient, target.transient))
     slope_of(found, renderer)
-
-
-@pytest.mark.slow
-def test_of_phasor_films(scene):
-    renderer = tt.TransientRenderer(scene, parameters=[GREY], spp=2, frequencies=BAND)
-    out, target = renderer(seed=1), renderer(seed=2).detach()
-    for loss in (losses.phasor_loss, losses.squared_loss):
-        found = loss(out, target)
-        torch.testing.assert_close(found, loss(out.phasor, target.phasor), rtol=0, atol=0)
-        slope_of(found, renderer)
 
 
 def test_of_a_simulated_capture(renderer):

@@ -1,7 +1,5 @@
 """Consistency of a volume with its measurement: the free scale, other comparisons, an operator of the library."""
 
-from __future__ import annotations
-
 import functools
 
 import pytest

@@ -1,7 +1,5 @@
 """Meshes: smoothness by closed forms, masks and derivatives, and distances against those that are known."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Losses of coarser records: sums of bins, likelihoods that stay likelihoods, from how far they pull."""
 
-from __future__ import annotations
-
 import functools
 import math
 
@@ -102,7 +100,6 @@ def of_a_record(input, target, *, mask, reduction):
 
 NO_COMPARES = {
     "bin_width_opl=0.1": functools.partial(losses.wasserstein_loss, bin_width_opl=0.1),
-    "dead_bins=3": functools.partial(losses.first_photon_nll, cycles=100, dead_bins=3.0),
     "the module SquaredLoss": losses.SquaredLoss(),
     "a value for each bin": of_a_record,
 }

@@ -1,7 +1,5 @@
 """Residuals of two renders, and schedules of samples."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

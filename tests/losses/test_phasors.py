@@ -1,7 +1,5 @@
 """Phasors of transients, and losses of them: delays, Parseval, the branch cut, dark pixels."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Losses of pictures: depth maps with holes and of any scale, structural similarity, projections of volumes."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Losses of results in place of tensors: renders, captures, reconstructions."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from types import SimpleNamespace

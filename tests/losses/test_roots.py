@@ -1,7 +1,5 @@
 """Counts on other scales: the variance of Anscombe's root, logarithms of ratios, values below zero."""
 
-from __future__ import annotations
-
 import functools
 import math
 

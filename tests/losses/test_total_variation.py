@@ -1,7 +1,5 @@
 """Total variation: areas of boxes, slopes of ramps, noise against edges, smoothness in flat places."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Wasserstein distances and running sums over time: shifts in metres, missing light, empty pixels."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

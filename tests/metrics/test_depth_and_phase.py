@@ -1,7 +1,5 @@
 """Depth maps and quantities that repeat, by closed forms."""
 
-from __future__ import annotations
-
 import functools
 import math
 from types import SimpleNamespace

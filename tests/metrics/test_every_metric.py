@@ -1,7 +1,5 @@
 """Contract of every metric: perfect answers, batches, masks, precisions, errors."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from types import SimpleNamespace

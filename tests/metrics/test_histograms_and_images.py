@@ -1,7 +1,5 @@
 """Distances of records and pictures, by closed forms."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Sums over batches and processes."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle

@@ -1,10 +1,7 @@
 """Hidden volumes: front views, depths, overlap, correlation, points."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
-import warnings
 
 import pytest
 import torch
@@ -105,11 +102,10 @@ def test_volumes_on_two_grids():
     x = blob([0.0, 0.0, 0.8])
     moved = dataclasses.replace(GRID, first=GRID.first + torch.tensor([0.01, 0.0, 0.0], dtype=torch.float64))
     assert float(metrics.volume_correlation(found(x), found(x))) == pytest.approx(1)
+    near = dataclasses.replace(GRID, first=GRID.first + 1e-6)  # rounding of files
     for function in (metrics.volume_correlation, metrics.volume_iou, metrics.front_depth_mae):
         with pytest.raises(UnitError, match="on one grid"):
             function(found(x), found(x, moved))
-        # rounding of files
-        near = dataclasses.replace(GRID, first=GRID.first + 1e-6)
         assert math.isfinite(float(function(found(x), found(x, near))))
 
 
@@ -121,8 +117,9 @@ POINTS = [[-0.21, -0.06, 0.72], [0.23, 0.12, 0.93]]
 def test_points_between_voxels_are_found():
     """A parabola misses the top of a Gaussian by a small part of a voxel; the voxel itself by up to half of one."""
     volume = blob(POINTS[0]) + 0.5 * blob(POINTS[1])
-    each = metrics.localization_rmse(volume, POINTS, radius_m=0.2, grid=GRID, reduction="none")
-    assert each.shape == (2,) and float(each.max()) < 0.012
+    each = metrics.localization_rmse(volume.requires_grad_(), POINTS, radius_m=0.2, grid=GRID, reduction="none")
+    assert each.shape == (2,) and float(each.max()) < 0.012 and not each.requires_grad
+    volume = volume.detach()
     both = metrics.localization_rmse(found(volume), torch.tensor(POINTS), radius_m=0.2)
     assert float(both) == pytest.approx(math.sqrt(float(each.square().mean())), rel=1e-4)
     alone = (8 + blob(POINTS[0]).log()).clamp_min(0)
@@ -167,23 +164,11 @@ def test_depth_maps_of_the_library():
     assert bool((ours.isfinite() == theirs.mask).all())
 
 
-def test_points_are_found_without_gradient():
-    place = torch.tensor([0.03, 0.02, 0.8], dtype=torch.float64)
-    values = torch.exp(-(GRID.points - place).square().sum(-1) / 0.01).float().requires_grad_()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # torch's, where numbers are taken of what has a gradient
-        found = metrics.localization_rmse(HiddenVolume(values[None], GRID, "fk"), place[None].numpy(), radius_m=0.2)
-    assert found.item() < 0.02 and not found.requires_grad
-
-
 @pytest.mark.parametrize(
     "change",
     [
         {"along_x": -GRID.along_x},
-        {"along_y": -GRID.along_y},
-        {"pitch": (1.01 * GRID.pitch[0], GRID.pitch[1])},
         {"pitch": (GRID.pitch[0], 1.01 * GRID.pitch[1])},
-        {"depths": GRID.depths + 0.01},
         {"depths": GRID.depths + 0.01 * (GRID.depths - GRID.depths[0])},
         {"normal": -GRID.normal},
     ],

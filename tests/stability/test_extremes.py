@@ -2,8 +2,6 @@
 forms; every value and derivative on the way is finite.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -223,31 +221,6 @@ def noise_of_sky(energy, largest, alpha):
     to the sky beside the lobe. Another 5e-4 of narrow lobes are the digits of the facet's height.
     """
     return NOISE * math.sqrt(max(largest * energy - energy**2, 0) + 2 * alpha)
-
-
-@for_all_runs
-def test_roughness_of_metal(variant, sampler, examples):
-    """What facets of a metal without losses send on to a white sky, once."""
-    bsdf = {"type": "diff_rough_conductor", "eta": 0.0, "k": 1.0, "alpha": 0.3, "distribution": "ggx"}
-    scene = tt.load(seen_from(0.5, 3, plate={"type": "rectangle", "bsdf": bsdf}, sky=SKY), variant=variant)
-    key = "plate.bsdf.alpha.value"
-    renderer = tt.TransientRenderer(
-        scene, [key], time_axis=tt.TimeAxis(0.0, 0.5, 60), spp=SAMPLES, sampler=sampler
-    )
-
-    def property_(alpha):
-        at = leaves(renderer, {key: alpha})
-        light = light_over_time(renderer(at, seed=0)).sum()
-        (slope,) = gradients(light, at)
-        clamped = max(alpha, 1e-4)  # Mitsuba's
-        energy = masking(clamped, 2 * facets(clamped)).mean()
-        assert float(light.detach()) == pytest.approx(energy, abs=noise_of_sky(energy, 1, alpha) + 5e-4)
-        near = [masking(a, 2 * facets(a)).mean() for a in (0.9 * clamped, 1.1 * clamped)]
-        # By the logarithm of the roughness that of the density has a variance of 4 / 3, and its masking less.
-        by_log = (near[1] - near[0]) / 0.2 if alpha > 1.001e-4 else 0
-        assert slope * clamped == pytest.approx(by_log, abs=1.5 * NOISE + 0.01)
-
-    holds(property_, examples, alpha=magnitudes(1e-5, 1, 0))
 
 
 @for_all_runs

@@ -2,8 +2,6 @@
 value and derivative on the way is finite.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -93,6 +93,7 @@ def test_every_bin_against_differences(scattering):
     assert lit >= 3, "one arrival alone would prove nothing"
 
 
+@pytest.mark.filterwarnings("ignore:the derivative by")  # of edges, which lie outside of the view
 @pytest.mark.parametrize("filter", long(["tent", "gaussian"], ["tent"]))
 def test_mean_arrival_of_a_moving_wall(filter):
     """Camera and light at z = 4, a wall at z = 0: d (mean arrival) / dz = -2 exactly, in both modes."""

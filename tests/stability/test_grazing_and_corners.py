@@ -1,7 +1,5 @@
 """Grazing views, corners and lights next to a surface: finite values, finite gradients, exact lengths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Arrivals at the edges of bins and of the window, and sums of very many small contributions in one bin."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """Optical path lengths of 100 m and 1000 m in bins of a millimetre, and phases of short wavelengths after them."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,7 +1,5 @@
 """Hard cases of captures: scenes of every size, times far from the origin, first arrivals, corners."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

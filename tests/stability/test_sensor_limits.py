@@ -3,8 +3,6 @@
 Float32 unless the test says otherwise, since that is what is trained with.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

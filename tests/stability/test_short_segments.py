@@ -1,7 +1,5 @@
 """Segments of millimetres between a wall that moves and what it nearly touches: gradients of bounded variance."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gradients through matrices that have no inverse: depolarisers, polarizers, absorbers, and frames that coincide."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

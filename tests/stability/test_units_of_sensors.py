@@ -1,7 +1,5 @@
 """Seconds, metres of optical path, metres of distance, and bins: the same scene in all of them, and mix-ups refused."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
