@@ -68,15 +68,6 @@ def test_unbalanced_gradient_of_an_empty_pixel():
     torch.testing.assert_close(x.grad, torch.full_like(x, -0.4))
 
 
-def test_an_empty_pixel_is_one_of_even_light():
-    even, full = torch.full((1, 40, 1, 1), 0.5, dtype=torch.float64), delta(0)
-    # from bin 0 to the middle of the record, on average
-    wanted = WIDTH * 39 / 2
-    assert float(losses.wasserstein_loss(even, full, WIDTH)) == pytest.approx(wanted, rel=1e-12)
-    assert float(losses.wasserstein_loss(0 * even, full, WIDTH)) == pytest.approx(wanted, rel=1e-12)
-    assert float(losses.wasserstein_loss(0 * even, 0 * full, WIDTH)) == 0
-
-
 def test_dim_pixels_fade_into_even_light():
     """Continuous at the floor, and linear below it."""
     a, b = delta(3, bins=10), delta(6, bins=10)

@@ -21,16 +21,6 @@ def steady_scene(integrator, **objects):
     return tt.load({"type": "scene", **node, "sensor": camera(transient=False), **objects}, variant=VARIANT)
 
 
-def test_parameters_of_media():
-    scene = steady_scene("volpath", **block(clouds()), fog=homogeneous())
-    table = scene.parameters()
-    prefix = "block.interior_medium."
-    for key, shape in (("sigma_t.data", (4, 4, 4, 1)), ("albedo.value.value", ())):
-        assert table[prefix + key].differentiable and table[prefix + key].shape == shape
-        assert not table[prefix + key].moves_path_length
-    assert not table[prefix + "scale"].differentiable
-
-
 @pytest.mark.slow
 def test_no_kernels_are_compiled_while_training():
     """Nor when a shape moves, which changes the size of the scene, and nothing of Dr.Jit's graph stays behind."""

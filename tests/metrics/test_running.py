@@ -71,13 +71,6 @@ def test_copies_and_casts():
     assert not running.state_dict() and "beyond_m=0.5" in repr(running)
 
 
-def test_a_batch_of_which_nothing_counts_changes_nothing():
-    running = Running(metrics.depth_rmse)
-    running.update(torch.ones(2, 2), torch.zeros(2, 2))
-    assert math.isnan(float(running(torch.ones(2, 2), torch.full((2, 2), torch.nan))))
-    assert float(running.compute()) == 1
-
-
 def test_one_process(tmp_path):
     dist.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
     try:

@@ -96,3 +96,16 @@ def test_smallest_roughness_is_still_accurate(distribution):
     assert np.quantile(error, 0.95) < 0.02
     _, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo)
     assert np.quantile(np.abs(pdf.numpy() / expected.numpy() - 1)[lit], 0.95) < 0.02
+
+
+def test_roughness_below_the_clamp_is_said():
+    """Guards against silence: a roughness below the clamp renders as the clamp and has no derivative."""
+    logger = mi.logger()
+    level = logger.error_level()
+    logger.set_error_level(mi.LogLevel.Warn)
+    try:
+        with pytest.raises(RuntimeError, match=r"'alpha_v' is clamped to 0\.001"):
+            mi.load_dict({"type": "diff_rough_dielectric", "alpha_u": 0.1, "alpha_v": 5e-4})
+        mi.load_dict({"type": "diff_rough_dielectric", "alpha": 2e-3})
+    finally:
+        logger.set_error_level(level)
