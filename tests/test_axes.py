@@ -44,19 +44,10 @@ def test_seconds():
 
 
 WRONG_UNITS = {
-    "picoseconds": lambda: TimeAxis.from_seconds(0, 50, 128),
-    "nanoseconds": lambda: TimeAxis.from_seconds(0.0, 0.05, 128),
-    "a picosecond in nanoseconds": lambda: TimeAxis.from_seconds(0.0, 1e-3, 128),
     "a picosecond in microseconds": lambda: TimeAxis.from_seconds(0.0, 1e-6, 128),
-    "metres as seconds": lambda: TimeAxis.from_seconds(0.0, 0.015, 128),
-    "a start in nanoseconds": lambda: TimeAxis.from_seconds(20.0, 50e-12, 128),
     "a start in picoseconds": lambda: TimeAxis.from_seconds(-500.0, 50e-12, 128),
-    "seconds as metres": lambda: TimeAxis(0.0, 50e-12, 128),
     "100 ns as metres": lambda: TimeAxis(0.0, 99e-9, 128),
-    "megahertz": lambda: FrequencyAxis.from_hertz([0.0, 60.6]),
     "megahertz, negative": lambda: FrequencyAxis.from_hertz([-80.0]),
-    "gigahertz": lambda: FrequencyAxis.from_hertz([0.06]),
-    "cycles per metre as hertz": lambda: FrequencyAxis.from_hertz([0.2]),
     "hertz as cycles per metre": lambda: FrequencyAxis([20e6]),
     "a step in hertz": lambda: FrequencyAxis.uniform(0.0, 10e6, 3),
 }

@@ -1,4 +1,4 @@
-"""What is done wrong first, and what the message says to do: arguments by another name, in another unit, by place."""
+"""First mistakes of a user: arguments by another name, times for lengths, files of another kind, no tensors."""
 
 from __future__ import annotations
 
@@ -31,26 +31,16 @@ def capture():
 
 
 def test_functions_that_hand_arguments_on_say_what_was_called(scene, capture):
-    reconstructions = {name: getattr(tt.nlos, name) for name in ("fk", "lct", "directional_lct", "midpoint_fk")}
-    for name, function in reconstructions.items():
-        with pytest.raises(TypeError, match=rf"^{name}\(\) .*'targe'\. Did you mean 'target'\? Its other .* target, "):
-            function(capture, targe="diffuse")
+    with pytest.raises(TypeError, match=r"^fk\(\) .*'targe'\. Did you mean 'target'\?"):
+        tt.nlos.fk(capture, targe="diffuse")
     with pytest.raises(TypeError, match=r"^render\(\) .*Did you mean 'temporal_filter'\?"):
         tt.render(scene, spp=1, temporal_filte="box")
-    with pytest.raises(TypeError, match=r"^Plan.renderer\(\) .*'spps'. Did you mean 'spp'\?"):
-        tt.plan(scene, pilot=False, max_depth="scene").renderer(spps=1)
-    with pytest.raises(TypeError, match=r"^Capture.read\(\) .*'wallsize'. Did you mean 'wall_size'\?"):
-        tt.nlos.Capture.read("letter.mat", wallsize=0.6)
 
 
 @pytest.mark.parametrize("width", [1e-10, torch.tensor(1e-10)], ids=["number", "tensor"])
 def test_widths_of_bins_in_seconds(width):
-    for loss in (tt.losses.wasserstein_loss, tt.losses.cumulative_loss):
-        with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
-            loss(LIGHT, LIGHT, bin_width_opl=width)
-    for module in (tt.losses.WassersteinLoss, tt.losses.CumulativeLoss):
-        with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
-            module(bin_width_opl=width)(LIGHT, LIGHT)
+    with pytest.raises(UnitError, match=r"bin_width_opl in metres of optical path, .* Seconds\?"):
+        tt.losses.wasserstein_loss(LIGHT, LIGHT, bin_width_opl=width)
 
 
 def test_files_of_another_kind_say_what_reads_them(scene, capture, tmp_path):

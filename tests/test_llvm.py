@@ -55,10 +55,8 @@ def good_library():
 @pytest.mark.parametrize(
     ("name", "version"),
     [
-        ("libLLVM-14.so.1", (14,)),
         ("libLLVM-15.so", (15,)),
         ("libLLVM-16.0.6.so.1", (16, 0, 6)),
-        ("libLLVM.so.18.1", (18, 1)),
         ("libLLVM.so.23.1", (23, 1)),
     ],
 )
@@ -139,11 +137,10 @@ def test_a_library_that_dr_jit_cannot_load_is_reported(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", ["drjit", "mitsuba"])
-def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tmp_path, first):
-    code = f"""
+def test_dr_jit_imported_first_with_an_old_library_is_warned_of_at_the_import(tmp_path):
+    code = """
         import warnings
-        import {first}, drjit
+        import mitsuba, drjit
         drjit.detail.llvm_version = lambda: (16, 0, 6)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")

@@ -110,20 +110,13 @@ def test_transform():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Pulse.gaussian(60e-12),  # seconds
-        lambda: Pulse.rectangular(99e-9),
+        lambda: Pulse.rectangular(99e-9),  # seconds
         lambda: Pulse.tabulated([0.0, 1e-10], [0.0, 1.0]),
-        lambda: Pulse.gaussian_s(60.0),  # picoseconds
         lambda: Pulse.gaussian_s(0.06),  # nanoseconds
-        lambda: Pulse.rectangular_s(1e-9, center_s=4.0),
         lambda: Pulse.gaussian_s(1e-9, center_s=-0.5),
         lambda: Pulse.tabulated_s([0.0, 50.0], [0.0, 1.0]),
-        lambda: Pulse.tabulated_s([0.0, 1e-10, 2e-10], [0.0, 1.0, 0.0], center_s=0.5),
         lambda: Gate.rectangular(10e-9, 14e-9),
-        lambda: Gate.rectangular_s(10.0, 14.0),
-        lambda: Gate.rectangular_s(-10.0, 1e-9),
         lambda: Gate.rectangular_s(1e-9, 14.0),
-        lambda: Gate.gaussian_s(4e-9, 0.02),
         lambda: Gate.gaussian_s(0.02, 4e-9),
     ],
 )

@@ -1,7 +1,5 @@
 """Gradients with an error: calibrated, and without one where the tail is heavy."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -10,7 +8,6 @@ import torch
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.accuracy import gradient_errors
-from torchtransient.errors import ArgumentError, UnitError
 
 
 def late(out):
@@ -67,15 +64,3 @@ def test_a_heavy_tail_has_no_error(monkeypatch):
     found = gradient_errors(own, rare, passes=2, progress=False)[COLOUR]
     assert found.tail.heavy and math.isnan(float(found.standard_error.sum()))
     assert "heavy tailed: no error" in str(found)
-
-
-def test_wrong_requests():
-    own = renderer()
-    with pytest.raises(UnitError, match="passes"):
-        gradient_errors(own, late, passes=1)
-    with pytest.raises(ArgumentError, match="parameters"):
-        gradient_errors(own, late, ["no such key"])
-    with pytest.raises(ArgumentError, match="one number"):
-        gradient_errors(own, lambda out: out.transient, progress=False)
-    with pytest.raises(ArgumentError, match="parameters"):
-        gradient_errors(tt.TransientRenderer(tt.load(make_room(), variant=VARIANT)), late)

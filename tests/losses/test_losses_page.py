@@ -1,26 +1,20 @@
-"""docs/losses.md: its program runs, and it names every function of the room and no other."""
+"""docs/losses.md and docs/noisy_renders.md: their programs run, the names and numbers are those of the library."""
 
-from __future__ import annotations
-
-import dataclasses
+import importlib.util
 import inspect
-import pkgutil
+import json
 import re
 from pathlib import Path
 
+import pytest
 import torch
 
-from support.loss_cases import CASES, OTHERS
+from support.loss_cases import OTHERS
 from support.pages import Page
 from torchtransient import losses
-from torchtransient.errors import ShapeError
 
 LOSSES = Page("docs/losses.md")
 PAGE = LOSSES.text
-# By the row of another: second names, and phasors of transients.
-SHARED_FLOORS = ("poisson_loss", "first_photon_loss", "transient_phasor_loss")
-
-
 def test_its_program_runs():
     torch.manual_seed(0)
     names = LOSSES.names()
@@ -37,47 +31,43 @@ def test_its_names_are_those_of_the_room():
     assert set(likely) <= functions
 
 
-def asks_for_dim(case):
-    """Of lists of points, without levels that are given: a scale is then that of an item."""
-    known = {name: value for name, value in case.options.items() if name not in ("floor", "background")}
-    x, y = (t.flatten(-2) for t in case.tensors())
-    if "operator" in known:
-        known["operator"], x = torch.clone, y  # one that takes lists
-    try:
-        dataclasses.replace(case, options=known)(x, y)
-    except ShapeError as error:
-        return "expected dim=" in str(error)
-    return False
+# ------------------------------------------------------------------------------------------------ docs/noisy_renders.md
 
 
-def test_what_asks_for_dim_is_said():
-    """The paragraph names all losses that do, and no other."""
-    (text,) = re.findall(r"\nIt is asked for by (.*?)\.\s+All", PAGE, re.DOTALL)
-    functions = {name for name in dir(losses) if name.islower() and inspect.isfunction(getattr(losses, name))}
-    asking = {case.function.__name__ for case in CASES if asks_for_dim(case)}
-    for function, call in OTHERS.items():
-        try:
-            call(torch.rand(2, 8, 9))
-        except ShapeError as error:
-            asking |= {function.__name__} if "expected dim=" in str(error) else set()
-    assert set(re.findall(r"`(\w+)`", text)) & functions == asking
+ROOT = Path(__file__).parents[2]
+NOISY = Page("docs/noisy_renders.md")
+NUMBERS = ROOT / "benchmarks" / "results" / "noisy_renders.json"
 
 
-def test_every_floor_is_in_the_table():
-    """Of what has one as an argument."""
-    (table,) = re.findall(r"\| loss \| floor \|.*?\n\n", PAGE, re.DOTALL)
-    for name in dir(losses):
-        function = getattr(losses, name)
-        if inspect.isfunction(function) and {"floor", "background", "smoothing"} & set(
-            inspect.signature(function).parameters
-        ):
-            assert re.search(rf"`{name}\b", table) or name in SHARED_FLOORS, name
+@pytest.mark.slow
+def test_its_blocks_run():
+    """The squared error of one render is above that of two by their variance; the schedule ends above its start."""
+    torch.manual_seed(0)
+    names = NOISY.names()
+    assert names["squares"].item() > 0 and names["noise"].item() > 0
+    values = names["renderer"].values[names["key"]]
+    assert bool(torch.isfinite(values).all()) and bool(torch.isfinite(values.grad).all())
+    assert names["schedule"](0) == 16 and names["schedule"](8) == names["schedule"].last > 16
+    significance = names["significance"]
+    assert significance.shape == (3,) and bool(torch.isfinite(significance).all())
 
 
-def test_names_elsewhere_are_there():
-    """`tt.nlos.FK` and the like, on the page and in docstrings of the room."""
-    texts = [PAGE, *(path.read_text(encoding="utf-8") for path in Path(losses.__file__).parent.glob("*.py"))]
-    names = {name for text in texts for name in re.findall(r"\b(?:tt|torchtransient)((?:\.\w+)+)", text)}
-    assert len(names) > 10
-    for name in names:
-        pkgutil.resolve_name("torchtransient" + name)
+def test_its_tables_are_those_of_the_numbers():
+    maker = ROOT / "docs" / "make_noisy_render_page.py"
+    specification = importlib.util.spec_from_file_location("make_noisy_render_page", maker)
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    data = json.loads(NUMBERS.read_text(encoding="utf-8"))
+    assert not data["settings"]["quick"]
+    assert module.written(NOISY.text, data) == NOISY.text
+    # what the page says of them
+    least = data["least"]
+    squares, likelihood = least["`squared_loss`, weighted"], least["`poisson_loss`, `poisson_nll`"]
+    assert squares["exact"]["64"]["rms"] < 0.2 and likelihood["exact"]["64"]["rms"] > 1 > squares["own"]["rms"]
+    late, few = (data["fits"][f"`expected_root_loss`, 64{more}"] for more in (" to 1024", ""))
+    assert late["rms"] < 0.1 < 1 < few["rms"]
+    errors = {name: sum(found["percent"]) / 3 for name, found in data["priors"].items()}
+    squares, roots, poisson = (
+        errors[name] for name in ("weighted squares, 64 samples", "`expected_root_loss`, 64", "`poisson_loss`, 64")
+    )
+    assert squares < 0.65 * roots and roots < errors["the start"] < 0.6 * poisson

@@ -1,7 +1,5 @@
 """Phasors of transients, and losses of them: delays, Parseval, the branch cut, dark pixels."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -30,15 +28,6 @@ def test_phasors_are_the_sum_of_oscillations():
     torch.testing.assert_close(found, torch.einsum("ft,...tyx->...fyx", torch.polar(torch.ones_like(angle), angle),
                                                    record.to(torch.complex128)))  # fmt: skip
     torch.testing.assert_close(found[:, :, 0].real, record.sum(2))
-
-
-def test_phasors_of_exhaustive_captures_and_of_points():
-    record = torch.rand(1, 64, 2, 2, 3, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    found = losses.transient_phasors(record, AXIS, BAND, dim=-5)
-    assert found.shape == (1, 4, 2, 2, 3, 2)
-    torch.testing.assert_close(found, losses.transient_phasors(record.reshape(1, 64, 4, 6), AXIS, BAND).view_as(found))
-    points = losses.transient_phasors(record.reshape(1, 64, 24), AXIS, BAND, dim=1)
-    torch.testing.assert_close(points, found.reshape(1, 4, 24))
 
 
 def test_phases_keep_their_digits_far_away():
@@ -82,7 +71,7 @@ def test_no_branch_cut():
     phasor = torch.polar(torch.ones_like(angle), angle)
     target = torch.polar(*torch.tensor([1.0, math.radians(179.9)], dtype=torch.float64))
     value = losses.phasor_loss(phasor, target, phase_only=True)
-    assert float(value) == pytest.approx(2 - 2 * math.cos(math.radians(0.2)), rel=1e-5)
+    assert value.item() == pytest.approx(2 - 2 * math.cos(math.radians(0.2)), rel=1e-5)
     value.backward()
     assert float(angle.grad) == pytest.approx(2 * math.sin(math.radians(0.2)), rel=1e-5)
 
@@ -113,15 +102,12 @@ def test_a_window_of_time_by_a_mask():
 def test_frequencies_above_half_of_one_over_the_bin(sign):
     """10 per metre for bins of 5 cm: above, records of whole bins have the phasors of lower frequencies."""
     record = pulse(3, 20)
-    calls = [
+    for call in (
         lambda band: losses.transient_phasors(record, AXIS, band),
         lambda band: losses.transient_phasor_loss(record, record, axis=AXIS, frequencies=band),
-        lambda band: losses.TransientPhasorLoss(AXIS, band)(record, record),
-    ]
-    for call in calls:
-        for frequency in (10.001, 20.5, 1e6):
-            with pytest.raises(UnitError, match="two bins at least, frequencies of 10 per metre"):
-                call(FrequencyAxis((1.0, sign * frequency)))
+    ):
+        with pytest.raises(UnitError, match="two bins at least, frequencies of 10 per metre"):
+            call(FrequencyAxis((1.0, sign * 10.001)))
         call(FrequencyAxis((sign * 10.0,)))
     # of a discrete transform, however it is computed
     for bins, width in ((64, 0.05), (30, 0.1), (7, 0.3), (1000, 0.0299792458 / 3)):
@@ -141,13 +127,5 @@ def test_errors():
         losses.transient_phasors(torch.zeros(1, 60, 2, 2), AXIS, BAND)
     with pytest.raises(ArgumentError, match="TimeAxis and a FrequencyAxis"):
         losses.transient_phasors(torch.zeros(1, 64, 2, 2), AXIS, [1.0])
-    with pytest.raises(ShapeError, match="dim="):
-        losses.transient_phasors(torch.zeros(64, 2), AXIS, BAND)
     with pytest.raises(UnitError, match="complex phasors"):
         losses.phasor_loss(torch.zeros(3), torch.zeros(3))
-    with pytest.raises(UnitError, match="greater than zero"):
-        losses.phasor_loss(torch.zeros(3) + 0j, torch.zeros(3) + 0j, phase_only=True, floor=0.0)
-    with pytest.raises(UnitError, match="real numbers"):
-        losses.transient_phasor_loss(
-            torch.zeros(1, 64, 1, 1) + 0j, torch.zeros(1, 64, 1, 1) + 0j, axis=AXIS, frequencies=BAND
-        )

@@ -1,6 +1,6 @@
-"""Losses of pictures: depth maps with holes, structural similarity, projections of volumes."""
+"""Losses of pictures: depth maps with holes and of any scale, structural similarity, projections of volumes."""
 
-from __future__ import annotations
+import math
 
 import pytest
 import torch
@@ -18,24 +18,13 @@ def test_depth_in_metres_where_there_is_a_surface():
     found = torch.tensor([[1.1, 1.8, 7.0], [3.0, 0.5, 9.0]], requires_grad=True)
     mask = torch.tensor([[True, True, True], [True, True, False]])
     value = losses.depth_loss(found, truth, mask=mask)
-    assert float(value) == pytest.approx((0.1 + 0.2 + 0) / 3, rel=1e-6)
+    assert value.item() == pytest.approx((0.1 + 0.2 + 0) / 3, rel=1e-6)
     value.backward()
     torch.testing.assert_close(found.grad, torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.0, 0.0]]) / 3)
     nowhere = losses.depth_loss(found, torch.full_like(truth, float("nan")))
     assert float(nowhere) == 0
     # a network that gives NaN where there is a surface is not passed over
     assert torch.isnan(losses.depth_loss(torch.full((2, 3), float("nan")), truth))
-
-
-def test_similarity_of_flat_pictures_is_that_of_their_brightness():
-    """`(2 a b + c1) / (a^2 + b^2 + c1)`, c1 = (0.01 L)^2."""
-    a, b = torch.full((1, 12, 12), 0.3, dtype=torch.float64), torch.full((1, 12, 12), 0.6, dtype=torch.float64)
-    for scale, value_range in ((1.0, 1.0), (50.0, 50.0), (1.0, 3.0)):
-        c1 = (0.01 * value_range) ** 2
-        x, y = 0.3 * scale, 0.6 * scale
-        wanted = 1 - (2 * x * y + c1) / (x**2 + y**2 + c1)
-        found = losses.ssim_loss(scale * a, scale * b, value_range=value_range, reduction="none")
-        torch.testing.assert_close(found, torch.full_like(found, wanted), rtol=1e-6, atol=1e-9)
 
 
 def test_similarity_against_its_definition():
@@ -48,8 +37,9 @@ def test_similarity_against_its_definition():
     va, vb, cov = (w * a * a).sum() - ma**2, (w * b * b).sum() - mb**2, (w * a * b).sum() - ma * mb
     c1, c2 = 0.01**2, 0.03**2
     wanted = 1 - (2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
-    found = losses.ssim_loss(a, b, value_range=1.0, reduction="none")[0, 5, 5]
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
+    for scale in (1.0, 50.0):
+        found = losses.ssim_loss(scale * a, scale * b, value_range=scale, reduction="none")[0, 5, 5]
+        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
 
 
 def test_the_default_range_knows_the_scale():
@@ -84,8 +74,6 @@ def test_pictures_that_are_too_small():
         losses.ssim_loss(a, a, window=17)
     with pytest.raises(ShapeError, match="real volume"):
         losses.maximum_projections(a + 0j)
-    with pytest.raises(ShapeError, match="volumes"):
-        losses.projection_ssim_loss(a, a)
 
 
 def test_the_range_of_a_target_has_no_gradient():
@@ -100,3 +88,64 @@ def test_the_range_of_a_target_has_no_gradient():
         losses.ssim_loss(a, target, window=3, value_range=value_range).backward()
         slopes.append(target.grad)
     torch.testing.assert_close(*slopes, rtol=1e-9, atol=1e-12)
+
+
+# ------------------------------------------------------------------------------------ depth maps of any scale
+
+
+def maps(seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return tuple(1 + torch.rand(2, 1, 6, 7, generator=g, dtype=torch.float64) for _ in range(2))
+
+
+@pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
+def test_moments_of_logarithms(balance):
+    """`mean(d^2) - balance mean(d)^2`: of a balance of one a common factor has no part."""
+    x, y = maps()
+    for factor in (1.0, 7.0):
+        d = (factor * x / y).log()
+        found = losses.scale_invariant_depth_loss(factor * x, y, balance=balance, reduction="none")
+        assert found.shape == (2, 1)
+        torch.testing.assert_close(found, d.square().mean((-2, -1)) - balance * d.mean((-2, -1)).square())
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1.0])
+def test_a_common_factor_in_single_precision(factor):
+    """Millimetres against metres: what is left is the variance, 1e-6, of squared logarithms of up to 48."""
+    g = torch.Generator().manual_seed(4)
+    y = 1 + torch.rand(16, 16, generator=g)
+    x = (factor * y * (1 + 1e-3 * torch.randn(16, 16, generator=g))).requires_grad_()
+    wide = x.detach().double().requires_grad_()
+    value = losses.scale_invariant_depth_loss(x, y, balance=1.0)
+    wanted = losses.scale_invariant_depth_loss(wide, y.double(), balance=1.0)
+    # logarithms up to 8 are rounded by 2^-22, of deviations of 1e-3
+    torch.testing.assert_close(value.double(), wanted, rtol=1e-3, atol=0)
+    value.backward()
+    wanted.backward()
+    torch.testing.assert_close(x.grad.double(), wide.grad, rtol=0, atol=2e-3 * float(wide.grad.abs().max()))
+
+
+def test_where_there_is_no_surface():
+    x, y = maps()
+    wanted = losses.scale_invariant_depth_loss(x[:, :, :3], y[:, :, :3])
+    for nothing in (math.nan, math.inf, 0.0, -1.0):
+        torch.testing.assert_close(
+            losses.scale_invariant_depth_loss(x, torch.where(torch.arange(6)[:, None] < 3, y, nothing)), wanted
+        )
+    # a map without any surface has no part in the mean
+    empty = y.clone()
+    empty[1] = 0.0
+    torch.testing.assert_close(
+        losses.scale_invariant_depth_loss(x, empty), losses.scale_invariant_depth_loss(x[:1], y[:1])
+    )
+
+
+def test_depths_below_the_floor_have_a_way_out():
+    x = torch.tensor([[[-1.0, 0.0], [1e-3, 2.0]]], dtype=torch.float64, requires_grad=True)
+    value = losses.scale_invariant_depth_loss(x, torch.ones(1, 2, 2, dtype=torch.float64), balance=0.0, floor=1e-3)
+    d = torch.tensor([math.log(1e-3) - 1001, math.log(1e-3) - 1, math.log(1e-3), math.log(2)], dtype=torch.float64)
+    torch.testing.assert_close(value, d.square().mean())
+    value.backward()
+    assert bool((x.grad[0].flatten()[:3] < 0).all())
+    with pytest.raises(ShapeError, match="depth maps"):
+        losses.scale_invariant_depth_loss(x[0, 0], x[0, 0])

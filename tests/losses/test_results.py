@@ -1,6 +1,4 @@
-"""Losses of results: renders, captures and what methods found, by their attributes, in place of tensors."""
-
-from __future__ import annotations
+"""Losses of results in place of tensors: renders, captures, reconstructions."""
 
 import dataclasses
 import functools
@@ -16,7 +14,7 @@ from torchtransient.errors import ArgumentError, ShapeError, UnitError
 
 # The attribute that a loss reads, by the argument that is a pair of results.
 READS = {
-    **dict.fromkeys((losses.phasor_loss,), "phasor"),
+    losses.phasor_loss: "phasor",
     **dict.fromkeys((losses.depth_loss, losses.scale_invariant_depth_loss), "depth_m"),
     losses.ssim_loss: "steady",
     **dict.fromkeys((losses.projection_ssim_loss, losses.total_variation), "values"),
@@ -120,8 +118,6 @@ def test_results_on_two_axes(case):
     with pytest.raises(UnitError, match="results on one axis") as caught:
         bare(case)(a, result(y, axis=other))
     assert str(caught.value).startswith(case.function.__name__ + ":")
-    rounded = TimeAxis(AXIS.start_opl * (1 + 1e-9), AXIS.bin_width_opl * (1 + 1e-9), BINS)
-    assert bool(torch.isfinite(bare(case)(a, result(y, axis=rounded))))
 
 
 def test_rates_and_beats_of_a_film():
@@ -155,23 +151,9 @@ def test_distances_between_results_over_rates():
     assert float(losses.wasserstein_loss(*spectra)) == pytest.approx(1.5)
     found = losses.wasserstein_loss(a, b, dim=-3, reduction="none")
     torch.testing.assert_close(found, losses.wasserstein_loss(x, y, AXIS.bin_width_opl, dim=-3, reduction="none"))
-    for loss in (losses.wasserstein_loss, losses.cumulative_loss):
-        for dim in (None, -4, 1):
-            torch.testing.assert_close(loss(a, y, dim=dim), loss(x, y, 0.5, dim=-4))
+    for dim in (None, 1):
+        torch.testing.assert_close(losses.cumulative_loss(a, y, dim=dim), losses.cumulative_loss(x, y, 0.5, dim=-4))
     torch.testing.assert_close(losses.multiscale_loss(a, b), losses.multiscale_loss(x, y, dim=-4))
-    beats = torch.rand(2, 1, 2, BINS, 3, 3)
-    found = losses.wasserstein_loss(*(result(t, "beats") for t in beats))
-    torch.testing.assert_close(found, losses.wasserstein_loss(*beats, AXIS.bin_width_opl))
-
-
-def test_frequencies_are_an_axis():
-    x = torch.randn(1, 5, 2, 2, dtype=torch.complex64)
-    bands = BAND, dataclasses.replace(BAND, start_opl=3)
-    one, other = (result(x, "phasor", None, frequencies=band) for band in bands)
-    assert float(losses.phasor_loss(one, one)) == 0
-    for loss in (losses.phasor_loss, losses.squared_loss):
-        with pytest.raises(UnitError, match="one axis"):
-            loss(one, other)
 
 
 def test_where_time_is_comes_from_the_scan():
@@ -191,25 +173,6 @@ def test_where_time_is_comes_from_the_scan():
     )
 
 
-def test_what_is_given_counts_more_than_what_a_result_knows():
-    x, y = (torch.rand(1, BINS, 3, 3, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
-    found = losses.cumulative_loss(result(x), result(y), 1.0)
-    torch.testing.assert_close(found, losses.cumulative_loss(x, y, 1.0))
-    torch.testing.assert_close(losses.cumulative_loss(result(x), y), losses.cumulative_loss(x, y, 0.05))
-    for loss in (losses.cumulative_loss, losses.wasserstein_loss):
-        with pytest.raises(UnitError, match="bin_width_opl, metres of optical path, with tensors"):
-            loss(x, y)
-    with pytest.raises(ArgumentError, match="expected a TimeAxis"):
-        losses.transient_phasor_loss(x, y, frequencies=BAND)
-    torch.testing.assert_close(
-        losses.transient_phasors(result(x), frequencies=BAND), losses.transient_phasors(x, AXIS, BAND)
-    )
-    torch.testing.assert_close(
-        losses.TransientPhasorLoss(frequencies=BAND)(result(x), y),
-        losses.transient_phasor_loss(x, y, axis=AXIS, frequencies=BAND),
-    )
-
-
 def test_a_capture_with_transient_and_phasor_beside_a_phasor():
     x, p = torch.rand(1, BINS, 2, 2), torch.randn(1, 5, 2, 2, dtype=torch.complex64)
     both = SimpleNamespace(transient=x, phasor=p, axis=AXIS, frequencies=BAND)
@@ -219,10 +182,9 @@ def test_a_capture_with_transient_and_phasor_beside_a_phasor():
 
 
 def test_renders_of_the_library():
-    """`RenderOutput`, a `Capture`, a `HiddenVolume` and an `ItofReading` are such results."""
+    """A rendered result, a `Capture` and an `ItofReading`; volumes are tested with the total variation."""
     from torchtransient.capture import Capture, Scan, Wall
     from torchtransient.files import Result
-    from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
     from torchtransient.sensing import ItofReading
 
     x = torch.rand(1, BINS, 2, 2)
@@ -234,58 +196,49 @@ def test_renders_of_the_library():
     phase, amplitude, offset, deviation = torch.rand(4, 1, 2, 3, 3)
     reading = ItofReading(phase, amplitude, offset=offset, depth_std_m=deviation, depth_m=torch.rand(1, 3, 3))
     torch.testing.assert_close(losses.depth_loss(reading, reading.depth_m + 1), torch.tensor(1.0))
-    grid = VoxelGrid.bounds([[-1, -1, 0.5], [1, 1, 1.5]], (4, 3, 5))
-    volume = HiddenVolume(torch.rand(1, 5, 3, 4), grid, "f-k migration")
-    wanted = losses.total_variation(volume.values, spacing=(0.2, 2 / 3, 0.5))
-    torch.testing.assert_close(losses.total_variation(volume), wanted)
-    uneven = dataclasses.replace(grid, depths=grid.depths**2)
-    with pytest.raises(ShapeError, match="evenly spaced planes"):
-        losses.total_variation(dataclasses.replace(volume, grid=uneven))
-    torch.testing.assert_close(
-        functools.partial(losses.ssim_loss, window=3)(rendered, rendered.steady), torch.tensor(0.0)
-    )
 
 
-def phasors(frequencies, start):
-    axis = FrequencyAxis(frequencies, start)
-    return SimpleNamespace(
-        transient=None, gated=None, steady=None, axis=None, frequencies=axis, phasor=torch.ones(1, 2, 2, 2) + 0j
-    )
-
-
-@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
-def test_starts_of_frequency_axes_are_told_apart_by_phase(frequencies, shift, one):
-    """What a start turns is the start times the highest frequency, in cycles."""
-    a, b = phasors(frequencies, 1.0), phasors(frequencies, 1.0 + shift)
-    if one:
-        assert losses.phasor_loss(a, b).item() == 0
-        return
-    with pytest.raises(UnitError, match="one axis"):
-        losses.phasor_loss(a, b)
+def test_a_width_that_is_given_counts_more_than_that_of_a_result():
+    x, y = (torch.rand(1, BINS, 3, 3, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+    found = losses.cumulative_loss(result(x), result(y), 1.0)
+    torch.testing.assert_close(found, losses.cumulative_loss(x, y, 1.0))
+    with pytest.raises(UnitError, match="bin_width_opl"):
+        losses.cumulative_loss(x, y)
+    with pytest.raises(ArgumentError, match="expected a TimeAxis"):
+        losses.transient_phasor_loss(x, y, frequencies=BAND)
 
 
 @pytest.mark.parametrize(
     ("other", "one"),
     [
-        (TimeAxis(1.0, 0.1, 10), True),
         (TimeAxis(1.00005, 0.1, 10), True),
         (TimeAxis(1.0, 0.101, 10), False),  # ends later
         (TimeAxis(0.99, 0.101, 10), False),  # begins sooner, ends alike
-        (TimeAxis(1.01, 0.1, 10), False),
         (TimeAxis(1.0005, 0.1, 10), False),
-        (TimeAxis(1.0, 0.1, 11), False),
         (TimeAxis(1.0, 1.0 / 11, 11), False),  # as long, in other bins
     ],
 )
-def test_axes_that_are_one(other, one):
+def test_time_axes_that_are_one(other, one):
     """Start, end and number of bins, each to a thousandth of a bin."""
-    cubes = [torch.rand(1, axis.num_bins, 2, 2) for axis in (TimeAxis(1.0, 0.1, 10), other)]
-    a, b = (
-        SimpleNamespace(transient=cube, phasor=None, gated=None, steady=None, frequencies=None, gates=None, axis=axis)
-        for cube, axis in zip(cubes, (TimeAxis(1.0, 0.1, 10), other), strict=True)
-    )
+    axis = TimeAxis(1.0, 0.1, 10)
+    a, b = (result(torch.rand(1, each.num_bins, 2, 2), axis=each) for each in (axis, other))
     if one:
         assert losses.wasserstein_loss(a, b).item() > 0
     else:
         with pytest.raises((UnitError, ShapeError), match=r"one axis|shape"):
             losses.wasserstein_loss(a, b)
+
+
+@pytest.mark.parametrize(("frequencies", "shift", "one"), [((0.5, 900.0), 1e-4, False), ((1e-4, 1e-3), 0.5, True)])
+def test_frequency_axes_that_are_one(frequencies, shift, one):
+    """Two starts differ by the phase that they turn, the start times the highest frequency in cycles."""
+    x = torch.ones(1, 2, 2, 2) + 0j
+    a, b = (
+        result(x, "phasor", None, frequencies=FrequencyAxis(frequencies, start)) for start in (1.0, 1.0 + shift)
+    )
+    if one:
+        assert losses.phasor_loss(a, b).item() == 0
+        return
+    for loss in (losses.phasor_loss, losses.squared_loss):
+        with pytest.raises(UnitError, match="one axis"):
+            loss(a, b)

@@ -1,7 +1,5 @@
 """Straight lines through several media, value and derivatives in both modes, by closed forms without noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,8 +1,9 @@
-"""Optical lengths in media: null collisions, boundaries and indices of refraction."""
+"""Optical lengths in media: null collisions, boundaries, indices of refraction, grids that end inside their shape."""
 
 import numpy as np
 import pytest
 
+from support.marks import long_rows
 from support.media_scenes import block, camera, film, homogeneous, load, volume
 from support.runs import T, runs
 from torchtransient.accuracy import two_sample_z_test, z_test
@@ -11,10 +12,9 @@ VARIANT = "llvm_ad_mono"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("majorant", [1.2, 4.0])
-def test_grid_of_one_density_is_homogeneous(majorant):
-    """In every bin, however many null collisions a majorant above the density makes."""
-    density = volume(np.full((3, 3, 3), 1.2)) | {"max_value": majorant}
+def test_grid_of_one_density_is_homogeneous():
+    """In every bin, though a majorant above the density makes null collisions."""
+    density = volume(np.full((3, 3, 3), 1.2)) | {"max_value": 4.0}
     grid = {"type": "heterogeneous", "sigma_t": density, "albedo": 0.8}
     axis = {"bins": 40, "bin_width": 0.4}
     _, a = runs(load(block(grid), camera(**axis)), spp=512)
@@ -28,21 +28,6 @@ def test_grid_of_one_density_is_homogeneous(majorant):
     assert two_sample_z_test(*mean).passed
     # Lengths of null collisions left out would shorten the mean by metres.
     assert mean[0].mean() == pytest.approx(mean[1].mean(), abs=0.1)
-
-
-def test_null_collisions_do_not_change_arrivals():
-    """Through a thin cloud that only absorbs, light arrives when it does without: all of it at one length."""
-    density = volume(np.full((2, 2, 2), 0.1)) | {"max_value": 5.0}
-    objects = block({"type": "heterogeneous", "sigma_t": density, "albedo": 0.0})
-    objects["lamp"] = {"type": "point", "position": [0, 0, 4], "intensity": 10.0}
-    sensor = {"type": "radiancemeter", "origin": [0, 0, 4], "direction": [0, 0, -1], "film": film(1, 1, bins=150)}
-    _, transient = runs(load(objects, sensor, max_depth=2), count=8, spp=4096)
-    histogram = transient.reshape(8, -1)
-    arrival = int(2 * 6.0 / 0.1)
-    assert histogram.sum() == pytest.approx(histogram[:, arrival - 1 : arrival + 1].sum())
-    expected = 0.6 / np.pi * 10 / 36 * np.exp(-2 * 0.1 * 2.0)
-    result = z_test(histogram.sum(1), expected)
-    assert result.passed, str(result)
 
 
 def test_medium_in_a_glass_slab():
@@ -74,21 +59,6 @@ def test_medium_in_a_glass_slab():
 
 
 @pytest.mark.slow
-def test_scattering_medium_of_another_index():
-    """The same medium in a block with and without an index: scattered light is later by the index, not weaker. A rough
-    boundary of nearly the same index on both sides is the open one.
-    """
-    axis = {"bins": 30, "bin_width": 0.6}
-    medium = homogeneous(1.0, 0.9)
-    rough = {"type": "roughdielectric", "int_ior": 1.0005, "ext_ior": 1.0, "alpha": 0.01}
-    # A boundary that refracts counts as a scattering event: let neither reach its limit.
-    _, a = runs(load(block(medium, rough), camera(**axis), max_depth=60), spp=1024)
-    _, b = runs(load(block(medium), camera(**axis), max_depth=60), spp=1024)
-    result = two_sample_z_test(a.sum((1, 2)), b.sum((1, 2)), rounding=1e-6)
-    assert result.passed, str(result)
-
-
-@pytest.mark.slow
 def test_unwarped_first_leg():
     """Without the first leg everything comes earlier, and no more or less of it."""
     objects = block(homogeneous(1.0, 0.8))
@@ -97,3 +67,71 @@ def test_unwarped_first_leg():
     np.testing.assert_allclose(full, unwarped, rtol=1e-5)
     first = [np.argmax(x.sum((0, 1, 2, 4)) > 0) for x in (transient, reference)]
     assert first[0] < first[1] - 15
+
+
+# --------------------------------------------------------------------------------------------------- grids from outside
+
+
+SIGMA = 0.7
+# The grid fills z from -1 to 1, its shape z from -3 to 3; beams start at z = 5, or at z = 2 inside of the shape.
+
+
+def cloud(albedo=0.0, majorant=1.5):
+    density = volume(np.full((2, 2, 2), SIGMA)) | {"max_value": majorant}
+    return {"type": "heterogeneous", "sigma_t": density, "albedo": albedo}
+
+
+def beam(start, bins=200, width=0.1):
+    film_of_one = film(1, 1, bins=bins, bin_width=width)
+    return {"type": "radiancemeter", "origin": [0.1, 0.1, start], "direction": [0, 0, -1], "film": film_of_one}
+
+
+def shape(medium, half=3.0):
+    return {"type": "cube", "to_world": T().scale(half), "bsdf": {"type": "null"}, "interior": medium}
+
+
+def inside(start, sensor, block):
+    """A beam that begins in the medium says so."""
+    if start < 3.0:
+        sensor["medium"] = block["interior"] = {"type": "ref", "id": "cloud"}
+    return sensor, block
+
+
+@pytest.mark.parametrize(("start", "light"), long_rows([(5.0, "connected"), (2.0, "found")], [(2.0, "found")]))
+def test_light_through_a_grid(start, light):
+    """exp(-σ l) with the length in the grid alone: by the walk of a ray to a lamp behind it, and by the shadow ray from
+    a wall behind it to a lamp before it.
+    """
+    medium = cloud()
+    objects = {"cloud": medium} if start < 3.0 else {}
+    sensor, block = inside(start, beam(start), shape(medium))
+    objects["block"] = block
+    if light == "found":
+        lamp = {"type": "rectangle", "to_world": T().translate([0, 0, -4]).scale(2)}
+        objects["lamp"] = lamp | {"emitter": {"type": "area", "radiance": 2.0}}
+        expected, arrival = 2.0 * np.exp(-SIGMA * 2), start + 4
+    else:
+        wall = {"type": "rectangle", "to_world": T().translate([0, 0, -4])}
+        objects["wall"] = wall | {"bsdf": {"type": "diffuse", "reflectance": 0.6}}
+        objects["lamp"] = {"type": "point", "position": [0.1, 0.1, 4], "intensity": 30.0}
+        expected, arrival = 0.6 / np.pi * 30.0 / 64 * np.exp(-SIGMA * 4), start + 4 + 8
+    _, transient = runs(load(objects, sensor, max_depth=2), count=8, spp=1 << 14)
+    histogram = transient.reshape(8, -1)
+    k = round(arrival / 0.1)
+    assert histogram.sum() == pytest.approx(histogram[:, k - 1 : k + 1].sum())
+    result = z_test(histogram.sum(1), expected)
+    assert result.passed, str(result)
+    assert histogram.sum(1).std() < 0.1 * expected
+
+
+@pytest.mark.slow
+def test_where_a_grid_scatters():
+    """As a homogeneous block of the grid's size does, bin by bin: collisions begin at the grid and not at its shape."""
+    histograms = []
+    for medium in (shape(cloud(albedo=0.9)), shape(homogeneous(SIGMA, 0.9), half=1.0)):
+        lamp = {"type": "point", "position": [0.3, 2.0, 0.4], "intensity": 30.0}
+        scene = load({"block": medium, "lamp": lamp}, beam(5.0, bins=60, width=0.2), max_depth=3)
+        histograms.append(runs(scene, count=8, spp=1 << 13)[1].reshape(8, -1))
+    result = two_sample_z_test(*histograms, rounding=1e-6)
+    assert result.passed and result.chi2_z < 4, str(result)
+    assert np.count_nonzero(histograms[0].sum(0)) > 15

@@ -26,8 +26,6 @@ def scene(sensor, sigma_t, albedo, max_depth, **objects):
         "type": sensor, "near_clip": CLIP, "to_world": np.eye(4), "medium": {"type": "ref", "id": "fog"},
         "film": {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"}},
     }  # fmt: skip
-    if sensor == "thinlens":
-        camera |= {"aperture_radius": 0.05, "focus_distance": 2.0}
     return tt.load(
         {
             "type": "scene",
@@ -67,7 +65,6 @@ def render(scene, keys=(), spp=1024, count=6):
     ("sensor", "sigma_t", "key"),
     [
         ("perspective", 1.0, "fog.sigma_t.value.value"),
-        pytest.param("thinlens", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.slow),
         pytest.param("orthographic", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.slow),
     ],
 )
@@ -84,7 +81,7 @@ def test_light_is_attenuated_up_to_the_camera(sensor, sigma_t, key):
         },
     )  # fmt: skip
     values, arrivals, slopes = render(described, [key, "sensor.to_world"])
-    # Angles of the view and the lens: path lengths differ by less than a thousandth.
+    # Angles of the view: path lengths differ by less than a thousandth.
     assert z_test(values, np.exp(-LAMP), rounding=1e-3).passed
     np.testing.assert_allclose(arrivals, LAMP, atol=0.06)
     by_extinction = [float(extinction.sum()) for extinction, _ in slopes]

@@ -1,7 +1,5 @@
 """docs/metrics.md: its program runs, and it names every function of the room and no other."""
 
-from __future__ import annotations
-
 import inspect
 import re
 

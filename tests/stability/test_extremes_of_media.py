@@ -2,8 +2,6 @@
 value and derivative on the way is finite.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -126,28 +124,6 @@ def test_light_scattered_once(variant, sampler, examples, height):
     holds(
         property_, examples, extinction=magnitudes(0.1, densest, 1), albedo=numbers(0, 1), g=numbers(-0.999, 0.999, 0)
     )
-
-
-@for_all_runs
-def test_light_from_the_side(variant, sampler, examples):
-    """Across the line of sight g and -g scatter alike, sample by sample, with opposite slopes."""
-    sun = {"type": "directional", "direction": [1.0, 0.0, 0.0], "irradiance": 1.0}
-    scene = tt.load(seen_from(1.0, 2, fog=fog_between(-1, 0), sun=sun), variant=variant)
-    renderer = tt.TransientRenderer(
-        scene, [G, SIGMA_T], time_axis=tt.TimeAxis(-100.0, 1.0, 200), spp=64, sampler=sampler, grad_seed="same"
-    )
-
-    def at_asymmetry(g, extinction):
-        at = leaves(renderer, {G: g, SIGMA_T: extinction})
-        light = light_over_time(renderer(at, seed=0)).sum()
-        return float(light.detach()), float(gradients(light, at)[0].sum())
-
-    def property_(g, extinction):
-        (light, slope), (other, opposite) = at_asymmetry(g, extinction), at_asymmetry(-g, extinction)
-        assert light == pytest.approx(other, rel=1e-5)
-        assert slope == pytest.approx(-opposite, rel=1e-4, abs=1e-6 * light)
-
-    holds(property_, examples // 2, g=numbers(0, 0.999, 0.5), extinction=magnitudes(1e-3, 5))
 
 
 @for_all_runs

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -11,11 +9,9 @@ import pytest
 import torch
 
 from support.dielectric_reference import rough_dielectric
-from support.marks import long_rows
 
 VARIANT = "llvm_ad_mono"
 ALPHA_MIN = 1e-3  # below it roughness is clamped
-ALPHAS = [0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0]
 
 
 def plugin(alpha, **more):
@@ -44,13 +40,7 @@ def hard_directions(count: int) -> np.ndarray:
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], 1).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("distribution", "alpha"),
-    long_rows(
-        itertools.product(["ggx", "beckmann"], ALPHAS),
-        [("ggx", 0.0), ("beckmann", 1.0)],
-    ),
-)
+@pytest.mark.parametrize(("distribution", "alpha"), [("ggx", 0.0), ("beckmann", 1e-3), ("beckmann", 1.0)])
 def test_values_and_derivatives_are_finite(distribution, alpha):
     """Guards against overflow: the density grows as 1 / alpha^2 and its derivative as 1 / alpha^3, exponentials
     underflow next to infinite arguments, masking divides by cosines that vanish. One such lane turns a whole
@@ -119,27 +109,3 @@ def test_roughness_below_the_clamp_is_said():
         mi.load_dict({"type": "diff_rough_dielectric", "alpha": 2e-3})
     finally:
         logger.set_error_level(level)
-
-
-@pytest.mark.slow
-def test_index_passing_through_one():
-    """Guards against 0 / 0 when an optimiser moves an index through exactly one, where the refracted lobe is a
-    delta function."""
-    bsdf = plugin(0.1)
-    wi = hard_directions(1000)
-    n = len(wi)
-    rng = np.random.default_rng(9)
-    u1, u2 = mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n)))
-    params = mi.traverse(bsdf)
-    for eta in (1 - 1e-6, 1.0, 1 + 1e-6):
-        params["eta"] = dr.opaque(mi.Float, eta)
-        dr.enable_grad(params["eta"])
-        params.update()
-        v = mi.Vector3f(wi.T)
-        dr.enable_grad(v)
-        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(v), u1, u2)
-        f, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(v), -v)
-        outputs = (bs.pdf, weight[0], f[0], pdf)
-        dr.backward(sum(outputs))
-        for found in (*dr.detach(outputs), dr.grad(params["eta"]), dr.grad(v)):
-            assert np.isfinite(found.numpy()).all()

@@ -1,7 +1,5 @@
 """Gradients through matrices that have no inverse: depolarisers, polarizers, absorbers, and frames that coincide."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.scenes import film, room, transform
-from support.gradient_cases.unknowns import move, rotate, set_color
+from support.gradient_cases.unknowns import set_color
 from support.marks import long
 from torchtransient import plugins
 
@@ -54,29 +52,28 @@ def polarizer(angle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("albedo", [0.0, 1e-8])
-def test_albedo_behind_two_polarizers(albedo):
+def test_albedo_behind_two_polarizers():
     """Guards against the light beyond a vertex being recovered by an inverse matrix: a diffuse wall forgets the
     polarization and a polarizer half of the light, neither can be undone. At albedo zero nothing is left at all.
     """
 
     def scene():
         parts = bench(polarizer(10.0), polarizer(50.0))
-        parts["wall"]["bsdf"] = {"type": "diffuse", "reflectance": albedo}
+        parts["wall"]["bsdf"] = {"type": "diffuse", "reflectance": 0.0}
         return parts
 
-    check(problem(scene, set_color("wall.bsdf.reflectance.value"), albedo))
+    check(problem(scene, set_color("wall.bsdf.reflectance.value"), 0.0))
 
 
-@pytest.mark.parametrize("angle", long([0.0, 45.0, 90.0, 30.0], [30.0]))
+@pytest.mark.parametrize("angle", long([0.0, 30.0], [30.0]))
 def test_angle_of_a_polarizer_in_a_chain(angle):
-    """Guards against NaN where two frames coincide (0 and 90 degrees, at normal incidence) and against stopping at a
+    """Guards against NaN where two frames coincide (0 degrees, at normal incidence) and against stopping at a
     product that is zero: between crossed polarizers the middle one decides whether there is light.
     """
     scene = lambda: bench(polarizer(0.0), polarizer(angle), polarizer(90.0))  # noqa: E731
     p = problem(scene, set_color("element_1.bsdf.theta.value"), angle, step=2.0)
-    if angle in (0.0, 90.0, 45.0):
-        # The light goes as sin(2 theta)^2: no slope at these angles, but a finite number.
+    if angle == 0.0:
+        # The light goes as sin(2 theta)^2: no slope, but a finite number.
         for mode in (p.reverse, p.forward):
             assert mode(1) == pytest.approx(0, abs=2e-6)
     else:
@@ -84,58 +81,11 @@ def test_angle_of_a_polarizer_in_a_chain(angle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("theta", [0.0, 90.0])
-def test_last_polarizer_before_the_camera(theta):
-    """S2 has its steepest slope by the angle where S1 has none, with all frames in line."""
-    check(problem(lambda: bench(polarizer(theta)), set_color("element_0.bsdf.theta.value"), theta, step=2.0), rel=5e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delta", long([0.0, 90.0, 180.0], [0.0]))
-def test_delay_of_a_wave_plate(delta):
+def test_delay_of_a_wave_plate():
+    delta = 0.0
     plate = {"type": "diff_retarder", "theta": 45.0, "delta": delta}
     scene = lambda: bench(polarizer(0.0), plate)  # noqa: E731
     check(problem(scene, set_color("element_1.bsdf.delta.value"), delta, step=2.0), smallest=1e-5)
-
-
-def mirror_square_to_the_rays(bsdf):
-    """An orthographic camera looks straight into a mirror beside itself: exactly normal incidence."""
-    scene = bench()
-    scene["wall"]["bsdf"] = bsdf
-    scene["behind"] = {
-        "type": "rectangle",
-        "to_world": transform().translate([0, 0, 5]).rotate([0, 1, 0], 180).scale(3),
-        "bsdf": {"type": "diffuse", "reflectance": 0.5},
-    }
-    scene["sensor"]["film"]["start_opl"] = 11.0
-    del scene["side"]
-    return scene
-
-
-MIRRORS = {
-    "diff_conductor": {"type": "diff_conductor", "eta": 0.5, "k": 2.0},
-    "diff_dielectric": {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0},
-}
-MOVES = {
-    "moved": (move("wall.to_world", (0, 0, 1)), 4e-3),
-    "turned": (rotate("wall.to_world", (0, 1, 0)), 0.1),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("bsdf", "moved"), [("diff_conductor", "turned"), ("diff_dielectric", "moved")])
-def test_mirror_at_normal_incidence(bsdf, moved):
-    """Guards against the plane of incidence that a ray along the normal does not have."""
-    apply, step = MOVES[moved]
-    p = problem(lambda: mirror_square_to_the_rays(MIRRORS[bsdf]), apply, 0.0, step=step, spp=4096)
-    reverse = np.array([p.reverse(s) for s in range(8)])
-    forward = np.array([p.forward(s) for s in range(2)])
-    differences = np.array([(p.loss(step, s) - p.loss(-step, s)) / (2 * step) for s in range(8)])
-    assert np.isfinite(reverse).all() and np.isfinite(forward).all()
-    np.testing.assert_allclose(forward, reverse[:2], rtol=2e-3)
-    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / 8)
-    assert abs(reverse.mean() - differences.mean()) < 3 * error
-    assert error < 0.15 * abs(differences.mean())
 
 
 def test_interface_matrices_are_finite():
@@ -160,28 +110,3 @@ def test_interface_matrices_are_finite():
         dr.backward(total)
         for value in (dr.detach(total), dr.grad(eta), *dr.grad(wi)):
             assert np.array(value).shape == theta.shape and np.isfinite(np.array(value)).all()
-
-
-@pytest.mark.slow
-def test_black_and_clear():
-    """A wall behind an element that lets nothing through has no gradient, one in front of it has, both finite."""
-    blocked = bench({"type": "diff_polarizer", "theta": 0.0, "transmittance": 0.0})
-    p = problem(lambda: blocked, set_color("wall.bsdf.reflectance.value"), 0.5)
-    assert p.reverse(1) == 0 and p.forward(1) == 0
-    p = problem(lambda: blocked, set_color("element_0.bsdf.transmittance.value"), 0.0)
-    check(p)
-
-
-@pytest.mark.slow
-def test_camera_rolls_before_a_polarizer():
-    """The sensor's own frame turns: S1 and S2 change into each other at twice the angle. Rays along the normal of
-    everything, where a rotation has no other effect.
-    """
-    scene = lambda: bench(polarizer(0.0))  # noqa: E731
-    p = problem(scene, rotate("sensor.to_world", (0, 0, 1)), 0.0, step=2.0, spp=1024)
-    reverse = np.array([p.reverse(s) for s in range(8)])
-    differences = np.array([(p.loss(2.0, s) - p.loss(-2.0, s)) / 4 for s in range(8)])
-    error = np.sqrt((reverse.var(ddof=1) + differences.var(ddof=1)) / 8)
-    assert abs(reverse.mean() - differences.mean()) < 3 * error
-    assert error < 0.15 * abs(differences.mean())
-    np.testing.assert_allclose([p.forward(s) for s in range(2)], reverse[:2], rtol=2e-3)

@@ -63,7 +63,6 @@ class LossCase:
     floors_detached: bool = False  # the scale of an item goes in without gradient
     dim: int | None = None  # where time is, of losses that want to know it
     second: Callable[..., torch.Tensor] | None = None  # what a loss of (input, another, target) is given as another
-    of_renders: dict[str, Any] = field(default_factory=dict)  # options beside the others where it compares two renders
 
     def tensors(self, seed=0, dtype=torch.float64):
         generator = torch.Generator().manual_seed(seed)
@@ -105,14 +104,13 @@ def _phasors(name, **options):
     return LossCase(
         name, losses.transient_phasor_loss, losses.TransientPhasorLoss, {"axis": AXIS, "frequencies": BAND, **options},
         crop=PIXELS, floors_detached=options == {"phase_only": True}, dim=-3,
-        of_renders={"frequencies": FrequencyAxis.uniform(0.2, 0.2, 5)},
     )  # fmt: skip
 
 
 def _likelihood(name, function, module, **options):
     return LossCase(
         name, function, module, options, draw_target=counts, crop=PIXELS, symmetric=False,
-        zero_at_equality=False, mapped=False, dim=-3, of_renders={"floor": 1e-3},
+        zero_at_equality=False, mapped=False, dim=-3,
     )  # fmt: skip
 
 

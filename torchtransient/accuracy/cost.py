@@ -54,7 +54,11 @@ class Task:
     to_common: Mapping[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = field(default_factory=dict)
 
     def comparable(self, estimates: Estimates) -> dict[str, NDArray[np.float32]]:
-        """Return the arrays of a run in the shape that all choices share."""
+        """Return the arrays of a run in the shape that all choices share.
+
+        Args:
+            estimates: result of the run.
+        """
         given = {**estimates.arrays, **estimates.derived()}
         arrays = {name: np.asarray(array, dtype=np.float32) for name, array in given.items()}
         return {name: self.to_common[name](x) if name in self.to_common else x for name, x in arrays.items()}
@@ -91,7 +95,7 @@ def measure(
         reference_spp: samples of a candidate's own reference, at least four times the largest of `spp`; None: pairs.
         repeats: runs at each count; even without a reference.
         seed: of the first run; no two runs share one.
-        progress: whether a bar counts the samples.
+        progress: show a bar that counts the samples.
         settings: kept in the report.
         finest: by name of a task, the choice whose reference all choices are compared with as well, which gives the
             total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
@@ -270,7 +274,7 @@ Loss = Callable[[RenderOutput], torch.Tensor]
 
 
 def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
-    """Default loss: the transient times one period of a cosine over the time axis, summed over bins, mean over pixels.
+    """Sum the transient times one period of a cosine over the time axis, mean over pixels: the default loss.
 
     Of phasors, the sum of their real parts, mean over pixels. It is linear in the measurement, so that its gradient has
     no bias, and it changes with energy and arrival time.
@@ -562,7 +566,7 @@ def _gradient_name(key: str) -> str:
 
 
 def _gradients_task(renderer: TransientRenderer, keys: tuple[str, ...], loss: Loss) -> Task:
-    # The samples of the derivative are as many as those of the render, whatever the renderer was told.
+    # The samples of the derivative are as many as those of the render, whatever the renderer's settings.
     renderer.spp_grad = None
 
     def run(spp: int, seed: int) -> Estimates:

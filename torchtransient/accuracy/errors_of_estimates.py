@@ -72,7 +72,7 @@ class Tail:
 
     @property
     def heavy(self) -> bool:
-        """True where the runs tell no variance: few of them decide about it, and more would find a larger one."""
+        """True where the runs show no variance: few of them decide about it, and more would find a larger one."""
         return not (self.index >= _LEAST_INDEX and self.largest <= _MOST_OF_ONE)
 
 
@@ -151,10 +151,14 @@ class ErrorTally:
         return np.asarray(values.mean(axis=axes), dtype=np.float64)
 
     def result(self, tail: Tail | None = None) -> ErrorEstimate:
-        """The figures of all runs so far; ShapeError when there were none (or a single one without a reference).
+        """Return the figures of all runs so far.
 
-        `tail`: of the estimate, from runs of its own: of a heavy one all figures are NaN, of others the standard error
-        comes from its spread, which a few runs do not show.
+        Args:
+            tail: of the estimate, from runs of its own: of a heavy one all figures are NaN, of others the standard
+                error comes from its spread, which a few runs do not show.
+
+        Raises:
+            ShapeError: without any run, and of a single one without a reference.
         """
         if not self.squared:
             raise ShapeError("ErrorTally: expected at least one run against a reference, or two without one")

@@ -146,7 +146,7 @@ class AccuracyReport:
         return list(dict.fromkeys(point.quantity for point in self.points))
 
     def curves(self) -> Iterator[tuple[str, Choice, list[CostPoint]]]:
-        """Every curve as (quantity, choice, points in rising spp)."""
+        """Yield every curve as (quantity, choice, points in rising spp)."""
         keys = dict.fromkeys((point.quantity, point.choice) for point in self.points)
         for quantity, choice in keys:
             yield quantity, choice, self.curve(quantity, choice)
@@ -363,7 +363,7 @@ class AccuracyReport:
         return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
     def table(self) -> str:
-        """The points as text, one row each, with the slope and the gain of each curve, and the Pareto fronts."""
+        """Return the points as text, one row each, with the slope and the gain of each curve, and the Pareto fronts."""
         lines = []
         header = f"{'spp':>7} {'seconds':>10} {'CPU s':>10} {'squared error':>22} {'relative':>10} {'median bin':>11}"
         for quantity, choice, curve in self.curves():
@@ -410,7 +410,7 @@ class AccuracyReport:
         return self.table()
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain data; NaN becomes None and an infinite number "inf", since JSON has neither."""
+        """Return everything as plain data; NaN becomes None and an infinite number "inf", since JSON has neither."""
         slopes = []
         for quantity, choice, _ in self.curves():
             slope = self.slope(quantity, choice)

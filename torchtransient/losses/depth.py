@@ -24,7 +24,7 @@ from torchtransient.losses.results import DEPTH, DepthMap, reads
 def depth_loss(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Absolute error of depths, `|input - target|`. Symmetric where both are finite.
+    """Compute the absolute error of depths, `|input - target|`. Symmetric where both are finite.
 
     Args:
         input: depth map (..., Y, X), metres.

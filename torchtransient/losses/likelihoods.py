@@ -81,7 +81,7 @@ def poisson_nll(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Negative log-likelihood of Poisson counts, `m - n log m` with the mean m and the counts n, in nats.
+    """Compute the negative log-likelihood of Poisson counts, `m - n log m` with mean m and counts n, in nats.
 
     Exact: a bin without counts has the value m and the gradient 1, at m = 0 too; a count at a mean of 0 costs about 20
     nats, with a slope of 1e9. The logarithm of a *noisy render* biases a fit by many times the noise of the counts
@@ -141,7 +141,7 @@ def read_noise_nll(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Negative log-likelihood of a normal distribution with read noise and the normal approximation of shot noise.
+    """Compute the negative log-likelihood of normal read noise with the normal approximation of shot noise.
 
     `(y - m)^2 / (2 v) + log(v) / 2` with the variance `v = read_noise^2 + max(m, 0)`, in nats.
 
@@ -234,7 +234,7 @@ def first_photon_nll(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Negative log-likelihood of a synchronous SPAD's histogram: binomial in each bin given the cycles still armed.
+    """Compute the negative log-likelihood of a synchronous SPAD: binomial in each bin given the cycles still armed.
 
     `r (armed - n) - n log(1 - exp(-r))`, in nats; convex in r, least at the Coates estimate. Flat beyond the width of a
     pulse: from farther away take `multiscale_loss` of it.
@@ -306,7 +306,7 @@ def free_running_nll(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Negative log-likelihood of a free-running SPAD's histogram with non-paralyzable dead time, up to a constant.
+    """Compute the negative log-likelihood of a free-running SPAD with non-paralyzable dead time, up to a constant.
 
     `r armed - n log r`, in nats: photons arrive as a Poisson process while the detector is armed, and the histogram
     tells when that is (`armed_periods`). Exact but for the periods at both ends of the exposure and the positions of
@@ -499,7 +499,7 @@ def _dark_level(
 
 @contextmanager
 def parts_of(input: object, averaged: Tensor | float) -> Iterator[None]:
-    """Context in which likelihoods compare parts of a prediction.
+    """Enter a context in which likelihoods compare parts of a prediction.
 
     Args:
         input: the prediction.

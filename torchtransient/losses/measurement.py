@@ -70,7 +70,7 @@ def measurement_consistency(
         reduction: "mean", "sum" or "none".
 
     Returns:
-        What `compare` returns.
+        Result of `compare`.
 
     Raises:
         ShapeError: if the prediction is not a tensor of the measurement's shape.

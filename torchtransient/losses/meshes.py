@@ -44,7 +44,7 @@ def mesh_laplacian_smoothing(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Squared distance of each vertex from the mean of its neighbors, `|mean of neighbors - vertex|^2`.
+    """Compute the squared distance of each vertex from the mean of its neighbors, `|mean - vertex|^2`.
 
     Args:
         vertices: (..., V, 3).
@@ -92,7 +92,7 @@ class MeshLaplacianSmoothing(LossModule, function=mesh_laplacian_smoothing, by_p
 def mesh_normal_consistency(
     vertices: Tensor, faces: Tensor, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Bend of each inner edge, `1 - cos` of the angle between the normals on both sides.
+    """Compute the bend of each inner edge, `1 - cos` of the angle between the normals on both sides.
 
     0 where the mesh is flat, 1 at a right angle, 2 where it folds back; independent of the order and sense of faces.
 
@@ -188,7 +188,7 @@ def _hinges(index: Tensor) -> Tensor:
 
 
 def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, *, cells: int = 4) -> Tensor:
-    """Mean distance of two surfaces, both ways: from points of each to the nearest point of the other, over the area.
+    """Compute the mean distance of two surfaces, from points of each to the nearest point of the other, over the area.
 
     Independent of how the surfaces are meshed. Time and memory grow with F times G.
 

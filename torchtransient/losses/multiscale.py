@@ -54,7 +54,7 @@ def multiscale_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean over scales of a loss of two transients in bins that many times as wide. ::
+    """Average a loss of two transients over scales, in bins that many times as wide. ::
 
         multiscale_loss(rates, histogram, functools.partial(first_photon_nll, cycles=n))
 

@@ -33,7 +33,7 @@ _MOST_SAMPLES = 2**32
 def two_render_loss(
     first: Light, second: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Unbiased squared error of a render, by two of them: `Re[(first - target) conj(second - target)]`. ::
+    """Compute the unbiased squared error of a render by two: `Re[(first - target) conj(second - target)]`. ::
 
         out = renderer({key: torch.stack([x, x])}, seed=(1, 2))
         loss = two_render_loss(out.transient[0], out.transient[1], target)

@@ -94,7 +94,7 @@ def phasor_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Squared difference of phasors, `|P - Q|^2`. Symmetric.
+    """Compute the squared difference of phasors, `|P - Q|^2`. Symmetric.
 
     Args:
         input: complex phasors P (..., C, F, Y, X), or any shape.
@@ -149,7 +149,7 @@ def transient_phasor_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`phasor_loss` of the phasors of two transients, for each pixel and frequency. Symmetric.
+    """Compute `phasor_loss` of the phasors of two transients, for each pixel and frequency. Symmetric.
 
     Parseval: over all frequencies of a discrete transform its mean is that of the squared difference times T; a band
     compares only its part.

@@ -85,7 +85,7 @@ Volume = Tensor | HasValues
 DepthMap = Tensor | HasDepth
 
 LIGHT = ("transient", "phasor", "gated", "rates", "beats")
-# What losses along the bins of a histogram take; of rates those of the rate.
+# Attributes of results for losses along the bins of a histogram; of rates the bins of the rate.
 BINNED = ("transient", "rates", "beats")
 TRANSIENT, PHASOR, STEADY, VALUES, DEPTH = ("transient",), ("phasor",), ("steady",), ("values",), ("depth_m",)
 # The axes of each attribute, which two results have to share.

@@ -73,7 +73,7 @@ def root_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Squared difference of roots, `(root(input) - root(target))^2`. Symmetric.
+    """Compute the squared difference of roots, `(root(input) - root(target))^2`. Symmetric.
 
     With `anscombe` it is about 1 per bin where `input` is the mean that `target` was drawn from: the loss of a perfect
     fit.
@@ -131,7 +131,7 @@ def expected_anscombe(mean: Tensor) -> Tensor:
 def expected_root_loss(
     input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Squared error of the root of counts, `(anscombe(target) - expected_anscombe(input))^2`.
+    """Compute the squared error of roots of counts, `(anscombe(target) - expected_anscombe(input))^2`.
 
     Nearly twice the negative log-likelihood of counts, without its logarithm: on average least where `input` is the
     mean that `target` was drawn from, however few counts. There it is the variance of `anscombe`, 1 within 1/(8 m) for
@@ -171,7 +171,7 @@ def log_ratio_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Squared logarithm of a ratio, `log((input + background) / (target + background))^2`.
+    """Compute the squared logarithm of a ratio, `log((input + background) / (target + background))^2`.
 
     Compares relative errors of bins brighter than the background, and errors of darker ones as shares of it.
 

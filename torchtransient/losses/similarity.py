@@ -31,7 +31,7 @@ def ssim_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Structural dissimilarity of each pixel, `1 - SSIM`, from 0 to 2.
+    """Compute the structural dissimilarity of each pixel, `1 - SSIM`, from 0 to 2.
 
     Args:
         input: picture (..., C, Y, X). Single precision holds values up to 1e9 times the range.
@@ -113,7 +113,7 @@ def projection_ssim_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean of `ssim_loss` of the front, top and side `maximum_projections` of two volumes.
+    """Average `ssim_loss` over the front, top and side `maximum_projections` of two volumes.
 
     Args:
         input: volume (..., C, Z, Y, X), real and not negative.

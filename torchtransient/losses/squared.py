@@ -11,7 +11,7 @@ from torchtransient.losses.results import LIGHT, Light, reads
 
 @reads(input=LIGHT, target=LIGHT)
 def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, reduction: Reduction = "mean") -> Tensor:
-    """Squared error, `|input - target|^2`. Symmetric.
+    """Compute the squared error, `|input - target|^2`. Symmetric.
 
     Args:
         input: real or complex tensor, any shape.

@@ -36,7 +36,7 @@ def total_variation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Modulus of the gradient of each voxel, by differences to the next voxel along Z, Y and X.
+    """Compute the modulus of the gradient of each voxel, by differences to the next voxel along Z, Y and X.
 
     Times the volume of a voxel, the sum is the area of a surface times the step across it (anisotropic: the area of its
     projections onto the axes).

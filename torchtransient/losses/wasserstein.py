@@ -39,7 +39,7 @@ def wasserstein_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Wasserstein-1 distance over time of each pixel of two transients: how far light has to be moved. Symmetric.
+    """Compute the Wasserstein-1 distance over time of each pixel: how far light has to be moved. Symmetric.
 
     Records are normalized to one, so that brightness has no part, and light counts as at the middle of its bin. A pixel
     with less light than `floor` is filled up to it evenly over its bins: without a jump, with gradients of at most
@@ -107,7 +107,7 @@ def cumulative_loss(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Area between the running sums of two transients, `bin_width_opl sum |cumsum(input - target)|`. Symmetric.
+    """Compute the area between running sums of transients, `bin_width_opl sum |cumsum(input - target)|`. Symmetric.
 
     Light that is late by d costs d; light that is missing, or too much, costs its distance to the end of the window.
     Records with background need a model with background. Gradients are at most `T bin_width_opl` per bin.

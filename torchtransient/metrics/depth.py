@@ -34,7 +34,7 @@ def _compared(
 def depth_mae(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean absolute error of depths, `mean(|input - target|)`.
+    """Compute the mean absolute error of depths, `mean(|input - target|)`.
 
     Args:
         input: depth maps (..., Y, X), metres.
@@ -58,7 +58,7 @@ def depth_mae(
 def depth_rmse(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Root mean square error of depths, `sqrt(mean((input - target)^2))`, metres.
+    """Compute the root mean square error of depths, `sqrt(mean((input - target)^2))`, metres.
 
     Args:
         input, target, mask, reduction: as in `depth_mae`.
@@ -72,7 +72,7 @@ def depth_rmse(
 def depth_bias(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean error of depths, `mean(input - target)`, metres, positive if too far.
+    """Compute the mean error of depths, `mean(input - target)`, metres, positive if too far.
 
     Args:
         input, target, mask, reduction: as in `depth_mae`.
@@ -84,7 +84,7 @@ def depth_bias(
 
 @reads(input=DEPTH, target=DEPTH)
 def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None = None) -> Tensor:
-    """Median absolute error of depths over all pixels that count.
+    """Compute the median absolute error of depths over all pixels that count.
 
     Of an even number of pixels the lower of the two in the middle, as `torch.median`. `Running` refuses it, since a
     median is not made of sums.
@@ -109,7 +109,7 @@ def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None
 def depth_abs_rel(
     input: DepthMap, target: DepthMap, *, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
-    """Mean relative error of depths, `mean(|input - target| / target)`.
+    """Compute the mean relative error of depths, `mean(|input - target| / target)`.
 
     Pixels with a target of zero or below do not count. Source: Eigen, Puhrsch and Fergus 2014.
 
@@ -130,7 +130,7 @@ def depth_delta(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Share of pixels with `max(input / target, target / input) < threshold`.
+    """Compute the share of pixels with `max(input / target, target / input) < threshold`.
 
     Args:
         input: depth maps (..., Y, X), metres. Depths of zero and below are outside of every threshold.
@@ -166,7 +166,7 @@ def depth_gross_errors(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
+    """Compute the share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
 
     Args:
         beyond_m: metres, above zero.

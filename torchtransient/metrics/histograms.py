@@ -28,7 +28,7 @@ def histogram_total_variation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Total variation distance of each pixel, `sum |p - q| / 2`: the share of light in wrong bins.
+    """Compute the total variation distance of each pixel, `sum |p - q| / 2`: the share of light in wrong bins.
 
     Args:
         input: transients (..., C, T, Y, X), or another layout with `dim`, not negative; normalized to p.
@@ -59,7 +59,7 @@ def histogram_wasserstein_opl(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Wasserstein-1 distance over time of each pixel, metres of path: how far light has to be moved.
+    """Compute the Wasserstein-1 distance over time of each pixel, metres: how far light has to be moved.
 
     Light counts as at the middle of its bin. `tt.losses.wasserstein_loss` fills up dark pixels instead of refusing
     them.
@@ -88,7 +88,7 @@ def histogram_wasserstein_s(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Wasserstein-1 distance over time of each pixel, seconds.
+    """Compute the Wasserstein-1 distance over time of each pixel, seconds.
 
     Args:
         input, target, axis, dim, mask, reduction: as in `histogram_wasserstein_opl`.
@@ -109,7 +109,7 @@ def histogram_kl(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Kullback-Leibler divergence of each pixel, `KL(q || p) = sum q log(q / p)`, nats. Not symmetric.
+    """Compute the Kullback-Leibler divergence of each pixel, `KL(q || p) = sum q log(q / p)`, nats. Not symmetric.
 
     Infinite where the target has light in a bin that is empty in the input.
 

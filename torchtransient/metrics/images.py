@@ -32,7 +32,7 @@ def psnr(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Peak signal-to-noise ratio, `10 log10(value_range^2 / mean((input - target)^2))` of each picture, decibels.
+    """Compute the peak signal-to-noise ratio, `10 log10(value_range^2 / mean((input - target)^2))`, decibels.
 
     Args:
         input: pictures (..., C, Y, X).
@@ -63,7 +63,7 @@ def ssim(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Structural similarity, `1 - tt.losses.ssim_loss`, in [-1, 1].
+    """Compute the structural similarity, `1 - tt.losses.ssim_loss`, in [-1, 1].
 
     Args:
         input: pictures (..., C, Y, X).
@@ -97,7 +97,7 @@ def transient_psnr(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`psnr` of transients as pictures.
+    """Compute `psnr` of transients as pictures.
 
     Args:
         input: transients (..., C, T, Y, X).
@@ -132,7 +132,7 @@ def transient_ssim(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """`ssim` of transients as pictures.
+    """Compute `ssim` of transients as pictures.
 
     Empty bins are alike, and dominate a mean over the bins of most scenes.
 

@@ -24,7 +24,7 @@ def localization_rmse(
     grid: VoxelGrid | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root mean square distance of points from the peaks of volumes near them, metres.
+    """Compute the root mean square distance of points from the peaks of volumes near them, metres.
 
     The peak of a point is the highest voxel within the radius, moved along each axis of the grid by the parabola
     through it and its neighbors, at most half a voxel. A search near the truth finds something near it: take a radius

@@ -21,7 +21,7 @@ _PICTURE = 2
 
 
 def wrapped_difference(input: Tensor, target: Tensor, *, period: float = 2 * math.pi) -> Tensor:
-    """Difference the short way round, `input - target` in [-period/2, period/2].
+    """Compute the difference the short way round, `input - target` in [-period/2, period/2].
 
     Args:
         input: real tensor, any shape.
@@ -54,7 +54,7 @@ def phase_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean absolute wrapped difference of phases.
+    """Compute the mean absolute wrapped difference of phases.
 
     Args:
         input: phases (..., Y, X) in the unit of `period`, or complex phasors.
@@ -87,7 +87,7 @@ def phase_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root mean square wrapped difference of phases (..., Y, X).
+    """Compute the root mean square wrapped difference of phases (..., Y, X).
 
     Args:
         input, target, period, weight, mask, reduction: as in `phase_mae`.
@@ -108,7 +108,7 @@ def phase_bias(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Circular mean of the difference of phases: the angle of the mean of `exp(i (input - target))`, signed.
+    """Compute the circular mean of the difference of phases: the angle of the mean of `exp(i (input - target))`.
 
     Right across the jump, where a mean of wrapped differences is wrong; meaningless for differences spread evenly over
     the circle. Source: Fisher 1993.

@@ -42,7 +42,7 @@ def dop_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean absolute error of the degree of polarization, `mean(|DoP(input) - DoP(target)|)`.
+    """Compute the mean absolute error of the degree of polarization, `mean(|DoP(input) - DoP(target)|)`.
 
     Degrees above one, of noise, are compared as they are.
 
@@ -79,7 +79,7 @@ def dop_rmse(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Root mean square error of the degree of polarization.
+    """Compute the root mean square error of the degree of polarization.
 
     Args:
         input, target, stokes_dim, part, floor, mask, reduction: as in `dop_mae`.
@@ -99,7 +99,7 @@ def aolp_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean absolute error of the angle of linear polarization, modulo pi, radians in [0, pi/2].
+    """Compute the mean absolute error of the angle of linear polarization, modulo pi, radians in [0, pi/2].
 
     For angles in place of Stokes components take `phase_mae(..., period=math.pi)`.
 

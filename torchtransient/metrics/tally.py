@@ -42,7 +42,15 @@ class Finish:
     scale: float = 1.0
 
     def of(self, total: Tensor, weight: Tensor) -> Tensor:
-        """Return the metric of two sums, NaN without weight."""
+        """Return the metric of two sums.
+
+        Args:
+            total: sum of the weighted elements, complex for directions, any shape.
+            weight: sum of the weights, of the same shape.
+
+        Returns:
+            Real tensor of that shape, NaN where there is no weight.
+        """
         counts = weight > 0
         mean = total / torch.where(counts, weight, torch.ones_like(weight))
         if self.kind == Kind.ANGLE:
@@ -75,7 +83,15 @@ class Tally:
     finish: Finish = Finish()
 
     def result(self, reduction: Reduction | Collector, where: str) -> Tensor:
-        """Return the metric of all elements, of each item, or of each element; NaN where nothing counts."""
+        """Return the metric, NaN where nothing counts.
+
+        Args:
+            reduction: "mean" of all elements, "item" of each item, "none" of each element, or a collector of sums.
+            where: begins the message.
+
+        Raises:
+            ArgumentError: for other reductions.
+        """
         if isinstance(reduction, Collector):
             total, weight = self._sums(tuple(range(self.values.ndim)))
             imaginary = total.imag if total.is_complex() else torch.zeros_like(total)
@@ -220,6 +236,7 @@ class Running(nn.Module):
         return value
 
     def forward(self, *args: Any, **keywords: Any) -> Tensor:
+        """Call `update`."""
         return self.update(*args, **keywords)
 
     def compute(self, *, across_ranks: bool = False) -> Tensor:

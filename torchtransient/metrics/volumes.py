@@ -41,7 +41,7 @@ def front_view(volume: Volume) -> Tensor:
 
 
 def front_depth(volume: Volume, depths: Any = None, *, threshold: float = 0.1) -> Tensor:
-    """Depth of the highest value behind each place of the wall, by a parabola through its plane and both neighbors.
+    """Find the depth of the highest value behind each place of the wall, by a parabola through its plane and neighbors.
 
     As `tt.nlos.depth_map`. Metrics of depth take NaN for no surface.
 
@@ -75,7 +75,7 @@ def front_depth_mae(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Mean absolute error of the front depths of two volumes, metres, where both have a surface.
+    """Compute the mean absolute error of the front depths of two volumes, metres, where both have a surface.
 
     `picture_iou` of the front views is its companion, and measures where only one of them has one.
 
@@ -113,7 +113,7 @@ def picture_correlation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Correlation of pictures, such as front views, in [-1, 1]; independent of brightness.
+    """Compute the correlation of pictures, such as front views, in [-1, 1]; independent of brightness.
 
     Args:
         input: pictures (..., Y, X). A flat one counts as 0.
@@ -142,7 +142,7 @@ def volume_correlation(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Correlation of volumes (..., Z, Y, X), voxel by voxel.
+    """Compute the correlation of volumes (..., Z, Y, X), voxel by voxel.
 
     Strict: a surface that is one plane off does not correlate.
 
@@ -165,7 +165,7 @@ def picture_iou(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Intersection over union of the shapes in pictures, such as front views, in [0, 1].
+    """Compute the intersection over union of the shapes in pictures, such as front views, in [0, 1].
 
     Args:
         input: pictures (..., Y, X), or boolean masks. A shape is where a pixel is above zero and reaches the threshold.
@@ -193,7 +193,7 @@ def volume_iou(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Intersection over union of volumes (..., Z, Y, X), voxel by voxel.
+    """Compute the intersection over union of volumes (..., Z, Y, X), voxel by voxel.
 
     Args:
         input, target, threshold, mask, reduction: as in `picture_iou`.

@@ -48,7 +48,11 @@ class FlightLaw:
     last_piece: int | None
 
     def supports(self, piece: int) -> bool:
-        """Return True where the density is non-zero on [piece, piece + 1]."""
+        """Return True where the density is non-zero on [piece, piece + 1].
+
+        Args:
+            piece: whole number of units of length.
+        """
         return piece >= self.first_piece and (self.last_piece is None or piece < self.last_piece)
 
 
@@ -201,7 +205,7 @@ MAX_TERMS = 100_000
 
 
 def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, intensity: float) -> Array:
-    """Irradiance per bin at a meter beside a point light above an infinite Lambertian plane.
+    """Compute the irradiance per bin at a meter beside a point light above an infinite Lambertian plane.
 
     E(tau) dtau = intensity * reflectance * h^3 / r^6 dtau with r = tau / 2 >= h (direct light, one bounce); a bin holds
     (2 I rho h^3 / 5) (r_a^-5 - r_b^-5), the total is 2 I rho / (5 h^2). Derivation: radiance rho I cos / (pi d^2) of
@@ -226,7 +230,7 @@ def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, in
 def integrating_sphere_irradiance(
     edges_opl: ArrayLike, radius: float, reflectance: float, energy: float = 1.0, max_flights: int | None = None
 ) -> Array:
-    """Irradiance per bin on the wall of a Lambertian sphere after energy reached the wall at t = 0.
+    """Compute the irradiance per bin on the wall of a Lambertian sphere after energy reached the wall at t = 0.
 
     E_n(tau) = energy rho^(n-1) / (4 pi R^2) p^{*n}(tau), n >= 1 flights with p(l) = l / (2 R^2) on [0, 2R]; the steady
     sum is energy / (4 pi R^2 (1 - rho)). Source: Fry et al. 2006; Labsphere integrating sphere guide.
@@ -249,7 +253,7 @@ def integrating_sphere_irradiance(
 def integrating_sphere_radiance(
     edges_opl: ArrayLike, radius: float, reflectance: float, intensity: float, max_bounces: int | None = None
 ) -> Array:
-    """Radiance per bin seen from the centre of a Lambertian sphere with a point light at the centre.
+    """Compute the radiance per bin at the centre of a Lambertian sphere with a point light there.
 
     L(tau) = (rho / pi) (I / R^2) [ delta(tau - 2R) + sum_{n>=1} rho^n p^{*n}(tau - 2R) ], steady rho I / (pi R^2 (1 -
     rho)). The scene is `tt.scenes.integrating_sphere`.
@@ -272,7 +276,7 @@ def integrating_sphere_radiance(
 
 
 def integrating_sphere_decay(radius: float, reflectance: float) -> float:
-    """Optical path length over which the late signal of a Lambertian sphere falls by 1/e.
+    """Compute the optical path length over which the late signal of a Lambertian sphere falls by 1/e.
 
     1/s with reflectance [e^{2Rs} (2Rs - 1) + 1] / (2 R^2 s^2) = 1, the pole of the renewal equation of p(l) = l / (2
     R^2). At reflectance 0.5 it is 2R exactly.
@@ -312,7 +316,7 @@ def integrating_sphere_decay(radius: float, reflectance: float) -> float:
 def furnace(
     edges_opl: ArrayLike, radius: float, reflectance: float, radiance: float, max_bounces: int | None = None
 ) -> Array:
-    """Radiance per bin seen from the centre of a Lambertian sphere whose wall emits at t = 0.
+    """Compute the radiance per bin at the centre of a Lambertian sphere whose wall emits at t = 0.
 
     L(tau) = Le [ delta(tau - R) + sum_{n>=1} rho^n p^{*n}(tau - R) ], steady Le / (1 - rho). The scene is
     `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
@@ -339,7 +343,7 @@ def parallel_plates(
     first_leg: float | None = None,
     max_bounces: int | None = None,
 ) -> Array:
-    """Radiance per bin seen at normal incidence between infinite Lambertian plates that emit at t = 0.
+    """Compute the radiance per bin at normal incidence between infinite Lambertian plates that emit at t = 0.
 
     L(tau) = Le [ delta(tau - z) + sum_{n>=1} rho^n p^{*n}(tau - z) ], p(r) = 2 h^2 / r^3 for r >= h, steady Le / (1 -
     rho). Source: the view factor of parallel planes. The scene is `tt.scenes.parallel_plates`.
@@ -361,7 +365,7 @@ def parallel_plates(
 
 
 def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[float, float]:
-    """Power reflectances (Rs, Rp) of a smooth interface met from the side of index 1.
+    """Compute power reflectances (Rs, Rp) of a smooth interface met from the side of index 1.
 
     Rs = ((cos_i - n cos_t) / (cos_i + n cos_t))^2, Rp = ((n cos_i - cos_t) / (n cos_i + cos_t))^2 (Fresnel). Total
     reflection (index < 1 beyond the critical angle) gives (1, 1).
@@ -396,7 +400,7 @@ def etalon_orders(
     polarization: str | None = None,
     absorption_per_m: float = 0.0,
 ) -> list[EtalonOrder]:
-    """Reflected or transmitted orders of a plane-parallel slab in air, incoherent, down to 1e-18 of the light.
+    """List reflected or transmitted orders of a plane-parallel slab in air, incoherent, down to 1e-18 of the light.
 
     With R, T = 1 - R at one interface and the travelled path q = index * thickness / cos_t: reflected m = 0: R at 0; m
     >= 1: T^2 R^(2m-1) at 2 m q; transmitted m >= 0: T^2 R^(2m) at (2m + 1) q; absorption multiplies by exp(-alpha *
@@ -440,7 +444,7 @@ def etalon_orders(
 def etalon_slab(
     edges_opl: ArrayLike, thickness: float, index: float, radiance: float, air_opl: float, side: str = "transmitted"
 ) -> Array:
-    """Radiance per bin of a uniform light seen through, or in, a slab at normal incidence.
+    """Compute the radiance per bin of a uniform light seen through, or in, a slab at normal incidence.
 
     The orders of `etalon_orders` shifted by the path in air.
 
@@ -498,7 +502,7 @@ def confocal_plane(
     energy: float = 1.0,
     radius: float = math.inf,
 ) -> Array:
-    """Radiance per bin of a confocal scan point before a plane that is parallel to the wall.
+    """Compute the radiance per bin of a confocal scan point before a plane that is parallel to the wall.
 
     With K = energy wall_albedo^2 albedo / pi^3 the light at tau = 2 r is K pi depth^4 / r^7 dtau, r >= depth; a bin
     holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), all of it pi K / (3 depth^2). Derivation: the patch of `hidden_patch`
@@ -537,7 +541,7 @@ def hidden_patch(
     wall_normal: ArrayLike = (0.0, 0.0, 1.0),
     energy: float = 1.0,
 ) -> tuple[float, float]:
-    """Optical path length and radiance of the light over a small diffuse patch.
+    """Compute the optical path length and radiance of the light over a small diffuse patch.
 
     energy (wall_albedo / pi)^2 (albedo / pi) times the four cosines times area / (r1^2 r2^2), where r1 and r2 are the
     distances of the patch from the spot and the scan point, whose wall has one normal. Zero where a side faces away.
