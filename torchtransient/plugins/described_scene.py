@@ -49,8 +49,13 @@ from torchtransient.plugins.sampling.lights import distant_reference
 
 
 def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
-    """The numbers of a plugin and of what it holds, attached where they are; ``shapes``: those whose attributes its
-    textures read. Attributes belong to the shapes.
+    """Yield the numbers of a plugin and of all that it holds, attached where they are.
+
+    Attributes of meshes belong to the shapes: those that textures below ``node`` read are among the numbers.
+
+    Args:
+        node: Mitsuba object.
+        shapes: shapes whose attributes the textures of ``node`` may read.
     """
     below = (node, *objects_below(node, mi.Object))
     for part in below:
@@ -65,7 +70,15 @@ def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
 
 
 def check_textures(params: Any) -> None:
-    """Raise ``SceneError`` where a built scene (``mi.traverse``) has a texture in a place where it cannot be read."""
+    """Check that each texture of a built scene is in a place where it can be read.
+
+    Args:
+        params: ``mi.traverse`` of the scene.
+
+    Raises:
+        SceneError: for textures whose channels, slopes, attributes or texture coordinates are not those that the plugin
+            or shape around them reads.
+    """
     somewhere = dr.zeros(mi.SurfaceInteraction3f)
     for node in params.hierarchy:
         if isinstance(node, mi.BSDF) and is_bump_map(node):
@@ -126,7 +139,7 @@ def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) ->
     if surface.ptr not in known:
         known[surface.ptr] = list(_attributes_of(surface))
     for read in known[surface.ptr]:
-        sizes = attributes_of(shape)
+        sizes = _attributes_of(shape)
         message = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
         if read.name not in sizes:
             has = ", ".join(map(repr, sizes)) or "none"
@@ -151,7 +164,7 @@ def _attributes_of(surface: Any) -> Iterator[Read]:
                     yield Read(name, part, slot, attribute_sizes(bsdf, slot))
 
 
-def attributes_of(shape: Any) -> dict[str, float | None]:
+def _attributes_of(shape: Any) -> dict[str, float | None]:
     """The attributes of a shape, by name: how many numbers they have at each place, None where a texture says so."""
     values, objects = shown_by(shape)
     found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}
@@ -217,7 +230,12 @@ class DescribedScene:
 
 
 def described(scene: Any, *plugins: Any) -> DescribedScene:
-    """Return the state of a scene as described. ``plugins``: further plugins that keep it."""
+    """Return the state of a scene as described, which is recorded once.
+
+    Args:
+        scene: Mitsuba scene.
+        plugins: further plugins that keep the state, beside those of the scene.
+    """
     keepers = [*plugins, *_keepers_of(scene)]
     known = (getattr(keeper, "described", None) for keeper in keepers)
     found = next((state for state in known if state is not None and state.is_of(scene)), None)
@@ -232,6 +250,10 @@ def note_scene(plugin: Any, callback: Any) -> None:
     """Record the scene that ``mi.traverse`` walks; for the ``traverse`` of a plugin that keeps a described scene.
 
     Such a scene is as described, or was recorded before.
+
+    Args:
+        plugin: plugin that is walked through.
+        callback: ``mi.TraversalCallback`` of the walk.
     """
     # Mitsuba's own callback knows the way down to each plugin; others do not install values.
     hierarchy = getattr(callback, "hierarchy", {})

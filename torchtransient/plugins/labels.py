@@ -88,7 +88,7 @@ class LabelTables:
         return mi.Int32(self._materials.look_up(si.bsdf(), hit)) - 1
 
 
-def check_sensor(sensor: Any, names: tuple[str, ...]) -> None:
+def _check_sensor(sensor: Any, names: tuple[str, ...]) -> None:
     """Raise ``SceneError`` where a pixel of a sensor is no direction, or there is no axis to measure along."""
     for one in sensors_of(sensor):
         if is_distant(one) or class_of(one) == "IrradianceMeter":
@@ -148,7 +148,7 @@ class LabelJob:
     @no_collection()
     def prepare(self) -> LabelJob:
         """Look up what is not part of what is recorded."""
-        check_sensor(self.sensor, self.names)
+        _check_sensor(self.sensor, self.names)
         self.tables.seen.follow_derivatives(self.scene, False)
         self.plugins = self.tables.seen.python_plugins(self.scene)
         for plugin in self.plugins:
@@ -209,7 +209,7 @@ class LabelJob:
         ray = mi.Ray3f(ray)
         origin = mi.Point3f(ray.o)
         before = length_to_sensor_origin(seen, ray)
-        si = first_surface(self.scene, ray, self._passes, self._hides_emitters)
+        si = _first_surface(self.scene, ray, self._passes, self._hides_emitters)
         hit = si.is_valid()
         found = []
         for name in self.names:
@@ -277,25 +277,25 @@ class LabelJob:
 
 
 @dr.syntax
-def first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> Any:
+def _first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> Any:
     """Find the first surface along each ray that does not let most of the light pass unbent. ``passes``: the scene may
     have surfaces that do; ``hides_emitters``: emitting surfaces are skipped, as by an integrator's ``hide_emitters``.
     """
     si = scene.ray_intersect(ray)
     if dr.hint(passes or hides_emitters, mode="scalar"):
         turns = mi.UInt32(0)
-        active = si.is_valid() & lets_pass(si, passes, hides_emitters)
+        active = si.is_valid() & _lets_pass(si, passes, hides_emitters)
         while dr.hint(active & (turns < MOST_PASSED), max_iterations=MOST_PASSED, label="labels"):
             left = ray.maxt - si.t
             ray = si.spawn_ray(ray.d)
             ray.maxt = left
             si = scene.ray_intersect(ray, active)
-            active = active & si.is_valid() & lets_pass(si, passes, hides_emitters)
+            active = active & si.is_valid() & _lets_pass(si, passes, hides_emitters)
             turns += 1
     return si
 
 
-def lets_pass(si: Any, passes: bool, hides_emitters: bool) -> Any:
+def _lets_pass(si: Any, passes: bool, hides_emitters: bool) -> Any:
     """Return a mask of surface interactions that a pixel looks through."""
     through = mi.Mask(False)
     if passes:

@@ -95,8 +95,12 @@ class RefractionTable:
 
 
 def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
-    """Return (BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by
-    a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+    """Return (BSDF, what holds its relative index) of those that light enters another medium through.
+
+    By a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+
+    Args:
+        bsdfs: BSDFs of a scene.
     """
     lobes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     leaves = ((bsdf, _refractive_leaves(bsdf, lobes)) for bsdf in bsdfs)
@@ -131,7 +135,14 @@ def _has_refraction_lobe(bsdf: Any, lobes: tuple[Any, ...]) -> bool:
 
 
 def index_of(leaf: Any) -> Any:
-    """Inside over outside index of a BSDF without nested ones, attached if its parameter is."""
+    """Return the inside over outside index of a BSDF without nested ones, attached if its parameter is.
+
+    Args:
+        leaf: one ``mi.BSDF`` with a lobe of refraction.
+
+    Raises:
+        SceneError: for a plugin that shows neither ``eta`` nor ``specular``.
+    """
     params = mi.traverse(leaf)
     if "eta" in params:
         return mi.Float(params["eta"])

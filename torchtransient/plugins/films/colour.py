@@ -96,7 +96,11 @@ class ChannelMatch:
 
 
 def mean_of(channels: list):
-    """Mean over the channels, those of the power in polarized variants."""
+    """Return the mean over channels, in polarized variants over those of the power.
+
+    Args:
+        channels: Float each; in polarized variants those of all Stokes components, the power first.
+    """
     if mi.is_polarized:
         channels = channels[: len(channels) // 4]
     return dr.sum(channels) / len(channels)

@@ -70,7 +70,7 @@ class GateTable:
 
 
 @dr.syntax
-def put_gates(layout, table, opl, value, slope_value, active):
+def _put_gates(layout, table, opl, value, slope_value, active):
     """Add to every gate that light arriving at ``opl`` meets."""
     g, end = table.candidates(opl, active)
     going = mi.Bool(active) & (g < end)
@@ -91,7 +91,7 @@ def _scatter(layout, gate, weight, slope, value, slope_value, active):
 
 
 @dr.syntax
-def read_gates(layout, table, opl, steady, active):
+def _read_gates(layout, table, opl, steady, active):
     """Adjoint and its slope summed over the gates that light arriving at ``opl`` meets."""
     A, slope = [mi.Float(0) for _ in range(layout.channels)], [mi.Float(0) for _ in range(layout.channels)]
     g, end = table.candidates(opl, active)
@@ -195,17 +195,17 @@ class GatedHDRFilm(TimeResolvedFilm):
     # ----------------------------------------------------------------------------------- splat and read
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False):
-        put_gates(self._layout(band, base, exclusive), self.table, opl_from_start, value, None, active)
+        _put_gates(self._layout(band, base, exclusive), self.table, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
-        put_gates(self._layout(band, base), self.table, opl_from_start, d_value, value_d_opl, active)
+        _put_gates(self._layout(band, base), self.table, opl_from_start, d_value, value_d_opl, active)
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):
         channels = self.channel_count()
         flat, gate_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
         layout = BinLayout(flat, base, gate_stride, channel_stride, self.gate_count(), channels)
-        return read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
+        return _read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
 
     def _layout(self, band, base, exclusive=False):
         channels = self.channel_count()

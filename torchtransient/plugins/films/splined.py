@@ -101,13 +101,13 @@ def spline_of(pulses, width: float, parts: int):
     weights = (weights.reshape(-1, parts) / weights.reshape(-1, parts).sum(0)).ravel()
     error = 0.0
     for d in (np.arange(8) + 0.5) / 8 - 0.5:
-        left, middle, right = (w for w, _ in splines(d))
+        left, middle, right = (w for w, _ in _splines(d))
         found = left * weights[:-2] + middle * weights[1:-1] + right * weights[2:]
         error = max(error, float(np.abs(found - share(nodes[1:-1] + d / parts)).max()))
     return below, weights, error / float(share(nodes).max())
 
 
-def splines(d):
+def _splines(d):
     """Return (value, slope) of the quadratic B-splines of the nodes before, at and after ``d``, -1/2 to 1/2."""
     return (
         (0.5 * (0.5 - d) * (0.5 - d), d - 0.5),
@@ -188,7 +188,7 @@ class SplinedHDRFilm(TransientHDRFilm):
         if not self.splined:
             return super().put(band, base, opl_from_start, value, active, exclusive, crowded)
         before, after, inside, nodes, d = self._place(base, opl_from_start, active)
-        for node, (weight, _) in zip(nodes, splines(d), strict=True):
+        for node, (weight, _) in zip(nodes, _splines(d), strict=True):
             self._add(self.band_array(band), node, [v * weight for v in value], inside)
         return dr.select(before, mi.Float(1), 0), dr.select(after, mi.Float(1), 0)
 
@@ -198,7 +198,7 @@ class SplinedHDRFilm(TransientHDRFilm):
             return
         _, _, inside, nodes, d = self._place(base, opl_from_start, active)
         scale = self.filter.parts / self.bin_width_opl
-        for node, (weight, slope) in zip(nodes, splines(d), strict=True):
+        for node, (weight, slope) in zip(nodes, _splines(d), strict=True):
             values = [a * weight + b * (slope * scale) for a, b in zip(d_value, value_d_opl, strict=True)]
             self._add(self.band_array(band), node, values, inside)
 
@@ -209,7 +209,7 @@ class SplinedHDRFilm(TransientHDRFilm):
         _, _, inside, nodes, d = self._place(base, opl_from_start, active)
         scale = self.filter.parts / self.bin_width_opl
         A, slope = [mi.Float(0)] * channels, [mi.Float(0)] * channels
-        for node, (weight, dweight) in zip(nodes, splines(d), strict=True):
+        for node, (weight, dweight) in zip(nodes, _splines(d), strict=True):
             values = self._gathered(adjoint[0], node, inside)
             for c in range(channels):
                 A[c] = dr.fma(values[c], weight, A[c])
@@ -234,7 +234,7 @@ class SplinedHDRFilm(TransientHDRFilm):
     def _bins_of(self, nodes):
         """Return the array of bins, and count as outside what the line spreads over the rims of the window."""
         *rows, bins, channels = self.cube_shape()
-        row, channel = divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
+        row, channel = _divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
         sweep = Sweep(self, nodes, dr.empty(mi.Float, math.prod(rows) * bins * channels))
         first = row * (self.node_count() * self.lanes()) + channel
         before, sums = swept(sweep, first, row * (bins * channels) + channel)
@@ -251,13 +251,13 @@ class SplinedHDRFilm(TransientHDRFilm):
         flat, offset, strides = adjoint
         shape, lanes, channels = self._node_shape(), self.lanes(), self.channel_count()
         index = dr.arange(mi.UInt32, math.prod(shape[:-1]))
-        rest, node = divided(index, shape[-2])
+        rest, node = _divided(index, shape[-2])
         at = mi.UInt32(offset)
         for size, stride in zip(shape[-3:0:-1], strides[-3:0:-1], strict=True):
-            rest, place = divided(rest, size)
+            rest, place = _divided(rest, size)
             at += place * stride
         at += rest * strides[0]
-        bin_, weight_number = divided(node, self.filter.parts)
+        bin_, weight_number = _divided(node, self.filter.parts)
         totals = [mi.Float(0)] * channels
         for _ in range(self.filter.weights_count // self.filter.parts):
             # Wraps below the first bin.
@@ -279,7 +279,7 @@ class SplinedHDRFilm(TransientHDRFilm):
         return values, 0, contiguous
 
 
-def divided(index, size: int):
+def _divided(index, size: int):
     """Return quotient and remainder, UInt32."""
     quotient = index // size
     return quotient, index - quotient * size

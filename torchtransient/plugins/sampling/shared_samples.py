@@ -63,7 +63,12 @@ class ScanTiles:
 
 
 def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
-    """Return the distance of the vertex (V, 3) that is nearest to any of the points (P, 3), metres."""
+    """Return the distance of the vertex that is nearest to any of some points, metres.
+
+    Args:
+        vertices: (V, 3), metres.
+        points: (P, 3), metres.
+    """
     nearest = np.inf
     for p in points:
         nearest = min(nearest, float(((vertices - p) ** 2).sum(1).min()))
@@ -142,7 +147,7 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
             f"draw_samples: shared samples hold a colour, which variant {mi.variant()} has not; expected a mono or RGB "
             "variant without polarization. Use the general path integrator."
         )
-    others = not_diffuse([elements.shapes[s] for s in set(elements.elements.shape.astype(int))])
+    others = _not_diffuse([elements.shapes[s] for s in set(elements.elements.shape.astype(int))])
     if others:
         raise SceneError(
             "draw_samples: expected surfaces of 'diffuse', or of 'twosided' around it, got "
@@ -206,7 +211,7 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
     return Local(p=mi.Point3f(si.p), n=n, geometric_n=geometric_n, front=front, back=back)
 
 
-def not_diffuse(shapes: list[Any]) -> list[str]:
+def _not_diffuse(shapes: list[Any]) -> list[str]:
     """Return the names of the shapes, with their BSDFs, that scatter otherwise than a Lambertian surface."""
     others = [(shape, shape.bsdf()) for shape in shapes if not is_lambertian(shape.bsdf())]
     return list(dict.fromkeys(f"{shape.id() or shape.class_name()} ({bsdf.class_name()})" for shape, bsdf in others))

@@ -388,5 +388,9 @@ def set_rate(vertex, term, end, d, η, wanted):
 
 
 def is_light(value):
-    """Return a mask of spectra that are not zero."""
+    """Return a mask of spectra that are not zero.
+
+    Args:
+        value: unpolarized spectrum.
+    """
     return dr.max(dr.abs(value)) > 0

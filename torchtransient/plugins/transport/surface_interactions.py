@@ -155,9 +155,16 @@ class AttachedSurfaces:
 
 
 def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
-    """``pi.compute_surface_interaction(ray, flags, active)``, attached to the ray, the shape, and what moves the shape.
+    """Return a surface interaction that is attached to the ray, the shape, and what moves the shape.
 
-    ``surfaces``: those of ``context``, None where Mitsuba's own are right.
+    Its values are those of ``pi.compute_surface_interaction(ray, flags, active)``.
+
+    Args:
+        surfaces: those of the job's context, None where Mitsuba's own derivatives are right.
+        pi: PreliminaryIntersection3f.
+        ray: Ray3f.
+        flags: ``mi.RayFlags``.
+        active: mask of lanes.
     """
     if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)
@@ -165,7 +172,14 @@ def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, fl
 
 
 def distance_to(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, active: Any) -> Any:
-    """Distance along an attached ``ray`` of the surface at ``pi``."""
+    """Return the distance of a surface along an attached ray, metres.
+
+    Args:
+        surfaces: as of :func:`surface_interaction`.
+        pi: PreliminaryIntersection3f of the surface.
+        ray: Ray3f.
+        active: mask of lanes.
+    """
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active)
     return attached_distance(pi, si, ray, active)
 

@@ -40,7 +40,12 @@ def intersection_fields(context, prefix=""):
 
 
 def intersection_numbers(pi, prefix=""):
-    """Return the numbers that record the PreliminaryIntersection3f ``pi``, by name."""
+    """Return the numbers that record an intersection, by name.
+
+    Args:
+        pi: PreliminaryIntersection3f.
+        prefix: put before each name.
+    """
     values = {prefix + name: getattr(pi, name) for name in NUMBERS}
     return values | {prefix + n: dr.reinterpret_array(mi.UInt32, getattr(pi, n)) for n in ("shape", "instance")}
 

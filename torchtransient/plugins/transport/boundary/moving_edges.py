@@ -263,15 +263,23 @@ def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = Non
 
 
 def rims_without_edges(scene: Any) -> list[Gap]:
-    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some."""
-    if not (shapes := shapes_without_edges(scene)):
+    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some.
+
+    Args:
+        scene: Mitsuba scene.
+    """
+    if not (shapes := _shapes_without_edges(scene)):
         return []
     where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
     return [Gap(where, "Use a mesh of the same form.")]
 
 
 def edges_in_mirrors(scene: Any) -> list[Gap]:
-    """Return the gap of edges that are seen by way of delta lobes, if some surface has one."""
+    """Return the gap of edges that are seen by way of delta lobes, if some surface has one.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     smooth = _smooth_shapes(scene)
     return [Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH)] if smooth else []
 
@@ -334,7 +342,7 @@ def _number_of_planes(mesh: Any) -> int:
     return len(np.unique(np.concatenate([n, offset], 1).round(3), axis=0))
 
 
-def shapes_without_edges(scene: Any) -> list[Any]:
+def _shapes_without_edges(scene: Any) -> list[Any]:
     """Return the shapes of a scene with outlines that the table of edges does not hold."""
     return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
 
@@ -364,7 +372,11 @@ def _is_in_view(scene: Any, sky: Any) -> bool:
 
 
 def has_delta_lobe(shape: Any) -> bool:
-    """Return True if a shape has a BSDF with a delta lobe."""
+    """Return True if a shape has a BSDF with a delta lobe.
+
+    Args:
+        shape: one ``mi.Shape``.
+    """
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 
