@@ -139,7 +139,7 @@ def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) ->
     if surface.ptr not in known:
         known[surface.ptr] = list(_attributes_of(surface))
     for read in known[surface.ptr]:
-        sizes = _attributes_of(shape)
+        sizes = _sizes_of_attributes(shape)
         message = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
         if read.name not in sizes:
             has = ", ".join(map(repr, sizes)) or "none"
@@ -164,7 +164,7 @@ def _attributes_of(surface: Any) -> Iterator[Read]:
                     yield Read(name, part, slot, attribute_sizes(bsdf, slot))
 
 
-def _attributes_of(shape: Any) -> dict[str, float | None]:
+def _sizes_of_attributes(shape: Any) -> dict[str, float | None]:
     """The attributes of a shape, by name: how many numbers they have at each place, None where a texture says so."""
     values, objects = shown_by(shape)
     found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}

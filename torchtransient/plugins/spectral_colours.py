@@ -123,7 +123,8 @@ def _colour_of(row: np.ndarray) -> np.ndarray:
             break
         # Away from the nearer end of the range.
         steps = np.where(rgb < 0.5, _STEP, -_STEP)
-        columns = [(_spectrum(_fetch(rgb + step * axis)) - wanted - residual) / step for step, axis in _axes(steps)]
+        moved = zip(steps.tolist(), np.eye(3), strict=True)
+        columns = [(_spectrum(_fetch(rgb + step * axis)) - wanted - residual) / step for step, axis in moved]
         slope = np.stack(columns, axis=1)
         move = np.linalg.solve(slope.T @ slope + damping * np.eye(3), slope.T @ residual)
         tried = np.clip(rgb - move, 0.0, 1.0)
@@ -137,7 +138,3 @@ def _colour_of(row: np.ndarray) -> np.ndarray:
 
 def _inside(low: float, high: float) -> np.ndarray:
     return np.abs(_WAVELENGTHS - (low + high) / 2) <= (high - low) / 2
-
-
-def _axes(steps: np.ndarray) -> zip[tuple[float, np.ndarray]]:
-    return zip(steps.tolist(), np.eye(3), strict=True)

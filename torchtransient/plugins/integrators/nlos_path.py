@@ -77,17 +77,13 @@ class HiddenGeometry(Guide):
         if primitive is None:  # a light was asked for a point of its shape, and does not say of which triangle
             ray = mi.Ray3f(mi.Point3f(p), dr.normalize(v))
             with dr.suspend_grad():
-                primitive = _shape_hit(context, ray, shape, active)
+                found = context.segment.next_surface(context, ray, active)
+            # Of what is hidden from there, any triangle will do.
+            primitive = dr.select(active & (found.shape == shape), found.prim_index, 0)
         per_area = self.elements.per_area(shape, primitive, q, active)
         d2 = dr.squared_norm(v)
         cos = dr.abs_dot(n, v) * dr.rsqrt(d2)
         return dr.select(active & (cos > 0), per_area * d2 / cos, 0)
-
-
-def _shape_hit(context, ray, shape, active):
-    """Number of the triangle of ``shape`` that a ray meets first (of what is hidden from there, any will do)."""
-    found = context.segment.next_surface(context, ray, active)
-    return dr.select(active & (found.shape == shape), found.prim_index, 0)
 
 
 class TransientNLOSPath(base.TransientIntegrator):

@@ -175,7 +175,9 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
     shape, primitive = elements.surface(element)
-    si = _interaction(elements, element, p, n, a, y)
+    # For the shading frame and texture coordinates.
+    pi, ray = _preliminary(elements, element, p, n, a, y)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
     if smooth:
@@ -215,12 +217,6 @@ def _not_diffuse(shapes: list[Any]) -> list[str]:
     """Return the names of the shapes, with their BSDFs, that scatter otherwise than a Lambertian surface."""
     others = [(shape, shape.bsdf()) for shape in shapes if not is_lambertian(shape.bsdf())]
     return list(dict.fromkeys(f"{shape.id() or shape.class_name()} ({bsdf.class_name()})" for shape, bsdf in others))
-
-
-def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """Return Mitsuba's interactions of the points: shading frame, texture coordinates."""
-    pi, ray = _preliminary(elements, element, p, n, a, y)
-    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:

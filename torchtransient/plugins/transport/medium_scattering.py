@@ -25,12 +25,6 @@ def _unpolarizing(value):
     return matrix
 
 
-def _phase_and_scattering(mei, active):
-    """(phase function, scattering coefficient) of the medium at ``mei``."""
-    phase = dr.select(active, mei.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
-    return phase, mei.medium.get_scattering_coefficients(mei, active)[0]
-
-
 class SurfaceOrMedium(Surface):
     """Scattering at surfaces, and in media by the phase function times the scattering coefficient."""
 
@@ -41,7 +35,8 @@ class SurfaceOrMedium(Surface):
 
     def _phase_and_scattering(self, mei, u, active):
         """Return (phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
-        phase, σ_s = _phase_and_scattering(mei, active)
+        phase = dr.select(active, mei.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
+        σ_s = mei.medium.get_scattering_coefficients(mei, active)[0]
         if self.blends is None:
             return phase, σ_s
         phase, weight = self.blends.part_of(phase, mei, u, active)

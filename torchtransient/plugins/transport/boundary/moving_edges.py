@@ -35,8 +35,7 @@ from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, obje
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
-from torchtransient.plugins.transport.boundary.clip_planes import clipped_shapes
-from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
+from torchtransient.plugins.transport.boundary.crossings import clipped_shapes, crossing_bodies
 from torchtransient.plugins.transport.scene_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
 
@@ -268,7 +267,7 @@ def rims_without_edges(scene: Any) -> list[Gap]:
     Args:
         scene: Mitsuba scene.
     """
-    if not (shapes := _shapes_without_edges(scene)):
+    if not (shapes := [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]):
         return []
     where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
     return [Gap(where, "Use a mesh of the same form.")]
@@ -340,11 +339,6 @@ def _number_of_planes(mesh: Any) -> int:
     n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)
     offset = (n * p[:, 0]).sum(1, keepdims=True) / max(np.abs(p).max(), 1e-30)
     return len(np.unique(np.concatenate([n, offset], 1).round(3), axis=0))
-
-
-def _shapes_without_edges(scene: Any) -> list[Any]:
-    """Return the shapes of a scene with outlines that the table of edges does not hold."""
-    return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
 
 
 def _is_met_by_connections_alone(emitter: Any) -> bool:
