@@ -307,7 +307,7 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
 
 def modules_of_others() -> tuple[PluginModule, ...]:
-    """Modules added with :func:`register_module`, in order."""
+    """Return the modules added with :func:`register_module`, in order."""
     with _state.changes:
         return tuple(_state.third_party)
 

@@ -179,7 +179,10 @@ def _with_one_row(value: Any, kept: list[tuple[Any, Any]]) -> Any:
 
 
 def double_transform() -> Any:
-    """Mitsuba's scalar transform in double precision, which has no public name in single precision variants."""
+    """Return Mitsuba's class of scalar transforms in double precision.
+
+    It has no public name in single precision variants.
+    """
     properties = mi.Properties()
     properties["transform"] = mi.ScalarTransform4f()
     return type(properties["transform"])

@@ -74,17 +74,27 @@ class LabelTables:
         return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self._bsdfs)
 
     def tables(self) -> list[Any]:
-        """Arrays that kernels read."""
+        """Return the arrays that kernels read."""
         return [self._shapes, self._materials, self.observer]
 
     def shape(self, si: Any, hit: Any) -> Any:
-        """Numbers of the shapes that are met, of the instance where it is one; -1 for none."""
+        """Return the numbers of the shapes that are met, of the instance where it is one; -1 for none.
+
+        Args:
+            si: SurfaceInteraction3f.
+            hit: mask of lanes that met something.
+        """
         copied = hit & (dr.reinterpret_array(mi.UInt32, si.instance) != 0)
         number = dr.select(copied, self._shapes.look_up(si.instance, copied), self._shapes.look_up(si.shape, hit))
         return mi.Int32(number) - 1
 
     def material(self, si: Any, hit: Any) -> Any:
-        """Numbers of the materials of the surfaces that are met; -1 for none."""
+        """Return the numbers of the materials of the surfaces that are met; -1 for none.
+
+        Args:
+            si: SurfaceInteraction3f.
+            hit: mask of lanes that met something.
+        """
         return mi.Int32(self._materials.look_up(si.bsdf(), hit)) - 1
 
 
@@ -169,7 +179,7 @@ class LabelJob:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height."""
+        """Return width and height."""
         return self._size
 
     def components(self, name: str) -> int:
@@ -196,7 +206,7 @@ class LabelJob:
         return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
 
     def run(self, job: LabelJob) -> None:
-        """Carry out a job that is prepared."""
+        """Execute a job that is prepared."""
         with dr.suspend_grad():
             job.film.put(job._computed())
 

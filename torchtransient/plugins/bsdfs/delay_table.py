@@ -118,7 +118,7 @@ class DelayedBSDFs:
         return bool(self.spectral_shifts)
 
     def read(self) -> DelayTable:
-        """Their parameters as they are now; to be called outside of loops, once a job."""
+        """Return the table of the current parameters. Call outside of loops, once a job."""
         return DelayTable(self)
 
 

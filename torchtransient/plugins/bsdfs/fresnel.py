@@ -148,7 +148,7 @@ class Interface:
         self.over_p = dr.select(grazing, 0.0, dr.rcp(dr.select(grazing, 1.0, self.m2 * self.c + self.g)))
 
     def reflection(self) -> Any:
-        """Mueller matrix of reflection in the frames perpendicular to the plane of incidence."""
+        """Return the Mueller matrix of reflection in the frames perpendicular to the plane of incidence."""
         r_s = -self.d * self.over_s * self.over_s
         r_p = self.d * (self.c * self.c * (self.m2 + 1) - 1) * self.over_p * self.over_p
         # Under total reflection both amplitudes have modulus one, and their phases differ by twice that of z.
@@ -162,7 +162,7 @@ class Interface:
         return two_by_two(a, b, c, sin_d)
 
     def transmission(self) -> Any:
-        """Mueller matrix of refraction, as power through the interface; zero under total reflection."""
+        """Return the Mueller matrix of refraction, as power through the interface; zero under total reflection."""
         power = 4 * self.c * self.g
         t_s, t_p = power * self.over_s * self.over_s, power * self.m2 * self.over_p * self.over_p
         cross = power * self.eta_it * self.over_s * self.over_p

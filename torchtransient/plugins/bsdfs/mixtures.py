@@ -351,8 +351,13 @@ class Mixtures:
         dr.make_opaque(self._numbers)
 
     def read(self, wanted: Any) -> MixtureChoice | None:
-        """Return the mixtures that a job takes apart, None for none; ``wanted``: the derivatives of the job, or
-        None.
+        """Return the mixtures that a job takes apart, None for none.
+
+        Args:
+            wanted: :class:`~..transport.context.Wanted` of the derivatives of the job, None for renders.
+
+        Raises:
+            GradientError: for a derivative that needs a mixture taken apart which cannot be.
         """
         for mixture in self.mixtures.values():
             mixture.follow()
@@ -364,7 +369,13 @@ class Mixtures:
         return MixtureChoice(self, chosen) if chosen else None
 
     def number(self, pointer: Any, index: Any, active: Any) -> Any:
-        """Number in Dr.Jit's registry of the part ``index`` of what ``pointer`` points to."""
+        """Return the numbers of parts in Dr.Jit's registry, UInt32.
+
+        Args:
+            pointer: pointers to mixtures.
+            index: number of the part among those of its mixture, UInt32.
+            active: mask of lanes.
+        """
         at = self._first.look_up(pointer, active) + index
         return dr.gather(mi.UInt32, self._numbers, at, active)
 
@@ -379,14 +390,29 @@ class MixtureChoice:
         self._of, self._chosen = mixtures, chosen
 
     def take_part(self, sample: Any, si: Any, u: Any, active: Any) -> None:
-        """Change ``sample`` (a :class:`.delay_table.DelaySample`) to one part, chosen by the uniform number
-        ``u``.
+        """Change a sample of BSDFs to one part of its mixtures.
+
+        Args:
+            sample: :class:`.delay_table.DelaySample`, which is changed.
+            si: SurfaceInteraction3f.
+            u: uniform number that chooses.
+            active: mask of lanes.
         """
         sample.bsdf, weight = self.part_of(sample.bsdf, si, u, active)
         sample.weight = weight if sample.weight is None else sample.weight * weight
 
     def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return (pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        """Choose one part of mixtures.
+
+        Args:
+            pointer: BSDFPtr or PhaseFunctionPtr; others than mixtures stay.
+            interaction: SurfaceInteraction3f or MediumInteraction3f.
+            u: uniform number that chooses.
+            active: mask of lanes.
+
+        Returns:
+            (pointer to the part, its weight over its probability; the weight is attached, the probability is not).
+        """
         kind = type(pointer)
         pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
         index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)

@@ -86,9 +86,13 @@ class RefractionTable:
         return self._indices.values
 
     def relative_index(self, bsdf: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """Index of the medium on ``wo``'s side over that on ``si.wi``'s side: 1 where both are on the same side.
+        """Return the index of the medium on ``wo``'s side over that on ``si.wi``'s side, 1 where both are on one side.
 
-        ``bsdf``: array of BSDF pointers; ``wo``: direction in the local frame of ``si``.
+        Args:
+            bsdf: array of BSDF pointers.
+            si: SurfaceInteraction3f.
+            wo: direction in the local frame of ``si``.
+            active: mask of lanes.
         """
         eta = self._indices.look_up(bsdf, active & (si.wi.z * wo.z < 0))
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))

@@ -51,14 +51,25 @@ class GateTable:
         )
 
     def candidates(self, opl, active):
-        """First and last (exclusive) gate that light arriving at ``opl`` (``Float64``) can meet."""
+        """Return the first and the last (exclusive) gate that an arrival can meet, UInt32.
+
+        Args:
+            opl: arrival, metres, Float64.
+            active: mask of lanes.
+        """
         inside = active & (opl >= self.first) & (opl < self.last)
         cell = mi.UInt32(dr.select(inside, (opl - self.first) * self._cell_scale, 0))
         cell = dr.minimum(cell, CELLS - 1)
         return dr.gather(mi.UInt32, self._low, cell, inside), dr.gather(mi.UInt32, self._high, cell, inside)
 
     def value(self, gate, opl, active):
-        """Sensitivity of a gate to light arriving at ``opl`` and its slope per metre."""
+        """Return the sensitivity of a gate to an arrival, and its slope per metre.
+
+        Args:
+            gate: number of the gate, UInt32.
+            opl: arrival, metres, Float64.
+            active: mask of lanes.
+        """
         start, end = dr.gather(mi.Float64, self._start, gate, active), dr.gather(mi.Float64, self._end, gate, active)
         inside = active & (opl >= start) & (opl < end)
         scale = dr.gather(mi.Float, self._scale, gate, inside)
@@ -184,11 +195,11 @@ class GatedHDRFilm(TimeResolvedFilm):
     # ---------------------------------------------------------------------------------------- storage
 
     def gate_count(self) -> int:
-        """G, the number of gates."""
+        """Return the number of gates, G."""
         return self.table.count
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
+        """Return the shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.gate_count(), self.channel_count())
 

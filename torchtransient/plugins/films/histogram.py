@@ -196,14 +196,18 @@ class TransientHDRFilm(TimeResolvedFilm):
     # ---------------------------------------------------------------------------------------- storage
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
+        """Return the shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
     # ----------------------------------------------------------------------------------- splat and read
 
     def bin_position(self, opl_from_start):
-        """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
+        """Return an arrival in units of bins, Float64.
+
+        Args:
+            opl_from_start: ``opl - start_opl``, metres, Float64.
+        """
         return opl_from_start / mi.Float64(self.bin_width_opl)
 
     def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
@@ -219,8 +223,11 @@ class TransientHDRFilm(TimeResolvedFilm):
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None):
-        """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
-        otherwise.
+        """Add a contribution, as of :meth:`~.base.TimeResolvedFilm.put`.
+
+        Args:
+            laser: index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
+                otherwise.
         """
         cube = self.band_array(band)
         x = self.bin_position(opl_from_start)

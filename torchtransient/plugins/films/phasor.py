@@ -127,7 +127,7 @@ def slots_for(most_events: int) -> int:
 
 
 def _rotation(turns):
-    """Cosine and sine of ``2 pi turns``: whole turns are taken off a double before single precision takes over."""
+    """Return (cos, sin) of ``2 pi turns``; whole turns are taken off a double before single precision takes over."""
     angle = mi.Float(turns - dr.round(turns)) * (2 * math.pi)
     sin, cos = dr.sincos(angle)
     return cos, sin
@@ -243,13 +243,21 @@ class FrequencyBlock:
             self.values = [dr.gather(mi.Float64, film.frequency_array, k, k < self.count) for k in numbers]
 
     def frequency(self, j):
-        """Frequency number ``j`` of the block, a double."""
+        """Return a frequency, cycles per metre, Float64.
+
+        Args:
+            j: its number in the block.
+        """
         if self.step is None:
             return self.values[j]
         return self.first + mi.Float64(self.start + j) * self.step
 
     def rotations(self, opl):
-        """(cos, sin) of the phase at every frequency of the block."""
+        """Return (cos, sin) of the phase at every frequency of the block.
+
+        Args:
+            opl: arrival, metres, Float64.
+        """
         if self.step is None:
             return [_rotation(ν * opl) for ν in self.values]
         z = _rotation(self.frequency(0) * opl)
@@ -263,9 +271,9 @@ class FrequencyBlock:
 
 @dr.syntax
 def _sum_events(events, frequencies, first, last):
-    """Sums of ``value * exp(-2 pi i nu opl)`` over the events of the paths from ``first`` to ``last``.
+    """Return the sums of ``value * exp(-2 pi i nu opl)`` over the events of the paths from ``first`` to ``last``.
 
-    Returns real and imaginary parts, each a list over the frequencies of the block of lists over the event's values.
+    Real and imaginary parts, each a list over the frequencies of the block of lists over the event's values.
     """
     numbers = len(events.values)
     re = [[mi.Float(0) for _ in range(numbers)] for _ in range(frequencies.size)]
@@ -309,7 +317,11 @@ class Phases:
         self.step = None if film.step is None else [_rotation(film.step_array * opl) for opl in opls]
 
     def at(self, ν):
-        """(cos, sin) of every arrival at the frequency ``ν``, in double precision up to whole turns."""
+        """Return (cos, sin) of every arrival at a frequency, in double precision up to whole turns.
+
+        Args:
+            ν: frequency, cycles per metre, Float64.
+        """
         return [_rotation(ν * opl) for opl in self.opls]
 
     def next(self, phases):
@@ -330,14 +342,19 @@ class AdjointRows:
         self.base, self.channels = base, channels
 
     def at(self, f, live):
-        """Real and imaginary parts of frequency number ``f``, for every channel."""
+        """Return the real and imaginary parts of one frequency, for every channel.
+
+        Args:
+            f: number of the frequency, UInt32.
+            live: mask of lanes.
+        """
         index = self.base + f * self.stride
         numbers = [dr.gather(mi.Float, self.flat, index + i * self.entry, live) for i in range(2 * self.channels)]
         return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 def _add_frequency(A, slope, row, phases, ω):
-    """``A`` (a list over channels for each arrival) and, unless None, ``slope`` with another frequency."""
+    """Add a frequency to ``A`` (a list over channels for each arrival) and, unless None, to ``slope``."""
     for n, (cos, sin) in enumerate(phases):
         for c, (a, b) in enumerate(row):
             A[n][c] = dr.fma(a, cos, dr.fma(-b, sin, A[n][c]))
@@ -351,7 +368,7 @@ def _add_frequency(A, slope, row, phases, ω):
 
 @dr.syntax
 def _read_arrivals(phases, rows, with_slope, active):
-    """(A, its slope or None): lists over the arrivals of lists over the channels."""
+    """Return (A, its slope or None): lists over the arrivals of lists over the channels."""
     A = [[mi.Float(0) for _ in range(rows.channels)] for _ in phases.opls]
     slope = [[mi.Float(0) for _ in range(rows.channels)] for _ in phases.opls] if with_slope else None
     f = mi.UInt32(0)
@@ -481,11 +498,14 @@ class PhasorHDRFilm(TimeResolvedFilm):
     # ---------------------------------------------------------------------------------------- storage
 
     def frequency_count(self) -> int:
-        """F, the number of frequencies."""
+        """Return the number of frequencies, F."""
         return len(self.frequencies)
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the phasors: (H, W, F, 2 C) or (H, W, Lh, Lw, F, 2 C), real and imaginary part in turn."""
+        """Return the shape of the phasors: (H, W, F, 2 C) or (H, W, Lh, Lw, F, 2 C).
+
+        Real and imaginary part of each channel in turn.
+        """
         size = self.crop_size()
         entries = (self.frequency_count(), 2 * self.channel_count())
         return (int(size[1]), int(size[0]), *self.laser_shape(), *entries)
@@ -506,7 +526,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False):
-        """One event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
+        """Add one event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
         _add_event(self._table(self.band_array(band), exclusive), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
@@ -514,10 +534,14 @@ class PhasorHDRFilm(TimeResolvedFilm):
         _add_event(self._table(self.band_array(band)), base, opl_from_start, d_value, value_d_opl, active)
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):
-        """``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival: lists over channels.
+        """Return ``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival.
 
-        ``adjoint`` is ``(flat array, frequency stride, entry stride)``; ``steady`` is always None, since the film keeps
-        a steady image.
+        Args:
+            adjoint: (flat array, frequency stride, entry stride).
+            steady: always None, since the film keeps a steady image.
+
+        Returns:
+            Lists over channels.
         """
         rows = AdjointRows(adjoint, base, self.channel_count())
         A, slope = _read_arrivals(Phases(self, [opl_from_start]), rows, True, active)

@@ -72,10 +72,13 @@ class BoxFilter:
     reach = (0.0, 0.0)
 
     def weights(self, x):
-        """Weights of one arrival.
+        """Return the weights of one arrival.
 
-        ``x`` is the arrival in bins (0 is the start of bin 0), ``Float64``. Returns a bin (``Float64``, which may lie
-        outside of the axis) and a list of ``(offset from that bin, weight, d weight / dx)``.
+        Args:
+            x: the arrival in bins (0 is the start of bin 0), Float64.
+
+        Returns:
+            (bin, Float64, which may lie outside of the axis; list of (offset from that bin, weight, d weight / dx)).
         """
         return dr.floor(x), [(0, mi.Float(1), mi.Float(0))]
 
@@ -187,7 +190,11 @@ class PulsedFilter:
         self._table = mi.Float(table.astype(np.float32))
 
     def begin(self, x):
-        """(bin of the first tap, node and share at its lower edge) for an arrival ``x`` in bins (``Float64``)."""
+        """Return (bin of the first tap, node and share at its lower edge) for an arrival.
+
+        Args:
+            x: the arrival in bins, Float64.
+        """
         start = dr.floor(x)
         # The node of an edge is the same for all bins but for a multiple of the nodes per bin.
         u = mi.Float(1 - (x - start)) * self.nodes_per_bin
@@ -195,7 +202,11 @@ class PulsedFilter:
         return start + self.first, node, u - mi.Float(node)
 
     def edge(self, node, share):
-        """Cumulative distribution at an edge, and its slope per bin."""
+        """Return the cumulative distribution at an edge, and its slope per bin.
+
+        Args:
+            node, share: place of the edge in the table, as of :meth:`begin`.
+        """
         low, high = dr.gather(mi.Float, self._table, node), dr.gather(mi.Float, self._table, node + 1)
         return dr.fma(high - low, share, low), (high - low) * self.nodes_per_bin
 

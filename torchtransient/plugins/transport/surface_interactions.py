@@ -41,7 +41,7 @@ class Instances:
         return Instances(found) if found else None
 
     def read(self) -> InstanceTable:
-        """Their matrices as they are now, attached where they are; to be called outside of loops, once a job."""
+        """Return the table of the current matrices, attached where they are. Call outside of loops, once a job."""
         with dr.resume_grad():
             table = mi.Float(self._identities)
             for number, (node, shown) in zip(self._numbers, self._shown, strict=True):
@@ -254,7 +254,7 @@ class DetachedHits:
         return DetachedHits(found) if found else None
 
     def read(self) -> HitTable:
-        """Their parameters as they are now, attached where they are; to be called outside of loops, once a job."""
+        """Return the table of the current parameters, attached where they are. Call outside of loops, once a job."""
         with dr.resume_grad():
             self._find_starts()
             kinds: list[Any] = []
