@@ -26,7 +26,6 @@ from torchtransient.plugins.mitsuba_compat import (
     VERTEX_COLUMNS,
     attribute_name,
     attribute_sizes,
-    has_surface,
     has_texcoords,
     is_bump_map,
     is_dark,
@@ -34,6 +33,7 @@ from torchtransient.plugins.mitsuba_compat import (
     read_as,
     scene_parameters,
 )
+from torchtransient.plugins.mitsuba_shapes import has_surface
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.properties import check_parameters

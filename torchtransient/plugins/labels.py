@@ -18,7 +18,8 @@ from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_below
 from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
+from torchtransient.plugins.mitsuba_compat import is_distant, near_clip
+from torchtransient.plugins.mitsuba_shapes import has_surface, is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views

@@ -9,15 +9,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import (
-    TEXTURES_WITHOUT_MEAN,
-    attribute_name,
-    group_name,
-    has_surface,
-    is_instance,
-    shows_rows,
-    users_name,
-)
+from torchtransient.plugins.mitsuba_compat import TEXTURES_WITHOUT_MEAN, attribute_name, shows_rows, users_name
+from torchtransient.plugins.mitsuba_shapes import group_name, has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -199,7 +192,7 @@ def members_of(scene: Any, instance: Any) -> list[Any]:
 
     Args:
         scene: Mitsuba scene that has the group.
-        instance: shape of :func:`~.mitsuba_compat.is_instance`.
+        instance: shape of :func:`~.mitsuba_shapes.is_instance`.
     """
     name = group_name(instance)
     group = next(s for s in objects_below(scene, mi.Shape) if s.class_name() == "ShapeGroupPlugin" and s.id() == name)

@@ -17,7 +17,8 @@ import numpy as np
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.joined import edge_keys, joined_places, near_places
 from torchtransient.plugins.kernel_arrays import PointerTable, host_numbers, registry_number, whole_numbers
-from torchtransient.plugins.mitsuba_compat import is_instance, lacks_edges, mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_shapes import is_instance, lacks_edges
 from torchtransient.plugins.node_walk import members_of, shapes_of_scene, shown_by
 from torchtransient.plugins.transport.strategy import Local
 

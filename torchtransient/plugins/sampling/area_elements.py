@@ -28,7 +28,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import host_numbers
-from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, mesh_faces, mesh_normals, mesh_positions
+from torchtransient.plugins.mitsuba_compat import has_normals, mesh_faces, mesh_normals, mesh_positions
+from torchtransient.plugins.mitsuba_shapes import has_surface
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of
 

@@ -7,7 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import bounds_of, sun_half_angle
+from torchtransient.plugins.mitsuba_compat import sun_half_angle
+from torchtransient.plugins.mitsuba_shapes import bounds_of
 
 # --------------------------------------------------------------- arrival time of light from infinitely distant emitters
 # Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches

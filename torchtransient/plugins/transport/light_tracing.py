@@ -11,7 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, has_vertices, normal_texture
+from torchtransient.plugins.mitsuba_compat import has_normals, normal_texture
+from torchtransient.plugins.mitsuba_shapes import has_surface, has_vertices
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.polarized import (
     intensity,

@@ -17,17 +17,14 @@ from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.described_scene import check_scene, described
 from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import (
-    EMIT_ALIKE,
-    SCATTER_ALIKE,
+from torchtransient.plugins.mitsuba_compat import EMIT_ALIKE, SCATTER_ALIKE, lacks_directions, varies
+from torchtransient.plugins.mitsuba_shapes import (
     has_no_material,
     has_smooth_shape,
     has_vertices,
     is_flat,
     is_flat_shape,
     is_instance,
-    lacks_directions,
-    varies,
 )
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameters import ParameterTracker

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
-from torchtransient.plugins.mitsuba_compat import attached_distance, is_instance, leaves_hits_detached, misplaces_hits
+from torchtransient.plugins.mitsuba_shapes import attached_distance, is_instance, leaves_hits_detached, misplaces_hits
 from torchtransient.plugins.node_walk import shapes_of_scene, shown_by
 
 # Entries of a matrix; the table holds it and its inverse, so that no lane inverts matrices.

@@ -13,7 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import PointerTable, whole_numbers
-from torchtransient.plugins.mitsuba_compat import has_vertices, mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_shapes import has_vertices
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
 from torchtransient.plugins.sampling.rays import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only

@@ -24,7 +24,8 @@ import mitsuba as mi
 from torchtransient.checks import some_of
 from torchtransient.errors import SceneError
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance, moved_by
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, moved_by
+from torchtransient.plugins.mitsuba_shapes import is_instance
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
 from torchtransient.plugins.transport.geometry_terms import point_of_light

@@ -18,7 +18,8 @@ from torchtransient.plugins.edges.joined import joined_places, merged
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
 from torchtransient.plugins.kernel_arrays import floats, host_numbers, registry_number
-from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_faces, mesh_positions, near_clip
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions, near_clip
+from torchtransient.plugins.mitsuba_shapes import bounds_of
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
 from torchtransient.plugins.sensors.seen_from import clip_planes_at

@@ -17,19 +17,21 @@ from torchtransient.plugins.mitsuba_compat import (
     NORMALS,
     TEXCOORDS,
     attribute_name,
-    has_limb,
     has_normals,
-    has_surface,
-    has_vertices,
     is_bump_map,
-    is_flat,
-    is_instance,
-    is_sphere,
-    lacks_edges,
     mesh_faces,
     mesh_positions,
     near_clip,
     normal_texture,
+)
+from torchtransient.plugins.mitsuba_shapes import (
+    has_limb,
+    has_surface,
+    has_vertices,
+    is_flat,
+    is_instance,
+    is_sphere,
+    lacks_edges,
 )
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, objects_of, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.edges.table import EdgeDensity
-from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mitsuba_shapes import is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.polarized import attenuated, intensity, product
 from torchtransient.plugins.sensors.seen_from import has_eye
