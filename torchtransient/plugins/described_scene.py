@@ -268,6 +268,7 @@ def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = N
     """Check the numbers and textures of a scene, once.
 
     Args:
+        scene: Mitsuba scene.
         params: the scene's parameters by users' keys, if the caller has them.
         known: the scene's :class:`DescribedScene`, if the caller has it.
 

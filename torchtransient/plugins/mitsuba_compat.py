@@ -18,8 +18,6 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 
-WRITTEN_AGAINST = "3.9.1"
-
 # ----------------------------------------------------------------------------------------- what Mitsuba's BSDFs return
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.

@@ -101,6 +101,7 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
     """Return the objects of a kind below a plugin, each once and in order.
 
     Args:
+        node: Mitsuba object, which is not among them.
         kind: class of Mitsuba.
         through: also look inside of objects of that kind.
     """

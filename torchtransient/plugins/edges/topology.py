@@ -307,6 +307,7 @@ def topology_of(scene: Any, memory: Cache, hides: Callable[[Any], bool] | None =
     """Return the :class:`Topology` of a scene as it is now, cached.
 
     Args:
+        scene: Mitsuba scene.
         memory: cache of the scene.
         hides: function of a shape that says whether it hides light, None for all.
     """

@@ -131,6 +131,7 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
     """Draw samples of the hidden geometry's density, for each tile of the table.
 
     Args:
+        elements: hidden surfaces and their density.
         count: number of samples of each tile.
         seed: UInt32 of width one, in memory, or a whole number.
 

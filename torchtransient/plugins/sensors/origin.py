@@ -118,6 +118,7 @@ def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, posit
     :func:`~torchtransient.plugins.mitsuba_compat.is_batch`.
 
     Args:
+        sensor: one ``mi.Sensor``.
         seen: result of :func:`views`.
         time, wavelength, position, aperture: numbers of ``sample_ray_differential``.
 
@@ -142,6 +143,7 @@ def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
     """Return the normal of an irradiance meter at the origins of its rays.
 
     Args:
+        sensor: one ``mi.Sensor``.
         ray: its rays.
         position: numbers that they were drawn with.
 
@@ -203,6 +205,7 @@ def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
     Args:
         seen: result of :func:`views`.
         surroundings: :class:`~.surroundings.Surroundings`, None for vacuum.
+        scene: Mitsuba scene.
     """
     if surroundings is None:
         return mi.Float(1)

@@ -40,6 +40,7 @@ def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) ->
     """Return a Carry with new leaves of the AD graph.
 
     Args:
+        carry: values of all fields.
         names: fields that become leaves.
         tangents: Carry with their tangents in forward mode, None in reverse mode.
     """

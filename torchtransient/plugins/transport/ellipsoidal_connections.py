@@ -326,7 +326,7 @@ class EllipsoidalSurface(Ellipsoidal):
         active &= e.pdf > 0
         n = dr.mulsign(mi.Normal3f(vertex.si.n), -dr.dot(vertex.si.n, path.ray.d))
         n_x = dr.select(vertex.surface, n, 0)
-        face, w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
+        face, w, n, along, chance = _choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
         active &= chance > 0
         d = dr.select(active, vertex.at.spawn_ray_to(w).d, mi.Vector3f(0, 0, 1))
         ds = Local(p=w, emitter=None)
@@ -369,14 +369,16 @@ class EllipsoidalSurface(Ellipsoidal):
 
 
 @dr.syntax
-def choose(connection, x, n_x, e, s, u_angle, u, active):
+def _choose(connection, x, n_x, e, s, u_angle, u, active):
     """Choose a point of the faces where the sum of the distances to the foci is ``s``.
 
     Args:
         connection: :class:`EllipsoidalSurface`.
         x, n_x: first focus and its normal on the side of the sensor, zero in a medium.
         e: second focus, :class:`~..sampling.flat_faces.LightPoint`.
+        s: sum of the distances, metres.
         u_angle, u: uniform numbers for the angles and the choice.
+        active: mask of lanes.
 
     Returns:
         (number of a face; point of it; its normal; derivative by the angle; weight of the point over the mean that all
@@ -406,7 +408,7 @@ def _among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
         point, derivative = section.point(sin, cos)
         a, b = dr.dot(point - face.o, face.U), dr.dot(point - face.o, face.V)
         inside = meets & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
-        weight = unoccluded(connection.width, x, n_x, e, s, point, derivative, h, h_e)
+        weight = _unoccluded(connection.width, x, n_x, e, s, point, derivative, h, h_e)
         weight = dr.select(inside & dr.isfinite(weight), weight, 0)
         total = total + weight
         share = dr.select(weight > 0, weight / total, 0)
@@ -418,7 +420,7 @@ def _among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
     return w, n, along, best, total, u, is_here
 
 
-def unoccluded(width, x, n_x, e, s, w, along, h, h_e):
+def _unoccluded(width, x, n_x, e, s, w, along, h, h_e):
     """Return the share of light by a point that ellipsoidal connections take, over its density.
 
     Of Lambertian surfaces without colour and with nothing in the way.

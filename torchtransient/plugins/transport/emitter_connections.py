@@ -378,8 +378,10 @@ def set_rate(vertex, term, end, d, η, wanted):
 
     Args:
         vertex: attached vertex.
+        term: :class:`~.strategy.EventTerm`, which is changed.
         end: attached velocity of that point.
         d, η: attached direction and index of the segment.
+        wanted: :class:`~.context.Wanted` derivatives.
     """
     rate = dr.select(term.active, η * dr.dot(end - vertex.velocity, d), 0)
     term.rate = vertex.v.rate + dr.detach(rate)

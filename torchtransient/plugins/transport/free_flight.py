@@ -172,7 +172,7 @@ def closed_surface(scene, media, ray, active):
 
     Args:
         scene: Mitsuba scene.
-        media: :class:`~.media.Media` of the scene, None without.
+        media: :class:`.scene_contents.FlightSettings`, None without media.
         ray: Ray3f.
         active: mask of lanes.
     """
@@ -204,14 +204,14 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
 
     Args:
         scene: Mitsuba scene.
-        media: :class:`~.media.Media` of the scene.
+        media: :class:`.scene_contents.FlightSettings`.
         ray: Ray3f.
         medium: MediumPtr at its start.
         carried: light per channel at the start, which only steers the choice of channels.
         u: uniform number of the sampler, which chooses the first flight and starts the generator of the others.
         lanes: number of each lane, UInt32.
         active: mask of lanes.
-        first: the ray comes from the sensor: it passes light sources with ``hide`` in ``media``.
+        first: the ray comes from the sensor: it passes light sources if ``media.hide_emitters``.
         clip: distance of the near clip plane, metres: nearer surfaces are not there. None without.
 
     Returns:
@@ -276,7 +276,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hid
 
     Args:
         scene: Mitsuba scene.
-        media: :class:`~.media.Media` of the scene.
+        media: :class:`.scene_contents.FlightSettings`.
         ray: Ray3f; what lies before its ``maxt`` is in the way.
         length: length that counts, metres. Open boundaries count up to the end.
         medium: MediumPtr at its start.
@@ -529,10 +529,12 @@ def with_log_slope(scene, media, leg, x0, x1, hook, active):
     """Return one, with the derivative of the logarithm of a leg's transmittance.
 
     Args:
+        scene: Mitsuba scene.
         media: :class:`.scene_contents.FlightSettings`.
         leg: detached :class:`Leg`.
         x0, x1: its attached ends.
         hook: attached value that keeps the operation in the AD graph.
+        active: mask of lanes.
     """
     if not media.extinction_changes:
         return 1

@@ -55,6 +55,7 @@ def point_of_light(context, ref, ds, active):
     """Trace a ray to the point of a light, whose shape the hit knows.
 
     Args:
+        context: :class:`~.context.RenderContext` of the job.
         ref: Interaction3f that the light is seen from.
         ds: the point, with ``p`` and ``emitter`` as of a DirectionSample3f.
         active: mask of lanes.
