@@ -212,10 +212,17 @@ def _named(texture: Any) -> str:
 
 
 class DescribedScene:
-    """State of a scene as described; ``reference``: the sphere around it.
+    """State of a scene as described.
 
     The scene is identified by its address and those of its shapes. One shape is kept, so that no later scene gets the
     same addresses: one without a sensor, whose film may keep this object, as a cycle would never be freed.
+
+    Args:
+        scene: Mitsuba scene.
+
+    Attributes:
+        reference: the sphere around it.
+        is_checked: its numbers and textures were checked.
     """
 
     def __init__(self, scene: Any) -> None:

@@ -109,13 +109,15 @@ def null_pointers() -> list[Any]:
 
 
 class PointerTable:
-    """One value per listed plugin, ``default`` for all others and for null pointers.
+    """One value per listed plugin, and a default for all others and for null pointers.
 
-    ``values``: one per plugin, a list of whole numbers or of Dr.Jit arrays of width one; derivatives go through where
-    those are attached. ``default``: a Python number. A plugin that is listed twice takes its last value. Build tables
-    outside of loops.
+    Build tables outside of loops. A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
 
-    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    Args:
+        plugins: plugins of one kind; one that is listed twice takes its last value.
+        values: one per plugin, whole numbers or Dr.Jit arrays of width one; derivatives go through where those are
+            attached.
+        default: a Python number.
     """
 
     def __init__(self, plugins: Sequence[Any], values: Sequence[Any], default: float = 0) -> None:

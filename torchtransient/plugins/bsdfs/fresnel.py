@@ -125,8 +125,10 @@ _SINE_SQUARED_ALONG_NORMAL = 1e-18
 class Interface:
     """Amplitudes at a dielectric interface.
 
-    ``cos_theta_i``: cosine between the normal and the direction towards the light's origin; negative inside. ``eta``:
-    inside over outside index. Both may be attached.
+    Args:
+        cos_theta_i: cosine between the normal and the direction towards the light's origin; negative inside. May be
+            attached.
+        eta: inside over outside index. May be attached.
     """
 
     def __init__(self, cos_theta_i: Any, eta: Any) -> None:

@@ -205,7 +205,16 @@ class Sides:
 class Mixture:
     """The parts of one BSDF or phase function of a scene.
 
-    ``always``: it is taken apart in renders, too. ``for_derivatives``: it is taken apart where there are derivatives.
+    Args:
+        node: the BSDF or phase function.
+        kind: ``mi.BSDF`` or ``mi.PhaseFunction``.
+        shapes: shapes that weights may be attributes of.
+
+    Attributes:
+        always: it is taken apart in renders, too.
+        for_derivatives: it is taken apart where there are derivatives.
+        parts: what it is taken apart into.
+        textures: weights.
     """
 
     def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:
@@ -381,9 +390,13 @@ class Mixtures:
 
 
 class MixtureChoice:
-    """Takes mixtures apart in one job. Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """The mixtures that one job takes apart.
 
-    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+    Args:
+        mixtures: mixtures of the scene.
+        chosen: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
     def __init__(self, mixtures: Mixtures, chosen: dict[int, tuple[bool, bool]]) -> None:

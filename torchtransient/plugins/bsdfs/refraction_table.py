@@ -29,7 +29,8 @@ class RefractiveBSDFs:
     for ``principled``) is. Delta lobes are left out: nothing connects through them, and ``sample`` returns their
     index.
 
-    ``entries``: (BSDF, its parts that hold an index).
+    Args:
+        entries: (BSDF, its parts that hold an index).
     """
 
     def __init__(self, entries: list[tuple[Any, list[Any]]]) -> None:
@@ -38,13 +39,16 @@ class RefractiveBSDFs:
 
     @staticmethod
     def from_scene(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
-        """Return the refractive surfaces of ``scene``, or None when nothing in it refracts through a lobe that can be
-        connected to.
+        """Return the refractive surfaces of a scene, None if no refractive lobe can be connected to.
 
-        ``bsdfs``: those of the scene where they are known already.
-        Raises SceneError for a BSDF of which two parts have different indices, where a connection has no single optical
-        length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of a scene
-        (:mod:`.mixtures`); a plugin of others may hold several.
+        Args:
+            scene: Mitsuba scene.
+            bsdfs: its outermost BSDFs, where they are known already.
+
+        Raises:
+            SceneError: for a BSDF of which two parts have different indices, where a connection has no single optical
+                length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of
+                a scene (:mod:`.mixtures`); a plugin of others may hold several.
         """
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
         leaves = ((bsdf, _refractive_leaves(bsdf, (mi.BSDFFlags.GlossyTransmission,))) for bsdf in found)

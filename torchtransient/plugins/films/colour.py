@@ -225,9 +225,19 @@ class SensorResponse:
         return [[value[k] * (1 / count) for value in values] for k in range(count)]
 
     def draw(self, sensor, ray, weight, u):
-        """Replace the wavelengths that a sensor drew for a ray from the number ``u``: (ray, weight).
+        """Replace the wavelengths that a sensor drew for a ray.
 
-        Raises SceneError for a sensor with a response curve of its own, which would be counted twice.
+        Args:
+            sensor: the sensor.
+            ray: its ray, which is changed.
+            weight: weight of the ray.
+            u: the number that its wavelengths were drawn from, Float.
+
+        Returns:
+            (ray, weight).
+
+        Raises:
+            SceneError: for a sensor with a response curve of its own, which would be counted twice.
         """
         self._check(sensor)
         _, drawn = mi.sample_rgb_spectrum(mi.sample_shifted(u))

@@ -240,8 +240,19 @@ class TransientHDRFilm(TimeResolvedFilm):
         return self.put_bins(cube, base, x, (0, bins), value, active, mode)
 
     def put_bins(self, cube, base, x, window, value, active, mode):
-        """Add to the bins that the filter reaches from ``x``, in bins (``Float`` or ``Float64``). ``base``: index of
-        bin 0; ``window``: first bin that is stored, and the one after the last.
+        """Add to the bins that the filter reaches.
+
+        Args:
+            cube: array of the band.
+            base: index of bin 0, UInt32.
+            x: arrival in bins, Float or Float64.
+            window: (first bin that is stored, the one after the last).
+            value: contribution by channel, list of Float.
+            active: mask of lanes.
+            mode: ``dr.ReduceMode`` of the additions.
+
+        Returns:
+            (share of the weight before the window, share behind it), Float.
         """
         channels = len(value)
         low, high = window

@@ -52,12 +52,15 @@ NOT_FLAT = (
 
 
 class HiddenGeometry(Guide):
-    """Draws points on hidden surfaces, more of them where the relay wall sees most of the light.
+    """Guide that draws points on hidden surfaces, more of them where the relay wall sees most of the light.
 
-    ``elements``: the :class:`~torchtransient.plugins.sampling.hidden_elements.HiddenElements` of the job.
-    ``at_wall``: its share of the samples that leave the first vertex; ``beyond``: of the others. Hidden surfaces light
-    each other best as their BSDFs say, so ``beyond`` is small, and less than one since a body close to another one
-    would have no bounded variance.
+    Hidden surfaces light each other best as their BSDFs say, so ``beyond`` is small, and less than one since a body
+    close to another one would have no bounded variance.
+
+    Args:
+        elements: :class:`~torchtransient.plugins.sampling.hidden_elements.HiddenElements` of the job.
+        at_wall: share of the samples that leave the first vertex.
+        beyond: share of the others.
     """
 
     name = "hidden_geometry"
@@ -260,9 +263,16 @@ class TransientNLOSPath(base.TransientIntegrator):
             return ScanTable(scene, contents, self.capture, fov, self.laser_sampling)
 
     def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
-        """Return the division of light among estimators. ``table``: the :class:`ScanTable` of the job, where it is
-        known. Raises SceneError
-        where light has to come from shared samples and cannot.
+        """Return the division of light among estimators.
+
+        Args:
+            scene: Mitsuba scene.
+            contents: its contents.
+            wanted: derivatives of the job, None in a render.
+            table: :class:`ScanTable` of the job, where it is known.
+
+        Raises:
+            SceneError: where light has to come from shared samples and cannot.
         """
         settings = self.settings()
         asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}

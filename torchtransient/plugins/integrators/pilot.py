@@ -30,12 +30,17 @@ _MAX_EVENTS = 2**22
 
 @dataclass(frozen=True)
 class PilotEvents:
-    """Arrivals of a pilot run, in no particular order, N of them from ``paths`` camera paths.
+    """Arrivals of a pilot run, N of them in no particular order.
 
-    ``opl`` (N,) float64, metres of optical path. ``energy`` (N,) float64: contribution to the mean over the image of
-    the mean over wavelengths or channels. ``depth`` (N,): smallest ``max_depth`` of a render that contains it.
-    ``path`` (N,): number of the camera path; ``pixel`` (N,): its pixel on the pilot's film of ``size`` (width, height).
-    ``rate`` (N,) float64: rate of the path, m/s; zero for a sensor whose film measures no rates.
+    Attributes:
+        opl: optical path length, (N,), metres, float64.
+        energy: contribution to the mean over the image of the mean over wavelengths or channels, (N,), float64.
+        depth: smallest ``max_depth`` of a render that contains it, (N,).
+        path: number of the camera path, (N,).
+        pixel: its pixel on the pilot's film, (N,).
+        rate: rate of the path, (N,), m/s, float64; zero for a sensor whose film measures no rates.
+        paths: number of camera paths.
+        size: width and height of the pilot's film.
     """
 
     opl: np.ndarray

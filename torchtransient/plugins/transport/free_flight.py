@@ -25,10 +25,13 @@ WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B
 class FreeFlight:
     """End of a free flight; a plain object that only lives within one iteration.
 
-    ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
-    that is not valid. ``pi`` is the next surface in both cases, counted from the ray's origin. ``medium`` is the one
-    that the walk ended in. ``weight``: transmittance over the probability density of what was sampled, without the
-    scattering coefficient. ``entry``: the last boundary that was passed, if ``media.keeps_entry``.
+    Args:
+        pi: the next surface, counted from the ray's origin.
+        scatter: mask of flights that end in a medium; others end at ``pi``, or nowhere if that is not valid.
+        t: distance of the end from the ray's origin, metres.
+        medium: MediumPtr that the walk ended in.
+        weight: transmittance over the probability density of what was sampled, without the scattering coefficient.
+        entry: the last boundary that was passed, if ``media.keeps_entry``.
     """
 
     def __init__(self, pi, scatter, t, medium, weight, entry):

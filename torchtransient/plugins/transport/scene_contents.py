@@ -171,12 +171,19 @@ def _room(plugin: Any) -> str:
 class MediaContents:
     """The participating media of a scene. Does not change once built.
 
-    ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
-    media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``transitions``: there is more than one medium, or a place without one.
-    ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
-    connections to emitters. ``extent``: the size of the scene in metres. ``phase_mixtures``: blends of phase functions,
-    None where there are none.
+    Args:
+        media: the media, each once.
+        at_sensor: the medium that the sensor stands in, or None.
+        open_boundaries: some surface lets light through unbent (BSDF ``null``), so that straight lines go through
+            several media.
+        shapes_in_groups: there are instances.
+        extent: the size of the scene, metres.
+        transitions: there is more than one medium, or a place without one.
+
+    Attributes:
+        homogeneous, heterogeneous: there are media of that kind.
+        emitter_sampling: every medium allows connections to emitters.
+        phase_mixtures: blends of phase functions, None where there are none.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
