@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,7 +12,6 @@ import pytest
 from support.plain_scenes import camera, load
 from support.runs import T
 from torchtransient.accuracy import two_sample_z_test, z_test
-from torchtransient.plugins.films import phasor_sums
 
 GRID = {"frequency_first": -0.6, "frequency_step": 0.2, "frequency_count": 10}
 FILMS = "torchtransient.plugins.films"
@@ -157,15 +158,16 @@ def test_light_is_not_lost():
 def test_deep_paths_and_no_limit():
     """More bounces than a path's memory has room for: equal to enough room, and right without any limit."""
     scene = scene_of(phasor_camera(), max_depth=20, rr_depth=50)
-    assert phasor_sums.slots_for(2 * 20) == phasor_sums.MAX_EVENTS < 40
+    phasor = sys.modules[f"{FILMS}.phasor"]
+    assert phasor.slots_for(2 * 20) == phasor.MAX_EVENTS < 40
     steady, a = render(scene)
-    before = phasor_sums.MAX_EVENTS
+    before = phasor.MAX_EVENTS
     try:
-        for phasor_sums.MAX_EVENTS in (2, 40):
+        for phasor.MAX_EVENTS in (2, 40):
             _, b = render(scene)
             np.testing.assert_allclose(a, b, atol=ROUNDING * steady.max())
     finally:
-        phasor_sums.MAX_EVENTS = before
+        phasor.MAX_EVENTS = before
     unlimited, limited = scene_of(phasor_camera(), max_depth=-1), scene_of(phasor_camera(), max_depth=40)
     np.testing.assert_allclose(render(unlimited)[1], render(limited)[1], rtol=1e-3, atol=1e-4 * np.abs(a).max())
 
@@ -175,7 +177,7 @@ def test_several_launches_and_bands(monkeypatch):
     """Jobs that are split by samples, by rows and into storage bands add up."""
     scene = scene_of(phasor_camera())
     one = np.array([render(scene, seed)[1] for seed in range(12)])
-    per_path = 8 * (phasor_sums.EVENT_BYTES + 12)
+    per_path = 8 * (sys.modules[f"{FILMS}.phasor"].EVENT_BYTES + 12)
     for limit in (24 * 10 * per_path, 7 * 16 * per_path):
         monkeypatch.setattr(f"{FILMS}.phasor.MAX_EVENT_BYTES", limit)
         assert len(scene.integrator().prepared(scene, spp=16).launches) > 1

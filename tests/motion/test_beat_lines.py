@@ -14,6 +14,7 @@ import torchtransient as tt
 from support.film_storage import storage
 from support.marks import long_pairs
 from support.rates import plate, scene
+from torchtransient.errors import StorageError
 from torchtransient.pulses import Pulse, cumulative_of_sum
 
 DISTANCE, SPEED = 3.217, 1.83
@@ -94,6 +95,22 @@ def test_sums_in_double_precision():
     for variant in ("llvm_ad_mono", "llvm_ad_rgb"):
         settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": "box"}
         compare(tt.render(wall(variant), seed=0, spp=2**16 + 2**12, **settings), chirps, axis)
+
+
+def test_nodes_that_do_not_fit_are_refused(monkeypatch):
+    """They are in memory beside the bins: bins alone would fit."""
+    chirps = tt.Chirps(1e9, 10e-6, 1550e-9)
+    axis = tt.TimeAxis(-2.1, chirps.resolution_opl / 2, 400)
+    moving = tt.load(scene(32, 20.0, wall=plate((0, 0, DISTANCE), (0, 0, 0))), variant="llvm_ad_rgb")
+    renderer = tt.TransientRenderer(moving, chirps=chirps, time_axis=axis, spp=1, physics="ignore")
+    bins = 32 * 32 * 2 * 400 * 3 * 4
+    for free, fits in ((2 * bins, False), (4 * bins, True)):
+        monkeypatch.setattr("torchtransient.rendering.memory.available_memory", lambda free=free: free)
+        if fits:
+            renderer(seed=0)
+            continue
+        with pytest.raises(StorageError, match="of nodes beside it"):
+            renderer(seed=0)
 
 
 def test_batches_of_a_crop():

@@ -16,6 +16,7 @@ import pytest
 from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins import mitsuba_shapes
 from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.spectral_colours import keeps_coefficients
@@ -383,7 +384,7 @@ def test_merged_rectangles_have_no_bounds():
     scene = mi.load_dict({"type": "scene", "paint": paint, "all": {"type": "merge", **parts}})
     (shape,) = scene.shapes()
     assert not shape.bbox().valid() and not scene.bbox().valid()
-    np.testing.assert_allclose(np.array(compat.bounds_of(shape).max), [1, 1, 1])
+    np.testing.assert_allclose(np.array(mitsuba_shapes.bounds_of(shape).max), [1, 1, 1])
 
 
 def round_shape(plugin):

@@ -9,6 +9,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
+from torchtransient.plugins import mitsuba_shapes
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene
 
 
@@ -100,11 +101,11 @@ def test_hits_of_ellipsoids_and_linear_curves_do_not_follow_the_shape(tmp_path):
     for shape, key, step in ((ellipsoid(), "data", 10), (linear_curve(tmp_path), "control_points", 4)):
         scene = mi.load_dict({"type": "scene", "it": shape})
         assert slope(scene, f"it.{key}", lifted(step), distance) == 0
-        assert compat.leaves_hits_detached(scene.shapes()[0])
+        assert mitsuba_shapes.leaves_hits_detached(scene.shapes()[0])
     ball = mi.load_dict({"type": "scene", "it": {"type": "sphere", "center": [0, 0, -2], "radius": 2}})
     lift = slope(ball, "it.to_world", lambda pose, x: mi.AffineTransform4f().translate([0, 0, x]) @ pose, distance)
     assert lift == pytest.approx(-1, abs=0.1)
-    assert not compat.leaves_hits_detached(ball.shapes()[0])
+    assert not mitsuba_shapes.leaves_hits_detached(ball.shapes()[0])
 
 
 def test_ellipsoids_do_not_show_what_they_are_made_of():

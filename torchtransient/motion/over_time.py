@@ -11,8 +11,7 @@ from torch import Tensor
 from torchtransient.checks import as_whole, function, mapping, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.floating import holds
-from torchtransient.motion.rigid import Motion
-from torchtransient.motion.slow_times import Exposure, Frames, SlowTimes
+from torchtransient.motion.slow_times import Exposure, Frames, Motion, SlowTimes
 from torchtransient.plugins.mitsuba_compat import POSITIONS, VELOCITY
 from torchtransient.rendering.job import draw_seed
 from torchtransient.rendering.output import RenderOutput

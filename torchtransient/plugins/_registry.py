@@ -68,19 +68,19 @@ def active_variant() -> str | None:
     return variant
 
 
-def is_jit(variant: str | None) -> bool:
+def _is_jit(variant: str | None) -> bool:
     """Return whether a variant compiles its kernels with Dr.Jit (`llvm_*`, `cuda_*`, `metal_*`)."""
     return variant is not None and variant.startswith(_JIT_PREFIXES)
 
 
-def require_jit_variant(what: str) -> str:
+def _require_jit_variant(what: str) -> str:
     """Return the active variant, or raise VariantError when `what` cannot work in it (none set, or a scalar one)."""
     variant = active_variant()
     if variant is None:
         raise VariantError(
             f"{what} needs an active Mitsuba variant and none is set. Call mi.set_variant('llvm_ad_rgb') first."
         )
-    if not is_jit(variant):
+    if not _is_jit(variant):
         raise VariantError(
             f"{what} works on whole arrays and needs a Dr.Jit variant (llvm_ad_*, cuda_ad_*); the active variant is "
             f"'{variant}'. Call mi.set_variant('llvm_ad_rgb') before the scene is loaded."
@@ -99,9 +99,16 @@ _warned: set[str] = set()
 
 
 def untested(name: str, version: str) -> str | None:
-    """Return a warning about `version` of the package `name`, None for a tested version or an unlisted package.
+    """Return a warning about an untested version of a package.
 
     Builds of a tested version, such as "1.5.0+local", are tested ones.
+
+    Args:
+        name: package, a key of :data:`TESTED`.
+        version: its version, as the package states it.
+
+    Returns:
+        The text, None for a tested version or an unlisted package.
     """
     tested = TESTED.get(name)
     if tested is None or version.partition("+")[0] in tested:
@@ -219,9 +226,14 @@ _state = _State()
 def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
     """Register a plugin for the active variant. Called at the end of a plugin module.
 
-    `kind` is one of `KINDS`, `name` the plugin's name in scene files, `constructor` the class (or a function) that
-    takes `mi.Properties`. Raises PluginRegistrationError for an unknown kind, for a class that lacks a member of an
-    interface that it signed up for, or when another module of the library's list already registered the name.
+    Args:
+        kind: one of :data:`KINDS`, "bsdf" of `mi.register_bsdf`.
+        name: name of the plugin in scene files.
+        constructor: the class, or a function, that takes `mi.Properties`.
+
+    Raises:
+        PluginRegistrationError: for an unknown kind, for a class that lacks a member of an interface that it signed up
+            for, and for a name that another module of the library's list has registered.
     """
     if kind not in KINDS:
         raise PluginRegistrationError(
@@ -258,12 +270,17 @@ def register(kind: str, name: str, constructor: Callable[..., object]) -> None:
 
 
 def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> None:
-    """Add a plugin module of your own, by its dotted name; it is executed now and at each later change of the variant.
+    """Add a plugin module of your own. It is executed now and at each later change of the variant.
 
-    `plugins` may list what it registers as `(kind, name)`; then the names answer with a clear VariantError in scalar
-    variants too, and a name that the module fails to register is an error. Modules are executed in Dr.Jit variants
-    only. Adding a module twice is the same as adding it once. Raises PluginRegistrationError when the module cannot be
-    found or executed.
+    Modules are executed in Dr.Jit variants only. Adding a module twice is the same as adding it once.
+
+    Args:
+        module: dotted name that Python can import.
+        plugins: what it registers, as (kind, name). Listed names answer with a clear VariantError in scalar variants,
+            and a listed name that the module fails to register is an error.
+
+    Raises:
+        PluginRegistrationError: for a module that cannot be found or executed.
     """
     with _state.changes:
         # A name is taken as given: find_spec imports the parent packages and raises for what is not a module.
@@ -290,7 +307,7 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
 
 def modules_of_others() -> tuple[PluginModule, ...]:
-    """Modules added with :func:`register_module`, in order."""
+    """Return the modules added with :func:`register_module`, in order."""
     with _state.changes:
         return tuple(_state.third_party)
 
@@ -312,7 +329,14 @@ def _version(module: str) -> str:
 
 
 def kind_of(name: str) -> str | None:
-    """The kind of a plugin of this library or of a module that was added to it, such as "bsdf"; None for others."""
+    """Return the kind of a plugin of this library, or of a module that was added to it.
+
+    Args:
+        name: name of the plugin in scene files.
+
+    Returns:
+        The kind, such as "bsdf"; None for plugins of Mitsuba and of others.
+    """
     with _state.changes:
         for entry in (*PLUGIN_MODULES, *_state.third_party):
             for kind, plugin in entry.plugins:
@@ -432,7 +456,7 @@ def _load_all(variant: str) -> None:
         _state.owner.clear()
         _state.waiting.clear()
     for entry in (*PLUGIN_MODULES, *_state.third_party):
-        if not is_jit(variant):
+        if not _is_jit(variant):
             for key in entry.plugins:
                 _add(key, entry.module, _refusal(*key))
         elif entry.module in _OWN_MODULES and entry.module not in sys.modules:
@@ -508,7 +532,7 @@ def _first_use(module: str, key: tuple[str, str]) -> Callable[[object], object]:
 
 def _refusal(kind: str, name: str) -> Callable[[object], object]:
     def refuse(_props: object) -> object:
-        require_jit_variant(f"{kind} plugin '{name}'")
+        _require_jit_variant(f"{kind} plugin '{name}'")
         raise PluginRegistrationError(
             f"{kind} plugin '{name}' was set up for a scalar variant but is used in '{active_variant()}'. "
             "Call torchtransient.plugins.sync() before the scene is loaded."

@@ -77,7 +77,11 @@ class Cache:
 
 
 def digest(*arrays: np.ndarray) -> bytes:
-    """Return a hash of arrays, of their values, shapes and types."""
+    """Return a hash of arrays, of their values, shapes and types.
+
+    Args:
+        arrays: numpy arrays of any shapes.
+    """
     found = hashlib.blake2b(digest_size=16)
     for array in arrays:
         found.update(f"{array.dtype.str}{array.shape}".encode())

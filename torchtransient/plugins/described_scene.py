@@ -26,7 +26,6 @@ from torchtransient.plugins.mitsuba_compat import (
     VERTEX_COLUMNS,
     attribute_name,
     attribute_sizes,
-    has_surface,
     has_texcoords,
     is_bump_map,
     is_dark,
@@ -34,6 +33,7 @@ from torchtransient.plugins.mitsuba_compat import (
     read_as,
     scene_parameters,
 )
+from torchtransient.plugins.mitsuba_shapes import has_surface
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.properties import check_parameters
@@ -49,8 +49,13 @@ from torchtransient.plugins.sampling.lights import distant_reference
 
 
 def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
-    """The numbers of a plugin and of what it holds, attached where they are; ``shapes``: those whose attributes its
-    textures read. Attributes belong to the shapes.
+    """Yield the numbers of a plugin and of all that it holds, attached where they are.
+
+    Attributes of meshes belong to the shapes: those that textures below ``node`` read are among the numbers.
+
+    Args:
+        node: Mitsuba object.
+        shapes: shapes whose attributes the textures of ``node`` may read.
     """
     below = (node, *objects_below(node, mi.Object))
     for part in below:
@@ -65,7 +70,15 @@ def numbers_below(node: Any, shapes: Sequence[Any]) -> Iterator[Any]:
 
 
 def check_textures(params: Any) -> None:
-    """Raise ``SceneError`` where a built scene (``mi.traverse``) has a texture in a place where it cannot be read."""
+    """Check that each texture of a built scene is in a place where it can be read.
+
+    Args:
+        params: ``mi.traverse`` of the scene.
+
+    Raises:
+        SceneError: for textures whose channels, slopes, attributes or texture coordinates are not those that the plugin
+            or shape around them reads.
+    """
     somewhere = dr.zeros(mi.SurfaceInteraction3f)
     for node in params.hierarchy:
         if isinstance(node, mi.BSDF) and is_bump_map(node):
@@ -126,7 +139,7 @@ def _check_attributes(shape: Any, surface: Any, known: dict[int, list[Read]]) ->
     if surface.ptr not in known:
         known[surface.ptr] = list(_attributes_of(surface))
     for read in known[surface.ptr]:
-        sizes = attributes_of(shape)
+        sizes = _sizes_of_attributes(shape)
         message = f"{shape.id()!r}: expected an attribute {read.name!r} for {read.slot!r} of its surface"
         if read.name not in sizes:
             has = ", ".join(map(repr, sizes)) or "none"
@@ -151,7 +164,7 @@ def _attributes_of(surface: Any) -> Iterator[Read]:
                     yield Read(name, part, slot, attribute_sizes(bsdf, slot))
 
 
-def attributes_of(shape: Any) -> dict[str, float | None]:
+def _sizes_of_attributes(shape: Any) -> dict[str, float | None]:
     """The attributes of a shape, by name: how many numbers they have at each place, None where a texture says so."""
     values, objects = shown_by(shape)
     found: dict[str, float | None] = {name: None for name, part, _ in objects if isinstance(part, mi.Texture)}
@@ -199,10 +212,17 @@ def _named(texture: Any) -> str:
 
 
 class DescribedScene:
-    """State of a scene as described; ``reference``: the sphere around it.
+    """State of a scene as described.
 
     The scene is identified by its address and those of its shapes. One shape is kept, so that no later scene gets the
     same addresses: one without a sensor, whose film may keep this object, as a cycle would never be freed.
+
+    Args:
+        scene: Mitsuba scene.
+
+    Attributes:
+        reference: the sphere around it.
+        is_checked: its numbers and textures were checked.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -217,7 +237,12 @@ class DescribedScene:
 
 
 def described(scene: Any, *plugins: Any) -> DescribedScene:
-    """Return the state of a scene as described. ``plugins``: further plugins that keep it."""
+    """Return the state of a scene as described, which is recorded once.
+
+    Args:
+        scene: Mitsuba scene.
+        plugins: further plugins that keep the state, beside those of the scene.
+    """
     keepers = [*plugins, *_keepers_of(scene)]
     known = (getattr(keeper, "described", None) for keeper in keepers)
     found = next((state for state in known if state is not None and state.is_of(scene)), None)
@@ -232,6 +257,10 @@ def note_scene(plugin: Any, callback: Any) -> None:
     """Record the scene that ``mi.traverse`` walks; for the ``traverse`` of a plugin that keeps a described scene.
 
     Such a scene is as described, or was recorded before.
+
+    Args:
+        plugin: plugin that is walked through.
+        callback: ``mi.TraversalCallback`` of the walk.
     """
     # Mitsuba's own callback knows the way down to each plugin; others do not install values.
     hierarchy = getattr(callback, "hierarchy", {})
@@ -246,6 +275,7 @@ def check_scene(scene: Any, params: Any = None, known: DescribedScene | None = N
     """Check the numbers and textures of a scene, once.
 
     Args:
+        scene: Mitsuba scene.
         params: the scene's parameters by users' keys, if the caller has them.
         known: the scene's :class:`DescribedScene`, if the caller has it.
 

@@ -85,12 +85,24 @@ class Voxels:
 
 
 def is_ours(node: Mapping[str, Any]) -> bool:
-    """Return True if a node is of a plugin of this library, or of one that was added to it."""
+    """Return True if a node is of a plugin of this library, or of one that was added to it.
+
+    Args:
+        node: dictionary of a plugin, with ``type``.
+    """
     return kind_of(str(node.get("type"))) is not None
 
 
 def numbers_in_text(entry: Any, where: str) -> str:
-    """A list of numbers as the text that plugins of this library read. Raises ``SceneError`` for what is no row."""
+    """Return a list of numbers as the text that plugins of this library read.
+
+    Args:
+        entry: real numbers, (N,).
+        where: place in the scene, for messages.
+
+    Raises:
+        SceneError: for anything but one row of real numbers.
+    """
     array = np.asarray(entry)
     if array.ndim != 1 or array.dtype.kind not in "fiu":
         raise SceneError(
@@ -100,7 +112,7 @@ def numbers_in_text(entry: Any, where: str) -> str:
     return ", ".join(repr(float(number)) for number in array)
 
 
-def for_mitsuba(value: Any, key: str = "") -> Any:
+def _for_mitsuba(value: Any, key: str = "") -> Any:
     """Return the dictionary that Mitsuba reads, for the active variant; values that Mitsuba accepts stay as they are.
     """
     if isinstance(value, Mapping):
@@ -124,7 +136,7 @@ def _entry(node: Mapping[str, Any], name: str, item: Any) -> Any:
         return mi.VolumeGrid(np.ascontiguousarray(item, dtype=np.float32))
     if name in NUMBERS_IN_TEXT and isinstance(item, list | tuple | np.ndarray) and is_ours(node):
         return numbers_in_text(item, name)
-    return for_mitsuba(item, name)
+    return _for_mitsuba(item, name)
 
 
 def _array(value: np.ndarray, key: str) -> Any:
@@ -140,13 +152,17 @@ def _array(value: np.ndarray, key: str) -> Any:
 
 
 def parsed(config: Any, tree: Mapping[str, Any]) -> Any:
-    """Mitsuba's parser state of a dictionary.
+    """Return Mitsuba's parser state of a dictionary.
 
     Tensors enter with one row and get their own once the parser keeps them: what has three rows Mitsuba tries as a
     point and as two kinds of colours first, and nanobind prints a line on stderr for each.
+
+    Args:
+        config: ``mi.parser.ParserConfig``.
+        tree: scene or plugin as nested dictionaries, plain data.
     """
     kept: list[tuple[Any, Any]] = []
-    state = mi.parser.parse_dict(config, _with_one_row(for_mitsuba(tree), kept))
+    state = mi.parser.parse_dict(config, _with_one_row(_for_mitsuba(tree), kept))
     for entered, tensor in kept:
         entered.__init__(tensor)
     return state
@@ -163,7 +179,10 @@ def _with_one_row(value: Any, kept: list[tuple[Any, Any]]) -> Any:
 
 
 def double_transform() -> Any:
-    """Mitsuba's scalar transform in double precision, which has no public name in single precision variants."""
+    """Return Mitsuba's class of scalar transforms in double precision.
+
+    It has no public name in single precision variants.
+    """
     properties = mi.Properties()
     properties["transform"] = mi.ScalarTransform4f()
     return type(properties["transform"])
@@ -207,9 +226,9 @@ def _taking_arrays(load_dict: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(load_dict)
     def taking_arrays(*args: Any, **options: Any) -> Any:
         if args and isinstance(args[0], dict):
-            args = (for_mitsuba(args[0]), *args[1:])
+            args = (_for_mitsuba(args[0]), *args[1:])
         elif isinstance(options.get("dict"), dict):
-            options["dict"] = for_mitsuba(options["dict"])
+            options["dict"] = _for_mitsuba(options["dict"])
         handled = sys.exc_info()[1]
         try:
             return load_dict(*args, **options)

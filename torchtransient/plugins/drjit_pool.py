@@ -52,7 +52,14 @@ def check_process() -> None:
 
 
 def set_drjit_threads(count: int) -> None:
-    """Set the number of Dr.Jit's threads, under the engine lock. Raises ``VariantError`` in a forked child."""
+    """Set the number of Dr.Jit's threads, under the engine lock.
+
+    Args:
+        count: threads, at least 1; the calling one is among them.
+
+    Raises:
+        VariantError: in a child that was forked from a process that had set them.
+    """
     check_process()
     if _pool["process"] not in (0, os.getpid()):
         raise VariantError(
@@ -65,13 +72,15 @@ def set_drjit_threads(count: int) -> None:
 
 
 def resize_pool(count: int) -> None:
-    """Set the number of Dr.Jit's threads without the hang of ``dr.set_thread_count``, under the engine lock, while no
-    kernel runs.
+    """Set the number of Dr.Jit's threads without the hang of ``dr.set_thread_count``.
 
-    If a worker falls asleep just as the pool shrinks, nanothread (of Dr.Jit 1.5) waits for it for ever: once in some
-    250,000 changes, and a process of one thread shrinks its pool after every file (:func:`threads_for_files`). A task
-    that is submitted meanwhile wakes the worker. ``dr.set_thread_count`` holds the interpreter's lock, which would stop
-    the thread that submits: so the pool is shrunk through ctypes.
+    Call under the engine lock, while no kernel runs. If a worker falls asleep just as the pool shrinks, nanothread (of
+    Dr.Jit 1.5) waits for it for ever: once in some 250,000 changes, and a process of one thread shrinks its pool after
+    every file (:func:`threads_for_files`). A task that is submitted meanwhile wakes the worker. ``dr.set_thread_count``
+    holds the interpreter's lock, which would stop the thread that submits: so the pool is shrunk through ctypes.
+
+    Args:
+        count: threads, at least 1.
     """
     library = _nanothread()
     # At the interpreter's end no thread begins any more, and its start would be waited for.

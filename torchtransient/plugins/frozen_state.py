@@ -64,7 +64,8 @@ class NotComparableError(Exception):
 def arrays_below(value: Any) -> list[Any]:
     """Return the Dr.Jit arrays of plain objects and of the containers that they hold, each once and in order.
 
-    Mitsuba's structures of arrays count as arrays.
+    Args:
+        value: object, list, tuple or dictionary. Mitsuba's structures of arrays count as arrays.
 
     Raises:
         NotComparableError: for objects of an unknown type.
@@ -76,6 +77,9 @@ def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
     """Return structure and arrays of plain objects and of the containers that they hold.
 
     Two jobs of the same structure are traced to the same kernels.
+
+    Args:
+        value: object, list, tuple or dictionary.
 
     Returns:
         (structure: all that is no array, with the places and types of arrays, hashable; Mitsuba's objects count by
@@ -257,6 +261,9 @@ def says_it_can_be_recorded(plugin: Any) -> bool:
 
     Subclasses do not inherit the declaration, since they may behave otherwise; classes of this library can all be
     recorded.
+
+    Args:
+        plugin: plugin written in Python.
     """
     kind = type(plugin)
     known = kind.__module__.startswith("torchtransient.plugins.")

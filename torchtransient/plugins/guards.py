@@ -142,7 +142,11 @@ def no_collection() -> Iterator[None]:
 
 
 def release_when_safe(contents: list[Any]) -> None:
-    """Empty a list that holds the last references to Mitsuba objects: now, or after the last :func:`no_collection`."""
+    """Empty a list that holds the last references to Mitsuba objects: now, or after the last :func:`no_collection`.
+
+    Args:
+        contents: the list, which is changed.
+    """
     with _lock:
         if _blocks:
             _waiting.extend(contents)

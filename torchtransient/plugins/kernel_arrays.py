@@ -19,21 +19,36 @@ _ALIGNMENT = 64
 
 
 def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
-    """Return a copy of an array's numbers.
+    """Return a copy of an array's numbers in the memory of the host.
 
     Of a detached handle: Dr.Jit evaluates what it reads in place, and a literal that a scene shows to recordings would
     be another array afterwards.
+
+    Args:
+        value: Dr.Jit array, attached or not.
+        dtype: dtype of the copy, None for that of ``value``.
+
+    Returns:
+        Numpy array of the shape of ``value``; of vectors with their components first, (3, N).
     """
     return np.array(dr.detach(value), dtype=dtype)
 
 
 def whole_numbers(values: np.ndarray) -> Any:
-    """Return a copy of an array of numpy's as a ``mi.UInt32``."""
+    """Return a copy of whole numbers as a ``mi.UInt32``.
+
+    Args:
+        values: (N,), 0 to 2^32 - 1.
+    """
     return mi.UInt32(_aligned(values, np.uint32))
 
 
 def floats(values: np.ndarray) -> Any:
-    """Return a copy of an array of numpy's as a ``mi.Float``."""
+    """Return a copy of numbers as a ``mi.Float``.
+
+    Args:
+        values: (N,).
+    """
     return mi.Float(_aligned(values, np.float32))
 
 
@@ -72,8 +87,15 @@ _STEP = 64
 
 
 def registry_number(plugin: Any) -> int:
-    """Return the number of a plugin in Dr.Jit's registry. Numbers start at one, each kind of plugin has its own. Raises
-    ``SceneError`` for what kernels cannot point to.
+    """Return the number of a plugin in Dr.Jit's registry, which a pointer to it holds.
+
+    Numbers start at one, each kind of plugin has its own.
+
+    Args:
+        plugin: BSDF, emitter, shape, medium or other plugin of which Mitsuba has arrays of pointers.
+
+    Raises:
+        SceneError: for what kernels cannot point to.
     """
     for kind, pointer in _POINTERS.items():
         if isinstance(plugin, getattr(mi, kind)):
@@ -87,13 +109,15 @@ def null_pointers() -> list[Any]:
 
 
 class PointerTable:
-    """One value per listed plugin, ``default`` for all others and for null pointers.
+    """One value per listed plugin, and a default for all others and for null pointers.
 
-    ``values``: one per plugin, a list of whole numbers or of Dr.Jit arrays of width one; derivatives go through where
-    those are attached. ``default``: a Python number. A plugin that is listed twice takes its last value. Build tables
-    outside of loops.
+    Build tables outside of loops. A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
 
-    A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
+    Args:
+        plugins: plugins of one kind; one that is listed twice takes its last value.
+        values: one per plugin, whole numbers or Dr.Jit arrays of width one; derivatives go through where those are
+            attached.
+        default: a Python number.
     """
 
     def __init__(self, plugins: Sequence[Any], values: Sequence[Any], default: float = 0) -> None:

@@ -18,7 +18,8 @@ from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.frozen_state import says_it_can_be_recorded, state_below
 from torchtransient.plugins.guards import no_collection
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance, near_clip
+from torchtransient.plugins.mitsuba_compat import is_distant, near_clip
+from torchtransient.plugins.mitsuba_shapes import has_surface, is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.parameter_effect import class_of
 from torchtransient.plugins.sensors.origin import length_to_sensor_origin, sensors_of, views
@@ -74,21 +75,31 @@ class LabelTables:
         return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self._bsdfs)
 
     def tables(self) -> list[Any]:
-        """Arrays that kernels read."""
+        """Return the arrays that kernels read."""
         return [self._shapes, self._materials, self.observer]
 
     def shape(self, si: Any, hit: Any) -> Any:
-        """Numbers of the shapes that are met, of the instance where it is one; -1 for none."""
+        """Return the numbers of the shapes that are met, of the instance where it is one; -1 for none.
+
+        Args:
+            si: SurfaceInteraction3f.
+            hit: mask of lanes that met something.
+        """
         copied = hit & (dr.reinterpret_array(mi.UInt32, si.instance) != 0)
         number = dr.select(copied, self._shapes.look_up(si.instance, copied), self._shapes.look_up(si.shape, hit))
         return mi.Int32(number) - 1
 
     def material(self, si: Any, hit: Any) -> Any:
-        """Numbers of the materials of the surfaces that are met; -1 for none."""
+        """Return the numbers of the materials of the surfaces that are met; -1 for none.
+
+        Args:
+            si: SurfaceInteraction3f.
+            hit: mask of lanes that met something.
+        """
         return mi.Int32(self._materials.look_up(si.bsdf(), hit)) - 1
 
 
-def check_sensor(sensor: Any, names: tuple[str, ...]) -> None:
+def _check_sensor(sensor: Any, names: tuple[str, ...]) -> None:
     """Raise ``SceneError`` where a pixel of a sensor is no direction, or there is no axis to measure along."""
     for one in sensors_of(sensor):
         if is_distant(one) or class_of(one) == "IrradianceMeter":
@@ -148,7 +159,7 @@ class LabelJob:
     @no_collection()
     def prepare(self) -> LabelJob:
         """Look up what is not part of what is recorded."""
-        check_sensor(self.sensor, self.names)
+        _check_sensor(self.sensor, self.names)
         self.tables.seen.follow_derivatives(self.scene, False)
         self.plugins = self.tables.seen.python_plugins(self.scene)
         for plugin in self.plugins:
@@ -169,7 +180,7 @@ class LabelJob:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height."""
+        """Return width and height."""
         return self._size
 
     def components(self, name: str) -> int:
@@ -196,7 +207,7 @@ class LabelJob:
         return state_below([held, [vars(plugin) for plugin in jobs[0].plugins]])
 
     def run(self, job: LabelJob) -> None:
-        """Carry out a job that is prepared."""
+        """Execute a job that is prepared."""
         with dr.suspend_grad():
             job.film.put(job._computed())
 
@@ -209,7 +220,7 @@ class LabelJob:
         ray = mi.Ray3f(ray)
         origin = mi.Point3f(ray.o)
         before = length_to_sensor_origin(seen, ray)
-        si = first_surface(self.scene, ray, self._passes, self._hides_emitters)
+        si = _first_surface(self.scene, ray, self._passes, self._hides_emitters)
         hit = si.is_valid()
         found = []
         for name in self.names:
@@ -277,25 +288,25 @@ class LabelJob:
 
 
 @dr.syntax
-def first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> Any:
+def _first_surface(scene: Any, ray: Any, passes: bool, hides_emitters: bool) -> Any:
     """Find the first surface along each ray that does not let most of the light pass unbent. ``passes``: the scene may
     have surfaces that do; ``hides_emitters``: emitting surfaces are skipped, as by an integrator's ``hide_emitters``.
     """
     si = scene.ray_intersect(ray)
     if dr.hint(passes or hides_emitters, mode="scalar"):
         turns = mi.UInt32(0)
-        active = si.is_valid() & lets_pass(si, passes, hides_emitters)
+        active = si.is_valid() & _lets_pass(si, passes, hides_emitters)
         while dr.hint(active & (turns < MOST_PASSED), max_iterations=MOST_PASSED, label="labels"):
             left = ray.maxt - si.t
             ray = si.spawn_ray(ray.d)
             ray.maxt = left
             si = scene.ray_intersect(ray, active)
-            active = active & si.is_valid() & lets_pass(si, passes, hides_emitters)
+            active = active & si.is_valid() & _lets_pass(si, passes, hides_emitters)
             turns += 1
     return si
 
 
-def lets_pass(si: Any, passes: bool, hides_emitters: bool) -> Any:
+def _lets_pass(si: Any, passes: bool, hides_emitters: bool) -> Any:
     """Return a mask of surface interactions that a pixel looks through."""
     through = mi.Mask(False)
     if passes:

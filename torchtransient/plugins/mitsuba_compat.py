@@ -18,8 +18,6 @@ import numpy as np
 
 from torchtransient.errors import SceneError
 
-WRITTEN_AGAINST = "3.9.1"
-
 # ----------------------------------------------------------------------------------------- what Mitsuba's BSDFs return
 
 # Delta lobes of these return value over probability with the probability attached: a Fresnel term has cancelled itself.
@@ -30,26 +28,40 @@ _WEIGHT_SLOTS = {"MaskBSDF": "opacity", "BlendBSDF": "weight", "BlendPhaseFuncti
 
 
 def cancels_lobe_probability(bsdf: Any) -> bool:
-    """Return True if the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability."""
+    """Return True if the weight of a BSDF's own delta lobe lacks the derivative of the lobe's probability.
+
+    Args:
+        bsdf: one ``mi.BSDF``; those that it holds are not asked.
+    """
     return bsdf.class_name() in _CANCELLING
 
 
 def weight_slot(bsdf: Any) -> str | None:
-    """Name of the texture or volume that mixes what a BSDF or phase function holds, None for those that are no mixture.
-    A mixture of one BSDF lets the rest of the light pass.
+    """Return the name of the texture or volume that mixes what a BSDF or phase function holds.
+
+    Args:
+        bsdf: one ``mi.BSDF`` or ``mi.PhaseFunction``.
+
+    Returns:
+        "weight" or "opacity", None for those that are no mixture. A mixture of one BSDF lets the rest of the light
+        pass.
     """
     return _WEIGHT_SLOTS.get(bsdf.class_name())
 
 
 def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
-    """Return True if a BSDF is a blend of which a part has a delta lobe or lets light through, or works on a side of
-    the surface where another does nothing. ``held``: the parts; ``nested``: all BSDFs in it, asked themselves since a
-    blend does not notice lobes that they get later.
+    """Return True for a blend whose values Mitsuba divides by another density than that of its samples.
 
-    Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is a
-    probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
+    So it is where a part has a delta lobe or lets light through, or works on a side of the surface where another does
+    nothing. Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is
+    a probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
     one that is seen from behind, a rough one whose facet mirrors or refracts there. What lets light through has a value
     there, which counts once too often (rough glass and paint, from behind: 10 %).
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+        held: its parts.
+        nested: all BSDFs in it, asked themselves since a blend does not notice lobes that they get later.
     """
     if bsdf.class_name() != "BlendBSDF":
         return False
@@ -59,12 +71,20 @@ def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
 
 
 def is_two_sided_itself(bsdf: Any) -> bool:
-    """Return True if a BSDF is ``twosided``, whose Mueller matrices are wrong from behind."""
+    """Return True for ``twosided``, whose Mueller matrices are wrong from behind.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+    """
     return bool(bsdf.class_name() == "TwoSidedBRDF")
 
 
 def has_equal_sides(bsdf: Any) -> bool:
-    """Return True if the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre."""
+    """Return True if the same medium lies on both sides, although a lobe of transmission is not symmetric: a fibre.
+
+    Args:
+        bsdf: one ``mi.BSDF``; plugins of others declare it as ``has_equal_sides``.
+    """
     return bool(bsdf.class_name() == "Hair" or getattr(bsdf, "has_equal_sides", False))
 
 
@@ -76,14 +96,22 @@ HIDDEN_FLAGS = ("flip_invalid_normals", "use_shadowing_function")
 
 
 def normal_texture(bsdf: Any) -> str | None:
-    """Name of the texture by which a BSDF turns the shading frame, None for BSDFs that leave it."""
+    """Return the name of the texture by which a BSDF turns the shading frame, None for BSDFs that leave it.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+    """
     return _NORMAL_TEXTURES.get(bsdf.class_name())
 
 
 def forgets_black_samples(bsdf: Any) -> bool:
-    """Return True if a BSDF drops samples of the one it holds whose weight is zero, so that the derivative of what is
-    black, by the light that comes from elsewhere, is lost. A normal map reports no density for them, and paths end
-    there; a bump map masks the weight, of which a delta lobe has no other value.
+    """Return True if a BSDF drops samples of weight zero of the one that it holds.
+
+    The derivative of what is black, by the light that comes from elsewhere, is lost then. A normal map reports no
+    density for them, and paths end there; a bump map masks the weight, of which a delta lobe has no other value.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
     """
     return bsdf.class_name() in ("NormalMap", "BumpMap")
 
@@ -93,7 +121,11 @@ PIXELS = "data"
 
 
 def is_bump_map(bsdf: Any) -> bool:
-    """Return True if a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap."""
+    """Return True if a BSDF takes its normals from the slope of a texture, which jumps at each texel of a bitmap.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+    """
     return bool(bsdf.class_name() == "BumpMap")
 
 
@@ -134,7 +166,12 @@ BUILDS_LOBES = ("principled", "principledthin", "diff_principled", "diff_princip
 
 
 def lost_at(bsdf: Any, slot: str) -> tuple[float, ...]:
-    """Return the values at which a BSDF loses a lobe, whose weight is the texture that it holds as ``slot``."""
+    """Return the values of a texture at which a BSDF loses the lobe that the texture weighs.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+        slot: name under which it holds the texture.
+    """
     name = bsdf.class_name()
     if slot == "base_color" and name in LOST_AT and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
         return (0,)
@@ -146,12 +183,15 @@ _LEAST_PRODUCT = 0.008
 
 
 def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, float]) -> bool:
-    """Return True if Mitsuba's Fresnel term of a metal loses its derivative by ``slot``, for indices in the ranges
-    ``eta, k``.
+    """Return True if Mitsuba's Fresnel term of a metal loses its derivative by the index or by the absorption.
 
     It takes a root of the difference of ``n^2 = |(eta - i k)^2 - sin^2|`` and its real part's modulus, which are equal
     in single precision where ``eta k`` is small: in total reflection (``eta < 1``), and in metals without losses. Its
     Mueller matrix takes a complex root instead, and loses that of no absorption alone.
+
+    Args:
+        slot: "eta" or "k", by which the derivative is taken.
+        eta, k: least and largest value of each in the scene, of the complex index ``eta - i k``.
     """
     least, (low, high) = eta[0], k
     if mi.is_polarized:
@@ -163,13 +203,21 @@ def loses_slope_of_metal(slot: str, eta: tuple[float, float], k: tuple[float, fl
 
 
 def is_absorption_of_hair(bsdf: Any, slot: str) -> bool:
-    """Return True if what a BSDF holds under the name ``slot`` is the absorption of Mitsuba's ``hair``."""
+    """Return True if a texture is the absorption of Mitsuba's ``hair``.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+        slot: name under which it holds the texture.
+    """
     return bool(bsdf.class_name() == "Hair" and slot == "sigma_a")
 
 
 def is_replaced_for(bsdf: Any, slot: str) -> bool:
-    """Return True if another BSDF is built in place of one where a derivative by what it holds under ``slot`` is asked
-    for.
+    """Return True if another BSDF is built in place of one where a derivative by one of its textures is asked for.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+        slot: name under which it holds the texture.
     """
     return bool(lost_at(bsdf, slot)) or is_absorption_of_hair(bsdf, slot)
 
@@ -215,12 +263,21 @@ def shows_rows() -> bool:
 
 
 def users_name(node: Any, name: str) -> str:
-    """Return users' key of the parameter that Mitsuba shows as ``name`` of a plugin."""
+    """Return users' name of a parameter, which is the same for all versions of Mitsuba.
+
+    Args:
+        node: plugin that shows it.
+        name: name under which Mitsuba shows it, without the path to the plugin.
+    """
     return _USERS_NAMES.get(name, name) if shows_rows() and isinstance(node, mi.Mesh) else name
 
 
 def scene_parameters(scene: Any) -> Any:
-    """Return the ``mitsuba.SceneParameters`` of a scene by users' keys."""
+    """Return the ``mi.SceneParameters`` of a scene by users' keys.
+
+    Args:
+        scene: Mitsuba scene, or another plugin.
+    """
     shown = mi.traverse(scene)
     if not shows_rows():
         return shown
@@ -248,39 +305,70 @@ def _users_parameters(base: type) -> type:
 
 
 def names_array(key: str, name: str) -> bool:
-    """Return True if a key of scene parameters, users' or Mitsuba's, names an array of a mesh, such as POSITIONS."""
+    """Return True if a key of scene parameters, users' or Mitsuba's, names an array of a mesh.
+
+    Args:
+        key: key of ``mi.traverse``, such as "box.vertex_positions".
+        name: the array, such as POSITIONS.
+    """
     own = key.rsplit(".", 1)[-1]
     return own == name or (shows_rows() and own == _NEW_NAMES.get(name))
 
 
 def key_beside(key: str, name: str) -> str:
-    """Return the key of an array of the mesh that has the parameter ``key``, in the spelling of that key."""
+    """Return the key of another array of the mesh that a parameter belongs to, in the spelling of that parameter.
+
+    Args:
+        key: key of an array of the mesh.
+        name: the other array, such as POSITIONS.
+    """
     prefix, dot, own = key.rpartition(".")
     return prefix + dot + (_NEW_NAMES.get(name, name) if own in _USERS_NAMES else name)
 
 
 def flat_array(value: Any) -> Any:
-    """Return the numbers of an array of a mesh in a row, from what Mitsuba shows."""
+    """Return the numbers of an array of a mesh in a row.
+
+    Args:
+        value: what ``mi.traverse`` shows of the mesh: a tensor with a row for each vertex in newer versions of Mitsuba,
+            a flat array in others.
+    """
     return value.array if dr.is_tensor_v(value) else value
 
 
 def mesh_positions(mesh: Any) -> Any:
-    """Return the places of the vertices of a mesh in the world, (3 V,) in a row, attached where they are."""
+    """Return the places of the vertices of a mesh, Float (3 V,), metres in the world, attached where they are.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return _mesh_array(mesh, POSITIONS)
 
 
 def mesh_normals(mesh: Any) -> Any:
-    """Return the normals at the vertices of a mesh, (3 V,) in a row, empty for meshes without."""
+    """Return the normals at the vertices of a mesh, Float (3 V,), empty for meshes without.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return _mesh_array(mesh, NORMALS)
 
 
 def mesh_texcoords(mesh: Any) -> Any:
-    """Return the texture coordinates of the vertices of a mesh, (2 V,) in a row, empty for meshes without."""
+    """Return the texture coordinates of the vertices of a mesh, Float (2 V,), empty for meshes without.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return _mesh_array(mesh, TEXCOORDS)
 
 
 def mesh_faces(mesh: Any) -> Any:
-    """Return the numbers of the vertices of the faces of a mesh, (3 F,) in a row."""
+    """Return the numbers of the vertices of the faces of a mesh, UInt32 (3 F,).
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return _mesh_array(mesh, FACES)
 
 
@@ -304,43 +392,74 @@ def _shared_rows(mesh: Any, name: str) -> Any:
 
 
 def rows_of_faces(mesh: Any, name: str) -> np.ndarray:
-    """Return the numbers of the rows of an array or attribute at vertices that faces refer to, in order."""
+    """Return the numbers of the rows of an array or attribute at vertices that faces refer to, in order.
+
+    Args:
+        mesh: ``mi.Mesh``.
+        name: array or attribute, such as POSITIONS or "vertex_color".
+    """
     faces, index = np.array(mesh_faces(mesh)), _shared_rows(mesh, name)
     vertices = np.unique(faces[faces < mesh.vertex_count()])
     return vertices if index is None else np.unique(np.array(index)[vertices])
 
 
 def has_normals(mesh: Any) -> bool:
-    """Return True if a mesh has normals at its vertices."""
+    """Return True if a mesh has normals at its vertices.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return bool(mesh.has_normals() if shows_rows() else mesh.has_vertex_normals())
 
 
 def has_texcoords(mesh: Any) -> bool:
-    """Return True if a mesh has texture coordinates at its vertices."""
+    """Return True if a mesh has texture coordinates at its vertices.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     return bool(mesh.has_texcoords() if shows_rows() else mesh.has_vertex_texcoords())
 
 
 def has_velocities(shape: Any) -> bool:
-    """Return True for meshes with velocities at their vertices."""
+    """Return True for meshes with velocities at their vertices.
+
+    Args:
+        shape: one ``mi.Shape``.
+    """
     return isinstance(shape, mi.Mesh) and shape.has_attribute(VELOCITY)
 
 
 def moved_by(plugin: Any) -> str | None:
-    """Return the name of the medium whose velocities a volume holds, which is named ``NAME.velocity``; None for others.
+    """Return the name of the medium whose velocities a volume holds.
+
+    Args:
+        plugin: any plugin; a volume of velocities is named "NAME.velocity".
+
+    Returns:
+        The name, None for other plugins.
     """
     name, _, last = plugin.id().rpartition(".") if isinstance(plugin, mi.Volume) else ("", "", "")
     return name if name and last == "velocity" else None
 
 
 def has_more_than_arrays(mesh: Any) -> bool:
-    """Return True if a mesh has parameters beside its arrays and its weight: attributes, or a material by face."""
+    """Return True if a mesh has parameters beside its arrays and its weight: attributes, or a material by face.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     shown = mi.traverse(mesh)
     names = {users_name(mesh, name) for name in shown.properties if "." not in name} - _OWN_PARAMETERS
     return any(name != _MATERIALS or dr.width(shown[name]) for name in names)
 
 
 def silhouette_weight(mesh: Any) -> dict[str, float]:
-    """Return the weight of a mesh among silhouettes by its name in scene files, where it is not that of all meshes."""
+    """Return the weight of a mesh among silhouettes, by its name in scene files, where it is not that of all meshes.
+
+    Args:
+        mesh: ``mi.Mesh``.
+    """
     weight = float(mesh.silhouette_sampling_weight())
     return {} if weight == 1 else {_WEIGHT: weight}
 
@@ -348,7 +467,15 @@ def silhouette_weight(mesh: Any) -> dict[str, float]:
 def mesh_of_arrays(
     props: Any, positions: np.ndarray, faces: np.ndarray, normals: np.ndarray | None, texcoords: np.ndarray | None
 ) -> Any:
-    """Return a mesh of arrays with a row for each vertex or face, positions and normals in the world."""
+    """Return a ``mi.Mesh`` of arrays with a row for each vertex or face.
+
+    Args:
+        props: ``mi.Properties`` of the mesh, with its children.
+        positions: places of the vertices, (V, 3), metres in the world.
+        faces: numbers of vertices, (F, 3).
+        normals: normals at the vertices, (V, 3), in the world, or None.
+        texcoords: texture coordinates, (V, 2), or None.
+    """
     arrays = {POSITIONS: positions, FACES: faces, TEXCOORDS: texcoords, NORMALS: normals}
     given = {name: array for name, array in arrays.items() if array is not None}
     if shows_rows():
@@ -369,122 +496,35 @@ def mesh_of_arrays(
 # ------------------------------------------------------------------------------------------------------ shapes, lights
 
 
-def is_instance(shape: Any) -> bool:
-    """Return True if a shape is one copy of a shape group."""
-    return bool(shape.class_name() == "Instance")
-
-
-def group_name(instance: Any) -> str:
-    """Return the identifier of the shape group that an instance copies. Mitsuba shows it in the description alone."""
-    found = re.search(r'name = "(.*?)",\n', str(instance))
-    if found is None:
-        raise SceneError(f"Instance: expected the name of a shape group in its description, got {instance}.")
-    return found[1]
-
-
-def has_surface(shape: Any) -> bool:
-    """Return True if rays can meet a shape itself. Groups and their copies only hold others, and have a BSDF
-    nevertheless.
-    """
-    return shape.class_name() not in ("Instance", "ShapeGroupPlugin")
-
-
-def is_sphere(shape: Any) -> bool:
-    """Return True if a shape is Mitsuba's ``sphere``, which is sampled over the cone that it fills."""
-    return bool(shape.class_name() == "Sphere")
-
-
 def samples_its_shape(emitter: Any) -> bool:
-    """Return True if an emitter is an area light that asks its shape for a direction. Mitsuba's sphere answers with the
-    solid angle ``2 pi (1 - cos)`` of its cone in single precision, which has no digits left for small spheres, and from
-    a point on its own surface with one of two densities that are not the same; see ``sampling/sphere_lights.py``.
+    """Return True if an emitter is an area light that asks its shape for a direction.
+
+    Mitsuba's sphere answers with the solid angle ``2 pi (1 - cos)`` of its cone in single precision, which has no
+    digits left for small spheres, and from a point on its own surface with one of two densities that are not the same;
+    see ``sampling/sphere_lights.py``.
+
+    Args:
+        emitter: one ``mi.Emitter``; plugins of others declare it as ``samples_its_shape``.
     """
     return bool(emitter.class_name() == "AreaLight" or getattr(emitter, "samples_its_shape", False))
 
 
 def is_dark(emitter: Any) -> bool:
-    """Return True if no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else."""
+    """Return True if no path that starts at a sensor finds an emitter: it shines along its normals and nowhere else.
+
+    Args:
+        emitter: one ``mi.Emitter``; plugins of others declare it as ``stays_dark``.
+    """
     return bool(emitter.class_name() == "DirectionalArea" or getattr(emitter, "stays_dark", False))
 
 
 def lacks_directions(emitter: Any) -> bool:
-    """Return True if an emitter raises where it is asked for its light in a direction: derivatives cannot be traced."""
+    """Return True if an emitter raises where it is asked for its light in a direction: derivatives cannot be traced.
+
+    Args:
+        emitter: one ``mi.Emitter``.
+    """
     return bool(emitter.class_name() == "DirectionalArea")
-
-
-def leaves_hits_detached(shape: Any) -> bool:
-    """Return True if the interactions of a shape lie at a detached distance along the ray: they follow neither the
-    shape nor a ray that moves.
-    """
-    return bool(shape.class_name() in ("Ellipsoids", "LinearCurve"))
-
-
-def misplaces_hits(shape: Any) -> bool:
-    """Return True if the place along a curve, at which a ray hits it, has a wrong derivative, and the normal with it:
-    Mitsuba projects onto one of two directions of its surface as if they were perpendicular.
-    """
-    return bool(shape.class_name() == "BSplineCurve")
-
-
-def has_no_material(shape: Any) -> bool:
-    """Return True if no point of a shape can be followed: Mitsuba's interactions follow the surface, not its points and
-    areas.
-    """
-    return bool(shape.class_name() in ("Ellipsoids", "EllipsoidsMesh", "LinearCurve", "BSplineCurve", "SDFGrid"))
-
-
-def has_vertices(shape: Any) -> bool:
-    """Return True if a shape is a mesh of listed vertices: False of rectangles and disks, which are `mi.Mesh` too."""
-    return isinstance(shape, mi.Mesh) and shape.class_name() not in _FLAT
-
-
-def has_smooth_shape(emitter: Any) -> bool:
-    """Return True if a light lies on a mesh with normals at its vertices. Mitsuba's density per solid angle of a point
-    on it is that of a face with the interpolated normal: lights of few faces are too bright or too dark, by 20 % and
-    more.
-    """
-    shape = emitter.get_shape() if mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface) else None
-    return shape is not None and has_vertices(shape) and has_normals(shape)
-
-
-# Meshes, and what of the others has edges or limbs in closed form.
-_OUTLINED = ("Sphere", "Disk", "Cylinder", "Ellipsoids", "Instance", "ShapeGroupPlugin")
-
-
-def lacks_edges(shape: Any) -> bool:
-    """Return True if a shape has outlines that no table of edges holds: curves and grids of distances."""
-    return not (shape.is_mesh() or shape.class_name() in _OUTLINED)
-
-
-def has_limb(shape: Any) -> bool:
-    """Return True if the points of a shape's outline depend on where it is seen from."""
-    return bool(shape.class_name() in ("Sphere", "Cylinder", "Ellipsoids"))
-
-
-# Their normal is the same everywhere.
-_FLAT = ("Rectangle", "Disk")
-# Meshes of more faces are not looked through.
-_LARGE_MESH = 10_000
-
-
-def is_flat_shape(shape: Any) -> bool:
-    """Return True if a shape is a rectangle or a disk."""
-    return bool(shape.class_name() in _FLAT)
-
-
-def is_flat(shape: Any) -> bool:
-    """Return True if the shading normal does not change along a face. Mitsuba's rectangles, its cube and the mesh that
-    it merges them into have normals at their vertices: across the faces.
-    """
-    if not isinstance(shape, mi.Mesh):
-        return is_flat_shape(shape)
-    if not has_normals(shape):
-        return True
-    if shape.face_count() > _LARGE_MESH:
-        return False
-    corners = np.array(mesh_faces(shape)).reshape(-1, 3)
-    normals = np.array(mesh_normals(shape)).reshape(-1, 3)[corners]
-    return bool(np.ptp(normals, axis=1).max(initial=0) < 1e-5)
 
 
 # What scatters or emits alike all over a flat surface unless one of its textures varies. What classes of others ask the
@@ -500,35 +540,15 @@ SCATTER_ALIKE = frozenset(
 EMIT_ALIKE = frozenset(("AreaLight", "DirectionalArea"))
 
 
-def bounds_of(shape: Any) -> Any:
-    """Return the bounding box of a shape.
-
-    Mitsuba leaves out that of a mesh that it merged from rectangles, and the scene's bounds lack it.
-    """
-    bounds = shape.bbox()
-    if not bounds.valid() and isinstance(shape, mi.Mesh):
-        shape.recompute_bbox()
-        bounds = shape.bbox()
-    return bounds
-
-
-def attached_distance(pi: Any, si: Any, ray: Any, active: Any) -> Any:
-    """Distance along an attached ``ray`` of the surface at ``pi``, which need not be the first that the ray meets;
-    ``si``: the interaction there, which follows its shape (``RayFlags.FollowShape``).
-
-    Mitsuba takes the derivative of the distance of spheres and cylinders from another intersection with the whole
-    shape, so that where a ray leaves them from outside it is that of where it entered. This one intersects the ray with
-    the plane that touches the shape at the hit point and moves with it.
-    """
-    n = dr.detach(si.n)
-    cosine = dr.dot(n, ray.d)
-    meets = active & (cosine != 0)
-    distance = dr.dot(si.p - ray.o, n) / dr.select(meets, cosine, 1)
-    return dr.replace_grad(pi.t, dr.select(meets, distance, 0))
-
-
 def sun_half_angle(emitter: Any) -> float:
-    """Half the angle (radians) that the sun of a ``sunsky`` fills. Mitsuba shows it in the description alone."""
+    """Return half the angle that the sun of a ``sunsky`` fills, radians, which Mitsuba shows in its description alone.
+
+    Args:
+        emitter: one ``mi.Emitter``.
+
+    Raises:
+        SceneError: for a description without it.
+    """
     shown = re.search(r"Sun aperture = ([-+.\de]+)", str(emitter))
     if shown is None:
         raise SceneError(f"{emitter.class_name()}: expected 'Sun aperture' in its description, got {emitter}.")
@@ -539,30 +559,53 @@ def sun_half_angle(emitter: Any) -> float:
 
 
 def is_distant(sensor: Any) -> bool:
-    """Return True if a sensor sits at infinity (two classes, by the kind of target)."""
+    """Return True if a sensor sits at infinity (two classes, by the kind of target).
+
+    Args:
+        sensor: one ``mi.Sensor``.
+    """
     return bool(sensor.class_name().startswith("DistantSensor"))
 
 
 def is_batch(sensor: Any) -> bool:
-    """Return True if a sensor only holds others, which share its film. Derivatives through its virtual call to them end
-    the process in forward mode, so they are asked one by one.
+    """Return True if a sensor holds others, which share its film.
+
+    Derivatives through its virtual call to them end the process in forward mode, so they are asked one by one.
+
+    Args:
+        sensor: one ``mi.Sensor``.
     """
     return bool(sensor.class_name() == "BatchSensor")
 
 
 def is_irradiance_meter(sensor: Any) -> bool:
-    """Return True if a sensor collects light from all directions over a shape, without a pixel for each."""
+    """Return True if a sensor collects light from all directions over a shape, without a pixel for each.
+
+    Args:
+        sensor: one ``mi.Sensor``.
+    """
     return bool(sensor.class_name() == "IrradianceMeter")
 
 
 def starts_off_itself(sensor: Any) -> bool:
-    """Return True if the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``."""
+    """Return True if the rays of a sensor start a little off the sensor, by ``mi.math.RayEpsilon``.
+
+    Args:
+        sensor: one ``mi.Sensor``.
+    """
     return bool(sensor.class_name() in ("RadianceMeter", "IrradianceMeter"))
 
 
 def near_clip(sensor: Any) -> Any:
-    """Distance along the axis at which the rays of a projective camera start, though their light goes on to the
-    sensor; None for other sensors.
+    """Return the distance along the axis at which the rays of a projective camera start.
+
+    Their light goes on to the sensor nevertheless.
+
+    Args:
+        sensor: one ``mi.Sensor``.
+
+    Returns:
+        Metres, None for sensors that are no projective cameras.
     """
     near = getattr(sensor, "near_clip", None)
     return None if near is None else near()
@@ -572,8 +615,13 @@ def near_clip(sensor: Any) -> Any:
 
 
 def attribute_name(texture: Any) -> str | None:
-    """Return the name of the shape attribute that a texture reads (``vertex_color``), None for other textures. Mitsuba
-    shows the name in the texture's description alone.
+    """Return the name of the shape attribute that a texture reads, which Mitsuba shows in its description alone.
+
+    Args:
+        texture: one ``mi.Texture``.
+
+    Returns:
+        Such as "vertex_color", None for other textures.
     """
     if texture.class_name() != "MeshAttribute":
         return None
@@ -582,7 +630,11 @@ def attribute_name(texture: Any) -> str | None:
 
 
 def attribute_scale(texture: Any) -> float:
-    """Return the factor of the attribute that a texture reads, 1 for other textures and volumes."""
+    """Return the factor of the attribute that a texture reads, 1 for other textures and volumes.
+
+    Args:
+        texture: one ``mi.Texture`` or ``mi.Volume``.
+    """
     return 1.0 if texture.class_name() != "MeshAttribute" else float(mi.traverse(texture)["scale"])
 
 
@@ -598,7 +650,12 @@ _SPECTRA = frozenset((
 
 
 def read_as(node: Any, slot: str) -> str:
-    """Return the texture method that a BSDF or emitter calls for a slot, empty if unknown."""
+    """Return the texture method that a BSDF or emitter calls for one of its textures, empty if unknown.
+
+    Args:
+        node: one ``mi.BSDF`` or ``mi.Emitter``.
+        slot: name under which it holds the texture.
+    """
     if isinstance(node, mi.BSDF) and normal_texture(node) == slot:
         return "eval_1" if is_bump_map(node) else "eval_3"
     if slot == "eta":
@@ -607,13 +664,20 @@ def read_as(node: Any, slot: str) -> str:
 
 
 def attribute_sizes(bsdf: Any, slot: str) -> tuple[int, ...]:
-    """Return the numbers of channels that a BSDF can read from a mesh attribute; with others it reads zero."""
+    """Return the numbers of channels that a BSDF can read from a mesh attribute; with others it reads zero.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+        slot: name under which it holds the texture that reads the attribute.
+    """
     return {"eval_1": (1,), "eval_3": (3,)}.get(read_as(bsdf, slot), (1, 3))
 
 
 def varies(texture: Any) -> bool:
-    """Return True if a texture may have another value at another place. Mitsuba's ``mesh_attribute`` does not say
-    so.
+    """Return True if a texture may have another value at another place; Mitsuba's ``mesh_attribute`` does not say so.
+
+    Args:
+        texture: one ``mi.Texture``.
     """
     return bool(texture.is_spatially_varying() or texture.class_name() == "MeshAttribute")
 
@@ -634,17 +698,35 @@ _TURNED_BY_REFLECTIONS = frozenset({("Sphere", "to_world"), ("Cylinder", "to_wor
 
 
 def is_number_of_kernels(class_name: str, name: str) -> bool:
-    """Return True if kernels contain a value as a literal, so that each value compiles its own."""
+    """Return True if kernels contain a parameter as a literal, so that each value compiles its own.
+
+    Args:
+        class_name: ``class_name()`` of the plugin.
+        name: parameter, without the path to the plugin.
+    """
     return (class_name, name) in _READ_WHEN_INSTALLED
 
 
 def is_turned_by_reflections(class_name: str, name: str) -> bool:
-    """Return True if a pose that reflects turns the shape inside out once more at every installation."""
+    """Return True if a pose that reflects turns the shape inside out once more at every installation.
+
+    Args:
+        class_name: ``class_name()`` of the shape.
+        name: its parameter, without the path to the shape.
+    """
     return (class_name, name) in _TURNED_BY_REFLECTIONS
 
 
 def check_pose(key: str, *poses: Any) -> None:
-    """Raise SceneError for poses (4, 4) that reflect, of a shape that they would turn inside out."""
+    """Check the poses of a shape that reflections would turn inside out.
+
+    Args:
+        key: key of the pose, for messages.
+        poses: matrices, (4, 4).
+
+    Raises:
+        SceneError: for one with a negative determinant.
+    """
     if any(np.linalg.det(np.asarray(pose, dtype=np.float64).reshape(4, 4)[:3, :3]) < 0 for pose in poses):
         raise SceneError(
             f"value of {key!r}: expected poses without a reflection, got one whose determinant is negative: Mitsuba "

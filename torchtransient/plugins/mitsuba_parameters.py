@@ -109,7 +109,7 @@ SLOPES = replace(COORDINATES, biased=True, reason=_STEPS)
 NORMAL_SLOPES = replace(NORMAL, biased=True, reason=_STEPS)
 
 
-def index_by_stand_in(plugin: str) -> ParameterEffect:
+def _index_by_stand_in(plugin: str) -> ParameterEffect:
     """Return the index of refraction of a plugin of Mitsuba that is built as one of ours when the key is asked for."""
     twin = DIFFERENTIABLE_PLUGINS[plugin]
     return ParameterEffect(
@@ -329,8 +329,8 @@ declare_effects("SpotLight", {"to_world": EMITTER})
 declare_effects("SunskyEmitter", {"sun_direction": SUN})
 
 declare_effects("BSDF", {"eta": INDEX})
-declare_effects("SmoothDielectric", {"eta": index_by_stand_in("dielectric")})
-declare_effects("RoughDielectric", {"eta": index_by_stand_in("roughdielectric")})
+declare_effects("SmoothDielectric", {"eta": _index_by_stand_in("dielectric")})
+declare_effects("RoughDielectric", {"eta": _index_by_stand_in("roughdielectric")})
 _LOST_INDEX = Row(replace(EXCHANGED_INDEX, stand_in_needed=True), _is_an_index_of_one, "an index of one")
 declare_effects("Principled", dict.fromkeys(("eta", "specular"), (_LOST_INDEX, Row(EXCHANGED_INDEX))))
 # Nothing is refracted onwards by these: their index changes how much is reflected, and no direction.

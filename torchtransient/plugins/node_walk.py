@@ -9,15 +9,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import (
-    TEXTURES_WITHOUT_MEAN,
-    attribute_name,
-    group_name,
-    has_surface,
-    is_instance,
-    shows_rows,
-    users_name,
-)
+from torchtransient.plugins.mitsuba_compat import TEXTURES_WITHOUT_MEAN, attribute_name, shows_rows, users_name
+from torchtransient.plugins.mitsuba_shapes import group_name, has_surface, is_instance
 
 
 class ShownValue(NamedTuple):
@@ -49,6 +42,9 @@ def unshared(value: Any) -> Any:
 
     Reading a plugin's literal would evaluate it into memory, which recorded calls cannot find in every plugin (``hg``
     shows it to Mitsuba alone).
+
+    Args:
+        value: value of a parameter.
     """
     return type(value)(value) if dr.is_jit_v(value) else value
 
@@ -77,7 +73,10 @@ def _collector(base: type) -> type:
 
 
 def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
-    """Return what one plugin shows.
+    """Return what one plugin shows to ``mi.TraversalCallback``, without what is below it.
+
+    Args:
+        node: Mitsuba object.
 
     Returns:
         (parameters; objects as (name, object, flags)).
@@ -90,7 +89,11 @@ def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
 
 
 def objects_of(node: Any) -> list[tuple[str, Any]]:
-    """Return the objects that a plugin holds, as (name, object), in order."""
+    """Return the objects that a plugin holds, as (name, object), in order.
+
+    Args:
+        node: Mitsuba object.
+    """
     return [(name, value) for name, value, _ in shown_by(node)[1]]
 
 
@@ -98,6 +101,7 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
     """Return the objects of a kind below a plugin, each once and in order.
 
     Args:
+        node: Mitsuba object, which is not among them.
         kind: class of Mitsuba.
         through: also look inside of objects of that kind.
     """
@@ -119,15 +123,22 @@ def objects_below(node: Any, kind: type, through: bool = True) -> list[Any]:
 
 
 def has_mean(texture: Any) -> bool:
-    """Return True if Mitsuba knows the mean of a texture, and those of the textures that it holds."""
+    """Return True if Mitsuba knows the mean of a texture, and those of the textures that it holds.
+
+    Args:
+        texture: one ``mi.Texture``.
+    """
     held = (texture, *objects_below(texture, mi.Texture))
     return not any(t.class_name() in TEXTURES_WITHOUT_MEAN.values() for t in held)
 
 
 def carries_derivatives(node: Any) -> bool:
-    """Return True if a number of a plugin, or of what it holds, is attached; call with gradients enabled.
+    """Return True if a number of a plugin, or of what it holds, is attached. Call with gradients enabled.
 
     Also for textures that read an attribute of their shapes, which may be attached.
+
+    Args:
+        node: Mitsuba object.
     """
     below = (node, *objects_below(node, mi.Object))
     if any(isinstance(part, mi.Texture) and attribute_name(part) is not None for part in below):
@@ -136,25 +147,40 @@ def carries_derivatives(node: Any) -> bool:
 
 
 def attached_as(*values: Any) -> tuple[int, ...]:
-    """Return the AD node of each array, 0 for detached arrays; call with gradients enabled."""
+    """Return the AD node of each array, 0 for detached arrays. Call with gradients enabled.
+
+    Args:
+        values: Dr.Jit arrays.
+    """
     return tuple(value.index_ad if dr.grad_enabled(value) else 0 for value in values)
 
 
 def bsdfs_below(node: Any) -> list[Any]:
     """Return the outermost BSDFs below a scene, shape or BSDF, those of shape groups included, each once and in order.
+
+    Args:
+        node: Mitsuba object, which is not among them.
     """
     return objects_below(node, mi.BSDF, through=False)
 
 
 def bsdfs_of_scene(scene: Any) -> list[Any]:
-    """Return the outermost BSDFs of a scene, those of shape groups included, each once."""
+    """Return the outermost BSDFs of a scene, those of shape groups included, each once.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     # Every shape is asked for its own: some (ellipsoids) do not show it in a walk.
     bsdfs = (shape.bsdf() for shape in shapes_of_scene(scene) if has_surface(shape))
     return list({bsdf.ptr: bsdf for bsdf in bsdfs if bsdf is not None}.values())
 
 
 def shapes_of_scene(scene: Any) -> list[Any]:
-    """Return all shapes of a scene, those of shape groups included."""
+    """Return all shapes of a scene, those of shape groups included.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     shapes = list(scene.shapes())
     if not any(is_instance(shape) for shape in shapes):
         return shapes
@@ -163,7 +189,12 @@ def shapes_of_scene(scene: Any) -> list[Any]:
 
 
 def members_of(scene: Any, instance: Any) -> list[Any]:
-    """Return the shapes that an instance copies, in the order of their numbers in intersections (``shape_index``)."""
+    """Return the shapes that an instance copies, in the order of their numbers in intersections (``shape_index``).
+
+    Args:
+        scene: Mitsuba scene that has the group.
+        instance: shape of :func:`~.mitsuba_shapes.is_instance`.
+    """
     name = group_name(instance)
     group = next(s for s in objects_below(scene, mi.Shape) if s.class_name() == "ShapeGroupPlugin" and s.id() == name)
     return [shape for _, shape in objects_of(group) if isinstance(shape, mi.Shape)]

@@ -139,7 +139,11 @@ def all_rows() -> Iterator[tuple[str, str, Row]]:
 
 
 def lineage(node: Any) -> tuple[str, ...]:
-    """Return the names of a plugin's classes, the most special first."""
+    """Return the names of a plugin's classes, the most special first.
+
+    Args:
+        node: Mitsuba object. One written in Python is called ``class_name()`` by the class that it derives from.
+    """
     names = [cls.__name__ for cls in type(node).__mro__]
     own = node.class_name().split("[")[0]
     # Mitsuba calls a plugin written in Python by the class that it derives from.
@@ -147,12 +151,20 @@ def lineage(node: Any) -> tuple[str, ...]:
 
 
 def class_of(node: Any) -> str:
-    """Return the name of a plugin's class for messages; for plugins in Python, that of the Python class."""
+    """Return the name of a plugin's class for messages; for plugins in Python, that of the Python class.
+
+    Args:
+        node: Mitsuba object.
+    """
     return lineage(node)[0]
 
 
 def matching_effect(site: Site) -> ParameterEffect:
-    """Return the effect of the row that counts for a parameter."""
+    """Return the declared effect of a parameter, that of the most special class; ``VALUE`` where none is declared.
+
+    Args:
+        site: place of the parameter.
+    """
     for name in lineage(site.node):
         by_key = _rows.get(name, {})
         for key in (site.key, ANY_KEY):
@@ -175,7 +187,14 @@ _NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
 def location_of(site: Site) -> tuple[str, ...]:
-    """Return the names of a parameter and of what its plugin is in, the nearest first: "class.key", "class.slot"."""
+    """Return the names of a parameter and of what its plugin is in, the nearest first.
+
+    Args:
+        site: place of the parameter.
+
+    Returns:
+        "class.key" of the parameter, "class.slot" of what holds its plugin.
+    """
     places = [(lineage(node)[0], name) for node, name in [(site.node, site.key), *site.owners]]
     return tuple(dict.fromkeys(cls if cls in _NAMED_BY_USERS else f"{cls}.{name}" for cls, name in places))
 

@@ -89,12 +89,19 @@ def _is_light(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
 
 
 def without_zeros(value: Any) -> Any:
-    """Return an array of numbers with :data:`ALMOST_BLACK` in place of zeros."""
+    """Return an array of numbers with :data:`ALMOST_BLACK` in place of zeros.
+
+    Args:
+        value: floating-point Dr.Jit array.
+    """
     return dr.select(value == 0, ALMOST_BLACK, value)
 
 
 def check_black(attached: Iterable[Attached]) -> None:
     """Check that no derivative is lost at numbers of zero.
+
+    Args:
+        attached: attached parameters of a scene.
 
     Raises:
         GradientError: if one is, with the parameter's name.
@@ -298,14 +305,23 @@ class ParameterTracker:
 
 
 def can_carry_gradients(value: Any) -> bool:
-    """Return True for a floating-point Dr.Jit array or a transform of one, False for a plain number."""
+    """Return True for a floating-point Dr.Jit array or a transform of one, False for a plain number.
+
+    Args:
+        value: value of a parameter.
+    """
     if "Transform" in type(value).__name__:  # by name: Dr.Jit arrays answer to any attribute made of component letters
         value = value.matrix
     return value is not None and bool(dr.is_diff_v(value) and dr.is_float_v(value))
 
 
 def is_attribute(node: Any, key: str) -> bool:
-    """Return True for an attribute of a mesh, whose memory moves when another attribute is added."""
+    """Return True for an attribute of a mesh, whose memory moves when another attribute is added.
+
+    Args:
+        node: plugin that shows the parameter.
+        key: name of the parameter, without the path to the plugin.
+    """
     return isinstance(node, mi.Mesh) and key.startswith(("vertex_", "face_")) and key not in VERTEX_COLUMNS
 
 
@@ -427,10 +443,16 @@ _EMITTER_RANGES = dict.fromkeys(("radiance", "intensity", "irradiance", "energy"
 _SENSOR_RANGES = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": LENGTH}
 
 def ranges_of(params: Any) -> dict[str, PhysicalRange]:
-    """Return the ranges of the parameters that have one, by key of ``mi.traverse``.
+    """Return the physical ranges of the parameters that have one.
 
     The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
     textures they are read. Coefficients of spectral models have none.
+
+    Args:
+        params: ``mi.traverse`` of a scene.
+
+    Returns:
+        Ranges by key.
     """
     tracker, found = ParameterTracker.from_params(params), {}
     for key in params.properties:
@@ -474,7 +496,11 @@ def _range_in(node: Any, name: str) -> PhysicalRange | None:
 
 
 def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, float]]:
-    """Return (key, range, smallest, largest number) of the parameters of a scene that have a range."""
+    """Yield (key, range, smallest, largest number) of the parameters of a scene that have a range.
+
+    Args:
+        params: ``mi.traverse`` of the scene.
+    """
     for key, limits in ranges_of(params).items():
         numbers = np.array(unshared(params[key]))
         if numbers.size:
@@ -482,7 +508,15 @@ def described_ranges(params: Any) -> Iterator[tuple[str, PhysicalRange, float, f
 
 
 def sun_axes(params: Any, keys: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the third axis of the sky for each key that is a direction of its sun."""
+    """Return the third axis of the sky for each key that is a direction of its sun.
+
+    Args:
+        params: ``mi.traverse`` of a scene.
+        keys: keys of parameters.
+
+    Returns:
+        Unit vectors (3,) in the world by key.
+    """
     suns = [key for key in keys if key.endswith(".sun_direction")]
     matrices = {key: params[f"{key.removesuffix('sun_direction')}to_world"].matrix for key in suns}
     return {key: np.array(unshared(matrix), dtype=float).reshape(4, 4)[:3, 2] for key, matrix in matrices.items()}

@@ -26,19 +26,33 @@ def light_type():
 
 
 def intensity(light):
-    """Return the power of light as a spectrum, whatever its polarization."""
+    """Return the power of light as a spectrum, whatever its polarization.
+
+    Args:
+        light: spectrum, in polarized variants a Stokes vector of spectra (``mi.SpectrumEntry``).
+    """
     return light[0] if mi.is_polarized else light
 
 
 def attenuated(β, T):
-    """Return a throughput times a spectrum ``T`` that acts on all of its components alike."""
+    """Return a throughput times a spectrum that acts on all of its components alike.
+
+    Args:
+        β: throughput, in polarized variants a Mueller matrix.
+        T: unpolarized spectrum.
+    """
     if not mi.is_polarized:
         return β * T
     return mi.Spectrum(*[β[i, j] * T for i in range(4) for j in range(4)])
 
 
 def product(a, b):
-    """``a b``: of two spectra, two Mueller matrices, or a Mueller matrix and a Stokes vector."""
+    """Return ``a b``: of two spectra, of two Mueller matrices, or of a Mueller matrix and a Stokes vector.
+
+    Args:
+        a: spectrum or Mueller matrix, on the sensor's side.
+        b: spectrum, Mueller matrix or Stokes vector, on the light's side.
+    """
     if not mi.is_polarized:
         return a * b
     if isinstance(b, mi.Spectrum):
@@ -47,8 +61,12 @@ def product(a, b):
 
 
 def first_column(matrix):
-    """Return the Stokes vector that a throughput makes of unpolarized light of unit power, which is all that Mitsuba
-    emits.
+    """Return the Stokes vector that a throughput makes of unpolarized light of unit power.
+
+    Mitsuba emits no other light.
+
+    Args:
+        matrix: throughput, in polarized variants a Mueller matrix.
     """
     if not mi.is_polarized:
         return matrix
@@ -56,7 +74,11 @@ def first_column(matrix):
 
 
 def rotation_tangent(t_rotation):
-    """Tangent of a throughput of one whose frame turns by half of ``t_rotation``, in polarized variants."""
+    """Return the tangent of a throughput of one whose frame turns, in polarized variants.
+
+    Args:
+        t_rotation: tangent of twice the angle, radians, as of :meth:`FrameRotation.angle`.
+    """
     zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_rotation)
     return mi.Spectrum(*[zero] * 6, t, *[zero] * 2, -t, *[zero] * 6)
 
@@ -89,7 +111,11 @@ def rotation_between(forward, current, target):
 
 
 def rotation_along(c, s):
-    """Return the rotation by the angle of the point ``(c, s)``, at any distance from the origin; none at the origin."""
+    """Return the rotation of a frame by the angle of a point in the plane, none at the origin.
+
+    Args:
+        c, s: coordinates of the point, at any distance from the origin.
+    """
     n = c * c + s * s
     there = n > 0
     scale = dr.rcp(dr.select(there, n, 1))
@@ -97,16 +123,23 @@ def rotation_along(c, s):
 
 
 def stokes_frame_of(d):
-    """Return the vector that the Stokes frame of a segment is tied to, from the direction of its ray."""
+    """Return the x axis of the Stokes frame of a segment, a detached unit vector.
+
+    Args:
+        d: direction of the segment's ray, away from the sensor, unit Vector3f in the world.
+    """
     return mi.coordinate_system(-dr.detach(d))[0]
 
 
 def rotation_to_sensor(si, d):
-    """Return the rotation from the BSDF's frame to the segment's, on the sensor's side of ``si``, which a ray in
-    direction ``d`` found.
+    """Return the rotation from the BSDF's implicit frame to the segment's, on the sensor's side of a vertex.
 
-    None in unpolarized variants, as :func:`rotation_from_light`. Where ``si.wi`` is attached to the direction, ``d``
-    must be.
+    Args:
+        si: SurfaceInteraction3f of the vertex.
+        d: direction of the ray that found it, unit Vector3f in the world; attached where ``si.wi`` is attached to it.
+
+    Returns:
+        :class:`FrameRotation`, None in unpolarized variants.
     """
     if not mi.is_polarized:
         return None
@@ -114,11 +147,16 @@ def rotation_to_sensor(si, d):
 
 
 def rotation_from_light(si, wo, out=None, d=None):
-    """Return the rotation from the BSDF's frame to the segment's, on the side of the light, where the path goes on in
-    direction ``wo``.
+    """Return the rotation from the BSDF's implicit frame to the segment's, on the side of the light.
 
-    ``out``: that direction in the world, attached where ``wo`` is; ``d``: the next ray's direction to the bit. Without
-    them both are computed as the next ray's is.
+    Args:
+        si: SurfaceInteraction3f of the vertex.
+        wo: direction in which the path goes on, unit Vector3f in the local frame of ``si``.
+        out: that direction in the world, attached where ``wo`` is; None computes it as that of the next ray.
+        d: direction of the next ray to the bit; None takes ``out``.
+
+    Returns:
+        :class:`FrameRotation`, None in unpolarized variants.
     """
     if not mi.is_polarized:
         return None
@@ -127,7 +165,12 @@ def rotation_from_light(si, wo, out=None, d=None):
 
 
 def rotate_stokes(light, rotation):
-    """Return a Stokes vector in the rotated frame."""
+    """Return a Stokes vector in the rotated frame.
+
+    Args:
+        light: Stokes vector of spectra; a spectrum in unpolarized variants, which is returned as it is.
+        rotation: :class:`FrameRotation`, None in unpolarized variants.
+    """
     if not mi.is_polarized:
         return light
     c, s = rotation.c, rotation.s
@@ -135,7 +178,12 @@ def rotate_stokes(light, rotation):
 
 
 def scatter_unpolarized(value, rotation):
-    """Scatter unpolarized light by a BSDF value, into the frame of the segment towards the sensor."""
+    """Return the Stokes vector of unpolarized light of unit power after a BSDF, in the frame of the sensor's segment.
+
+    Args:
+        value: BSDF times cosine, in polarized variants a Mueller matrix between implicit frames.
+        rotation: that of :func:`rotation_to_sensor`.
+    """
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)
     return rotate_stokes(first_column(value), rotation)

@@ -24,7 +24,17 @@ MOST = 2**32 - 2
 
 
 def whole_number(props: Any, name: str, default: int, least: int = -1) -> int:
-    """Return a whole number from ``least`` to 2^32 - 2. Raises SceneError."""
+    """Return a whole number of a plugin's properties.
+
+    Args:
+        props: ``mi.Properties``.
+        name: name of the property.
+        default: value without it.
+        least: least value that is allowed; the largest one is 2^32 - 2.
+
+    Raises:
+        SceneError: for other values.
+    """
     given = props.get(name, default)
     if isinstance(given, bool) or not isinstance(given, (int, float)) or given != given // 1:
         raise SceneError(f"{props.plugin_name()}: {name}: expected a whole number, got {shown(given)}.")
@@ -36,7 +46,16 @@ def whole_number(props: Any, name: str, default: int, least: int = -1) -> int:
 
 
 def number(props: Any, name: str, default: float | None = None) -> float:
-    """Return a finite number; without a ``default`` it has to be there. Raises SceneError."""
+    """Return a finite number of a plugin's properties.
+
+    Args:
+        props: ``mi.Properties``.
+        name: name of the property.
+        default: value without it; None: it has to be there.
+
+    Raises:
+        SceneError: for other values.
+    """
     given = props[name] if default is None else props.get(name, default)
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         raise SceneError(
@@ -48,7 +67,16 @@ def number(props: Any, name: str, default: float | None = None) -> float:
 
 
 def vector(props: Any, name: str, default: Sequence[float]) -> list[float]:
-    """Return three finite numbers. Raises SceneError."""
+    """Return three finite numbers of a plugin's properties.
+
+    Args:
+        props: ``mi.Properties``.
+        name: name of the property.
+        default: value without it, (3,).
+
+    Raises:
+        SceneError: for other values.
+    """
     given = np.array(props.get(name, default), dtype=np.float64).reshape(-1)
     if len(given) != 3 or not np.isfinite(given).all():
         raise SceneError(f"{props.plugin_name()}: {name}: expected three finite numbers, got {shown(given.tolist())}.")
@@ -56,7 +84,16 @@ def vector(props: Any, name: str, default: Sequence[float]) -> list[float]:
 
 
 def truth(props: Any, name: str, default: bool) -> bool:
-    """True or false, or 1 or 0. Raises SceneError."""
+    """Return a property that is true or false, or 1 or 0.
+
+    Args:
+        props: ``mi.Properties``.
+        name: name of the property.
+        default: value without it.
+
+    Raises:
+        SceneError: for other values.
+    """
     given = props.get(name, default)
     if not isinstance(given, (bool, int, float)) or given not in (0, 1):
         raise SceneError(f"{props.plugin_name()}: {name}: expected true or false, got {shown(given)}.")
@@ -70,9 +107,15 @@ def truth(props: Any, name: str, default: bool) -> bool:
 
 
 def check_parameters(params: Any) -> None:
-    """Raise ``SceneError`` with the keys of the parameters of a built scene (``mi.traverse``) that are not finite.
+    """Check that the parameters of a built scene are finite.
 
     Vertices of a mesh count where a face has them: files come with others that no ray can meet.
+
+    Args:
+        params: ``mi.traverse`` of the scene.
+
+    Raises:
+        SceneError: with the keys of those that are not.
     """
     bad = {}
     for key, (handle, cpptype, node, _) in params.properties.items():
@@ -86,14 +129,27 @@ def check_parameters(params: Any) -> None:
 
 
 def count_bad(bad: dict[str, str], key: str, array: np.ndarray) -> None:
-    """Note under ``key`` how many numbers of an array are not finite, if any are not."""
+    """Note how many numbers of an array are not finite, if any are not.
+
+    Args:
+        bad: notes by key, for :func:`refuse`; changed.
+        key: key of the array.
+        array: numbers of any shape.
+    """
     wrong = int(array.size - np.isfinite(array).sum())
     if wrong:
         bad[key] = f"{wrong} of {array.size}" if array.size > 1 else str(float(array.reshape(-1)[0]))
 
 
 def refuse(bad: Mapping[str, str]) -> None:
-    """Raise ``SceneError`` where :func:`count_bad` has noted something."""
+    """Raise for what :func:`count_bad` has noted, if there is something.
+
+    Args:
+        bad: notes by key.
+
+    Raises:
+        SceneError: with the keys.
+    """
     if not bad:
         return
     listed = "; ".join(f"{key!r} ({count})" for key, count in bad.items())
@@ -103,7 +159,14 @@ def refuse(bad: Mapping[str, str]) -> None:
 
 
 def numbers_of(value: Any) -> np.ndarray | None:
-    """Return the real numbers of a value of Mitsuba, detached; None for what has none."""
+    """Return the real numbers of a value of Mitsuba, detached.
+
+    Args:
+        value: property or parameter: number, transform, spectrum, bitmap, grid or Dr.Jit array.
+
+    Returns:
+        Numpy array of the value's shape, None for what has no real numbers (text, whole numbers, objects).
+    """
     if isinstance(value, (bool, int, str)) or value is None:
         return None
     if isinstance(value, float):

@@ -23,8 +23,13 @@ TOLERANCE = 2e-5
 
 
 def keeps_coefficients(node: Any, key: str) -> bool:
-    """Return True if the numbers ``key`` of a texture, volume or mesh are coefficients of a smooth spectrum (Jakob and
-    Hanika 2019) instead of a colour: those of colours, in spectral variants.
+    """Return True if the numbers of a parameter are coefficients of a smooth spectrum instead of a colour.
+
+    Those of colours are, in spectral variants (Jakob and Hanika 2019).
+
+    Args:
+        node: texture, volume or mesh.
+        key: name of the parameter, without the path to ``node``.
     """
     if not mi.is_spectral:
         return False
@@ -62,7 +67,18 @@ def colours_of(coefficients: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
-    """The colours of ``coefficients`` (..., 3). Raises ``SceneError``, with the place ``where``, if there are none."""
+    """Return the colours whose spectra have given coefficients.
+
+    Args:
+        coefficients: (..., 3).
+        where: key of the parameter, for messages.
+
+    Returns:
+        Linear sRGB in [0, 1], (..., 3).
+
+    Raises:
+        SceneError: if there are no such colours.
+    """
     found, error = colours_of(coefficients)
     if error > TOLERANCE:
         raise SceneError(
@@ -73,7 +89,11 @@ def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
 
 
 def same_spectra(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return True if coefficients (..., 3) describe the same spectra, to the precision of files."""
+    """Return True if coefficients describe the same spectra, to the precision of files.
+
+    Args:
+        a, b: coefficients, (..., 3), of any shapes.
+    """
     if a.shape != b.shape or a.size % 3:
         return False
     pairs = zip(a.reshape(-1, 3), b.reshape(-1, 3), strict=True)
@@ -103,7 +123,8 @@ def _colour_of(row: np.ndarray) -> np.ndarray:
             break
         # Away from the nearer end of the range.
         steps = np.where(rgb < 0.5, _STEP, -_STEP)
-        columns = [(_spectrum(_fetch(rgb + step * axis)) - wanted - residual) / step for step, axis in _axes(steps)]
+        moved = zip(steps.tolist(), np.eye(3), strict=True)
+        columns = [(_spectrum(_fetch(rgb + step * axis)) - wanted - residual) / step for step, axis in moved]
         slope = np.stack(columns, axis=1)
         move = np.linalg.solve(slope.T @ slope + damping * np.eye(3), slope.T @ residual)
         tried = np.clip(rgb - move, 0.0, 1.0)
@@ -117,7 +138,3 @@ def _colour_of(row: np.ndarray) -> np.ndarray:
 
 def _inside(low: float, high: float) -> np.ndarray:
     return np.abs(_WAVELENGTHS - (low + high) / 2) <= (high - low) / 2
-
-
-def _axes(steps: np.ndarray) -> zip[tuple[float, np.ndarray]]:
-    return zip(steps.tolist(), np.eye(3), strict=True)

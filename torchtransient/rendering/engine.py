@@ -315,7 +315,8 @@ class Images:
         self._memory: Any = None
         check_items(session.sensors, job.items)
         self.films = [session.film(item) for item in job.items]
-        check_fits(self.films[0].cube_shape(), self.count, job.scene.variant)
+        film = self.films[0]
+        check_fits(film.cube_shape(), self.count, job.scene.variant, film.storage_shape())
 
     def install(self, item: Item, group: Sequence[Numbered]) -> None:
         """Install the values of an item's entry, which the group shares, and check the scene that holds them."""

@@ -26,7 +26,9 @@ def available_bytes(variant: str) -> int | None:
     return available_memory()
 
 
-def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
+def check_fits(
+    cube_shape: tuple[int, ...], items: int, variant: str, storage_shape: tuple[int, ...] | None = None
+) -> None:
     """Raise ``StorageError`` if the films of a call exceed the free memory.
 
     Several items are gathered in one tensor while the next is rendered: one film more than there are items.
@@ -35,19 +37,26 @@ def check_fits(cube_shape: tuple[int, ...], items: int, variant: str) -> None:
         cube_shape: shape of a film, (H, W, T, C).
         items: number of films.
         variant: variant, whose device has the memory.
+        storage_shape: shape of the array that a render adds to; another one than that of the film, such as the nodes
+            of beats, is in memory beside it when the render ends.
     """
     cube = math.prod(cube_shape) * _BYTES_PER_VALUE
     films = items + 1 if items > 1 else 1
-    if cube * films <= _SMALL:
+    nodes = 0
+    if storage_shape is not None and storage_shape != cube_shape:
+        nodes = math.prod(storage_shape) * _BYTES_PER_VALUE
+    total = cube * films + nodes
+    if total <= _SMALL:
         return
     available = available_bytes(variant)
-    if available is None or cube * films <= available:
+    if available is None or total <= available:
         return
     parts = " x ".join(str(n) for n in cube_shape)
     batch = f", {films} of them for {items} renders" if items > 1 else ""
+    beside = f", with {_human(nodes)} of nodes beside it" if nodes else ""
     raise StorageError(
-        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}), "
-        f"{_human(cube * films)} in all, and {_human(available)} are available on this {device_type(variant)}. Use "
+        f"the transient cube would take {_human(cube)} (H x W x T x C = {parts} float32{batch}){beside}, "
+        f"{_human(total)} in all, and {_human(available)} are available on this {device_type(variant)}. Use "
         f"fewer bins, a smaller film or crop, or a smaller batch."
     )
 

@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.edges.joined import FLAT, Triangles, edge_keys
-from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_positions
+from torchtransient.plugins.mitsuba_shapes import bounds_of
 
 # Edges that are weighed at a time.
 BLOCK = 2048

@@ -14,7 +14,8 @@ from torchtransient.interfaces import CaptureType
 from torchtransient.plugins.around_corner.geometry import OFFSET, WallPoints, front_normal, points_of, sees
 from torchtransient.plugins.bsdfs.lambertian import is_lambertian
 from torchtransient.plugins.kernel_arrays import host_numbers, registry_number
-from torchtransient.plugins.mitsuba_compat import is_flat_shape, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_positions
+from torchtransient.plugins.mitsuba_shapes import is_flat_shape
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.sampling.area_elements import TRIANGLE, has_shading_normals
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements

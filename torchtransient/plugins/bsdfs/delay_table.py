@@ -118,7 +118,7 @@ class DelayedBSDFs:
         return bool(self.spectral_shifts)
 
     def read(self) -> DelayTable:
-        """Their parameters as they are now; to be called outside of loops, once a job."""
+        """Return the table of the current parameters. Call outside of loops, once a job."""
         return DelayTable(self)
 
 
@@ -198,8 +198,16 @@ def _scatters_late(bsdf) -> bool:
 
 
 def delays_of(bsdfs):
-    """Return (BSDFs that paths can meet, the delayed ones): delayed BSDFs are replaced by their parts; the latter is
-    None where there are none. Raises SceneError for one inside another BSDF.
+    """Return the BSDFs that paths can meet, and the delayed ones among them.
+
+    Args:
+        bsdfs: outermost BSDFs of a scene.
+
+    Returns:
+        (BSDFs, where parts stand in place of delayed ones; the delayed ones, None if there are none).
+
+    Raises:
+        SceneError: for a delayed BSDF inside another one.
     """
     if _created == 0:
         return bsdfs, None

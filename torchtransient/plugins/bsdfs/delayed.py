@@ -90,11 +90,11 @@ class DelayedBSDF(mi.BSDF):
 
     @property
     def at_once(self) -> Any:
-        """The BSDF that scatters at once, None without one."""
+        """Return the BSDF that scatters at once, None without one."""
         return self.nested if self.elastic_fraction is not None else self.elastic
 
     def weights(self) -> tuple[Any, Any]:
-        """Factors of the elastic and of the delayed part."""
+        """Return the factors of the elastic and of the delayed part, Float."""
         if self.elastic_fraction is not None:
             return self.elastic_fraction, (1 - self.elastic_fraction) * self.quantum_yield
         return mi.Float(0 if self.elastic is None else 1), self.quantum_yield

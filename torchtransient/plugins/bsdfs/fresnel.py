@@ -47,14 +47,15 @@ class FresnelTerms(NamedTuple):
 
 
 def fresnel(cos_theta_i: Any, eta: Any) -> FresnelTerms:
-    """Unpolarised Fresnel terms of a dielectric interface, differentiable in both arguments.
-
-    ``cos_theta_i``: cosine between the normal and the direction towards the light's origin; negative inside.
-    ``eta``: index of the inside over that of the outside, > 0.
+    """Return the unpolarised Fresnel terms of a dielectric interface, differentiable in both arguments.
 
     Derivatives are finite everywhere: zero in total internal reflection, clamped within 1e-6 of the critical angle's
     cosine (where the true slope diverges), and exact to rounding as ``eta`` goes to one. At ``eta == 1`` the interface
     is invisible even at grazing incidence. Complex indices and polarised amplitudes are not supported here.
+
+    Args:
+        cos_theta_i: cosine between the normal and the direction towards the light's origin; negative inside.
+        eta: index of the inside over that of the outside, > 0.
     """
     outside = cos_theta_i >= 0
     c = dr.abs(cos_theta_i)
@@ -88,12 +89,23 @@ def fresnel(cos_theta_i: Any, eta: Any) -> FresnelTerms:
 
 
 def sqrt_with_bounded_slope(x: Any) -> Any:
+    """Return the square root, with a slope that stays finite at zero.
+
+    Args:
+        x: Float >= 0, attached or not.
+    """
     root = dr.sqrt(dr.detach(x))
     return dr.replace_grad(root, x * (0.5 / dr.maximum(root, _MIN_ROOT_IN_SLOPE)))
 
 
 def refract(wi: Any, normal: Any, cos_theta_t: Any, eta_ti: Any) -> Any:
-    """Refracted direction of ``wi`` (pointing away from the surface) at a facet with the given unit ``normal``."""
+    """Return the refracted direction of ``wi`` at a facet.
+
+    Args:
+        wi: direction away from the surface, towards the light's origin, unit vector.
+        normal: unit normal of the facet.
+        cos_theta_t, eta_ti: of :class:`FresnelTerms`.
+    """
     return normal * (dr.dot(wi, normal) * eta_ti + cos_theta_t) - wi * eta_ti
 
 
@@ -113,8 +125,10 @@ _SINE_SQUARED_ALONG_NORMAL = 1e-18
 class Interface:
     """Amplitudes at a dielectric interface.
 
-    ``cos_theta_i``: cosine between the normal and the direction towards the light's origin; negative inside. ``eta``:
-    inside over outside index. Both may be attached.
+    Args:
+        cos_theta_i: cosine between the normal and the direction towards the light's origin; negative inside. May be
+            attached.
+        eta: inside over outside index. May be attached.
     """
 
     def __init__(self, cos_theta_i: Any, eta: Any) -> None:
@@ -136,7 +150,7 @@ class Interface:
         self.over_p = dr.select(grazing, 0.0, dr.rcp(dr.select(grazing, 1.0, self.m2 * self.c + self.g)))
 
     def reflection(self) -> Any:
-        """Mueller matrix of reflection in the frames perpendicular to the plane of incidence."""
+        """Return the Mueller matrix of reflection in the frames perpendicular to the plane of incidence."""
         r_s = -self.d * self.over_s * self.over_s
         r_p = self.d * (self.c * self.c * (self.m2 + 1) - 1) * self.over_p * self.over_p
         # Under total reflection both amplitudes have modulus one, and their phases differ by twice that of z.
@@ -150,7 +164,7 @@ class Interface:
         return two_by_two(a, b, c, sin_d)
 
     def transmission(self) -> Any:
-        """Mueller matrix of refraction, as power through the interface; zero under total reflection."""
+        """Return the Mueller matrix of refraction, as power through the interface; zero under total reflection."""
         power = 4 * self.c * self.g
         t_s, t_p = power * self.over_s * self.over_s, power * self.m2 * self.over_p * self.over_p
         cross = power * self.eta_it * self.over_s * self.over_p
@@ -158,8 +172,11 @@ class Interface:
 
 
 def two_by_two(a: Any, b: Any, c: Any, s: Any) -> Any:
-    """Mueller matrix of an element with two eigenaxes: ``a, b`` mean and half difference of the powers along them,
-    ``c, s`` cosine and sine of the retardance times the geometric mean of the powers.
+    """Return the Mueller matrix of an element with two eigenaxes.
+
+    Args:
+        a, b: mean and half difference of the powers along them.
+        c, s: cosine and sine of the retardance, times the geometric mean of the powers.
     """
     o = mi.UnpolarizedSpectrum(0)
     a, b, c, s = (mi.UnpolarizedSpectrum(x) for x in (a, b, c, s))
@@ -169,7 +186,12 @@ def two_by_two(a: Any, b: Any, c: Any, s: Any) -> Any:
 def across_plane(matrix: Any, normal: Any, wi: Any, wo: Any) -> Any:
     """Convert a matrix between the frames across the plane of incidence to one between Mitsuba's implicit frames.
 
-    Light comes along ``-wo`` and leaves along ``wi``; ``normal`` spans the plane with them.
+    Light comes along ``-wo`` and leaves along ``wi``.
+
+    Args:
+        matrix: Mueller matrix.
+        normal: vector that spans the plane of incidence with the directions.
+        wi, wo: unit directions away from the surface, in the local frame.
     """
     s_in, s_out = dr.cross(normal, -wo), dr.cross(normal, wi)
     along = (dr.squared_norm(s_in) < _SINE_SQUARED_ALONG_NORMAL) | (dr.squared_norm(s_out) < _SINE_SQUARED_ALONG_NORMAL)
@@ -181,10 +203,17 @@ def across_plane(matrix: Any, normal: Any, wi: Any, wo: Any) -> Any:
 
 
 def metal_reflection(cos_theta_i: Any, eta: Any, k: Any) -> Any:
-    """Reflection from the outside of a medium of complex index ``eta - i k`` (spectra, ``k >= 0``).
+    """Return the reflection from the outside of a medium of complex index ``eta - i k``.
 
-    The Mueller matrix in the frames perpendicular to the plane of incidence; in unpolarized variants the reflectance.
     Born and Wolf, 14.2, with the cosine of refraction times the index, ``p = sqrt(n^2 - sin^2)``.
+
+    Args:
+        cos_theta_i: cosine between the normal and the direction towards the light's origin, >= 0.
+        eta, k: index and absorption by channel, ``k >= 0``.
+
+    Returns:
+        The Mueller matrix in the frames perpendicular to the plane of incidence; in unpolarized variants the
+        reflectance.
     """
     c = cos_theta_i
     n2_re, n2_im = (eta - k) * (eta + k), -2 * eta * k

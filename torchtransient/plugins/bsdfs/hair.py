@@ -68,7 +68,7 @@ _LARGE_0 = _asymptotic_coefficients(0)
 _LARGE_DIFFERENCE = [one - zero for zero, one in zip(_LARGE_0, _asymptotic_coefficients(1), strict=True)][1:]
 
 
-def scaled_i0(x: Any) -> Any:
+def _scaled_i0(x: Any) -> Any:
     """``I0(x) exp(-x)`` for x >= 0, to 1e-6 of its value, with a slope that is as good."""
     with dr.suspend_grad():
         is_large = x > BORDER
@@ -333,7 +333,7 @@ def _longitudinal(sin_i: Any, cos_i: Any, sin_o: Any, cos_o: Any, concentration:
     """Longitudinal term ``M_p``, which integrates to one over the sine of the angle."""
     # 1 + sin sin' - cos cos', whose digits a concentration of thousands needs.
     deviation = 0.5 * (dr.square(sin_i + sin_o) + dr.square(cos_i - cos_o))
-    peak = scaled_i0(concentration * cos_i * cos_o) * dr.exp(-concentration * deviation)
+    peak = _scaled_i0(concentration * cos_i * cos_o) * dr.exp(-concentration * deviation)
     return peak * concentration / (1 - dr.exp(-2 * concentration))
 
 

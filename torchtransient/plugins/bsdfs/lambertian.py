@@ -10,8 +10,12 @@ from torchtransient.plugins.node_walk import bsdfs_below
 
 
 def is_lambertian(bsdf: Any) -> bool:
-    """Return True if a BSDF is Mitsuba's ``diffuse``, or ``twosided`` around nothing else. By class, since other
-    plugins may set the diffuse flag without being Lambertian.
+    """Return True for Mitsuba's ``diffuse``, or ``twosided`` around nothing else.
+
+    By class, since other plugins may set the diffuse flag without being Lambertian.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
     """
     name = bsdf.class_name()
     if name == "TwoSidedBRDF":
@@ -21,5 +25,9 @@ def is_lambertian(bsdf: Any) -> bool:
 
 
 def scatters_behind(bsdf: Any) -> Any:
-    """Return whether light scatters behind the normal as well (a mask for BSDF pointers)."""
+    """Return a mask of BSDFs that scatter light behind the normal as well.
+
+    Args:
+        bsdf: one ``mi.BSDF``, or array of BSDF pointers.
+    """
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)

@@ -25,9 +25,14 @@ _BECKMANN_CUTOFF = 45.0
 
 
 def normal_density(m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
-    """Density of microfacet normals per solid angle, so that its integral times ``m.z`` over the hemisphere is one.
+    """Return the density of microfacet normals per solid angle.
 
-    ``m``: unit normal in the shading frame (``m.z >= 0``). ``ggx``: GGX if true, else Beckmann.
+    Its integral times ``m.z`` over the hemisphere is one.
+
+    Args:
+        m: unit normal of the facet in the shading frame, ``m.z >= 0``.
+        alpha_u, alpha_v: roughness along both tangents.
+        ggx: GGX, else Beckmann.
     """
     slope2 = dr.square(m.x / alpha_u) + dr.square(m.y / alpha_v)
     z2 = m.z * m.z
@@ -43,10 +48,15 @@ def normal_density(m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
 
 
 def smith_g1_over_cos(v: Any, m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> Any:
-    """Smith's masking of direction ``v`` divided by ``|v.z|``, which stays finite as ``v`` grows parallel to the
-    surface.
+    """Return Smith's masking of a direction divided by ``|v.z|``, which stays finite along the surface.
 
-    Zero where ``v`` sees the facet ``m`` and the surface from two sides.
+    Zero where ``v`` sees the facet and the surface from two sides.
+
+    Args:
+        v: unit direction in the shading frame.
+        m: unit normal of the facet.
+        alpha_u, alpha_v: roughness along both tangents.
+        ggx: GGX, else Beckmann.
     """
     xy2 = dr.square(alpha_u * v.x) + dr.square(alpha_v * v.y)
     z = dr.abs(v.z)
@@ -68,10 +78,13 @@ def smith_g1_over_cos(v: Any, m: Any, alpha_u: Any, alpha_v: Any, ggx: bool) -> 
 
 
 def half_vector(wi: Any, wo: Any, weight: Any) -> tuple[Any, Any]:
-    """Unit vector along ``wi + weight * wo``, turned to the side of ``+z``, and the mask where it is defined.
+    """Return the unit vector along ``wi + weight * wo``, turned to the side of ``+z``, and a mask where it is defined.
 
-    ``weight`` is 1 for reflection and the relative index in the direction of travel for refraction. It is undefined
-    where the sum vanishes, as it does for straight transmission through an interface of index one.
+    It is undefined where the sum vanishes, as it does for straight transmission through an interface of index one.
+
+    Args:
+        wi, wo: unit directions away from the surface.
+        weight: 1 for reflection, the relative index in the direction of travel for refraction.
     """
     h = mi.Vector3f(wi + wo * weight)
     h2 = dr.squared_norm(h)

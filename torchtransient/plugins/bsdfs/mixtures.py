@@ -47,10 +47,12 @@ from torchtransient.plugins.parameter_effect import class_of
 
 
 def hides_lobe_probability(bsdf: Any) -> bool:
-    """Return True if the weight of a delta lobe lacks the derivative of the lobe's probability, which has to be put
-    back.
+    """Return True if the weight of a delta lobe lacks the derivative of the lobe's probability, to be put back.
 
     Of a mixture (mask, blend) it is asked for each part, since a part's probability hides its weight as well.
+
+    Args:
+        bsdf: one ``mi.BSDF``, asked with all that it holds.
     """
     return _has(bsdf, "hides_lobe_probability", cancels_lobe_probability, lambda node: weight_slot(node) is not None)
 
@@ -61,6 +63,9 @@ def mirrors_matrices(bsdf: Any) -> bool:
     From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
     Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
     exchanged.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
     """
     return _has(bsdf, "mirrors_matrices", is_two_sided_itself, lambda node: False)
 
@@ -81,14 +86,14 @@ def _has(bsdf: Any, attribute: str, itself: Callable[[Any], bool], ends: Callabl
 # Copies of BSDFs that hold one other (two-sided, bump and normal maps), around another nested one.
 
 
-def can_be_rebuilt(wrapper: Any) -> bool:
-    """Return True if a BSDF is one that :func:`rebuild_wrapper` knows."""
+def _can_be_rebuilt(wrapper: Any) -> bool:
+    """Return True if a BSDF is one that :func:`_rebuild_wrapper` knows."""
     return is_two_sided_itself(wrapper) or normal_texture(wrapper) is not None
 
 
-def rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
+def _rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
     """Wrap ``nested`` as ``wrapper`` (two-sided, bump or normal map) wraps its own nested BSDF. Shares
-    the textures. ``flags``: see :func:`flags_of`.
+    the textures. ``flags``: see :func:`_flags_of`.
     """
     slot = normal_texture(wrapper)
     if slot is None:
@@ -98,7 +103,7 @@ def rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
     return mi.load_dict({"type": wrapper.class_name().lower(), slot: texture, **plain, **flags, "nested": nested})
 
 
-def flags_of(wrapper: Any) -> dict[str, bool]:
+def _flags_of(wrapper: Any) -> dict[str, bool]:
     """Properties of a bump or normal map that a built one does not show.
 
     They are told by what it samples, with values of textures by which all choices differ: not with those of now, since
@@ -108,10 +113,10 @@ def flags_of(wrapper: Any) -> dict[str, bool]:
         return {}
     own = next(value for _, value in objects_of(wrapper) if isinstance(value, mi.BSDF))
     with _telling_values(wrapper):
-        reference = samples_of(wrapper)
+        reference = _samples_of(wrapper)
         for number in reversed(range(2 ** len(HIDDEN_FLAGS))):
             flags = {name: bool(number >> place & 1) for place, name in enumerate(HIDDEN_FLAGS)}
-            if samples_of(rebuild_wrapper(wrapper, own, flags)) == reference:
+            if _samples_of(_rebuild_wrapper(wrapper, own, flags)) == reference:
                 return flags
     raise SceneError(
         f"{wrapper.class_name()} '{wrapper.id()}': expected one that samples as those of Mitsuba with some choice of "
@@ -149,7 +154,7 @@ def _random(value: Any, rng: np.random.Generator) -> Any:
     return type(value)(drawn.astype(numbers.dtype) if dr.is_array_v(value) else float(drawn))
 
 
-def samples_of(bsdf: Any) -> list[bytes]:
+def _samples_of(bsdf: Any) -> list[bytes]:
     """Directions and weights that a BSDF draws from many sides at many places."""
     rng = mi.PCG32(size=4096)
     u = [rng.next_float32() for _ in range(7)]
@@ -200,7 +205,16 @@ class Sides:
 class Mixture:
     """The parts of one BSDF or phase function of a scene.
 
-    ``always``: it is taken apart in renders, too. ``for_derivatives``: it is taken apart where there are derivatives.
+    Args:
+        node: the BSDF or phase function.
+        kind: ``mi.BSDF`` or ``mi.PhaseFunction``.
+        shapes: shapes that weights may be attributes of.
+
+    Attributes:
+        always: it is taken apart in renders, too.
+        for_derivatives: it is taken apart where there are derivatives.
+        parts: what it is taken apart into.
+        textures: weights.
     """
 
     def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:
@@ -212,7 +226,7 @@ class Mixture:
         self._flags: dict[int, dict[str, bool]] = {}
         self._null: Any = None
         self.tree = self._tree_of(node, ())
-        self.always = any(map(needs_choice, [node, *objects_below(node, kind)]))
+        self.always = any(map(_needs_choice, [node, *objects_below(node, kind)]))
         self.for_derivatives = self.always or any(hides_lobe_probability(part) for part in self.parts)
 
     def _tree_of(self, node: Any, wrappers: tuple[Any, ...]) -> Any:
@@ -226,7 +240,7 @@ class Mixture:
                 nested = [self._null, *nested]
             first, second = (self._tree_of(part, wrappers) for part in nested)
             return Choice(texture, first, second)
-        if not is_mixture(node):
+        if not _is_mixture(node):
             return self._leaf(node, wrappers)
         trees = [self._tree_of(part, (*wrappers, node)) for part in nested]
         return trees[0] if len(trees) == 1 else Sides(*trees)
@@ -234,8 +248,8 @@ class Mixture:
     def _leaf(self, node: Any, wrappers: tuple[Any, ...]) -> Leaf:
         for wrapper in reversed(wrappers):
             if wrapper.ptr not in self._flags:
-                self._flags[wrapper.ptr] = flags_of(wrapper)
-            node = rebuild_wrapper(wrapper, node, self._flags[wrapper.ptr])
+                self._flags[wrapper.ptr] = _flags_of(wrapper)
+            node = _rebuild_wrapper(wrapper, node, self._flags[wrapper.ptr])
             self.wrapped.append((wrapper, node))
         self.parts.append(node)
         return Leaf(len(self.parts) - 1)
@@ -271,7 +285,7 @@ class Seal:
         self.node, held, self._shapes = node, objects_below(node, kind), shapes
         self._mixtures = [part for part in held if weight_slot(part) is not None]
         for part in self._mixtures:
-            if needs_choice(part):
+            if _needs_choice(part):
                 raise SceneError(
                     f"{self._names(part)}. Mitsuba samples a blend wrongly of which a part has a delta lobe or lets "
                     f"light through, or works on other sides than another. {self._REMEDY}"
@@ -307,28 +321,28 @@ class Seal:
                 )
 
 
-def needs_choice(node: Any) -> bool:
+def _needs_choice(node: Any) -> bool:
     """Return True if a mixture has wrong values where Mitsuba samples it as a whole."""
     held = [part for _, part in objects_of(node) if isinstance(part, mi.BSDF)]
     return adds_up_wrongly(node, held, objects_below(node, mi.BSDF))
 
 
-def is_mixture(node: Any) -> bool:
+def _is_mixture(node: Any) -> bool:
     """Return True if a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
     holds.
     """
     if weight_slot(node) is not None:
         return True
-    return can_be_rebuilt(node) and any(is_mixture(part) for part in bsdfs_below(node))
+    return _can_be_rebuilt(node) and any(_is_mixture(part) for part in bsdfs_below(node))
 
 
-def seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
+def _seals_of(node: Any, kind: type, shapes: Sequence[Any]) -> list[Seal]:
     """Return the seals of a BSDF or phase function and all that it holds."""
     others = (part for part in (node, *objects_below(node, kind)) if weight_slot(part) is None)
     return [
         Seal(part, kind, shapes)
         for part in others
-        if not can_be_rebuilt(part) and any(weight_slot(below) is not None for below in objects_below(part, kind))
+        if not _can_be_rebuilt(part) and any(weight_slot(below) is not None for below in objects_below(part, kind))
     ]
 
 
@@ -346,8 +360,13 @@ class Mixtures:
         dr.make_opaque(self._numbers)
 
     def read(self, wanted: Any) -> MixtureChoice | None:
-        """Return the mixtures that a job takes apart, None for none; ``wanted``: the derivatives of the job, or
-        None.
+        """Return the mixtures that a job takes apart, None for none.
+
+        Args:
+            wanted: :class:`~..transport.context.Wanted` of the derivatives of the job, None for renders.
+
+        Raises:
+            GradientError: for a derivative that needs a mixture taken apart which cannot be.
         """
         for mixture in self.mixtures.values():
             mixture.follow()
@@ -359,29 +378,54 @@ class Mixtures:
         return MixtureChoice(self, chosen) if chosen else None
 
     def number(self, pointer: Any, index: Any, active: Any) -> Any:
-        """Number in Dr.Jit's registry of the part ``index`` of what ``pointer`` points to."""
+        """Return the numbers of parts in Dr.Jit's registry, UInt32.
+
+        Args:
+            pointer: pointers to mixtures.
+            index: number of the part among those of its mixture, UInt32.
+            active: mask of lanes.
+        """
         at = self._first.look_up(pointer, active) + index
         return dr.gather(mi.UInt32, self._numbers, at, active)
 
 
 class MixtureChoice:
-    """Takes mixtures apart in one job. Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
+    """The mixtures that one job takes apart.
 
-    ``chosen``: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+    Args:
+        mixtures: mixtures of the scene.
+        chosen: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+
+    Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """
 
     def __init__(self, mixtures: Mixtures, chosen: dict[int, tuple[bool, bool]]) -> None:
         self._of, self._chosen = mixtures, chosen
 
     def take_part(self, sample: Any, si: Any, u: Any, active: Any) -> None:
-        """Change ``sample`` (a :class:`.delay_table.DelaySample`) to one part, chosen by the uniform number
-        ``u``.
+        """Change a sample of BSDFs to one part of its mixtures.
+
+        Args:
+            sample: :class:`.delay_table.DelaySample`, which is changed.
+            si: SurfaceInteraction3f.
+            u: uniform number that chooses.
+            active: mask of lanes.
         """
         sample.bsdf, weight = self.part_of(sample.bsdf, si, u, active)
         sample.weight = weight if sample.weight is None else sample.weight * weight
 
     def part_of(self, pointer: Any, interaction: Any, u: Any, active: Any) -> tuple[Any, Any]:
-        """Return (pointer to one part of what ``pointer`` points to, its weight over its probability)."""
+        """Choose one part of mixtures.
+
+        Args:
+            pointer: BSDFPtr or PhaseFunctionPtr; others than mixtures stay.
+            interaction: SurfaceInteraction3f or MediumInteraction3f.
+            u: uniform number that chooses.
+            active: mask of lanes.
+
+        Returns:
+            (pointer to the part, its weight over its probability; the weight is attached, the probability is not).
+        """
         kind = type(pointer)
         pointer_or_none = dr.select(active, pointer, dr.zeros(kind))
         index, weight, apart = dr.dispatch(pointer_or_none, self._choose, interaction, u, active)
@@ -425,16 +469,24 @@ def _descend(tree: Any, interaction: Any, u: Any, active: Any, at_ends: bool) ->
 
 
 def mixtures_of(nodes: list[Any], kind: type, shapes: Sequence[Any] = ()) -> tuple[list[Any], Mixtures | None]:
-    """Return (BSDFs or phase functions that paths can meet, the mixtures among them or None): a mixture that is always
-    taken apart is replaced by its parts, the parts of others join it. ``shapes``: those that weights may be attributes
-    of.
+    """Return the BSDFs or phase functions that paths can meet, and the mixtures among them.
+
+    Args:
+        nodes: outermost BSDFs or phase functions of a scene.
+        kind: their type, ``mi.BSDF`` or ``mi.PhaseFunction``.
+        shapes: shapes that weights may be attributes of.
+
+    Returns:
+        (nodes: a mixture that is always taken apart is replaced by its parts, the parts of others join it; mixtures,
+            None
+        if there are none).
     """
     met: list[Any] = []
     mixtures: list[Mixture] = []
     seals: list[Seal] = []
     for node in nodes:
-        seals += seals_of(node, kind, shapes)
-        if not is_mixture(node):
+        seals += _seals_of(node, kind, shapes)
+        if not _is_mixture(node):
             met.append(node)
             continue
         mixture = Mixture(node, kind, shapes)

@@ -156,7 +156,11 @@ def _internal_reflectance(eta: Any) -> Any:
 
 
 def depolarizing(value: Any) -> Any:
-    """Scattering by an unpolarized ``value`` that leaves nothing of the polarization, as Mitsuba's plastics do."""
+    """Return the Mueller matrix of scattering that leaves nothing of the polarization, as Mitsuba's plastics do.
+
+    Args:
+        value: unpolarized spectrum; in unpolarized variants it is returned as it is.
+    """
     return mi.mueller.depolarizer(value) if mi.is_polarized else value
 
 

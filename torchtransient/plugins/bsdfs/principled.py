@@ -43,7 +43,14 @@ class Reading:
 
 
 class Weight(mi.Texture):
-    """The weight of a lobe, ``ends``: the values at which Mitsuba skips that lobe or another one."""
+    """The weight of a lobe.
+
+    Args:
+        slot: name under which the surface holds it.
+        texture: its texture.
+        ends: the values at which Mitsuba skips that lobe or another one.
+        reading: how it is read now.
+    """
 
     def __init__(self, slot: str, texture: Any, ends: tuple[float, ...], reading: Reading) -> None:
         mi.Texture.__init__(self, mi.Properties())

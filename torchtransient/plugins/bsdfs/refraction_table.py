@@ -29,7 +29,8 @@ class RefractiveBSDFs:
     for ``principled``) is. Delta lobes are left out: nothing connects through them, and ``sample`` returns their
     index.
 
-    ``entries``: (BSDF, its parts that hold an index).
+    Args:
+        entries: (BSDF, its parts that hold an index).
     """
 
     def __init__(self, entries: list[tuple[Any, list[Any]]]) -> None:
@@ -38,13 +39,16 @@ class RefractiveBSDFs:
 
     @staticmethod
     def from_scene(scene: Any, bsdfs: list[Any] | None = None) -> RefractiveBSDFs | None:
-        """Return the refractive surfaces of ``scene``, or None when nothing in it refracts through a lobe that can be
-        connected to.
+        """Return the refractive surfaces of a scene, None if no refractive lobe can be connected to.
 
-        ``bsdfs``: those of the scene where they are known already.
-        Raises SceneError for a BSDF of which two parts have different indices, where a connection has no single optical
-        length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of a scene
-        (:mod:`.mixtures`); a plugin of others may hold several.
+        Args:
+            scene: Mitsuba scene.
+            bsdfs: its outermost BSDFs, where they are known already.
+
+        Raises:
+            SceneError: for a BSDF of which two parts have different indices, where a connection has no single optical
+                length, and for a refractive plugin that does not expose ``eta``. A path sees one part of the blends of
+                a scene (:mod:`.mixtures`); a plugin of others may hold several.
         """
         found = bsdfs if bsdfs is not None else bsdfs_of_scene(scene)
         leaves = ((bsdf, _refractive_leaves(bsdf, (mi.BSDFFlags.GlossyTransmission,))) for bsdf in found)
@@ -86,17 +90,25 @@ class RefractionTable:
         return self._indices.values
 
     def relative_index(self, bsdf: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        """Index of the medium on ``wo``'s side over that on ``si.wi``'s side: 1 where both are on the same side.
+        """Return the index of the medium on ``wo``'s side over that on ``si.wi``'s side, 1 where both are on one side.
 
-        ``bsdf``: array of BSDF pointers; ``wo``: direction in the local frame of ``si``.
+        Args:
+            bsdf: array of BSDF pointers.
+            si: SurfaceInteraction3f.
+            wo: direction in the local frame of ``si``.
+            active: mask of lanes.
         """
         eta = self._indices.look_up(bsdf, active & (si.wi.z * wo.z < 0))
         return dr.select(si.wi.z > 0, eta, dr.rcp(eta))
 
 
 def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
-    """Return (BSDF, what holds its relative index) for those of ``bsdfs`` that light enters another medium through, by
-    a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+    """Return (BSDF, what holds its relative index) of those that light enters another medium through.
+
+    By a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
+
+    Args:
+        bsdfs: BSDFs of a scene.
     """
     lobes = (mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.GlossyTransmission)
     leaves = ((bsdf, _refractive_leaves(bsdf, lobes)) for bsdf in bsdfs)
@@ -131,7 +143,14 @@ def _has_refraction_lobe(bsdf: Any, lobes: tuple[Any, ...]) -> bool:
 
 
 def index_of(leaf: Any) -> Any:
-    """Inside over outside index of a BSDF without nested ones, attached if its parameter is."""
+    """Return the inside over outside index of a BSDF without nested ones, attached if its parameter is.
+
+    Args:
+        leaf: one ``mi.BSDF`` with a lobe of refraction.
+
+    Raises:
+        SceneError: for a plugin that shows neither ``eta`` nor ``specular``.
+    """
     params = mi.traverse(leaf)
     if "eta" in params:
         return mi.Float(params["eta"])

@@ -31,10 +31,17 @@ _ABOVE = 1e-5
 
 
 def external_transmittance(alpha: Any, eta: Any, ggx: bool) -> Any:
-    """Fraction of the light from outside that a rough interface lets through, by the cosine of the angle of incidence.
+    """Return the fraction of light from outside that a rough interface lets through, by the angle of incidence.
 
-    ``alpha`` (roughness), ``eta`` (index inside over outside): Dr.Jit numbers, attached or not. Light that is scattered
-    more than once by the facets is lost, as in all of Mitsuba's rough plugins.
+    Light that is scattered more than once by the facets is lost, as in all of Mitsuba's rough plugins.
+
+    Args:
+        alpha: roughness, Float, attached or not.
+        eta: index inside over outside, Float, attached or not.
+        ggx: GGX, else Beckmann.
+
+    Returns:
+        Float (:data:`ENTRIES`,), equally spaced in the cosine of the angle.
     """
 
     def table(alpha: Any, eta: Any) -> Any:
@@ -44,7 +51,11 @@ def external_transmittance(alpha: Any, eta: Any, ggx: bool) -> Any:
 
 
 def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
-    """Fraction of diffuse light from inside that a rough interface throws back."""
+    """Return the fraction of diffuse light from inside that a rough interface throws back.
+
+    Args:
+        alpha, eta, ggx: as of :func:`external_transmittance`.
+    """
 
     def number(alpha: Any, eta: Any) -> Any:
         return dr.mean(_facet_mean(alpha, dr.rcp(eta), ggx, transmitted=False) * _cosines()) * 2
@@ -53,7 +64,13 @@ def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
 
 
 def look_up(table: Any, cos_theta: Any, active: Any) -> Any:
-    """Linear interpolation in one of the tables."""
+    """Return linear interpolation in a table of :func:`external_transmittance`.
+
+    Args:
+        table: Float (:data:`ENTRIES`,).
+        cos_theta: cosine of the angle of incidence, 0 to 1.
+        active: mask of lanes.
+    """
     x = cos_theta * (ENTRIES - 1)
     index = dr.minimum(mi.UInt32(x), ENTRIES - 2)
     below, above = dr.gather(mi.Float, table, index, active), dr.gather(mi.Float, table, index + 1, active)

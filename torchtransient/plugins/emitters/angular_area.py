@@ -48,7 +48,11 @@ class AngularAreaLight(mi.Emitter):
         cb.put("radiance", self.radiance, mi.ParamFlags.Differentiable)
 
     def falloff(self, cos_theta: Any) -> Any:
-        """Share of the radiance at an angle from the normal, given by its cosine."""
+        """Return the share of the radiance at an angle from the normal.
+
+        Args:
+            cos_theta: cosine of the angle.
+        """
         cutoff, beam = math.radians(self.cutoff_angle), math.radians(self.beam_width)
         full, dark = cos_theta >= math.cos(beam), cos_theta <= math.cos(cutoff)
         if cutoff == beam:

@@ -50,7 +50,12 @@ class LaserBeam(mi.Emitter):
         return self.to_world
 
     def energy_at(self, wavelengths: Any, active: Any) -> Any:
-        """Energy per colour (UnpolarizedSpectrum) at a path's wavelengths."""
+        """Return the energy per colour at a path's wavelengths, UnpolarizedSpectrum.
+
+        Args:
+            wavelengths: nanometres, in spectral variants.
+            active: mask of lanes.
+        """
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = wavelengths
         return self.energy.eval(si, active)

@@ -20,7 +20,7 @@ from torchtransient.plugins.parameter_effect import ANY_KEY, VALUE, declare_effe
 from torchtransient.plugins.properties import number, truth, whole_number
 
 
-def plain_image(film):
+def _plain_image(film):
     """Return an ``hdrfilm`` of the same size, crop and filter in single precision: RGB, or luminance in mono variants.
     """
     size, crop, offset = film.size(), film.crop_size(), film.crop_offset()
@@ -233,7 +233,7 @@ class TimeResolvedFilm(mi.Film):
             aovs: names of further channels, behind the film's own.
         """
         self.clear()
-        self._image = plain_image(self)
+        self._image = _plain_image(self)
         return self._image.prepare(list(aovs))
 
     def _begun_image(self):

@@ -33,7 +33,11 @@ class StandardObserver:
         return StandardObserver() if mi.is_spectral else None
 
     def matrix(self, wavelengths) -> list:
-        """Per wavelength of a ray the share of each channel."""
+        """Return for each wavelength of a ray the share of each channel.
+
+        Args:
+            wavelengths: nanometres.
+        """
         return [self._shares(wavelengths[k]) for k in range(len(wavelengths))]
 
     def _shares(self, wavelength):
@@ -64,7 +68,11 @@ class ChannelMatch:
             self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
 
     def to_channels(self, value) -> list:
-        """Channel values (list of Float) of what an event contributes."""
+        """Return the channel values of what an event contributes, list of Float.
+
+        Args:
+            value: spectrum, in polarized variants a Stokes vector.
+        """
         if mi.is_polarized:
             return [c for component in rotate_stokes(value, self.rotation) for c in self._to_channels(component)]
         return self._to_channels(value)
@@ -96,7 +104,11 @@ class ChannelMatch:
 
 
 def mean_of(channels: list):
-    """Mean over the channels, those of the power in polarized variants."""
+    """Return the mean over channels, in polarized variants over those of the power.
+
+    Args:
+        channels: Float each; in polarized variants those of all Stokes components, the power first.
+    """
     if mi.is_polarized:
         channels = channels[: len(channels) // 4]
     return dr.sum(channels) / len(channels)
@@ -159,7 +171,11 @@ class SensorResponse:
         return np.maximum(total, FLOOR * total.max())
 
     def tabulate(self, wavelengths: np.ndarray) -> np.ndarray:
-        """Values of the curves (C, N) at wavelengths (N,) in nanometres."""
+        """Return the values of the curves at wavelengths, (C, N).
+
+        Args:
+            wavelengths: (N,), nanometres.
+        """
         values = self._evaluate(mi.UnpolarizedSpectrum(mi.Float(wavelengths)))
         return np.array([np.broadcast_to(np.array(value[0], dtype=float), len(wavelengths)) for value in values])
 
@@ -183,7 +199,14 @@ class SensorResponse:
         return SensorResponse({name: props.get_unbounded_texture(name) for name in names})
 
     def sample(self, u):
-        """Wavelengths (nm) for a uniform number per ray, and the reciprocal of their densities (nm)."""
+        """Draw the wavelengths of rays in proportion to the curves.
+
+        Args:
+            u: uniform number per ray, Float.
+
+        Returns:
+            (wavelengths, reciprocals of their densities), both in nanometres.
+        """
         shifted = mi.sample_shifted(u)
         wavelengths, weight = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
         for k in range(len(shifted)):
@@ -192,15 +215,29 @@ class SensorResponse:
         return wavelengths, weight
 
     def matrix(self, wavelengths) -> list:
-        """Per wavelength of a ray the share of each channel: the mean over the ray's wavelengths is the channel."""
+        """Return for each wavelength of a ray the share of each channel, of which the mean is taken.
+
+        Args:
+            wavelengths: nanometres.
+        """
         values = self._evaluate(wavelengths)
         count = len(wavelengths)
         return [[value[k] * (1 / count) for value in values] for k in range(count)]
 
     def draw(self, sensor, ray, weight, u):
-        """Replace the wavelengths that a sensor drew for a ray from the number ``u``: (ray, weight).
+        """Replace the wavelengths that a sensor drew for a ray.
 
-        Raises SceneError for a sensor with a response curve of its own, which would be counted twice.
+        Args:
+            sensor: the sensor.
+            ray: its ray, which is changed.
+            weight: weight of the ray.
+            u: the number that its wavelengths were drawn from, Float.
+
+        Returns:
+            (ray, weight).
+
+        Raises:
+            SceneError: for a sensor with a response curve of its own, which would be counted twice.
         """
         self._check(sensor)
         _, drawn = mi.sample_rgb_spectrum(mi.sample_shifted(u))

@@ -51,14 +51,25 @@ class GateTable:
         )
 
     def candidates(self, opl, active):
-        """First and last (exclusive) gate that light arriving at ``opl`` (``Float64``) can meet."""
+        """Return the first and the last (exclusive) gate that an arrival can meet, UInt32.
+
+        Args:
+            opl: arrival, metres, Float64.
+            active: mask of lanes.
+        """
         inside = active & (opl >= self.first) & (opl < self.last)
         cell = mi.UInt32(dr.select(inside, (opl - self.first) * self._cell_scale, 0))
         cell = dr.minimum(cell, CELLS - 1)
         return dr.gather(mi.UInt32, self._low, cell, inside), dr.gather(mi.UInt32, self._high, cell, inside)
 
     def value(self, gate, opl, active):
-        """Sensitivity of a gate to light arriving at ``opl`` and its slope per metre."""
+        """Return the sensitivity of a gate to an arrival, and its slope per metre.
+
+        Args:
+            gate: number of the gate, UInt32.
+            opl: arrival, metres, Float64.
+            active: mask of lanes.
+        """
         start, end = dr.gather(mi.Float64, self._start, gate, active), dr.gather(mi.Float64, self._end, gate, active)
         inside = active & (opl >= start) & (opl < end)
         scale = dr.gather(mi.Float, self._scale, gate, inside)
@@ -70,7 +81,7 @@ class GateTable:
 
 
 @dr.syntax
-def put_gates(layout, table, opl, value, slope_value, active):
+def _put_gates(layout, table, opl, value, slope_value, active):
     """Add to every gate that light arriving at ``opl`` meets."""
     g, end = table.candidates(opl, active)
     going = mi.Bool(active) & (g < end)
@@ -91,7 +102,7 @@ def _scatter(layout, gate, weight, slope, value, slope_value, active):
 
 
 @dr.syntax
-def read_gates(layout, table, opl, steady, active):
+def _read_gates(layout, table, opl, steady, active):
     """Adjoint and its slope summed over the gates that light arriving at ``opl`` meets."""
     A, slope = [mi.Float(0) for _ in range(layout.channels)], [mi.Float(0) for _ in range(layout.channels)]
     g, end = table.candidates(opl, active)
@@ -184,28 +195,28 @@ class GatedHDRFilm(TimeResolvedFilm):
     # ---------------------------------------------------------------------------------------- storage
 
     def gate_count(self) -> int:
-        """G, the number of gates."""
+        """Return the number of gates, G."""
         return self.table.count
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
+        """Return the shape of the gated images: (H, W, G, C) or (H, W, Lh, Lw, G, C)."""
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.gate_count(), self.channel_count())
 
     # ----------------------------------------------------------------------------------- splat and read
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False):
-        put_gates(self._layout(band, base, exclusive), self.table, opl_from_start, value, None, active)
+        _put_gates(self._layout(band, base, exclusive), self.table, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
     def put_slope(self, band, base, opl_from_start, d_value, value_d_opl, active):
-        put_gates(self._layout(band, base), self.table, opl_from_start, d_value, value_d_opl, active)
+        _put_gates(self._layout(band, base), self.table, opl_from_start, d_value, value_d_opl, active)
 
     def read(self, adjoint, base, opl_from_start, active, steady=None):
         channels = self.channel_count()
         flat, gate_stride, channel_stride = (None, 1, 1) if adjoint is None else adjoint
         layout = BinLayout(flat, base, gate_stride, channel_stride, self.gate_count(), channels)
-        return read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
+        return _read_gates(layout, self.table, mi.Float64(opl_from_start), steady, active)
 
     def _layout(self, band, base, exclusive=False):
         channels = self.channel_count()

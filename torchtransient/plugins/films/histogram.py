@@ -196,14 +196,18 @@ class TransientHDRFilm(TimeResolvedFilm):
     # ---------------------------------------------------------------------------------------- storage
 
     def cube_shape(self) -> tuple[int, ...]:
-        """Shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
+        """Return the shape of the transient: (H, W, T, C) or (H, W, Lh, Lw, T, C)."""
         size = self.crop_size()
         return (int(size[1]), int(size[0]), *self.laser_shape(), self.temporal_bins, self.channel_count())
 
     # ----------------------------------------------------------------------------------- splat and read
 
     def bin_position(self, opl_from_start):
-        """Arrival in units of bins from ``opl - start_opl`` (``Float64``)."""
+        """Return an arrival in units of bins, Float64.
+
+        Args:
+            opl_from_start: ``opl - start_opl``, metres, Float64.
+        """
         return opl_from_start / mi.Float64(self.bin_width_opl)
 
     def create_event_block(self, job, base, match, most_events, tangents=False, exclusive=False, origin=None):
@@ -219,8 +223,11 @@ class TransientHDRFilm(TimeResolvedFilm):
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None):
-        """``laser`` is the index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
-        otherwise.
+        """Add a contribution, as of :meth:`~.base.TimeResolvedFilm.put`.
+
+        Args:
+            laser: index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
+                otherwise.
         """
         cube = self.band_array(band)
         x = self.bin_position(opl_from_start)
@@ -233,8 +240,19 @@ class TransientHDRFilm(TimeResolvedFilm):
         return self.put_bins(cube, base, x, (0, bins), value, active, mode)
 
     def put_bins(self, cube, base, x, window, value, active, mode):
-        """Add to the bins that the filter reaches from ``x``, in bins (``Float`` or ``Float64``). ``base``: index of
-        bin 0; ``window``: first bin that is stored, and the one after the last.
+        """Add to the bins that the filter reaches.
+
+        Args:
+            cube: array of the band.
+            base: index of bin 0, UInt32.
+            x: arrival in bins, Float or Float64.
+            window: (first bin that is stored, the one after the last).
+            value: contribution by channel, list of Float.
+            active: mask of lanes.
+            mode: ``dr.ReduceMode`` of the additions.
+
+        Returns:
+            (share of the weight before the window, share behind it), Float.
         """
         channels = len(value)
         low, high = window

@@ -33,7 +33,7 @@ class Row:
         self.number, self.inside, self.shift, self.k, self.weight, self.slope = number, inside, shift, k, weight, slope
 
 
-def sheared(scales, rate):
+def _sheared(scales, rate):
     """Return rows of all the light, one at ``opl + k rate`` for each ``k`` of ``scales`` (Float64, seconds)."""
     return [
         Row(mi.UInt32(n), mi.Bool(True), k * mi.Float64(rate), mi.Float(k), mi.Float(1), mi.Float(0))
@@ -212,7 +212,7 @@ class BeatHDRFilm(film_of_rows(SplinedHDRFilm)):
         return 2
 
     def rows_of(self, rate):
-        return sheared(self._scales, rate)
+        return _sheared(self._scales, rate)
 
 
 class SlowPhasorHDRFilm(film_of_rows(PhasorHDRFilm)):
@@ -244,7 +244,7 @@ class SlowPhasorHDRFilm(film_of_rows(PhasorHDRFilm)):
         return len(self.slow_times)
 
     def rows_of(self, rate):
-        return sheared(self._scales, rate)
+        return _sheared(self._scales, rate)
 
 
 register("film", "rate_hdr_film", RateHDRFilm)

@@ -101,13 +101,13 @@ def spline_of(pulses, width: float, parts: int):
     weights = (weights.reshape(-1, parts) / weights.reshape(-1, parts).sum(0)).ravel()
     error = 0.0
     for d in (np.arange(8) + 0.5) / 8 - 0.5:
-        left, middle, right = (w for w, _ in splines(d))
+        left, middle, right = (w for w, _ in _splines(d))
         found = left * weights[:-2] + middle * weights[1:-1] + right * weights[2:]
         error = max(error, float(np.abs(found - share(nodes[1:-1] + d / parts)).max()))
     return below, weights, error / float(share(nodes).max())
 
 
-def splines(d):
+def _splines(d):
     """Return (value, slope) of the quadratic B-splines of the nodes before, at and after ``d``, -1/2 to 1/2."""
     return (
         (0.5 * (0.5 - d) * (0.5 - d), d - 0.5),
@@ -188,7 +188,7 @@ class SplinedHDRFilm(TransientHDRFilm):
         if not self.splined:
             return super().put(band, base, opl_from_start, value, active, exclusive, crowded)
         before, after, inside, nodes, d = self._place(base, opl_from_start, active)
-        for node, (weight, _) in zip(nodes, splines(d), strict=True):
+        for node, (weight, _) in zip(nodes, _splines(d), strict=True):
             self._add(self.band_array(band), node, [v * weight for v in value], inside)
         return dr.select(before, mi.Float(1), 0), dr.select(after, mi.Float(1), 0)
 
@@ -198,7 +198,7 @@ class SplinedHDRFilm(TransientHDRFilm):
             return
         _, _, inside, nodes, d = self._place(base, opl_from_start, active)
         scale = self.filter.parts / self.bin_width_opl
-        for node, (weight, slope) in zip(nodes, splines(d), strict=True):
+        for node, (weight, slope) in zip(nodes, _splines(d), strict=True):
             values = [a * weight + b * (slope * scale) for a, b in zip(d_value, value_d_opl, strict=True)]
             self._add(self.band_array(band), node, values, inside)
 
@@ -209,7 +209,7 @@ class SplinedHDRFilm(TransientHDRFilm):
         _, _, inside, nodes, d = self._place(base, opl_from_start, active)
         scale = self.filter.parts / self.bin_width_opl
         A, slope = [mi.Float(0)] * channels, [mi.Float(0)] * channels
-        for node, (weight, dweight) in zip(nodes, splines(d), strict=True):
+        for node, (weight, dweight) in zip(nodes, _splines(d), strict=True):
             values = self._gathered(adjoint[0], node, inside)
             for c in range(channels):
                 A[c] = dr.fma(values[c], weight, A[c])
@@ -234,7 +234,7 @@ class SplinedHDRFilm(TransientHDRFilm):
     def _bins_of(self, nodes):
         """Return the array of bins, and count as outside what the line spreads over the rims of the window."""
         *rows, bins, channels = self.cube_shape()
-        row, channel = divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
+        row, channel = _divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
         sweep = Sweep(self, nodes, dr.empty(mi.Float, math.prod(rows) * bins * channels))
         first = row * (self.node_count() * self.lanes()) + channel
         before, sums = swept(sweep, first, row * (bins * channels) + channel)
@@ -249,44 +249,28 @@ class SplinedHDRFilm(TransientHDRFilm):
         if not self.splined:
             return adjoint
         flat, offset, strides = adjoint
-        shape, lanes, channels = self._node_shape(), self.lanes(), self.channel_count()
-        index = dr.arange(mi.UInt32, math.prod(shape[:-1]))
-        rest, node = divided(index, shape[-2])
-        at = mi.UInt32(offset)
+        shape, channels = self._node_shape(), self.channel_count()
+        row, channel = _divided(dr.arange(mi.UInt32, math.prod(shape[:-2]) * channels), channels)
+        rest, at = row, mi.UInt32(offset) + channel * strides[-1]
         for size, stride in zip(shape[-3:0:-1], strides[-3:0:-1], strict=True):
-            rest, place = divided(rest, size)
+            rest, place = _divided(rest, size)
             at += place * stride
         at += rest * strides[0]
-        bin_, weight_number = divided(node, self.filter.parts)
-        totals = [mi.Float(0)] * channels
-        for _ in range(self.filter.weights_count // self.filter.parts):
-            # Wraps below the first bin.
-            inside = (bin_ < self.temporal_bins) & (weight_number < self.filter.weights_count)
-            weight = dr.gather(mi.Float, self.filter.node_weights, weight_number, inside)
-            for c in range(channels):
-                value = dr.gather(mi.Float, flat, dr.fma(bin_, strides[-2], at + c * strides[-1]), inside)
-                totals[c] = dr.fma(value, weight, totals[c])
-            bin_, weight_number = bin_ - 1, weight_number + self.filter.parts
-        contiguous = tuple(int(stride) for stride in np.cumprod((1, *shape[:0:-1]))[::-1])
-        if lanes == 1:
-            dr.eval(totals)
-            return totals[0], 0, contiguous
-        values = dr.empty(mi.Float, math.prod(shape))
-        totals += [mi.Float(0)] * (lanes - channels)
-        for c in range(0, lanes, PACKET):
-            dr.scatter(values, mi.Vector4f(*totals[c : c + PACKET]), dr.fma(index, lanes, c) // PACKET)
-        dr.eval(values)
-        return values, 0, contiguous
+        # Numbers of lanes without a channel are read with the others, and count nowhere.
+        sweep = Sweep(self, dr.empty(mi.Float, math.prod(shape)), flat)
+        swept_back(sweep, at, strides[-2], row * (shape[-2] * shape[-1]) + channel)
+        dr.eval(sweep.nodes)
+        return sweep.nodes, 0, tuple(int(stride) for stride in np.cumprod((1, *shape[:0:-1]))[::-1])
 
 
-def divided(index, size: int):
+def _divided(index, size: int):
     """Return quotient and remainder, UInt32."""
     quotient = index // size
     return quotient, index - quotient * size
 
 
 class Sweep:
-    """Arrays and weights of :func:`swept`. A plain object, which Dr.Jit loops leave alone.
+    """Arrays and weights of :func:`swept` and :func:`swept_back`. A plain object, which Dr.Jit loops leave alone.
 
     Args:
         film: film of the nodes.
@@ -298,7 +282,8 @@ class Sweep:
         self.nodes, self.bins = nodes, bins
         self.parts, self.lanes, self.channels = film.filter.parts, film.lanes(), film.channel_count()
         self.most = film.filter.weights_count // self.parts
-        self.count = film.temporal_bins + self.most - 1
+        self.bin_count = film.temporal_bins
+        self.count = self.bin_count + self.most - 1
         table = film.filter.node_weights
         self.weights = [dr.gather(mi.Float, table, mi.UInt32(e)) for e in range(film.filter.weights_count)]
 
@@ -310,6 +295,19 @@ class Sweep:
             for j in range(self.most):
                 sums[j] = dr.fma(value, self.weights[(self.most - 1 - j) * self.parts + p], sums[j])
         return sums
+
+    def spread(self, values, at):
+        """Write the adjoint of the nodes of one bin, whose first is at ``at``.
+
+        Args:
+            values: adjoint of that bin and of those before it, which these nodes are part of.
+            at: index of the first node and channel.
+        """
+        for p in range(self.parts):
+            total = mi.Float(0)
+            for j, value in enumerate(values):
+                total = dr.fma(value, self.weights[j * self.parts + p], total)
+            dr.scatter(self.nodes, total, at + p * self.lanes)
 
 
 @dr.syntax
@@ -335,3 +333,22 @@ def swept(sweep, at, to):
         at += sweep.parts * sweep.lanes
         number += 1
     return before, sums
+
+
+@dr.syntax
+def swept_back(sweep, at, stride, to):
+    """Write the adjoint of the nodes of all rows, by the transpose of :func:`swept`: each bin is read once.
+
+    Args:
+        sweep: :class:`Sweep` with the adjoint of the bins.
+        at: index of each row's first bin and channel.
+        stride: from one bin to the next.
+        to: index of the first node and channel.
+    """
+    values, number = [mi.Float(0) for _ in range(sweep.most)], mi.UInt32(0)
+    while dr.hint(number < sweep.count, label="nodes of bins"):
+        values = [dr.gather(mi.Float, sweep.bins, at, number < sweep.bin_count), *values[:-1]]
+        sweep.spread(values, to)
+        at += stride
+        to += sweep.parts * sweep.lanes
+        number += 1

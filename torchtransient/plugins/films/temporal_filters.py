@@ -38,13 +38,27 @@ CUT_STDDEVS = 4.0
 
 
 def check_stddev(stddev: float):
-    """Raise ``SceneError`` unless ``stddev`` is a positive number of bins."""
+    """Check the width of a Gaussian filter.
+
+    Args:
+        stddev: standard deviation, bins.
+
+    Raises:
+        SceneError: unless it is positive and finite.
+    """
     if not (math.isfinite(stddev) and stddev > 0):
         raise SceneError(f"gaussian_stddev: expected a positive number of bins, got {stddev!r}.")
 
 
 def check_name(name: str):
-    """Raise ``SceneError`` unless ``name`` is a filter."""
+    """Check the name of a temporal filter.
+
+    Args:
+        name: name, one of :data:`NAMES`.
+
+    Raises:
+        SceneError: for another one.
+    """
     if name not in NAMES:
         raise SceneError(f"temporal_filter: expected one of {', '.join(NAMES)}, got {name!r}.")
 
@@ -58,10 +72,13 @@ class BoxFilter:
     reach = (0.0, 0.0)
 
     def weights(self, x):
-        """Weights of one arrival.
+        """Return the weights of one arrival.
 
-        ``x`` is the arrival in bins (0 is the start of bin 0), ``Float64``. Returns a bin (``Float64``, which may lie
-        outside of the axis) and a list of ``(offset from that bin, weight, d weight / dx)``.
+        Args:
+            x: the arrival in bins (0 is the start of bin 0), Float64.
+
+        Returns:
+            (bin, Float64, which may lie outside of the axis; list of (offset from that bin, weight, d weight / dx)).
         """
         return dr.floor(x), [(0, mi.Float(1), mi.Float(0))]
 
@@ -117,7 +134,15 @@ class GaussianFilter:
 
 
 def make_temporal_filter(name: str, stddev: float = 0.5):
-    """Return the filter called ``name`` (``box``, ``tent`` or ``gaussian``). Raises ``SceneError`` for another name."""
+    """Return a temporal filter by its name.
+
+    Args:
+        name: ``box``, ``tent`` or ``gaussian``.
+        stddev: standard deviation of the Gaussian, bins.
+
+    Raises:
+        SceneError: for another name or width.
+    """
     check_name(name)
     if name == "box":
         return BoxFilter()
@@ -165,7 +190,11 @@ class PulsedFilter:
         self._table = mi.Float(table.astype(np.float32))
 
     def begin(self, x):
-        """(bin of the first tap, node and share at its lower edge) for an arrival ``x`` in bins (``Float64``)."""
+        """Return (bin of the first tap, node and share at its lower edge) for an arrival.
+
+        Args:
+            x: the arrival in bins, Float64.
+        """
         start = dr.floor(x)
         # The node of an edge is the same for all bins but for a multiple of the nodes per bin.
         u = mi.Float(1 - (x - start)) * self.nodes_per_bin
@@ -173,7 +202,11 @@ class PulsedFilter:
         return start + self.first, node, u - mi.Float(node)
 
     def edge(self, node, share):
-        """Cumulative distribution at an edge, and its slope per bin."""
+        """Return the cumulative distribution at an edge, and its slope per bin.
+
+        Args:
+            node, share: place of the edge in the table, as of :meth:`begin`.
+        """
         low, high = dr.gather(mi.Float, self._table, node), dr.gather(mi.Float, self._table, node + 1)
         return dr.fma(high - low, share, low), (high - low) * self.nodes_per_bin
 
@@ -190,7 +223,13 @@ class PulsedFilter:
 
 
 def with_filter(pulses, base, bin_width_opl: float) -> list[Pulse]:
-    """Return ``pulses`` and that of the temporal filter ``base`` for bins of a width in metres."""
+    """Return pulses together with the one that a temporal filter spreads arrivals by.
+
+    Args:
+        pulses: :class:`~torchtransient.pulses.Pulse` each.
+        base: temporal filter, whose pulse is a box (tent) or a Gaussian; the box filter has none.
+        bin_width_opl: width of a bin, metres.
+    """
     if isinstance(base, TentFilter):
         return [*pulses, Pulse.rectangular(bin_width_opl)]
     if isinstance(base, GaussianFilter):
@@ -233,7 +272,16 @@ def pulse_of(props, prefix: str, plugin: str) -> Pulse | None:
 
 
 def numbers_of(text, name: str, plugin: str) -> list[float]:
-    """Numbers separated by spaces or commas; a single number is one. Raises SceneError."""
+    """Return the numbers of a text.
+
+    Args:
+        text: numbers separated by spaces or commas; a single number is one.
+        name: name of the property, for messages.
+        plugin: name of the plugin, for messages.
+
+    Raises:
+        SceneError: for other text.
+    """
     try:
         return [float(part) for part in re.split(r"[,\s]+", str(text).strip()) if part]
     except ValueError:
@@ -242,8 +290,18 @@ def numbers_of(text, name: str, plugin: str) -> list[float]:
 
 @dr.syntax
 def put_long(layout, kernel, x, value, slope_value, active):
-    """Add ``value`` times the weight and ``slope_value`` times its slope per bin; returns the shares of the weight
-    before and after the window. ``slope_value`` may be None.
+    """Add an arrival to all bins that a long kernel reaches.
+
+    Args:
+        layout: :class:`.block.BinLayout` of the histogram.
+        kernel: :class:`PulsedFilter`.
+        x: place of the arrival, bins from the start of the window, Float64.
+        value: light by channel, times the weight of each bin.
+        slope_value: numbers by channel, times the slope of the weight per bin, or None.
+        active: mask of lanes.
+
+    Returns:
+        (share of the weight before the window, share behind it), Float.
     """
     k, node, share = kernel.begin(x)
     end = k + kernel.count
@@ -277,8 +335,17 @@ def _scatter_bin(layout, inside, k, weight, dweight, value, slope_value):
 
 @dr.syntax
 def read_long(layout, kernel, x, active, steady=None):
-    """Weighted sum of a cube's entries and its slope per bin: two lists over channels. ``steady``: list that is added
-    to every entry.
+    """Return the sum of a cube's entries, weighed by a long kernel, and its slope.
+
+    Args:
+        layout: :class:`.block.BinLayout` of the histogram.
+        kernel: :class:`PulsedFilter`.
+        x: place of the arrival, bins from the start of the window, Float64.
+        active: mask of lanes.
+        steady: numbers by channel that are added to every entry, or None.
+
+    Returns:
+        (sums, slopes per bin), lists over channels.
     """
     k, node, share = kernel.begin(x)
     end = k + kernel.count

@@ -57,7 +57,11 @@ class Job:
 
 
 def laser_count(film: Any) -> int:
-    """Return the number of laser positions of every pixel of a film."""
+    """Return the number of laser positions of every pixel of a film, 1 but for exhaustive scans.
+
+    Args:
+        film: film of this library.
+    """
     return film.laser_count() if film.exhaustive_scan else 1
 
 
@@ -233,6 +237,9 @@ class Prepared:
 
 def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
     """Return what the kernels of jobs depend on, beside the scene's parameters.
+
+    Args:
+        jobs: jobs of one scene.
 
     Returns:
         (structure: hashable, all that is no array; arrays that the kernels read), see

@@ -34,12 +34,11 @@ from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.transport.boundary.moving_edges import MovingEdges, missing, switched_off
 from torchtransient.plugins.transport.context import PathSettings, RenderContext
 from torchtransient.plugins.transport.emitter_connections import EmitterFound, EmitterSampled
-from torchtransient.plugins.transport.guides import HiddenGeometry
 from torchtransient.plugins.transport.laser_spot import LaserSpot
 from torchtransient.plugins.transport.material_points import FoundVacuum, MaterialVacuum
 from torchtransient.plugins.transport.media import Media
 from torchtransient.plugins.transport.medium_scattering import SurfaceOrMedium
-from torchtransient.plugins.transport.strategy import Local
+from torchtransient.plugins.transport.strategy import Guide, GuidedPoint, Local
 from torchtransient.plugins.transport.surface_scattering import Lambertian, Surface
 from torchtransient.plugins.transport.vacuum import Vacuum
 
@@ -50,6 +49,44 @@ NOT_FLAT = (
     "the wall is not flat, or scanned points and laser spots lie off it, and points of walls that see each other from "
     "nearby weigh without bound"
 )
+
+
+class HiddenGeometry(Guide):
+    """Guide that draws points on hidden surfaces, more of them where the relay wall sees most of the light.
+
+    Hidden surfaces light each other best as their BSDFs say, so ``beyond`` is small, and less than one since a body
+    close to another one would have no bounded variance.
+
+    Args:
+        elements: :class:`~torchtransient.plugins.sampling.hidden_elements.HiddenElements` of the job.
+        at_wall: share of the samples that leave the first vertex.
+        beyond: share of the others.
+    """
+
+    name = "hidden_geometry"
+
+    def __init__(self, elements, at_wall, beyond):
+        self.elements, self.at_wall, self.share = elements, at_wall, beyond
+
+    def share_at(self, depth):
+        return dr.select(depth == 0, mi.Float(self.at_wall), mi.Float(self.share))
+
+    def draw(self, context, vertex, x, y):
+        p, n, uv, shape, primitive = self.elements.draw_with_surface(x, y, vertex.goes_on)
+        return GuidedPoint(p, shape, primitive, n, uv)
+
+    def density(self, context, p, q, n, shape, active, primitive=None):
+        v = dr.select(active, q - p, mi.Vector3f(0, 0, 1))
+        if primitive is None:  # a light was asked for a point of its shape, and does not say of which triangle
+            ray = mi.Ray3f(mi.Point3f(p), dr.normalize(v))
+            with dr.suspend_grad():
+                found = context.segment.next_surface(context, ray, active)
+            # Of what is hidden from there, any triangle will do.
+            primitive = dr.select(active & (found.shape == shape), found.prim_index, 0)
+        per_area = self.elements.per_area(shape, primitive, q, active)
+        d2 = dr.squared_norm(v)
+        cos = dr.abs_dot(n, v) * dr.rsqrt(d2)
+        return dr.select(active & (cos > 0), per_area * d2 / cos, 0)
 
 
 class TransientNLOSPath(base.TransientIntegrator):
@@ -226,9 +263,16 @@ class TransientNLOSPath(base.TransientIntegrator):
             return ScanTable(scene, contents, self.capture, fov, self.laser_sampling)
 
     def division(self, scene: Any, contents: Any, wanted: Any = None, table: Any = None) -> Division:
-        """Return the division of light among estimators. ``table``: the :class:`ScanTable` of the job, where it is
-        known. Raises SceneError
-        where light has to come from shared samples and cannot.
+        """Return the division of light among estimators.
+
+        Args:
+            scene: Mitsuba scene.
+            contents: its contents.
+            wanted: derivatives of the job, None in a render.
+            table: :class:`ScanTable` of the job, where it is known.
+
+        Raises:
+            SceneError: where light has to come from shared samples and cannot.
         """
         settings = self.settings()
         asked = {"third_bounce": (self.third_bounce, BOUNCES, BOUNCES), "late_light": (self.late_light, FIRST, MOST)}

@@ -30,12 +30,17 @@ _MAX_EVENTS = 2**22
 
 @dataclass(frozen=True)
 class PilotEvents:
-    """Arrivals of a pilot run, in no particular order, N of them from ``paths`` camera paths.
+    """Arrivals of a pilot run, N of them in no particular order.
 
-    ``opl`` (N,) float64, metres of optical path. ``energy`` (N,) float64: contribution to the mean over the image of
-    the mean over wavelengths or channels. ``depth`` (N,): smallest ``max_depth`` of a render that contains it.
-    ``path`` (N,): number of the camera path; ``pixel`` (N,): its pixel on the pilot's film of ``size`` (width, height).
-    ``rate`` (N,) float64: rate of the path, m/s; zero for a sensor whose film measures no rates.
+    Attributes:
+        opl: optical path length, (N,), metres, float64.
+        energy: contribution to the mean over the image of the mean over wavelengths or channels, (N,), float64.
+        depth: smallest ``max_depth`` of a render that contains it, (N,).
+        path: number of the camera path, (N,).
+        pixel: its pixel on the pilot's film, (N,).
+        rate: rate of the path, (N,), m/s, float64; zero for a sensor whose film measures no rates.
+        paths: number of camera paths.
+        size: width and height of the pilot's film.
     """
 
     opl: np.ndarray
@@ -65,7 +70,7 @@ class _PilotFilm:
         return sample - 0.5, None
 
 
-def pilot_size(film, pixels: int) -> tuple[int, int]:
+def _pilot_size(film, pixels: int) -> tuple[int, int]:
     """Width and height of a film of about ``pixels`` pixels in the proportions of ``film``, no more than it has."""
     width, height = (int(n) for n in film.crop_size())
     shrink = min(1.0, (pixels / (width * height)) ** 0.5)
@@ -73,11 +78,23 @@ def pilot_size(film, pixels: int) -> tuple[int, int]:
 
 
 def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: int, roulette=True) -> PilotEvents:
-    """Trace about ``paths`` camera paths of a transient integrator and list what arrives.
+    """Trace camera paths of a transient integrator and list what arrives.
 
-    ``sensor`` is a sensor of ``scene`` with one of the library's films. ``max_depth`` is :data:`PILOT_DEPTH` for
-    the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the latest, or, without ``roulette``, not at all.
-    Raises what the integrator raises for scenes that it cannot render.
+    ``max_depth`` is :data:`PILOT_DEPTH` for the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the
+    latest.
+
+    Args:
+        scene: Mitsuba scene.
+        integrator: transient integrator of this library.
+        sensor: sensor of ``scene`` with one of the library's films, or its number.
+        seed: seed of the sampler.
+        pixels: pixels of the pilot's film, about.
+        paths: camera paths, about.
+        roulette: False: paths are not ended at random.
+
+    Raises:
+        VariantError: in polarized variants.
+        SceneError: and what else the integrator raises for scenes that it cannot render.
     """
     if mi.is_polarized:
         raise VariantError(
@@ -85,7 +102,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
             f"{mi.variant()!r}; load the scene in {mi.variant().removesuffix('_polarized')!r}."
         )
     sensor, film = integrator.resolve(scene, sensor)
-    size = pilot_size(film, pixels)
+    size = _pilot_size(film, pixels)
     slots = _EVENTS_PER_PATH
     while True:
         spp = max(1, min(paths, _MAX_EVENTS // slots) // (size[0] * size[1]))

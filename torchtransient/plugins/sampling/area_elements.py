@@ -28,7 +28,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import host_numbers
-from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, mesh_faces, mesh_normals, mesh_positions
+from torchtransient.plugins.mitsuba_compat import has_normals, mesh_faces, mesh_normals, mesh_positions
+from torchtransient.plugins.mitsuba_shapes import has_surface
 from torchtransient.plugins.node_walk import shown_by
 from torchtransient.plugins.parameter_effect import class_of
 
@@ -160,6 +161,9 @@ def can_be_listed(shape: Any) -> bool:
 
     Not on copies of groups, curves, signed distances and ellipsoids, nor on sheared disks, spheres and cylinders, where
     Mitsuba's rays disagree with the matrix.
+
+    Args:
+        shape: one ``mi.Shape``.
     """
     if not has_surface(shape) or shape.is_ellipsoids():
         return False
@@ -209,7 +213,11 @@ def _corner_normals(mesh: Any, faces: np.ndarray) -> np.ndarray | None:
 
 
 def has_shading_normals(shape: Any) -> bool:
-    """Return True if the normals at the corners of some triangle are not those of one side of its plane."""
+    """Return True if the normals at the corners of some triangle are not those of one side of its plane.
+
+    Args:
+        shape: one ``mi.Shape``.
+    """
     if not shape.is_mesh():
         return False
     at_corners = _corner_normals(shape, np.array(mesh_faces(shape), dtype=np.int64).reshape(-1, 3))

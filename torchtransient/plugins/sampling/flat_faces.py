@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import PointerTable, floats, registry_number
-from torchtransient.plugins.mitsuba_compat import has_smooth_shape, lacks_directions
+from torchtransient.plugins.mitsuba_compat import lacks_directions
+from torchtransient.plugins.mitsuba_shapes import has_smooth_shape
 from torchtransient.plugins.sampling.area_elements import AreaElements
 from torchtransient.plugins.sampling.hidden_elements import packed
 

@@ -31,6 +31,9 @@ def packed(values: np.ndarray) -> Any:
 
     Dr.Jit lays its array over numpy's memory otherwise. Where that does not begin at a multiple of 16 bytes, which is
     chance, packets are loaded number by number, by a kernel of its own.
+
+    Args:
+        values: numbers of any shape.
     """
     source = mi.Float(np.ravel(values).astype(np.float32))
     target = dr.empty(mi.Float, dr.width(source))

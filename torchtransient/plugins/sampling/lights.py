@@ -7,7 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import bounds_of, sun_half_angle
+from torchtransient.plugins.mitsuba_compat import sun_half_angle
+from torchtransient.plugins.mitsuba_shapes import bounds_of
 
 # --------------------------------------------------------------- arrival time of light from infinitely distant emitters
 # Light of an environment map or a directional emitter has no point of departure. Here t = 0 when its wavefront touches
@@ -36,7 +37,11 @@ class DistantReference:
 
 
 def distant_reference(scene) -> DistantReference:
-    """Return the sphere around all shapes of a scene."""
+    """Return the sphere around all shapes of a scene, at which light from infinity starts.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     box = mi.ScalarBoundingBox3f()
     for shape in scene.shapes():
         box.expand(bounds_of(shape))
@@ -106,11 +111,15 @@ _LEAST_SHARE = 1e-3
 
 
 def least_probability(count: int) -> float:
-    """Return the probability of being chosen among ``count`` lights, below which a light counts as rarely drawn."""
+    """Return the probability of being chosen below which a light counts as rarely drawn.
+
+    Args:
+        count: number of lights.
+    """
     return _LEAST_SHARE / count
 
 
-def is_rare(scene: Any, light: Any) -> bool:
+def _is_rare(scene: Any, light: Any) -> bool:
     """Return True if a light of a scene is rarely drawn."""
     weights = {emitter.ptr: float(emitter.sampling_weight()) for emitter in scene.emitters()}
     return weights[light.ptr] < least_probability(len(weights)) * sum(weights.values())
@@ -135,11 +144,11 @@ class MovingSun:
 
     Attributes:
         direction: unit vector to the sun in world space, attached.
-        rare: the sky is rarely drawn (:func:`is_rare`), so that paths that escape into the sun take its derivative.
+        rare: the sky is rarely drawn (:func:`_is_rare`), so that paths that escape into the sun take its derivative.
     """
 
     def __init__(self, scene: Any, emitter: Any) -> None:
-        self.rare = is_rare(scene, emitter)
+        self.rare = _is_rare(scene, emitter)
         params = mi.traverse(emitter)
         to_world = mi.AffineTransform4f(params["to_world"])
         # Mitsuba keeps two angles, taken as those of a unit vector whatever its length: where the sun is seen follows

@@ -32,7 +32,11 @@ def scrambled(x: Any, seed: Any) -> Any:
 
 
 def hashed(x: Any) -> Any:
-    """Return a bijective hash of 32 bits (constants of Wellons' lowbias32)."""
+    """Return a bijective hash of 32 bits (constants of Wellons' lowbias32).
+
+    Args:
+        x: UInt32.
+    """
     x = mi.UInt32(x)
     x ^= x >> 16
     x *= mi.UInt32(0x7FEB352D)
@@ -45,6 +49,9 @@ def sobol_second(index: Any) -> Any:
     """Return the second coordinate of Sobol's points, a ``UInt32`` fraction; the first one is ``dr.brev(index)``.
 
     Its direction numbers are the rows of Pascal's triangle modulo 2, which five steps multiply with.
+
+    Args:
+        index: numbers of the points, UInt32.
     """
     x = dr.brev(mi.UInt32(index))
     for shift, mask in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
@@ -60,6 +67,12 @@ def second_pair(index: Any) -> Any:
     3, 2; of ``2^12`` to ``2^20`` points t is 4 to 6, of ``2^23`` 7, where Sobol's stays at 3 and its second pair is no
     net. The best of some million products of shifts: each
     step brings higher bits down, without which many points would fill the same few boxes again and again.
+
+    Args:
+        index: numbers of points, UInt32.
+
+    Returns:
+        Numbers of the points whose two coordinates are the third and the fourth one, UInt32.
     """
     x = mi.UInt32(index)
     for shift, mask in (
@@ -164,11 +177,19 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
 
 def unit_float(bits: Any) -> Any:
-    """Return a ``Float`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float`` in (0, 1) from a 32-bit fraction.
+
+    Args:
+        bits: UInt32.
+    """
     # With one more bit the largest would be rounded to one.
     return mi.Float(bits >> 9) * 2.0**-23 + 2.0**-24
 
 
 def unit_double(bits: Any) -> Any:
-    """Return a ``Float64`` in (0, 1) from a 32-bit fraction."""
+    """Return a ``Float64`` in (0, 1) from a 32-bit fraction.
+
+    Args:
+        bits: UInt32.
+    """
     return (mi.Float64(bits) + 0.5) * 2.0**-32

@@ -14,15 +14,22 @@ SHORTEST = 1e-6
 
 
 def past(p: Any) -> Any:
-    """Return the offset behind a hit ``p`` at which a ray goes on without meeting the same surface again, metres.
+    """Return the offset behind a hit at which a ray goes on without meeting the same surface again, metres.
 
     Mitsuba's own rays start as far off a surface.
+
+    Args:
+        p: place of the hit, Point3f, metres in the world.
     """
     return (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
 
 
 def shortest(o: Any) -> Any:
-    """Return the shortest distance from ``o`` to a point that has a direction seen from there, metres."""
+    """Return the shortest distance to a point that has a direction seen from there, metres.
+
+    Args:
+        o: place that it is seen from, Point3f, metres in the world.
+    """
     return (1 + dr.max(dr.abs(o))) * SHORTEST
 
 

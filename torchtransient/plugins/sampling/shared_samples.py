@@ -63,7 +63,12 @@ class ScanTiles:
 
 
 def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
-    """Return the distance of the vertex (V, 3) that is nearest to any of the points (P, 3), metres."""
+    """Return the distance of the vertex that is nearest to any of some points, metres.
+
+    Args:
+        vertices: (V, 3), metres.
+        points: (P, 3), metres.
+    """
     nearest = np.inf
     for p in points:
         nearest = min(nearest, float(((vertices - p) ** 2).sum(1).min()))
@@ -126,6 +131,7 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
     """Draw samples of the hidden geometry's density, for each tile of the table.
 
     Args:
+        elements: hidden surfaces and their density.
         count: number of samples of each tile.
         seed: UInt32 of width one, in memory, or a whole number.
 
@@ -142,7 +148,7 @@ def draw_samples(elements: HiddenElements, count: int, seed: Any) -> SharedSampl
             f"draw_samples: shared samples hold a colour, which variant {mi.variant()} has not; expected a mono or RGB "
             "variant without polarization. Use the general path integrator."
         )
-    others = not_diffuse([elements.shapes[s] for s in set(elements.elements.shape.astype(int))])
+    others = _not_diffuse([elements.shapes[s] for s in set(elements.elements.shape.astype(int))])
     if others:
         raise SceneError(
             "draw_samples: expected surfaces of 'diffuse', or of 'twosided' around it, got "
@@ -170,7 +176,9 @@ def samples_at(elements: HiddenElements, x: Any, y: Any, count: int, tile: Any =
     element, a = elements.select_element(x, tile=tile)
     p, n = elements.point(element, a, y)
     shape, primitive = elements.surface(element)
-    si = _interaction(elements, element, p, n, a, y)
+    # For the shading frame and texture coordinates.
+    pi, ray = _preliminary(elements, element, p, n, a, y)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
     weight = dr.rcp(elements.density_of(element, tile=tile) * dr.opaque(mi.Float, float(count)))
     smooth = elements.smooth
     if smooth:
@@ -206,16 +214,10 @@ def material_samples(elements: HiddenElements, samples: SharedSamples, meshes: A
     return Local(p=mi.Point3f(si.p), n=n, geometric_n=geometric_n, front=front, back=back)
 
 
-def not_diffuse(shapes: list[Any]) -> list[str]:
+def _not_diffuse(shapes: list[Any]) -> list[str]:
     """Return the names of the shapes, with their BSDFs, that scatter otherwise than a Lambertian surface."""
     others = [(shape, shape.bsdf()) for shape in shapes if not is_lambertian(shape.bsdf())]
     return list(dict.fromkeys(f"{shape.id() or shape.class_name()} ({bsdf.class_name()})" for shape, bsdf in others))
-
-
-def _interaction(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> Any:
-    """Return Mitsuba's interactions of the points: shading frame, texture coordinates."""
-    pi, ray = _preliminary(elements, element, p, n, a, y)
-    return pi.compute_surface_interaction(ray, mi.RayFlags.All)
 
 
 def _preliminary(elements: HiddenElements, element: Any, p: Any, n: Any, a: Any, y: Any) -> tuple[Any, Any]:

@@ -17,7 +17,8 @@ import numpy as np
 
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import is_sphere, samples_its_shape
+from torchtransient.plugins.mitsuba_compat import samples_its_shape
+from torchtransient.plugins.mitsuba_shapes import is_sphere
 from torchtransient.plugins.node_walk import objects_below, objects_of, shown_by
 from torchtransient.plugins.sampling.lights import least_probability
 

@@ -101,15 +101,14 @@ def views(sensor: Any, position: Any, reference: Any) -> list[View]:
 
 
 def sensors_of(sensor: Any) -> list[Any]:
-    """Return the children of a ``batch`` in their order on the film, or the sensor itself."""
+    """Return the children of a ``batch`` in their order on the film, or the sensor itself.
+
+    Args:
+        sensor: one ``mi.Sensor``.
+    """
     if not is_batch(sensor):
         return [sensor]
     return [child for _, child in objects_of(sensor) if isinstance(child, mi.Sensor)]
-
-
-def shapes_of_sensors(sensor: Any) -> list[Any]:
-    """Return the shape that each sensor sits on, None for those that stand alone."""
-    return [one.get_shape() for one in sensors_of(sensor)]
 
 
 def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, position: Any, aperture: Any) -> Any:
@@ -119,6 +118,7 @@ def sample_rays(sensor: Any, seen: list[View], time: Any, wavelength: Any, posit
     :func:`~torchtransient.plugins.mitsuba_compat.is_batch`.
 
     Args:
+        sensor: one ``mi.Sensor``.
         seen: result of :func:`views`.
         time, wavelength, position, aperture: numbers of ``sample_ray_differential``.
 
@@ -143,6 +143,7 @@ def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
     """Return the normal of an irradiance meter at the origins of its rays.
 
     Args:
+        sensor: one ``mi.Sensor``.
         ray: its rays.
         position: numbers that they were drawn with.
 
@@ -156,13 +157,17 @@ def meter_normal(sensor: Any, ray: Any, position: Any) -> Any:
 
 
 def length_to_sensor_origin(seen: list[View], ray: Any) -> Any:
-    """Return the distance in metres from the sensor's origin to ``ray.o``, 0 for rays of none of the sensors ``seen``.
+    """Return the distance from the sensor's origin to the starts of rays, metres; 0 for rays of other sensors.
 
     Mitsuba's projective cameras start their rays on the near clip plane; their light travels on to the pinhole
     (perspective), to the sampled point of the aperture (thin lens) or to the sensor plane (orthographic). Radiance and
     irradiance meters lift the start off themselves by a little. Light for a sensor at infinity arrives when its wave
     front leaves the sphere around the scene, as it starts there when it comes from infinity. Other sensors start rays
     where they are.
+
+    Args:
+        seen: views of the sensors.
+        ray: primary rays, Ray3f.
     """
     length = mi.Float(0)
     for view in seen:
@@ -174,6 +179,10 @@ def start_at_sensor(seen: list[View], ray: Any) -> tuple[Any, Any]:
     """Return rays that start at the origins of projective cameras.
 
     A medium around the camera attenuates and scatters light before the near clip plane, too.
+
+    Args:
+        seen: views of the sensors.
+        ray: primary rays, Ray3f.
 
     Returns:
         (rays, attached where they are; distance to the near clip plane, detached, 0 for rays of other sensors, None
@@ -196,6 +205,7 @@ def index_at_sensor(seen: list[View], surroundings: Any, scene: Any) -> Any:
     Args:
         seen: result of :func:`views`.
         surroundings: :class:`~.surroundings.Surroundings`, None for vacuum.
+        scene: Mitsuba scene.
     """
     if surroundings is None:
         return mi.Float(1)

@@ -23,28 +23,41 @@ FAR = 300
 
 
 def can_be_connected(sensor: Any) -> bool:
-    """Return True if rays of a sensor fill a solid angle or a beam in which a point of the scene is found again."""
+    """Return True if rays of a sensor fill a solid angle or a beam in which a point of the scene is found again.
+
+    Args:
+        sensor: one ``mi.Sensor``; of a batch all are asked.
+    """
     return all(is_irradiance_meter(one) or near_clip(one) is not None for one in sensors_of(sensor))
 
 
 def has_eye(sensor: Any) -> bool:
-    """Return True if rays of a sensor start at a point that their random numbers choose, wherever they go."""
+    """Return True if rays of a sensor start at a point that their random numbers choose, wherever they go.
+
+    Args:
+        sensor: one ``mi.Sensor``; of a batch all are asked.
+    """
     return all(near_clip(one) is not None and not _sees_in_parallel(one) for one in sensors_of(sensor))
 
 
 def sees_one_line(sensor: Any) -> bool:
-    """Return True if each sensor sees along one ray, which no edge meets but for moments."""
+    """Return True if each sensor sees along one ray, which no edge meets but for moments.
+
+    Args:
+        sensor: one ``mi.Sensor``; of a batch all are asked.
+    """
     return all(one.class_name() == "RadianceMeter" for one in sensors_of(sensor))
 
 
-def has_clip_planes(camera: Any) -> bool:
-    """Return True for projective cameras."""
-    return near_clip(camera) is not None
-
-
 def clip_planes_at(camera: Any, place: Any) -> tuple[Any, Any]:
-    """Return the points of both clip planes that a camera sees at places of the film in [0, 1]^2, through the middle of
-    its lens.
+    """Return the points of both clip planes that a camera sees, through the middle of its lens.
+
+    Args:
+        camera: projective camera, with :func:`~..mitsuba_compat.near_clip`.
+        place: place on the film, Point2f in [0, 1]^2.
+
+    Returns:
+        (near, far), Point3f in the world.
     """
     _, near, far = _axis_and_clips(camera)
     o, way = SensorPlaces._line(camera, (place.x, place.y), mi.Point2f(0.5))

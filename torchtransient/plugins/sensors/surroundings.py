@@ -22,7 +22,8 @@ import numpy as np
 from torchtransient.plugins.bsdfs.refraction_table import boundaries_of, index_of
 from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import has_surface, is_distant, is_instance
+from torchtransient.plugins.mitsuba_compat import is_distant
+from torchtransient.plugins.mitsuba_shapes import has_surface, is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
 

@@ -17,13 +17,25 @@ from torchtransient.plugins.parameter_effect import ParameterEffect, declare_eff
 def mesh_arrays(props: Any) -> Any:
     """Return a Mitsuba mesh of arrays.
 
-    ``vertices``: (V, 3), metres, before ``to_world``; ``faces``: (F, 3), whole numbers, wound against the clock as seen
-    from outside. ``normals``: (V, 3), directions at the vertices before ``to_world``; without them there is one normal
-    a triangle. ``texcoords``: (V, 2). ``vertex_velocity``: (V, 3), m/s in the world, for films that measure how fast
-    path lengths change. ``to_world``, ``face_normals``, ``flip_normals`` and children (BSDF, emitter, sensor, media) as
-    Mitsuba's meshes have them. Parameters are those of every mesh, ``vertex_positions`` in world space among them.
-    Raises SceneError for missing arrays, sizes that do not fit, numbers that are not finite and faces of vertices that
-    are not there. Not supported: other attributes of vertices and faces.
+    Properties, beside ``to_world``, ``face_normals``, ``flip_normals`` and children (BSDF, emitter, sensor, media) as
+    Mitsuba's meshes have them:
+
+    ``vertices``: (V, 3), metres, before ``to_world``.
+    ``faces``: (F, 3), whole numbers, wound against the clock as seen from outside.
+    ``normals``: (V, 3), directions at the vertices before ``to_world``; without them there is one normal a triangle.
+    ``texcoords``: (V, 2).
+    ``vertex_velocity``: (V, 3), m/s in the world, for films that measure how fast path lengths change.
+
+    Parameters are those of every mesh, ``vertex_positions`` in world space among them.
+
+    Args:
+        props: ``mi.Properties``.
+
+    Raises:
+        SceneError: for missing arrays, sizes that do not fit, numbers that are not finite and faces of vertices that
+            are not there.
+
+    Not supported: other attributes of vertices and faces.
     """
     vertices = _rows(props, "vertices")
     faces = _rows(props, "faces")

@@ -40,6 +40,7 @@ def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) ->
     """Return a Carry with new leaves of the AD graph.
 
     Args:
+        carry: values of all fields.
         names: fields that become leaves.
         tangents: Carry with their tangents in forward mode, None in reverse mode.
     """
@@ -54,17 +55,33 @@ def attach(carry: Carry, names: Sequence[str], tangents: Carry | None = None) ->
 
 
 def adjoint_of(carry: Carry, names: Sequence[str]) -> Carry:
-    """Return the gradients of the leaves ``names``, zeros for other fields."""
+    """Return the gradients of leaves of the graph as a Carry, zeros for other fields.
+
+    Args:
+        carry: Carry whose fields ``names`` are the leaves.
+        names: fields of :class:`Carry`.
+    """
     return with_fields(Carry.zeros(), names, [dr.grad(getattr(carry, name)) for name in names])
 
 
 def with_fields(carry: Carry, names: Sequence[str], values: Sequence[Any]) -> Carry:
-    """Return the Carry with the fields ``names`` replaced by ``values``."""
+    """Return a Carry with some fields replaced.
+
+    Args:
+        carry: the other fields.
+        names: fields of :class:`Carry`.
+        values: their values, in the order of ``names``.
+    """
     return replace(carry, **{n: type(getattr(carry, n))(v) for n, v in zip(names, values, strict=True)})
 
 
 def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
-    """Return ``<adjoint, carry>``, the sum over the fields ``names`` (Float)."""
+    """Return the inner product ``<adjoint, carry>``, Float.
+
+    Args:
+        adjoint, carry: the factors.
+        names: fields of :class:`Carry` that count.
+    """
     total = mi.Float(0)
     for name in names:
         total += total_of(getattr(adjoint, name), getattr(carry, name))
@@ -72,7 +89,11 @@ def inner(adjoint: Carry, carry: Carry, names: Sequence[str]) -> Any:
 
 
 def total_of(a: Any, b: Any) -> Any:
-    """Return the sum of ``a b`` over entries of numbers, vectors, spectra, Stokes vectors or Mueller matrices."""
+    """Return the sum of ``a b`` over entries, Float.
+
+    Args:
+        a, b: numbers, vectors, spectra, Stokes vectors or Mueller matrices, both of one kind.
+    """
     if mi.is_polarized and isinstance(b, mi.Spectrum):
         return dr.sum(sum(a[i, j] * b[i, j] for i in range(4) for j in range(4)))
     if mi.is_polarized and isinstance(b, mi.SpectrumEntry):
@@ -81,10 +102,20 @@ def total_of(a: Any, b: Any) -> Any:
 
 
 def choose(mask: Any, a: Carry, b: Carry, names: Sequence[str]) -> Carry:
-    """Return the fields ``names`` of ``a`` where ``mask``, and of ``b`` elsewhere; other fields are those of ``b``."""
+    """Return a Carry with fields of one or of another, lane by lane.
+
+    Args:
+        mask: lanes of ``a``.
+        a, b: the two.
+        names: fields that are chosen; other fields are those of ``b``.
+    """
     return replace(b, **{name: dr.select(mask, getattr(a, name), getattr(b, name)) for name in names})
 
 
 def slope_only(x: Any) -> Any:
-    """Return a number whose value is 0 and whose derivative is that of ``x``."""
+    """Return a number whose value is 0 and whose derivative is that of ``x``.
+
+    Args:
+        x: Float.
+    """
     return dr.replace_grad(mi.Float(0), x)

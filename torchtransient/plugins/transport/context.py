@@ -13,7 +13,7 @@ from torchtransient.errors import SceneError
 from torchtransient.plugins.mitsuba_compat import NORMALS, POSITIONS
 from torchtransient.plugins.parameter_effect import ParameterEffect
 from torchtransient.plugins.sampling.lights import LightBox
-from torchtransient.plugins.sensors.origin import sensors_of, shapes_of_sensors
+from torchtransient.plugins.sensors.origin import sensors_of
 from torchtransient.plugins.transport.boundary.moving_edges import moves_edges
 from torchtransient.plugins.transport.record import record_room
 from torchtransient.plugins.transport.surface_interactions import AttachedSurfaces
@@ -214,7 +214,7 @@ class Wanted:
             return [node for node, _, effect in effects if effect.role == role]
 
         sensors = {one.ptr for one in sensors_of(sensor)}
-        carriers = {shape.ptr for shape in shapes_of_sensors(sensor) if shape is not None}
+        carriers = {one.get_shape().ptr for one in sensors_of(sensor) if one.get_shape() is not None}
         self.nodes = frozenset(node.ptr for node, _, _ in effects)
         self.geometry = any(effect.moves_length and effect.role != "velocity" for _, _, effect in effects)
         self.rate = rates and any(effect.moves_length for _, _, effect in effects)

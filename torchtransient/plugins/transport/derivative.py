@@ -162,7 +162,11 @@ def _is_untouched(value):
 
 
 def tangents_of(values):
-    """Return the tangents of values, pushed through the AD graph; zeros for detached ones."""
+    """Return the tangents of values, pushed through the AD graph; zeros for detached ones.
+
+    Args:
+        values: Dr.Jit arrays, some of which may be inputs of others.
+    """
     attached = [v for v in values if dr.grad_enabled(v)]
     if not attached:
         return [dr.zeros(type(v)) for v in values]
@@ -294,7 +298,12 @@ def objective_of(context: Any, rays: Any, adjoint: Carry) -> Any:
 
 
 def tangent_of(context: Any, rays: Any) -> Carry:
-    """Return the tangent of the Carry of attached primary rays (:class:`~..sensors.origin.PrimaryRays`)."""
+    """Return the tangent of the Carry at the sensor.
+
+    Args:
+        context: :class:`~.context.RenderContext` of the job.
+        rays: attached primary rays, :class:`~..sensors.origin.PrimaryRays`.
+    """
     tangent = Carry.zeros()
     with dr.resume_grad():
         if not (context.wanted.sensor or dr.grad_enabled(rays.η)):

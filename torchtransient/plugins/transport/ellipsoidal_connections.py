@@ -49,7 +49,12 @@ _BEHIND = 1e-3
 
 
 def why_not(contents, film):
-    """Return why ellipsoidal connections cannot be made in a scene and what to do, None if they can."""
+    """Return why ellipsoidal connections cannot be made in a scene and what to do, None if they can.
+
+    Args:
+        contents: :class:`~.scene_contents.SceneContents` of the scene.
+        film: film of this library.
+    """
     if mi.is_polarized:
         return f"the variant {mi.variant()} is polarized; load the scene in one without"
     if film.arrivals() is None:
@@ -70,13 +75,18 @@ def why_not(contents, film):
 # Tables, kept as long as no shape moves. Derivatives, which are those of ordinary connections, have none.
 
 def flat_faces(scene, contents):
-    """Return the :class:`~..sampling.flat_faces.FlatFaces` that can be connected to lights."""
-    shapes = [shape for shape in scene.shapes() if scatters(shape)]
+    """Return the :class:`~..sampling.flat_faces.FlatFaces` that can be connected to lights.
+
+    Args:
+        scene: Mitsuba scene.
+        contents: its :class:`~.scene_contents.SceneContents`, which keeps them.
+    """
+    shapes = [shape for shape in scene.shapes() if _scatters(shape)]
     numbers = tuple(map(registry_number, shapes))
     return _as_they_stand(scene, contents).get("flat faces", numbers, lambda: FlatFaces(shapes))
 
 
-def light_faces(scene, contents):
+def _light_faces(scene, contents):
     """Return the :class:`~..sampling.flat_faces.LightFaces` of a scene."""
     weights = tuple(emitter.sampling_weight() for emitter in scene.emitters())
     return _as_they_stand(scene, contents).get("light faces", weights, lambda: LightFaces(scene, emits_by_place))
@@ -100,7 +110,7 @@ class WindowedEmitterSampled(EmitterSampled):
 
     def prepare(self, context):
         super().prepare(context)
-        self.faces = light_faces(context.scene, context.contents)
+        self.faces = _light_faces(context.scene, context.contents)
         if not self.faces.count:
             raise SceneError(
                 "connections='ellipsoidal': expected an area light on a mesh or rectangle without texture, found none. "
@@ -122,7 +132,7 @@ class WindowedEmitterSampled(EmitterSampled):
             u = sampler.next_2d()
         ends = (mi.Float(mi.Float64(end) - vertex.scattered_τ) / vertex.η for end in (window.first, window.last))
         e = self.faces.sample_between(mi.Point3f(vertex.at.p), *ends, u, active & listed)
-        ds = towards(vertex.at, e)
+        ds = _towards(vertex.at, e)
         cos = dr.abs_dot(e.n, ds.d)
         lit = active & listed & (e.pdf > 0) & (cos > 0)
         # The density by which the weights beside light that is run into go.
@@ -141,7 +151,7 @@ class WindowedEmitterSampled(EmitterSampled):
         return event
 
 
-def towards(ref, e):
+def _towards(ref, e):
     """Return the DirectionSample3f of a :class:`~..sampling.flat_faces.LightPoint`, seen from an interaction."""
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.n, ds.time, ds.emitter = e.p, e.n, ref.time, e.emitter
@@ -205,7 +215,7 @@ class Ellipsoidal(Connection):
             e: point of the light.
             value, pdf: scattering towards it, and its density.
         """
-        ds = towards(at, e)
+        ds = _towards(at, e)
         density = self.lights.density(context, at, ds, active)
         weight = self.lights.weight(context, at, ds, density, pdf, active)
         Le = mi.unpolarized_spectrum(e.emitter.eval_direction(at, ds, active))
@@ -316,7 +326,7 @@ class EllipsoidalSurface(Ellipsoidal):
         active &= e.pdf > 0
         n = dr.mulsign(mi.Normal3f(vertex.si.n), -dr.dot(vertex.si.n, path.ray.d))
         n_x = dr.select(vertex.surface, n, 0)
-        face, w, n, along, chance = choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
+        face, w, n, along, chance = _choose(self, x, n_x, e, s, u.y, sampler.next_1d(), mi.Mask(active))
         active &= chance > 0
         d = dr.select(active, vertex.at.spawn_ray_to(w).d, mi.Vector3f(0, 0, 1))
         ds = Local(p=w, emitter=None)
@@ -359,14 +369,16 @@ class EllipsoidalSurface(Ellipsoidal):
 
 
 @dr.syntax
-def choose(connection, x, n_x, e, s, u_angle, u, active):
+def _choose(connection, x, n_x, e, s, u_angle, u, active):
     """Choose a point of the faces where the sum of the distances to the foci is ``s``.
 
     Args:
         connection: :class:`EllipsoidalSurface`.
         x, n_x: first focus and its normal on the side of the sensor, zero in a medium.
         e: second focus, :class:`~..sampling.flat_faces.LightPoint`.
+        s: sum of the distances, metres.
         u_angle, u: uniform numbers for the angles and the choice.
+        active: mask of lanes.
 
     Returns:
         (number of a face; point of it; its normal; derivative by the angle; weight of the point over the mean that all
@@ -378,7 +390,7 @@ def choose(connection, x, n_x, e, s, u_angle, u, active):
     i, going = mi.UInt32(0), active & (connection.faces.count > 0)
     while dr.hint(going, label="faces"):
         face = connection.faces.face(i)
-        w, n, along, best, total, u, taken = among(
+        w, n, along, best, total, u, taken = _among(
             face, connection, x, n_x, e, s, angles, w, n, along, best, total, u
         )
         found = dr.select(taken, i, found)
@@ -387,7 +399,7 @@ def choose(connection, x, n_x, e, s, u_angle, u, active):
     return found, w, n, along, dr.select(total > 0, best * ANGLES / total, 0)
 
 
-def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
+def _among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
     """Return the choice among the points of one more face, by weights (a reservoir of one)."""
     section = Section(x, e.p, s, face.n, face.o)
     h, h_e = dr.dot(face.n, face.o - x), dr.dot(face.n, face.o - e.p)
@@ -396,7 +408,7 @@ def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
         point, derivative = section.point(sin, cos)
         a, b = dr.dot(point - face.o, face.U), dr.dot(point - face.o, face.V)
         inside = meets & (a > 0) & (b > 0) & (a < 1) & (b < 1) & (a + b < face.most)
-        weight = unoccluded(connection.width, x, n_x, e, s, point, derivative, h, h_e)
+        weight = _unoccluded(connection.width, x, n_x, e, s, point, derivative, h, h_e)
         weight = dr.select(inside & dr.isfinite(weight), weight, 0)
         total = total + weight
         share = dr.select(weight > 0, weight / total, 0)
@@ -408,7 +420,7 @@ def among(face, connection, x, n_x, e, s, angles, w, n, along, best, total, u):
     return w, n, along, best, total, u, is_here
 
 
-def unoccluded(width, x, n_x, e, s, w, along, h, h_e):
+def _unoccluded(width, x, n_x, e, s, w, along, h, h_e):
     """Return the share of light by a point that ellipsoidal connections take, over its density.
 
     Of Lambertian surfaces without colour and with nothing in the way.
@@ -420,21 +432,21 @@ def unoccluded(width, x, n_x, e, s, w, along, h, h_e):
     inv_r = dr.rsqrt(dr.squared_norm(w - x))
     inv_r_e = dr.rcp(s - dr.rcp(inv_r))
     ω, to_w = (w - x) * inv_r, (w - e.p) * inv_r_e
-    cos_x = dr.select(dr.all(n_x == 0), 0.25, facing(dr.dot(n_x, ω)))
+    cos_x = dr.select(dr.all(n_x == 0), 0.25, _facing(dr.dot(n_x, ω)))
     cos_w, cos_w_e = dr.abs(h) * inv_r, dr.abs(h_e) * inv_r_e
     gradient2 = dr.squared_norm(ω + to_w) - dr.square(h * inv_r + h_e * inv_r_e)
     p = dr.sqrt(dr.maximum(gradient2, 0) / dr.squared_norm(along)) * (dr.inv_two_pi / width)
     a = cos_x * dr.inv_pi * cos_w * dr.square(inv_r)
-    light = cos_x * cos_w * cos_w_e * facing(dr.dot(e.n, to_w)) * dr.square(inv_r * inv_r_e)
+    light = cos_x * cos_w * cos_w_e * _facing(dr.dot(e.n, to_w)) * dr.square(inv_r * inv_r_e)
     return light * p / (dr.square(a) + dr.square(p))
 
 
-def scatters(shape):
+def _scatters(shape):
     """Return True for shapes that can be connected to lights."""
     return shape.bsdf() is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Smooth)
 
 
-def facing(cos):
+def _facing(cos):
     """Return a cosine, and little of it on the other side."""
     return dr.select(cos > 0, cos, -_BEHIND * cos)
 
@@ -459,7 +471,7 @@ class EllipsoidalMedium(Ellipsoidal):
 
     def share_of_paths(self, context, path, vertex, ds):
         """Return the share that paths keep of a connection at ``vertex`` to the point ``ds`` of a listed light."""
-        a = collision_density(vertex.mei, vertex.scatter) * self.preference(vertex.at.p, ds.p)
+        a = _collision_density(vertex.mei, vertex.scatter) * self.preference(vertex.at.p, ds.p)
         p = self.density_between(path.ray.d, vertex.at.p, ds.p, path.η)
         drawn = vertex.scatter & self.draws_on(context, path)
         return dr.select(drawn, dr.square(a) / (dr.square(a) + dr.square(p)), 1)
@@ -500,12 +512,12 @@ class EllipsoidalMedium(Ellipsoidal):
         active, T_e = self.cleared(context, to, dr.norm(e.p - w), medium, [u.x, u.y], sampler, active)
         value = self.last_segment(context, mei, e, value, pdf, active)
         # ------------------------------------------------------------------------- weight
-        a, p = collision_density(mei, active) * self.preference(w, e.p), self.density_between(ω, w, e.p, path.η)
+        a, p = _collision_density(mei, active) * self.preference(w, e.p), self.density_between(ω, w, e.p, path.η)
         factor = p / (dr.square(a) + dr.square(p))
         value = mi.unpolarized_spectrum(path.β) * (value * T * T_e) * dr.select(active, factor, 0)
         return Event(value=value, opl=proposal.opl, active=active, depth=path.depth + 2, crowded=True)
 
 
-def collision_density(mei, active):
+def _collision_density(mei, active):
     """Return the density of collisions that weights go by: that of the majorant, without what was attenuated before."""
     return dr.mean(mi.unpolarized_spectrum(mei.medium.get_majorant(mei, active)))

@@ -378,8 +378,10 @@ def set_rate(vertex, term, end, d, η, wanted):
 
     Args:
         vertex: attached vertex.
+        term: :class:`~.strategy.EventTerm`, which is changed.
         end: attached velocity of that point.
         d, η: attached direction and index of the segment.
+        wanted: :class:`~.context.Wanted` derivatives.
     """
     rate = dr.select(term.active, η * dr.dot(end - vertex.velocity, d), 0)
     term.rate = vertex.v.rate + dr.detach(rate)
@@ -388,5 +390,9 @@ def set_rate(vertex, term, end, d, η, wanted):
 
 
 def is_light(value):
-    """Return a mask of spectra that are not zero."""
+    """Return a mask of spectra that are not zero.
+
+    Args:
+        value: unpolarized spectrum.
+    """
     return dr.max(dr.abs(value)) > 0

@@ -25,17 +25,20 @@ WALK, SHADOW = 0x9E3779B9, 0x85EBCA6B
 class FreeFlight:
     """End of a free flight; a plain object that only lives within one iteration.
 
-    ``scatter``: in a medium, at distance ``t`` from the ray's origin. Otherwise at the surface ``pi``, or nowhere if
-    that is not valid. ``pi`` is the next surface in both cases, counted from the ray's origin. ``medium`` is the one
-    that the walk ended in. ``weight``: transmittance over the probability density of what was sampled, without the
-    scattering coefficient. ``entry``: the last boundary that was passed, if ``media.keeps_entry``.
+    Args:
+        pi: the next surface, counted from the ray's origin.
+        scatter: mask of flights that end in a medium; others end at ``pi``, or nowhere if that is not valid.
+        t: distance of the end from the ray's origin, metres.
+        medium: MediumPtr that the walk ended in.
+        weight: transmittance over the probability density of what was sampled, without the scattering coefficient.
+        entry: the last boundary that was passed, if ``media.keeps_entry``.
     """
 
     def __init__(self, pi, scatter, t, medium, weight, entry):
         self.pi, self.scatter, self.t, self.medium, self.weight, self.entry = pi, scatter, t, medium, weight, entry
 
 
-def generator(numbers, lanes, stream):
+def _generator(numbers, lanes, stream):
     """Random numbers of one straight line, a function of the sampler's ``numbers`` and of the lane."""
     bits = mi.UInt32(stream)
     for number in numbers:
@@ -52,7 +55,13 @@ def generator(numbers, lanes, stream):
 
 
 def medium_interaction(ray, medium, t):
-    """Return the point at distance ``t`` on ``ray`` inside ``medium``."""
+    """Return the point on a ray inside a medium, a MediumInteraction3f.
+
+    Args:
+        ray: Ray3f.
+        medium: MediumPtr.
+        t: distance along the ray, metres.
+    """
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray(t)
@@ -64,13 +73,13 @@ def medium_interaction(ray, medium, t):
     return mei
 
 
-def channel_probabilities(carried):
+def _channel_probabilities(carried):
     """Probability of each channel, in proportion to the light it carries."""
     total = dr.sum(carried)
     return dr.select(total > 0, carried / total, 1 / len(carried))
 
 
-def value_of_channel(spectrum, probabilities, u):
+def _value_of_channel(spectrum, probabilities, u):
     """Return the entry of a channel drawn by ``u``."""
     value, below = spectrum[0], probabilities[0]
     for c in range(1, len(spectrum)):
@@ -79,12 +88,12 @@ def value_of_channel(spectrum, probabilities, u):
     return value
 
 
-def attenuation(rate, stretch):
+def _attenuation(rate, stretch):
     """``exp(-rate stretch)`` per channel, 1 where the rate is zero, however long the stretch is."""
     return dr.exp(-dr.select(rate > 0, rate * stretch, 0))
 
 
-def stretch_inside(media, medium, ray, t, t_end, inside):
+def _stretch_inside(media, medium, ray, t, t_end, inside):
     """(begin, end) of the part of ``[t, t_end]`` where the medium can have density."""
     if not media.heterogeneous:
         return t, t_end
@@ -94,7 +103,7 @@ def stretch_inside(media, medium, ray, t, t_end, inside):
     return begin, dr.maximum(begin, end)
 
 
-def tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
+def _tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
     """One tentative flight from distance ``t`` on ``ray`` towards ``t_end``.
 
     Returns (collides, is the collision real, distance of the collision, factor on the weight).
@@ -103,9 +112,9 @@ def tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
     if media.rate_floor is not None:
         rate = dr.maximum(rate, media.rate_floor)
     many = len(rate) > 1
-    p = channel_probabilities(carried)
-    one = value_of_channel(rate, p, rng.next_float32()) if many else rate[0]
-    begin, end = stretch_inside(media, medium, ray, t, t_end, inside)
+    p = _channel_probabilities(carried)
+    one = _value_of_channel(rate, p, rng.next_float32()) if many else rate[0]
+    begin, end = _stretch_inside(media, medium, ray, t, t_end, inside)
     flight = dr.select(one > 0, -dr.log(1 - u) / one, dr.inf)
     t_new = begin + flight
     collides = inside & (t_new < end)
@@ -119,9 +128,9 @@ def tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
         σ_t = rate
         if media.rate_floor is not None:
             σ_t = medium.get_majorant(mei, inside & analytic)
-        density = attenuation(rate, stretch)
+        density = _attenuation(rate, stretch)
         density = dr.sum(p * dr.select(collides, rate * density, density))
-        factor = dr.select(density > 0, attenuation(σ_t, stretch) / density, 0)
+        factor = dr.select(density > 0, _attenuation(σ_t, stretch) / density, 0)
     if media.heterogeneous:
         σ_t = medium.get_scattering_coefficients(mei, collides & ~analytic)[2]
         # Forced collisions where there is little density, about one in four walks through the scene in total.
@@ -138,17 +147,17 @@ def tentative_flight(media, medium, ray, t, t_end, carried, u, rng, inside):
     return collides, real, t_new, mi.UnpolarizedSpectrum(dr.select(inside, factor, 1))
 
 
-def cross_boundary(scene, ray, pi, medium, passes):
+def _cross_boundary(scene, ray, pi, medium, passes):
     """Behind the open boundary at ``pi``: (next surface counted from ``ray.o``, medium)."""
     si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, passes)
     changes = passes & si.is_medium_transition()
     medium = dr.select(changes, si.target_medium(ray.d), medium)
     # The search goes on along the line itself: an origin lifted off along the normal would land beside it.
-    found = surface_beyond(scene, ray, pi.t + past(si.p), passes)
+    found = _surface_beyond(scene, ray, pi.t + past(si.p), passes)
     return dr.select(passes, found, pi), medium
 
 
-def surface_beyond(scene, ray, start, active, coherent=False):
+def _surface_beyond(scene, ray, start, active, coherent=False):
     """Return the first hit along ``ray`` at a distance of ``start`` (None for 0) or more, counted from ``ray.o``."""
     if start is None:
         return scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
@@ -162,17 +171,24 @@ def surface_beyond(scene, ray, start, active, coherent=False):
 
 @dr.syntax
 def closed_surface(scene, media, ray, active):
-    """Return the next surface along ``ray`` that is not an open boundary."""
+    """Return the next surface along a ray that is not an open boundary, a PreliminaryIntersection3f.
+
+    Args:
+        scene: Mitsuba scene.
+        media: :class:`.scene_contents.FlightSettings`, None without media.
+        ray: Ray3f.
+        active: mask of lanes.
+    """
     pi = scene.ray_intersect_preliminary(ray, active=active)
     if dr.hint(media is not None and media.open_boundaries, mode="scalar"):
-        passes = active & lets_through(media, ray, pi, False)
+        passes = active & _lets_through(media, ray, pi, False)
         while dr.hint(passes, label="open boundaries"):
-            pi, _ = cross_boundary(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
-            passes &= lets_through(media, ray, pi, False)
+            pi, _ = _cross_boundary(scene, ray, pi, dr.zeros(mi.MediumPtr), passes)
+            passes &= _lets_through(media, ray, pi, False)
     return pi
 
 
-def lets_through(media, ray, pi, hide):
+def _lets_through(media, ray, pi, hide):
     """Return a mask of open boundaries at ``pi``; with ``hide`` emitting surfaces count as such."""
     shape = pi.shape
     if media.shapes_in_groups:  # of an instance, only the interaction knows which shape of the group was met
@@ -185,14 +201,26 @@ def lets_through(media, ray, pi, hide):
 
 @dr.syntax
 def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, first=False, clip=None):
-    """Walk from ``ray.o`` in ``medium`` to the next event; returns a :class:`FreeFlight`.
+    """Walk from the start of a ray through media to the next event.
 
-    ``carried``: light per channel at the start, which only steers the choice of channels. ``u``: a number of the
-    sampler, which chooses the first flight and starts the generator of the others; the same arguments give the same
-    walk. ``first``: the ray comes from the sensor. ``hide`` in ``media`` makes it pass light sources then, and
-    surfaces nearer than ``clip`` are not there.
+    The same arguments give the same walk.
+
+    Args:
+        scene: Mitsuba scene.
+        media: :class:`.scene_contents.FlightSettings`.
+        ray: Ray3f.
+        medium: MediumPtr at its start.
+        carried: light per channel at the start, which only steers the choice of channels.
+        u: uniform number of the sampler, which chooses the first flight and starts the generator of the others.
+        lanes: number of each lane, UInt32.
+        active: mask of lanes.
+        first: the ray comes from the sensor: it passes light sources if ``media.hide_emitters``.
+        clip: distance of the near clip plane, metres: nearer surfaces are not there. None without.
+
+    Returns:
+        :class:`FreeFlight`.
     """
-    rng = generator([u], lanes, WALK)
+    rng = _generator([u], lanes, WALK)
     u = mi.Float(u)
     t = mi.Float(0)
     medium = mi.MediumPtr(medium)
@@ -201,23 +229,23 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
     hide = first and media.hide_emitters
     entry = dr.zeros(mi.PreliminaryIntersection3f, dr.width(lanes))
     entry.t = dr.full(mi.Float, dr.inf, dr.width(lanes))
-    pi = surface_beyond(scene, ray, clip, active, coherent=first)
+    pi = _surface_beyond(scene, ray, clip, active, coherent=first)
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         inside = active & (medium != None)  # noqa: E711 (a Dr.Jit comparison)
-        scatter, _, t, weight = tentative_flight(media, medium, ray, t, pi.t, carried, u, rng, inside)
+        scatter, _, t, weight = _tentative_flight(media, medium, ray, t, pi.t, carried, u, rng, inside)
     else:
         going = mi.Bool(active)
         while dr.hint(going, label="walk through media"):
             inside = going & (medium != None)  # noqa: E711
             so_far = carried * weight
-            collides, real, t_new, factor = tentative_flight(media, medium, ray, t, pi.t, so_far, u, rng, inside)
+            collides, real, t_new, factor = _tentative_flight(media, medium, ray, t, pi.t, so_far, u, rng, inside)
             weight *= factor
             scatter = collides & real
-            passes = going & ~collides & lets_through(media, ray, pi, hide)
+            passes = going & ~collides & _lets_through(media, ray, pi, hide)
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
             if dr.hint(media.keeps_entry, mode="scalar"):
                 entry = dr.select(passes, pi, entry)
-            pi, medium = cross_boundary(scene, ray, pi, medium, passes)
+            pi, medium = _cross_boundary(scene, ray, pi, medium, passes)
             going = (collides & ~real) | passes
             # A stretch of empty space leaves the number of the sampler, which is spread evenly, to the first medium.
             u = dr.select(inside, rng.next_float32(), u)
@@ -226,32 +254,50 @@ def sample_free_flight(scene, media, ray, medium, carried, u, lanes, active, fir
 
 @dr.syntax
 def medium_along(scene, ray, medium, active):
-    """Return the medium at the end of ``ray``, which starts in ``medium``, whatever is in between."""
+    """Return the medium at the end of a ray, whatever is in between.
+
+    Args:
+        scene: Mitsuba scene.
+        ray: Ray3f with an end.
+        medium: MediumPtr at its start.
+        active: mask of lanes.
+    """
     medium = mi.MediumPtr(medium)
     pi = scene.ray_intersect_preliminary(ray, active=active)
     going = active & pi.is_valid()
     while dr.hint(going, label="through boundaries"):
-        pi, medium = cross_boundary(scene, ray, pi, medium, going)
+        pi, medium = _cross_boundary(scene, ray, pi, medium, going)
         going &= pi.is_valid()
     return medium
 
 
 @dr.syntax
 def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hide=False):
-    """Transmittance over ``length`` along ``ray``, which starts in ``medium``; with ``hide`` light sources are passed,
-    as rays from the sensor pass them.
+    """Return the transmittance along a ray, and whether it is free.
 
-    Returns (per channel, whether nothing is in the way before ``ray.maxt``). Open boundaries count up to the end.
-    Analytic in homogeneous media; ratio tracking (Novak et al. 2014) in others, with random numbers that follow from
-    ``numbers`` of the sampler and the lane.
+    Analytic in homogeneous media; ratio tracking (Novak et al. 2014) in others.
+
+    Args:
+        scene: Mitsuba scene.
+        media: :class:`.scene_contents.FlightSettings`.
+        ray: Ray3f; what lies before its ``maxt`` is in the way.
+        length: length that counts, metres. Open boundaries count up to the end.
+        medium: MediumPtr at its start.
+        numbers: uniform numbers of the sampler, from which those of ratio tracking follow.
+        lanes: number of each lane, UInt32, likewise.
+        active: mask of lanes.
+        hide: light sources are passed, as rays from the sensor pass them.
+
+    Returns:
+        (transmittance per channel, mask of rays that nothing is in the way of).
     """
     if dr.hint(media.one_stretch and not hide, mode="scalar"):
         visible = active & ~scene.ray_test(ray, active)
         inside = visible & (medium != None)  # noqa: E711
         σ_t = medium.get_majorant(medium_interaction(ray, medium, mi.Float(0)), inside)
-        T = mi.UnpolarizedSpectrum(attenuation(dr.select(inside, σ_t, 0), length))
+        T = mi.UnpolarizedSpectrum(_attenuation(dr.select(inside, σ_t, 0), length))
     else:
-        rng = generator(numbers, lanes, SHADOW)
+        rng = _generator(numbers, lanes, SHADOW)
         medium = mi.MediumPtr(medium)
         T = mi.UnpolarizedSpectrum(1)
         visible = mi.Bool(active)
@@ -265,18 +311,18 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hid
         while dr.hint(going, label="transmittance through media"):
             inside = going & (medium != None)  # noqa: E711
             t_end = dr.minimum(pi.t, last)
-            collides, t_new, factor = ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
+            collides, t_new, factor = _ratio_tracking_step(media, medium, ray, t, t_end, rng, inside)
             T *= factor
-            blocked = pi.is_valid() & ~lets_through(media, ray, pi, hide)
+            blocked = pi.is_valid() & ~_lets_through(media, ray, pi, hide)
             passes = going & ~collides & pi.is_valid() & ~blocked
             visible &= ~(going & ~collides & blocked & (pi.t < until))
             t = dr.select(collides, t_new, dr.select(passes, pi.t, t))
-            pi, medium = cross_boundary(scene, ray, pi, medium, passes)
+            pi, medium = _cross_boundary(scene, ray, pi, medium, passes)
             going = (collides | passes) & (dr.max(T) > 0)
     return T, visible
 
 
-def ratio_tracking_step(media, medium, ray, t, t_end, rng, inside):
+def _ratio_tracking_step(media, medium, ray, t, t_end, rng, inside):
     """One step of ratio tracking, or the whole stretch where the medium is homogeneous.
 
     Returns (a collision came before the end, its distance, factor on the transmittance).
@@ -286,14 +332,14 @@ def ratio_tracking_step(media, medium, ray, t, t_end, rng, inside):
     analytic = mi.Bool(True)
     if media.heterogeneous:
         analytic = medium.is_homogeneous()
-        begin, end = stretch_inside(media, medium, ray, t, t_end, inside)
+        begin, end = _stretch_inside(media, medium, ray, t, t_end, inside)
         rate = majorant[0]
         t_new = begin + dr.select(rate > 0, -dr.log(1 - rng.next_float32()) / rate, dr.inf)
         collides = inside & ~analytic & (t_new < end)
         σ_t = medium.get_scattering_coefficients(medium_interaction(ray, medium, t_new), collides)[2]
         factor = dr.select(collides, dr.maximum(1 - σ_t / rate, 0), 1)
     if media.homogeneous:
-        factor = dr.select(inside & analytic, attenuation(majorant, t_end - t), factor)
+        factor = dr.select(inside & analytic, _attenuation(majorant, t_end - t), factor)
     return collides, t_new, mi.UnpolarizedSpectrum(factor)
 
 
@@ -340,7 +386,7 @@ class Stretch:
         self.entry, self.t, self.pi, self.medium, self.u = entry, t, pi, medium, u
 
 
-def optical_depth(media, leg, part, x0, x1, active):
+def _optical_depth(media, leg, part, x0, x1, active):
     """Attached estimate of the optical depth of one stretch of a leg whose ends are ``x0, x1``."""
     inside = active & (part.medium != None)  # noqa: E711 (a Dr.Jit comparison)
     ray, ends = mi.Ray3f(leg.ray), part.pi.is_valid()
@@ -364,50 +410,50 @@ def optical_depth(media, leg, part, x0, x1, active):
     return part.medium.get_scattering_coefficients(mei, bounded)[2] * length
 
 
-def first_stretch(scene, media, leg, active):
+def _first_stretch(scene, media, leg, active):
     """(random numbers, next surface, its predecessor) at the start of a leg."""
-    rng = generator(leg.numbers, leg.lanes, leg.stream)
+    rng = _generator(leg.numbers, leg.lanes, leg.stream)
     nothing = dr.zeros(mi.PreliminaryIntersection3f, dr.width(leg.lanes))
     nothing.t = dr.full(mi.Float, dr.inf, dr.width(leg.lanes))
     if not media.open_boundaries:
         return rng, nothing, nothing
-    return rng, surface_beyond(scene, leg.ray, leg.clip, active), nothing
+    return rng, _surface_beyond(scene, leg.ray, leg.clip, active), nothing
 
 
 @dr.syntax
-def leg_backward(scene, media, leg, g, active):
+def _leg_backward(scene, media, leg, g, active):
     """Reverse mode: propagate ``sum(g dlog T)`` to the medium's parameters and shapes; returns the adjoints of the
     leg's ends. ``g``: adjoint of the logarithm of the transmittance, per channel.
     """
     a0, a1 = mi.Vector3f(0), mi.Vector3f(0)
     if dr.hint(not media.extinction_changes, mode="scalar"):
         return a0, a1
-    rng, pi, entry = first_stretch(scene, media, leg, active)
+    rng, pi, entry = _first_stretch(scene, media, leg, active)
     if dr.hint(not media.open_boundaries, mode="scalar"):
         part = Stretch(entry, mi.Float(0), pi, leg.medium, rng.next_float32())
-        a0, a1 = stretch_backward(media, leg, part, g, active)
+        a0, a1 = _stretch_backward(media, leg, part, g, active)
     else:
         t = mi.Float(0)
         medium = mi.MediumPtr(leg.medium)
         going = mi.Bool(active)
         while dr.hint(going, label="derivative of a leg"):
-            d0, d1 = stretch_backward(media, leg, Stretch(entry, t, pi, medium, rng.next_float32()), g, going)
+            d0, d1 = _stretch_backward(media, leg, Stretch(entry, t, pi, medium, rng.next_float32()), g, going)
             a0 += d0
             a1 += d1
             going &= pi.is_valid()
             t = dr.select(going, pi.t, t)
             entry = dr.select(going, pi, entry)
-            pi, medium = cross_boundary(scene, leg.ray, pi, medium, going)
+            pi, medium = _cross_boundary(scene, leg.ray, pi, medium, going)
     return a0, a1
 
 
-def stretch_backward(media, leg, part, g, active):
-    """One step of :func:`leg_backward`."""
+def _stretch_backward(media, leg, part, g, active):
+    """One step of :func:`_leg_backward`."""
     with dr.resume_grad():
         x0, x1 = mi.Point3f(leg.x0), mi.Point3f(leg.x1)
         if media.geometry:
             dr.enable_grad(x0, x1)
-        depth = optical_depth(media, leg, part, x0, x1, active)
+        depth = _optical_depth(media, leg, part, x0, x1, active)
         if dr.grad_enabled(depth):
             dr.backward_from(dr.select(active, -dr.dot(g, depth), 0))
         if not media.geometry:
@@ -416,38 +462,38 @@ def stretch_backward(media, leg, part, g, active):
 
 
 @dr.syntax
-def leg_forward(scene, media, leg, t0, t1, active):
+def _leg_forward(scene, media, leg, t0, t1, active):
     """Forward mode: the derivative of the logarithm of the transmittance, where the leg's ends move by ``t0, t1``."""
     d_log = mi.UnpolarizedSpectrum(0)
     if dr.hint(not media.extinction_changes, mode="scalar"):
         return d_log
-    rng, pi, entry = first_stretch(scene, media, leg, active)
+    rng, pi, entry = _first_stretch(scene, media, leg, active)
     if dr.hint(not media.open_boundaries, mode="scalar"):
         part = Stretch(entry, mi.Float(0), pi, leg.medium, rng.next_float32())
-        d_log = stretch_forward(media, leg, part, t0, t1, active)
+        d_log = _stretch_forward(media, leg, part, t0, t1, active)
     else:
         t = mi.Float(0)
         medium = mi.MediumPtr(leg.medium)
         going = mi.Bool(active)
         while dr.hint(going, label="derivative of a leg"):
             part = Stretch(entry, t, pi, medium, rng.next_float32())
-            d_log += stretch_forward(media, leg, part, t0, t1, going)
+            d_log += _stretch_forward(media, leg, part, t0, t1, going)
             going &= pi.is_valid()
             t = dr.select(going, pi.t, t)
             entry = dr.select(going, pi, entry)
-            pi, medium = cross_boundary(scene, leg.ray, pi, medium, going)
+            pi, medium = _cross_boundary(scene, leg.ray, pi, medium, going)
     return d_log
 
 
-def stretch_forward(media, leg, part, t0, t1, active):
-    """One step of :func:`leg_forward`. Attached values die on return."""
+def _stretch_forward(media, leg, part, t0, t1, active):
+    """One step of :func:`_leg_forward`. Attached values die on return."""
     with dr.resume_grad():
         x0, x1 = mi.Point3f(leg.x0), mi.Point3f(leg.x1)
         if media.geometry:
             dr.enable_grad(x0, x1)
             dr.set_grad(x0, t0)
             dr.set_grad(x1, t1)
-        depth = optical_depth(media, leg, part, x0, x1, active)
+        depth = _optical_depth(media, leg, part, x0, x1, active)
         if not dr.grad_enabled(depth):
             return mi.UnpolarizedSpectrum(0)
         slope = dr.forward_to(depth, flags=dr.ADFlag.ClearEdges)
@@ -468,14 +514,14 @@ class LogTransmittance(dr.CustomOp):
     def backward(self):
         g = self.grad_out()
         with dr.suspend_grad():  # the loops attach what they need by themselves
-            a0, a1 = leg_backward(self.scene, self.media, self.leg, g, mi.Bool(self.active))
+            a0, a1 = _leg_backward(self.scene, self.media, self.leg, g, mi.Bool(self.active))
         self.set_grad_in("x0", mi.Point3f(a0))
         self.set_grad_in("x1", mi.Point3f(a1))
 
     def forward(self):
         t0, t1 = mi.Vector3f(self.grad_in("x0")), mi.Vector3f(self.grad_in("x1"))
         with dr.suspend_grad():
-            t = leg_forward(self.scene, self.media, self.leg, t0, t1, mi.Bool(self.active))
+            t = _leg_forward(self.scene, self.media, self.leg, t0, t1, mi.Bool(self.active))
         self.set_grad_out(mi.UnpolarizedSpectrum(t))
 
     def name(self):
@@ -486,10 +532,12 @@ def with_log_slope(scene, media, leg, x0, x1, hook, active):
     """Return one, with the derivative of the logarithm of a leg's transmittance.
 
     Args:
+        scene: Mitsuba scene.
         media: :class:`.scene_contents.FlightSettings`.
         leg: detached :class:`Leg`.
         x0, x1: its attached ends.
         hook: attached value that keeps the operation in the AD graph.
+        active: mask of lanes.
     """
     if not media.extinction_changes:
         return 1

@@ -14,7 +14,12 @@ EDGE_ON = 1e-4
 
 
 def distance(p, q, active):
-    """Return the distance from ``p`` to ``q``, 1 where inactive."""
+    """Return the distance between points, metres, 1 where inactive.
+
+    Args:
+        p, q: Point3f, attached or not.
+        active: mask of lanes.
+    """
     return dr.norm(dr.select(active, q - p, mi.Vector3f(0, 0, 1)))
 
 
@@ -50,6 +55,7 @@ def point_of_light(context, ref, ds, active):
     """Trace a ray to the point of a light, whose shape the hit knows.
 
     Args:
+        context: :class:`~.context.RenderContext` of the job.
         ref: Interaction3f that the light is seen from.
         ds: the point, with ``p`` and ``emitter`` as of a DirectionSample3f.
         active: mask of lanes.
@@ -90,7 +96,12 @@ def slide_on_shape(pi, ray, drag, active):
 
 
 def displacement(p, active):
-    """Return zero with the derivative of the point or vector ``p``, where active."""
+    """Return zero with the derivative of a point or vector.
+
+    Args:
+        p: Point3f, Vector3f or Point2f.
+        active: mask of lanes; zero without a derivative elsewhere.
+    """
     zero = dr.zeros(mi.Point2f if dr.size_v(p) == 2 else mi.Vector3f)
     return dr.select(active, dr.replace_grad(zero, type(zero)(p)), zero)
 

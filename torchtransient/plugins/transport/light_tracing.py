@@ -11,7 +11,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import has_normals, has_surface, has_vertices, normal_texture
+from torchtransient.plugins.mitsuba_compat import has_normals, normal_texture
+from torchtransient.plugins.mitsuba_shapes import has_surface, has_vertices
 from torchtransient.plugins.node_walk import objects_below, shapes_of_scene
 from torchtransient.plugins.polarized import (
     intensity,
@@ -75,14 +76,23 @@ class SensorSampled(Connection):
 
 
 def first_row(matrix):
-    """Return unpolarized light after it has run through a chain of matrices the other way round: U changes its sign."""
+    """Return unpolarized light of unit power after it has run through matrices the other way round: U changes its sign.
+
+    Args:
+        matrix: throughput from the sensor on, in polarized variants a Mueller matrix.
+    """
     if not mi.is_polarized:
         return matrix
     return mi.SpectrumEntry(*[matrix[0, i] * (-1 if i == 2 else 1) for i in range(4)])
 
 
 def in_sensor_frame(light, d):
-    """Light of a path from a light that leaves in direction ``d``, in the frame of the sensor's own ray, against it."""
+    """Return light of a path from a light in the frame of the sensor's own ray, which runs against it.
+
+    Args:
+        light: Stokes vector, a spectrum in unpolarized variants.
+        d: direction in which the light leaves, unit Vector3f.
+    """
     if not mi.is_polarized:
         return light
     return rotate_stokes(light, rotation_between(d, stokes_frame_of(d), stokes_frame_of(-d)))
@@ -124,7 +134,11 @@ class FromLight:
 
 
 def shades_by_other_normals(scene: Any) -> bool:
-    """Return True if some surface has normals at its vertices or in a texture."""
+    """Return True if some surface has normals at its vertices or in a texture.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     shapes = [shape for shape in shapes_of_scene(scene) if has_surface(shape) and shape.bsdf() is not None]
     if any(has_vertices(shape) and has_normals(shape) for shape in shapes):
         return True

@@ -244,12 +244,22 @@ class Media(Vacuum):
 
 
 def lane_numbers(sampler):
-    """Return the number of each lane."""
+    """Return the number of each lane, UInt32.
+
+    Args:
+        sampler: seeded sampler of the job.
+    """
     return dr.arange(mi.UInt32, sampler.wavefront_size())
 
 
 def reference(si, mei, scatter):
-    """Return the vertex as a point of reference: that of the surface, or of the medium where ``scatter``."""
+    """Return a vertex as a point of reference, an Interaction3f.
+
+    Args:
+        si: SurfaceInteraction3f.
+        mei: MediumInteraction3f.
+        scatter: mask of vertices in a medium, which have no normal: rays start at the point itself.
+    """
     at = dr.zeros(mi.Interaction3f)
     at.t = dr.select(scatter, mei.t, si.t)
     at.time = si.time
@@ -261,6 +271,13 @@ def reference(si, mei, scatter):
 
 
 def medium_behind(si, d, medium, at_surface):
-    """Return the medium of a ray that leaves a vertex in direction ``d``."""
+    """Return the medium of a ray that leaves a vertex.
+
+    Args:
+        si: SurfaceInteraction3f of the vertex.
+        d: direction of the ray, in the world.
+        medium: MediumPtr that the path arrived in.
+        at_surface: mask of vertices on surfaces.
+    """
     changes = at_surface & si.is_medium_transition()
     return dr.select(changes, si.target_medium(d), medium)

@@ -11,24 +11,18 @@ from torchtransient.plugins.transport.surface_scattering import Surface
 DELTA_LIKE = 1e15
 
 
-def finite(value, otherwise=0):
+def _finite(value, otherwise=0):
     """``otherwise`` where a phase function is so narrow that single precision has no value for it."""
     return dr.select(dr.isfinite(value), value, otherwise)
 
 
-def unpolarizing(value):
+def _unpolarizing(value):
     """Scattering by ``value`` that leaves nothing of the polarization: what a scalar phase function says."""
     if not mi.is_polarized:
         return value
     matrix = dr.zeros(mi.Spectrum)
     matrix[0, 0] = value
     return matrix
-
-
-def phase_and_scattering(mei, active):
-    """(phase function, scattering coefficient) of the medium at ``mei``."""
-    phase = dr.select(active, mei.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
-    return phase, mei.medium.get_scattering_coefficients(mei, active)[0]
 
 
 class SurfaceOrMedium(Surface):
@@ -41,7 +35,8 @@ class SurfaceOrMedium(Surface):
 
     def _phase_and_scattering(self, mei, u, active):
         """Return (phase function, or the part of one that ``u`` chooses; scattering coefficient times its weight)."""
-        phase, σ_s = phase_and_scattering(mei, active)
+        phase = dr.select(active, mei.medium.phase_function(), dr.zeros(mi.PhaseFunctionPtr))
+        σ_s = mei.medium.get_scattering_coefficients(mei, active)[0]
         if self.blends is None:
             return phase, σ_s
         phase, weight = self.blends.part_of(phase, mei, u, active)
@@ -66,13 +61,13 @@ class SurfaceOrMedium(Surface):
         for p, answer in zip(proposals, answers, strict=True):
             if p is not None:
                 f, pdf = phase.eval_pdf(ctx, mei, p.d, p.active & scatter)
-                f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
+                f = _unpolarizing(_finite(mi.unpolarized_spectrum(f)) * σ_s)
                 answer.value = dr.select(scatter, f, answer.value)
-                answer.pdf = dr.select(scatter, finite(pdf), answer.pdf)
+                answer.pdf = dr.select(scatter, _finite(pdf), answer.pdf)
         out, w, pdf = phase.sample(ctx, mei, step.u_lobe, step.u_dir, active)
-        pdf = finite(pdf, DELTA_LIKE)
-        w = dr.select(pdf > 0, finite(mi.unpolarized_spectrum(w)) * σ_s, 0)
-        step.weight = dr.select(scatter, unpolarizing(w), step.weight)
+        pdf = _finite(pdf, DELTA_LIKE)
+        w = dr.select(pdf > 0, _finite(mi.unpolarized_spectrum(w)) * σ_s, 0)
+        step.weight = dr.select(scatter, _unpolarizing(w), step.weight)
         step.out, step.pdf = dr.select(scatter, out, step.out), dr.select(scatter, pdf, step.pdf)
         step.eta, step.delta = dr.select(scatter, 1, step.eta), step.delta & ~scatter
         step.unconnected = step.delta
@@ -84,8 +79,8 @@ class SurfaceOrMedium(Surface):
         scatter, mei = vertex.scatter, vertex.mei
         phase, σ_s = self._phase_and_scattering(mei, vertex.u_phase, active & scatter)
         f, f_pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active & scatter)
-        f = unpolarizing(finite(mi.unpolarized_spectrum(f)) * σ_s)
-        return dr.select(scatter, f, value), dr.select(scatter, finite(f_pdf), pdf)
+        f = _unpolarizing(_finite(mi.unpolarized_spectrum(f)) * σ_s)
+        return dr.select(scatter, f, value), dr.select(scatter, _finite(f_pdf), pdf)
 
     def value_in_medium(self, mei, out, u, active):
         """Return the scattering at a point in a medium that no path has walked to, unpolarized.
@@ -100,7 +95,7 @@ class SurfaceOrMedium(Surface):
         """
         phase, σ_s = self._phase_and_scattering(mei, u, active)
         f, pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, out, active)
-        return finite(mi.unpolarized_spectrum(f)) * σ_s, finite(pdf)
+        return _finite(mi.unpolarized_spectrum(f)) * σ_s, _finite(pdf)
 
     # ------------------------------------------------------------------------------------------------- record
 
@@ -125,5 +120,5 @@ class SurfaceOrMedium(Surface):
         value, pdf = vertex.phase.eval_pdf(ctx, vertex.mei, out, active & scatter)
         usable = dr.isfinite(pdf) & (pdf > 0)
         other = 1 if sampled else 0
-        value = unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value), other) * vertex.σ_s)
+        value = _unpolarizing(dr.select(usable, mi.unpolarized_spectrum(value), other) * vertex.σ_s)
         return dr.select(scatter, value, surface_value), dr.select(scatter, dr.select(usable, pdf, other), surface_pdf)

@@ -99,7 +99,7 @@ class RecordLayout:
 
     def bytes_of_vertex(self):
         """Return the bytes of a vertex, without the list of arrivals."""
-        return sum(bytes_of(kind) for kind in [*self.types.values(), mi.UInt32])
+        return sum(_bytes_of(kind) for kind in [*self.types.values(), mi.UInt32])
 
     def bytes_of(self, size):
         """Return the bytes of the local arrays of ``size`` vertices."""
@@ -379,9 +379,9 @@ def record_room(context: Any) -> RecordRoom:
     return RecordRoom(False, None, room) if needed <= room else RecordRoom(True, MEMORY // needed, room)
 
 
-def bytes_of(kind: Any) -> int:
+def _bytes_of(kind: Any) -> int:
     """Return the bytes of one entry of a Dr.Jit type."""
-    return dr.itemsize_v(kind) if dr.depth_v(kind) == 1 else dr.size_v(kind) * bytes_of(dr.value_t(kind))
+    return dr.itemsize_v(kind) if dr.depth_v(kind) == 1 else dr.size_v(kind) * _bytes_of(dr.value_t(kind))
 
 
 def room_of_path() -> int:
@@ -460,7 +460,7 @@ class GlobalArray:
         leaf = kind
         while dr.depth_v(leaf) > 1:
             leaf = dr.value_t(leaf)
-        self.numbers = dr.empty(leaf, bytes_of(kind) // dr.itemsize_v(leaf) * size * lanes)
+        self.numbers = dr.empty(leaf, _bytes_of(kind) // dr.itemsize_v(leaf) * size * lanes)
 
     def _places(self, index: Any) -> Any:
         return dr.fma(mi.UInt32(index), self.lanes, dr.arange(mi.UInt32, self.lanes))

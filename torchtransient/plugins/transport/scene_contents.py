@@ -17,17 +17,14 @@ from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.described_scene import check_scene, described
 from torchtransient.plugins.films.colour import StandardObserver
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import (
-    EMIT_ALIKE,
-    SCATTER_ALIKE,
+from torchtransient.plugins.mitsuba_compat import EMIT_ALIKE, SCATTER_ALIKE, lacks_directions, varies
+from torchtransient.plugins.mitsuba_shapes import (
     has_no_material,
     has_smooth_shape,
     has_vertices,
     is_flat,
     is_flat_shape,
     is_instance,
-    lacks_directions,
-    varies,
 )
 from torchtransient.plugins.node_walk import bsdfs_below, bsdfs_of_scene, objects_below, shapes_of_scene
 from torchtransient.plugins.parameters import ParameterTracker
@@ -89,7 +86,7 @@ class SceneContents:
         self.surroundings = Surroundings.from_scene(scene, sensor, outermost)
         self.two_sided = _two_sided(self.bsdfs) if mi.is_polarized else None
         self.hidden_probability = PointerTable.marking([bsdf for bsdf in self.bsdfs if hides_lobe_probability(bsdf)])
-        self.media = media_of(scene, sensor)
+        self.media = _media_of(scene, sensor)
         self.sphere_lights = SphereLights.from_scene(scene)
         self.shape_lights = ShapeLights(scene) if self.sphere_lights is None else self.sphere_lights.others
         self.smooth_lights = PointerTable.marking([e for e in scene.emitters() if has_smooth_shape(e)])
@@ -127,14 +124,23 @@ def _two_sided(bsdfs: list[Any]) -> PointerTable | None:
 # Whether what happens at a surface differs from place to place: where a vertex slides, that changes too.
 
 def scatters_by_place(bsdf: Any) -> bool:
-    """Return True if a BSDF, or one inside it, may scatter otherwise at another place of a flat surface."""
+    """Return True if a BSDF, or one inside it, may scatter otherwise at another place of a flat surface.
+
+    Args:
+        bsdf: one ``mi.BSDF``.
+    """
     held = [bsdf, *objects_below(bsdf, mi.BSDF)]
     return _varies_by_texture(bsdf) or not all(_is_known(one, SCATTER_ALIKE) for one in held)
 
 
 def emits_by_place(emitter: Any) -> bool:
-    """Return True if the light that leaves a surface in a given direction may differ from place to place: a texture, or
-    what counts angles from the normal of a curved shape. Mitsuba's ``area`` asks for the side alone.
+    """Return True if the light that leaves a surface in a given direction may differ from place to place.
+
+    It does with a texture, and where angles count from the normal of a curved shape. Mitsuba's ``area`` asks for the
+    side alone.
+
+    Args:
+        emitter: one ``mi.Emitter``.
     """
     if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
         return False
@@ -165,12 +171,19 @@ def _room(plugin: Any) -> str:
 class MediaContents:
     """The participating media of a scene. Does not change once built.
 
-    ``at_sensor``: the medium that the sensor stands in, or None. ``homogeneous``, ``heterogeneous``: whether there are
-    media of that kind. ``open_boundaries``: some surface lets light through unbent (BSDF ``null``), so that straight
-    lines go through several media. ``transitions``: there is more than one medium, or a place without one.
-    ``shapes_in_groups``: there are instances. ``emitter_sampling``: every medium allows
-    connections to emitters. ``extent``: the size of the scene in metres. ``phase_mixtures``: blends of phase functions,
-    None where there are none.
+    Args:
+        media: the media, each once.
+        at_sensor: the medium that the sensor stands in, or None.
+        open_boundaries: some surface lets light through unbent (BSDF ``null``), so that straight lines go through
+            several media.
+        shapes_in_groups: there are instances.
+        extent: the size of the scene, metres.
+        transitions: there is more than one medium, or a place without one.
+
+    Attributes:
+        homogeneous, heterogeneous: there are media of that kind.
+        emitter_sampling: every medium allows connections to emitters.
+        phase_mixtures: blends of phase functions, None where there are none.
 
     A plain class on purpose: Dr.Jit loops would take a dataclass apart as loop state.
     """
@@ -254,7 +267,7 @@ class FlightSettings:
             self.rate_floor = dr.opaque(mi.Float, 0.5 / contents.extent)
 
 
-def media_of(scene: Any, sensor: Any) -> MediaContents | None:
+def _media_of(scene: Any, sensor: Any) -> MediaContents | None:
     """Return the media of a scene, None when it has none."""
     shapes = shapes_of_scene(scene)
     found = [sensor.get_medium() if sensor is not None else None]
@@ -272,10 +285,10 @@ def media_of(scene: Any, sensor: Any) -> MediaContents | None:
 
 
 def is_open(shape: Any) -> bool:
-    """Return True if light passes ``shape`` unbent and unweakened, so that nothing happens there: a BSDF ``null``,
-    no emitter.
+    """Return True for shapes that light passes unbent and unweakened: a BSDF ``null``, no emitter.
 
-    Works on one shape and on arrays of shape pointers.
+    Args:
+        shape: one ``mi.Shape``, or an array of shape pointers, for which a mask is returned.
     """
     sides = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
     bsdf = shape.bsdf()

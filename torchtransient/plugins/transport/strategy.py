@@ -160,7 +160,11 @@ class EventTerm(Local):
 
 
 def rate_of(event: Any) -> dict[str, Any]:
-    """Return the rate of an event or a term as the keyword of film blocks, nothing where the film measures none."""
+    """Return the rate of an event or a term as the keyword of film blocks, nothing where the film measures none.
+
+    Args:
+        event: :class:`Event` or :class:`EventTerm`.
+    """
     return {} if event.rate is None else {"rate": event.rate}
 
 
@@ -639,7 +643,12 @@ class Scattering(Strategy):
 
 
 def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
-    """Return the weight of the power heuristic, zero where both densities are zero."""
+    """Return the weight of the power heuristic, zero where both densities are zero.
+
+    Args:
+        pdf_a: density of the strategy that drew the sample, Float.
+        pdf_b: density, in the same measure, of the other one.
+    """
     a2 = dr.square(pdf_a)
     w = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(w), w, 0)

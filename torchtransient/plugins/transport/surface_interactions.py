@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import PointerTable, registry_number
-from torchtransient.plugins.mitsuba_compat import attached_distance, is_instance, leaves_hits_detached, misplaces_hits
+from torchtransient.plugins.mitsuba_shapes import attached_distance, is_instance, leaves_hits_detached, misplaces_hits
 from torchtransient.plugins.node_walk import shapes_of_scene, shown_by
 
 # Entries of a matrix; the table holds it and its inverse, so that no lane inverts matrices.
@@ -41,7 +41,7 @@ class Instances:
         return Instances(found) if found else None
 
     def read(self) -> InstanceTable:
-        """Their matrices as they are now, attached where they are; to be called outside of loops, once a job."""
+        """Return the table of the current matrices, attached where they are. Call outside of loops, once a job."""
         with dr.resume_grad():
             table = mi.Float(self._identities)
             for number, (node, shown) in zip(self._numbers, self._shown, strict=True):
@@ -155,9 +155,16 @@ class AttachedSurfaces:
 
 
 def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, flags: int, active: Any) -> Any:
-    """``pi.compute_surface_interaction(ray, flags, active)``, attached to the ray, the shape, and what moves the shape.
+    """Return a surface interaction that is attached to the ray, the shape, and what moves the shape.
 
-    ``surfaces``: those of ``context``, None where Mitsuba's own are right.
+    Its values are those of ``pi.compute_surface_interaction(ray, flags, active)``.
+
+    Args:
+        surfaces: those of the job's context, None where Mitsuba's own derivatives are right.
+        pi: PreliminaryIntersection3f.
+        ray: Ray3f.
+        flags: ``mi.RayFlags``.
+        active: mask of lanes.
     """
     if surfaces is None:
         return pi.compute_surface_interaction(ray, flags, active)
@@ -165,7 +172,14 @@ def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, fl
 
 
 def distance_to(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, active: Any) -> Any:
-    """Distance along an attached ``ray`` of the surface at ``pi``."""
+    """Return the distance of a surface along an attached ray, metres.
+
+    Args:
+        surfaces: as of :func:`surface_interaction`.
+        pi: PreliminaryIntersection3f of the surface.
+        ray: Ray3f.
+        active: mask of lanes.
+    """
     si = surface_interaction(surfaces, pi, ray, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, active)
     return attached_distance(pi, si, ray, active)
 
@@ -240,7 +254,7 @@ class DetachedHits:
         return DetachedHits(found) if found else None
 
     def read(self) -> HitTable:
-        """Their parameters as they are now, attached where they are; to be called outside of loops, once a job."""
+        """Return the table of the current parameters, attached where they are. Call outside of loops, once a job."""
         with dr.resume_grad():
             self._find_starts()
             kinds: list[Any] = []

@@ -132,7 +132,7 @@ class Surface(Scattering):
         )  # fmt: skip
         step.unconnected = step.delta
         if context.wanted is not None and context.contents.glossy:
-            step.pdf = dr.select(is_black(weight) & is_on_wrong_side(si.wi, bs), 0, step.pdf)
+            step.pdf = dr.select(_is_black(weight) & is_on_wrong_side(si.wi, bs), 0, step.pdf)
         self.scatter_in_volume(context, vertex, proposals, answers, step)
         rotation = rotation_to_sensor(si, path.ray.d)
         for p, answer in zip(proposals, answers, strict=True):
@@ -244,7 +244,7 @@ class Surface(Scattering):
         arrived = reached & (pi.shape == step.shape) & ((step.primitive == _ANY) | (pi.prim_index == step.primitive))
         arrived &= (dr.norm(found.p - step.point) < 1e-3 * way) & (guided > 0)
         pdf = dr.select(step.guided & ~arrived, 0, pdf)
-        kept = step.guided | ~is_black(step.weight)
+        kept = step.guided | ~_is_black(step.weight)
         step.weight = dr.select(smooth, dr.select((pdf > 0) & kept, value / pdf, 0), step.weight)
         step.pdf = dr.select(smooth, pdf, step.pdf)
         wo = vertex.scattered_si.to_local(step.out)
@@ -325,7 +325,7 @@ class Surface(Scattering):
         return fields | ({"pdf": mi.Float} if self.guides else {})
 
     def record(self, step):
-        return vars(step) | {"black": is_black(step.weight)}
+        return vars(step) | {"black": _is_black(step.weight)}
 
     # ----------------------------------------------------------------------------------------------- attached
 
@@ -375,7 +375,7 @@ class Surface(Scattering):
         if context.contents.glossy:
             # Some BSDFs throw samples away (the facet that was drawn mirrors to behind the surface): their weight is
             # zero, though other lobes have a value and a density there.
-            counts &= ~r["black"] | is_black(towards.value)
+            counts &= ~r["black"] | _is_black(towards.value)
         inv_pdf = dr.select(counts, v.rr / pdf, 0)
         weight = rotate_mueller(towards.value, vertex.rotation, rotation_from_light(si, towards.wo, out, following.d))
         if wanted.geometry:
@@ -430,7 +430,7 @@ def is_on_wrong_side(wi, bs):
     return (reflects & ~transmits & crosses) | (transmits & ~reflects & ~crosses)
 
 
-def is_black(weight):
+def _is_black(weight):
     """Return a mask of weights of zero."""
     return dr.max(mi.unpolarized_spectrum(weight)) == 0
 

@@ -13,7 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.plugins.kernel_arrays import PointerTable, whole_numbers
-from torchtransient.plugins.mitsuba_compat import has_vertices, mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_shapes import has_vertices
 from torchtransient.plugins.sampling.area_elements import has_shading_normals
 from torchtransient.plugins.sampling.rays import behind_area_lights
 from torchtransient.plugins.transport.carry import slope_only
@@ -40,7 +41,12 @@ def intersection_fields(context, prefix=""):
 
 
 def intersection_numbers(pi, prefix=""):
-    """Return the numbers that record the PreliminaryIntersection3f ``pi``, by name."""
+    """Return the numbers that record an intersection, by name.
+
+    Args:
+        pi: PreliminaryIntersection3f.
+        prefix: put before each name.
+    """
     values = {prefix + name: getattr(pi, name) for name in NUMBERS}
     return values | {prefix + n: dr.reinterpret_array(mi.UInt32, getattr(pi, n)) for n in ("shape", "instance")}
 

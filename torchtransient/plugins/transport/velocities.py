@@ -24,7 +24,8 @@ import mitsuba as mi
 from torchtransient.checks import some_of
 from torchtransient.errors import SceneError
 from torchtransient.plugins.kernel_arrays import PointerTable
-from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, is_instance, moved_by
+from torchtransient.plugins.mitsuba_compat import VELOCITY, has_velocities, is_batch, moved_by
+from torchtransient.plugins.mitsuba_shapes import is_instance
 from torchtransient.plugins.node_walk import objects_of, shapes_of_scene
 from torchtransient.plugins.sensors.origin import sensors_of
 from torchtransient.plugins.transport.geometry_terms import point_of_light
@@ -90,7 +91,11 @@ class Movers:
 
 
 def unmeasured(keys: Sequence[str]) -> str:
-    """Return the warning of derivatives by velocities, the parameters ``keys``, on a film without rates."""
+    """Return the warning of derivatives by velocities on a film without rates.
+
+    Args:
+        keys: parameters, at least one.
+    """
     return (
         f"the derivative by {', '.join(map(repr, keys))} is zero: a velocity changes the rates of paths and nothing "
         "else, and the film measures none. Render with rates=tt.RateAxis(...) or chirps=tt.Chirps(...), or leave the "
@@ -105,7 +110,12 @@ AT_REST = (
 
 
 def movers_of(scene: Any, contents: Any) -> Movers:
-    """Return the bodies of a scene that move; ``contents``: its :class:`.scene_contents.SceneContents`."""
+    """Return the bodies of a scene that move, looked up once.
+
+    Args:
+        scene: Mitsuba scene.
+        contents: its :class:`.scene_contents.SceneContents`.
+    """
     found: Movers = contents.memory.get("movers", 0, lambda: Movers(scene))
     return found
 
@@ -115,12 +125,12 @@ def _motions(scene: Any, shapes: list[Any]) -> list[tuple[Any, Any]]:
     bodies: dict[str, list[Any]] = {}
     for body in (*shapes, *scene.emitters(), *scene.sensors(), *_media_of(scene, shapes)):
         bodies.setdefault(body.id(), []).append(body)
-    pairs = [(shape, held) for shape in shapes for _, held in objects_of(shape) if is_motion(held)]
+    pairs = [(shape, held) for shape in shapes for _, held in objects_of(shape) if _is_motion(held)]
     for shape, held in pairs:
         if held.of not in ("", shape.id()):
             raise SceneError(f"rigid_motion: expected no other 'of' inside of {shape.id()!r}, got {held.of!r}.")
     for _, motion in objects_of(scene):
-        if is_motion(motion):
+        if _is_motion(motion):
             if motion.of not in bodies:
                 raise SceneError(
                     f"rigid_motion {motion.id()!r}: expected the name of a shape, an emitter, a sensor or a medium, "
@@ -183,7 +193,7 @@ def _media_of(scene: Any, shapes: list[Any]) -> list[Any]:
     return list({medium.ptr: medium for medium in found if medium is not None}.values())
 
 
-def is_motion(plugin: Any) -> bool:
+def _is_motion(plugin: Any) -> bool:
     """Return True for a ``rigid_motion``."""
     return hasattr(plugin, "rows") and hasattr(plugin, "of")
 

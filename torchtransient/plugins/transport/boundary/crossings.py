@@ -1,12 +1,12 @@
-"""Bodies that run into each other: edges of one cross faces of another one.
+"""Lines that no table of edges holds: where bodies run into each other, and where a camera's clip planes cut shapes.
 
-The line in which they meet is no edge of either one, so that no table of edges holds it. Bodies that touch or stand on
-each other have no such line.
+Two bodies run into each other where edges of one cross faces of the other. The line in which they meet is no edge of
+either one. Bodies that touch or stand on each other have no such line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -18,7 +18,11 @@ from torchtransient.plugins.edges.joined import joined_places, merged
 from torchtransient.plugins.edges.table import BESIDE
 from torchtransient.plugins.edges.topology import BALL, DISK_RIM, Body, bodies_of
 from torchtransient.plugins.kernel_arrays import floats, host_numbers, registry_number
-from torchtransient.plugins.mitsuba_compat import bounds_of, mesh_faces, mesh_positions
+from torchtransient.plugins.mitsuba_compat import mesh_faces, mesh_positions, near_clip
+from torchtransient.plugins.mitsuba_shapes import bounds_of
+from torchtransient.plugins.node_walk import shapes_of_scene
+from torchtransient.plugins.sensors.origin import sensors_of
+from torchtransient.plugins.sensors.seen_from import clip_planes_at
 from torchtransient.plugins.transport.scene_contents import is_open
 
 # How deep an edge reaches through a face at least, in parts of the largest coordinate of both bodies: edges that lie
@@ -40,6 +44,8 @@ _ALONG = (0.31, 0.57, 0.43)
 _MOST_FACES = 64
 # Faces and connected parts of a mesh up to which these are looked at one by one.
 _MOST_SPLIT, _MOST_PARTS = 10_000, 256
+# Lines across the picture, in each direction, along which clip planes are searched; surfaces that are met along each.
+_LINES, _MOST_HITS = 64, 1024
 
 
 class _Solid:
@@ -113,11 +119,14 @@ def _grid(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def crossing_bodies(scene: Any) -> list[tuple[Body, Body]]:
-    """Return the pairs of bodies of a ``scene`` that run into each other, each once; a body and itself where parts of
-    one mesh do.
+    """Return the pairs of bodies of a scene that run into each other, each once.
 
-    Open boundaries of media are left out: light does not jump there. Rays are traced along the edges of faces that
-    reach into the box of another body; scenes without such faces run no kernel for it.
+    A pair is a body and itself where parts of one mesh do. Open boundaries of media are left out: light does not jump
+    there. Rays are traced along the edges of faces that reach into the box of another body; scenes without such faces
+    run no kernel for it.
+
+    Args:
+        scene: Mitsuba scene.
     """
     with dr.suspend_grad():
         bodies = [body for body in bodies_of(scene) if not (body.shape.is_medium_transition() and is_open(body.shape))]
@@ -240,3 +249,47 @@ def _next_face(
     dr.eval(t, address, cosine, inside)
     numbers = np.array([np.array(each, np.int64) for each in address])
     return host_numbers(t), numbers, host_numbers(cosine), np.array(inside)
+
+
+# -------------------------------------------------------------------------------------------------------- clip planes
+
+
+def clipped_shapes(scene: Any, sensors: Sequence[Any]) -> list[Any]:
+    """Return the shapes, instances included, that clip planes cut within the picture, hidden ones too.
+
+    Searched along lines of the planes, so that a cut that is shorter than 1 / 64 of the picture may be missed.
+
+    Args:
+        scene: Mitsuba scene.
+        sensors: some of its sensors.
+    """
+    found: set[int] = set()
+    with dr.suspend_grad():
+        for camera in [one for sensor in sensors for one in sensors_of(sensor) if near_clip(one) is not None]:
+            across = (dr.arange(mi.Float, _LINES) + 0.5) / _LINES
+            low, high = dr.zeros(mi.Float, _LINES), dr.ones(mi.Float, _LINES)
+            starts = mi.Point2f(dr.concat([low, across]), dr.concat([across, low]))
+            stops = mi.Point2f(dr.concat([high, across]), dr.concat([across, high]))
+            for start, stop in zip(clip_planes_at(camera, starts), clip_planes_at(camera, stops), strict=True):
+                found |= _met(scene, mi.Ray3f(start, stop - start))
+    shapes = [shape for shape in shapes_of_scene(scene) if registry_number(shape) in found]
+    return [shape for shape in shapes if not (shape.is_medium_transition() and is_open(shape))]
+
+
+def _met(scene: Any, ray: Any) -> set[int]:
+    """Return the registry numbers of shapes and instances that rays meet at distances below one."""
+    found: set[int] = set()
+    ray.maxt = mi.Float(1)
+    active = mi.Bool(True)
+    for _ in range(_MOST_HITS):
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        active &= pi.is_valid()
+        numbers = [dr.reinterpret_array(mi.UInt32, pointer) for pointer in (pi.shape, pi.instance)]
+        met = [np.array(dr.select(active, number, 0)) for number in numbers]
+        if not any(one.any() for one in met):
+            break
+        found |= {int(number) for one in met for number in np.unique(one)}
+        step = pi.t + 1e-4
+        ray.o, ray.maxt = ray.o + ray.d * step, ray.maxt - step
+        active &= ray.maxt > 0
+    return found - {0}

@@ -153,7 +153,7 @@ class LightPass(BoundaryPass):
         return Local(ds=ds, b=b, far=far, Le=dr.select(k.ball, other, Le), near=near, u=u)
 
     def _speeds(self, term, edges, light, x, path, ray, numbers, sampler, active):
-        """Return the attached speeds of the edge by :data:`.weigh.PixelSums.NAMES`.
+        """Return the attached speeds of the edge by :data:`.term.PixelSums.NAMES`.
 
         For x as the first vertex of a path of the sensor, as another one, and as the first one seen through a chain.
         """

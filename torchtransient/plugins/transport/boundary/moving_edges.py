@@ -17,26 +17,27 @@ from torchtransient.plugins.mitsuba_compat import (
     NORMALS,
     TEXCOORDS,
     attribute_name,
-    has_limb,
     has_normals,
-    has_surface,
-    has_vertices,
     is_bump_map,
-    is_flat,
-    is_instance,
-    is_sphere,
-    lacks_edges,
     mesh_faces,
     mesh_positions,
     near_clip,
     normal_texture,
 )
+from torchtransient.plugins.mitsuba_shapes import (
+    has_limb,
+    has_surface,
+    has_vertices,
+    is_flat,
+    is_instance,
+    is_sphere,
+    lacks_edges,
+)
 from torchtransient.plugins.node_walk import bsdfs_of_scene, objects_below, objects_of, shapes_of_scene
 from torchtransient.plugins.parameter_effect import CORRECT, ParameterEffect
 from torchtransient.plugins.sampling.lights import MovingSun
 from torchtransient.plugins.sensors.seen_from import SensorPlaces, can_be_connected, has_eye, sees_one_line
-from torchtransient.plugins.transport.boundary.clip_planes import clipped_shapes
-from torchtransient.plugins.transport.boundary.crossings import crossing_bodies
+from torchtransient.plugins.transport.boundary.crossings import clipped_shapes, crossing_bodies
 from torchtransient.plugins.transport.scene_contents import is_open
 from torchtransient.plugins.transport.strategy import Local
 
@@ -263,15 +264,23 @@ def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = Non
 
 
 def rims_without_edges(scene: Any) -> list[Gap]:
-    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some."""
-    if not (shapes := shapes_without_edges(scene)):
+    """Return the gap of shapes with outlines that the table of edges does not hold, if there are some.
+
+    Args:
+        scene: Mitsuba scene.
+    """
+    if not (shapes := [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]):
         return []
     where = f"at the rims of {_listed_shapes(shapes)}, which have no edges"
     return [Gap(where, "Use a mesh of the same form.")]
 
 
 def edges_in_mirrors(scene: Any) -> list[Gap]:
-    """Return the gap of edges that are seen by way of delta lobes, if some surface has one."""
+    """Return the gap of edges that are seen by way of delta lobes, if some surface has one.
+
+    Args:
+        scene: Mitsuba scene.
+    """
     smooth = _smooth_shapes(scene)
     return [Gap(f"{_SEEN} ({_listed_shapes(smooth)})", _TAKE_ROUGH)] if smooth else []
 
@@ -334,11 +343,6 @@ def _number_of_planes(mesh: Any) -> int:
     return len(np.unique(np.concatenate([n, offset], 1).round(3), axis=0))
 
 
-def shapes_without_edges(scene: Any) -> list[Any]:
-    """Return the shapes of a scene with outlines that the table of edges does not hold."""
-    return [shape for shape in shapes_of_scene(scene) if lacks_edges(shape)]
-
-
 def _is_met_by_connections_alone(emitter: Any) -> bool:
     """Return True if connections alone differentiate an emitter: points, directions and spheres."""
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
@@ -364,7 +368,11 @@ def _is_in_view(scene: Any, sky: Any) -> bool:
 
 
 def has_delta_lobe(shape: Any) -> bool:
-    """Return True if a shape has a BSDF with a delta lobe."""
+    """Return True if a shape has a BSDF with a delta lobe.
+
+    Args:
+        shape: one ``mi.Shape``.
+    """
     bsdf = shape.bsdf()
     return bsdf is not None and bool(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta))
 

@@ -95,6 +95,12 @@ def where_normals_face(b):
 
     Between there and the edge the face is black, a rim that gets as narrow as the faces of the mesh and is taken to
     move with the edge.
+
+    Args:
+        b: outlines seen from the sensor.
+
+    Returns:
+        PreliminaryIntersection3f.
     """
     u, v = b.inner.prim_uv
     w, ray = 1 - u - v, mi.Ray3f(b.V, b.d_in)

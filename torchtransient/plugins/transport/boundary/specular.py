@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from torchtransient.plugins.edges.table import EdgeDensity
-from torchtransient.plugins.mitsuba_compat import is_instance
+from torchtransient.plugins.mitsuba_shapes import is_instance
 from torchtransient.plugins.node_walk import shapes_of_scene
 from torchtransient.plugins.polarized import attenuated, intensity, product
 from torchtransient.plugins.sensors.seen_from import has_eye
@@ -198,7 +198,7 @@ class Chains:
     def image_of_eye(self, chain, eye):
         """Return the image of the ``eye`` in the mirrors of a chain."""
         for i, (n, offset, ratio) in enumerate(chain.planes):
-            eye = dr.select((i < chain.count) & (ratio == 0), mirrored(eye, n, offset), eye)
+            eye = dr.select((i < chain.count) & (ratio == 0), _mirrored(eye, n, offset), eye)
         return mi.Point3f(eye)
 
     def look(self, chain, eye, p, numbers, active):
@@ -210,12 +210,12 @@ class Chains:
         """
         image = p
         for i, (n, offset, ratio) in reversed(list(enumerate(chain.planes))):
-            image = dr.select((i < chain.count) & (ratio == 0), mirrored(image, n, offset), image)
+            image = dr.select((i < chain.count) & (ratio == 0), _mirrored(image, n, offset), image)
         straight = dr.normalize(image - eye)
         _, missed, _ = self._missed(self._sent(chain, eye, straight), p)
         # Total reflection may leave the straight line without a ray.
         begin = dr.select(dr.isfinite(dr.norm(missed)), straight, chain.ω)
-        end = self._sent(chain, eye, newton(self, chain, eye, p, begin))
+        end = self._sent(chain, eye, _newton(self, chain, eye, p, begin))
         _, missed, det = self._missed(end, p)
         way = dr.dot(p - end.o, end.d)
         length = end.length + way
@@ -315,12 +315,16 @@ def attached_ray(context, ray, ratios, count, active):
 
 
 def ratios_of(chain):
-    """Return for each plane the ratio of the index behind it to that before, 0 for a mirror."""
+    """Return for each plane the ratio of the index behind it to that before, 0 for a mirror.
+
+    Args:
+        chain: planes as :meth:`Chains.draw` returns them.
+    """
     return [ratio for _, _, ratio in chain.planes]
 
 
 @dr.syntax
-def newton(chains, chain, eye, p, ω):
+def _newton(chains, chain, eye, p, ω):
     """Return the direction at the ``eye`` of the ray to ``p``, from a direction ``ω`` of some ray through the chain."""
     i, step, least = mi.UInt32(0), mi.Vector3f(0), mi.Float(dr.inf)
     while dr.hint(i < _STEPS, max_iterations=_STEPS, label="ray through a chain"):
@@ -329,7 +333,7 @@ def newton(chains, chain, eye, p, ω):
     return ω
 
 
-def mirrored(p, n, offset):
+def _mirrored(p, n, offset):
     """Return the image of ``p`` in the plane ``n . q = offset``."""
     return p - n * (2 * (dr.dot(n, p) - offset))
 
@@ -425,7 +429,12 @@ def traced(chains, chain, seen, rays, sampler, active):
 
 
 def sees_chains(context, sensor):
-    """Return True if a sensor has a point of view from which it may see something in mirrors or through glass."""
+    """Return True if a sensor has a point of view from which it may see something in mirrors or through glass.
+
+    Args:
+        context: :class:`~..context.RenderContext` of the job.
+        sensor: its sensor.
+    """
     contents = context.contents
     return context.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)
 

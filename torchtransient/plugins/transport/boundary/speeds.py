@@ -23,7 +23,12 @@ from torchtransient.plugins.transport.surface_interactions import surface_intera
 
 
 def dragged_share(r, radius):
-    """Return the share ``a`` of :func:`~..geometry_terms.damped_motion` at distance ``r``."""
+    """Return the share ``a`` of :func:`~..geometry_terms.damped_motion` at a distance.
+
+    Args:
+        r: distance from the vertex before, metres.
+        radius: damping radius, metres.
+    """
     return dr.select(r < radius, dr.square(1 - dr.square(r / radius)), 0)
 
 
@@ -47,7 +52,12 @@ def sides_from(context, b, edges, v_x, y, radius, active):
 
 
 def slides(context, b):
-    """Return a mask of outlines of shapes without material points."""
+    """Return a mask of outlines of shapes without material points.
+
+    Args:
+        context: :class:`~..context.RenderContext` of the job.
+        b: outlines.
+    """
     table = context.contents.sliding
     return mi.Bool(False) if table is None else table.lists(b.inner.shape)
 

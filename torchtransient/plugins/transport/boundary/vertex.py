@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from torchtransient.plugins.mitsuba_compat import is_sphere
+from torchtransient.plugins.mitsuba_shapes import is_sphere
 from torchtransient.plugins.polarized import attenuated, product
 from torchtransient.plugins.sensors.seen_from import sees_one_line
 from torchtransient.plugins.transport.boundary.sides import BoundaryPass, both_sides, in_memory, past_edge
