@@ -48,15 +48,6 @@ def test_visible_sky_arrives_from_the_sphere_around_the_scene(sky, z):
     assert arrival == pytest.approx(np.sqrt(2.0) - (z + 1.0), abs=6e-4)
 
 
-def test_clock_of_a_second_scene_is_its_own():
-    """One integrator for many scenes: a scene that is gone must not lend its sphere to another at its address."""
-    integrator = mi.load_dict({"type": "transient_path"})
-    for size in (1.0, 2.0, 3.0, 1.5):
-        scene = mi.load_dict({"type": "scene", "wall": wall(size=size), "sky": {"type": "constant"}})
-        assert integrator.reference(scene).radius == pytest.approx(size * np.sqrt(2), rel=1e-6)
-        del scene
-
-
 def test_sky_through_both_strategies():
     """Under a uniform sky the first bounce arrives at known times whichever strategy found the light."""
     objects = {"wall": wall(size=1.0), "sky": {"type": "constant", "radiance": 1.0}}

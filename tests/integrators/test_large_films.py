@@ -20,23 +20,6 @@ def scene():
     return mi.load_dict(room(sensor=sensor))
 
 
-def functions_of(film):
-    return type(film).prepare.__globals__
-
-
-@pytest.mark.slow
-def test_memory_is_zero_at_the_start_of_every_render(scene):
-    film = scene.sensors()[0].film()
-    assert SIZE * SIZE * film.entries_per_pixel() > functions_of(film)["MANY_VALUES"]
-    first = np.array(scene.integrator().render(scene, seed=1, spp=4)[1])
-    again = np.array(scene.integrator().render(scene, seed=1, spp=4)[1])
-    assert first.sum() > 0
-    np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-7)
-    film.start_render()
-    assert not np.array(film.band_array(0)).any()
-    assert film.band_array(0).state == dr.VarState.Evaluated
-
-
 @pytest.mark.slow
 def test_direct_sums_lose_nothing(scene, monkeypatch):
     """The transient of lanes that add each by itself is that of lanes that add together, and sums to the image."""

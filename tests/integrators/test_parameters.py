@@ -82,7 +82,7 @@ def lit_wall(**lamp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("depth", [0, 1, 3, -1])
+@pytest.mark.parametrize("depth", [0, 1, -1])
 def test_max_depth(depth):
     steady, transient = runs(load(camera(), lit_wall(), max_depth=depth), 6, 128)
     np.testing.assert_allclose(transient.sum(3), steady, atol=1e-5)
@@ -93,11 +93,10 @@ def test_max_depth(depth):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("small_box", ["diffuse", "dielectric"])
-def test_roulette_does_not_change_the_mean(small_box):
+def test_roulette_does_not_change_the_mean():
     """In glass the chance goes by the square of the index."""
     box = mi.cornell_box()
-    box["small-box"]["bsdf"] = {"type": small_box}
+    box["small-box"]["bsdf"] = {"type": "dielectric"}
     objects = {k: v for k, v in box.items() if k not in ("type", "integrator", "sensor")}
     sensor = camera(fov=39, origin=(0, 0, 3.9), bin_width=0.4, bins=60)
     scenes = [load(sensor, objects, max_depth=12, rr_depth=depth) for depth in (1, 1000)]
@@ -175,32 +174,13 @@ def test_discard_direct_light():
     check(discarded + only_emission, kept)
 
 
-@pytest.mark.slow
-def test_temporal_filter_of_the_integrator_is_handed_to_the_film():
-    objects, sensor = lit_wall(), camera(fov=2, width=1, height=1, bins=8, bin_width=0.5, start=5.0, origin=(2.0, 0, 4))
-    histograms = {}
-    # The width alone is for a film that names its filter.
-    own = sensor | {"film": sensor["film"] | {"temporal_filter": "gaussian"}}
-    for name, camera_of, asked in (("box", sensor, {"temporal_filter": "box"}), ("gaussian", own, {})):
-        scene = load(camera_of, objects, gaussian_stddev=1.5, max_depth=2, **asked)
-        histograms[name] = np.array(scene.integrator().render(scene, spp=64, seed=1)[1])[0, 0, :, 0]
-        film = scene.sensors()[0].film()
-        assert film.temporal_filter == name and film.gaussian_stddev == 1.5
-    assert film.filter.stddev == 1.5
-    occupied = [int((h > 1e-6 * h.max()).sum()) for h in histograms.values()]
-    assert occupied[0] < occupied[1]
-
-
 def test_scene_of_mitransient_loads():
     scene = load(camera(), lit_wall(), temporal_filter="box", gaussian_stddev=2.0, camera_unwarp=False)
     assert scene.integrator().render(scene, spp=1)[1].shape == (6, 8, 200, 3)
     load(camera(), lit_wall(), temporal_filter="", gaussian_stddev=2.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("max_depth", -2), ("rr_depth", 0), ("temporal_filter", "exponential"), ("gaussian_stddev", 0.0)],
-)
+@pytest.mark.parametrize(("name", "value"), [("max_depth", -2), ("temporal_filter", "exponential")])
 def test_wrong_settings(name, value):
     with pytest.raises(SceneError, match=name):
         load(camera(), {}, **{name: value})

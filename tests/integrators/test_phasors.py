@@ -135,25 +135,6 @@ def test_the_derivative_by_the_light_is_the_render():
 
 
 @pytest.mark.slow
-def test_crop_window():
-    crop = {"crop_offset_x": 2, "crop_offset_y": 1, "crop_width": 3, "crop_height": 2}
-    window, whole = scene_of(phasor_camera(crop=crop)), scene_of(phasor_camera())
-    a = np.array([render(window, seed)[1] for seed in range(12)])
-    b = np.array([render(whole, 50 + seed)[1][1:3, 2:5] for seed in range(12)])
-    assert a.shape == (12, 2, 3, 10, 3)
-    for part in (np.real, np.imag):
-        result = two_sample_z_test(part(a), part(b), rounding=1e-6)
-        assert result.passed, str(result)
-
-
-def test_light_is_not_lost():
-    film = scene_of(phasor_camera())
-    render(film)
-    film = film.sensors()[0].film()
-    assert (film.energy_before, film.energy_after) == (0.0, 0.0)
-
-
-@pytest.mark.slow
 def test_deep_paths_and_no_limit():
     """More bounces than a path's memory has room for: equal to enough room, and right without any limit."""
     scene = scene_of(phasor_camera(), max_depth=20, rr_depth=50)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from support.marks import long
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.plugins.guards import no_collection
 
@@ -83,9 +82,7 @@ def stokes_of(scene, seed):
     return image[..., :1] if mi.is_monochromatic else image
 
 
-@pytest.mark.parametrize("variant", long([VARIANT, "llvm_ad_spectral_polarized"], [VARIANT]))
-def test_the_sum_over_time_is_mitsubas_stokes_image(variant):
-    mi.set_variant(variant)
+def test_the_sum_over_time_is_mitsubas_stokes_image():
     scene, reference = ours(everything()), mitsubas(everything())
     summed = []
     for seed in range(6):
@@ -191,16 +188,3 @@ def test_gradient_of_a_polarization_loss():
     assert float(dop.detach()) == pytest.approx(1.0, abs=1e-5)
 
 
-@pytest.mark.slow
-def test_scenes_are_built_with_finite_derivatives():
-    """``tt.load`` takes this library's elements in polarized variants."""
-    film = {"type": "transient_hdr_film", "temporal_bins": 10, "start_opl": 2.5, "bin_width_opl": 0.1}
-    key = "screen.bsdf.theta.value"
-    scene = tt.load(lit_polarizer(film, "retarder"), variant=VARIANT)
-    assert scene.parameters()[key].differentiable
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=4)
-    renderer(seed=0).transient.sum().backward()
-    assert np.isfinite(float(renderer.values[key].grad))
-    built = renderer.scene.built(renderer._options).scene
-    bsdf = next(shape for shape in built.shapes() if shape.id() == "screen").bsdf()
-    assert str(bsdf).startswith("DiffRetarder")

@@ -12,7 +12,6 @@ import torch
 
 import torchtransient as tt
 from support.film_storage import storage
-from support.marks import long_pairs
 from support.rates import plate, scene
 from torchtransient.pulses import Pulse, cumulative_of_sum
 
@@ -56,11 +55,8 @@ def compare(out, chirps, axis, temporal_filter="box"):
     assert beats.mean(0).sum() / 2 + sum(outside) == pytest.approx(whole, rel=1e-5)
 
 
-QUICK = [("rectangular", "tent"), ("hann", "box"), ("blackmanharris", "tent")]
-
-
 @pytest.mark.parametrize(
-    ("window", "temporal_filter"), long_pairs(("rectangular", "hann", "blackmanharris"), ("box", "tent"), QUICK)
+    ("window", "temporal_filter"), [("rectangular", "tent"), ("hann", "box"), ("blackmanharris", "tent")]
 )
 def test_windows_and_widths_of_bins(window, temporal_filter):
     """From a quarter of a line to a width of eight lines, with the arrival anywhere in its bin."""
@@ -74,7 +70,7 @@ def test_windows_and_widths_of_bins(window, temporal_filter):
             compare(tt.render(moving, seed=0, spp=16, **settings), chirps, axis, temporal_filter)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
 def test_what_the_window_cuts_off(variant):
     """Both spectra have their middle near a rim of the axis, which lets part of the line through."""
     chirps = tt.Chirps(1e9, 10e-6, 1550e-9)

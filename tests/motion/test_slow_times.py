@@ -53,14 +53,6 @@ def test_the_beat_is_the_light_over_the_sensor(beat_hz):
         assert tap == pytest.approx(0.5 * (phasor * np.exp(-1j * phase)).real, abs=3e-4)
 
 
-def test_the_steady_image_has_no_beat():
-    """Real tensors are averaged, complex ones with the beat."""
-    exposure = tt.Exposure(DURATION_S, beat_hz=1 / DURATION_S)
-    still = torch.ones(3, 2, 2)
-    assert exposure.combine(still).sub(1).abs().max() < 1e-6
-    assert exposure.combine(still.to(torch.complex64)).abs().max() < 1e-15
-
-
 @together("row_s, rows, poses", [(2e-5, 16, 3), (-2e-5, 7, 4), (1e-3, 1, 3), (2e-5, 5, 1)])
 def test_rows_see_their_own_times(row_s, rows, poses):
     shutter = tt.RollingShutter(row_s, poses=poses)
@@ -72,17 +64,6 @@ def test_rows_see_their_own_times(row_s, rows, poses):
     assert at[0] == pytest.approx(-1e3 * row_s * (rows - 1) / 2, abs=1e-12)
     expected = polynomial(at)[:, None].expand(2, rows, 3)
     torch.testing.assert_close(shutter.combine(pictures), expected, atol=1e-11, rtol=0)
-
-
-@pytest.mark.parametrize("poses", [2, 3, 8])
-def test_rows_lie_between_the_poses(poses):
-    """The first and the last row are poses, and no pose counts with much more than one."""
-    shutter = tt.RollingShutter(1e-5, poses=poses)
-    pictures = torch.eye(poses).double()[:, :, None, None].expand(poses, poses, 65, 1)
-    weights = shutter.combine(pictures)[..., 0]
-    assert weights[0, 0] == pytest.approx(1) and weights[-1, -1] == pytest.approx(1)
-    assert weights.abs().max() < 1.0 + 1e-9
-    assert shutter.poses_s(65)[-1] == pytest.approx(shutter.rows_s(65)[-1])
 
 
 def test_phase_steps_take_each_tap_from_its_own_exposure():

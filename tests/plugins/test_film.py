@@ -11,13 +11,11 @@ import pytest
 from scipy.special import erf
 
 from support.film_storage import storage
-from support.marks import long_rows
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 
-SLOPED = [("tent", 0.5), ("gaussian", 0.5), ("gaussian", 0.2), ("gaussian", 3.0)]
-FILTERS = long_rows([("box", 0.5), *SLOPED], [("box", 0.5), *SLOPED[:2]])
-SLOPED = long_rows(SLOPED, SLOPED[:2])
+SLOPED = [("tent", 0.5), ("gaussian", 0.5), pytest.param("gaussian", 3.0, marks=pytest.mark.slow)]
+FILTERS = [("box", 0.5), *SLOPED]
 BINS, WIDTH, START = 40, 0.25, 2.0
 
 
@@ -90,8 +88,10 @@ def test_stored_and_lost_make_one(name, stddev):
     assert np.all(cube[early | late] == 0)
 
 
-@pytest.mark.parametrize("layout", ["film", "channels first"])
-@pytest.mark.parametrize("name, stddev", FILTERS)
+@pytest.mark.parametrize(
+    ("name", "stddev", "layout"),
+    [("box", 0.5, "film"), ("tent", 0.5, "channels first"), ("gaussian", 0.5, "film")],
+)
 def test_read_is_the_transpose_of_put(name, stddev, layout):
     film = make_film(temporal_filter=name, gaussian_stddev=stddev)
     rng = np.random.default_rng(1)
@@ -141,26 +141,15 @@ def test_slope_is_the_derivative_of_what_is_read(name, stddev):
     "arguments, words",
     [
         ({"temporal_bins": 0}, "temporal_bins"),
-        ({"bin_width_opl": 0.0}, "bin_width_opl"),
-        ({"bin_width_opl": -1.0}, "bin_width_opl"),
         ({"bin_width_opl": float("inf")}, "bin_width_opl"),
         ({"start_opl": float("nan")}, "start_opl"),
         ({"temporal_filter": "triangle"}, "box, tent, gaussian"),
         ({"temporal_filter": "gaussian", "gaussian_stddev": 0.0}, "gaussian_stddev"),
-        ({"gaussian_stddev": -2.0}, "gaussian_stddev"),
         ({"exhaustive_scan": True}, "laser_scan_width"),
-        ({"laser_scan_width": 4}, "exhaustive_scan"),
     ],
 )
 def test_bad_parameters(arguments, words):
     with pytest.raises(SceneError, match=words):
         make_film(**arguments)
-
-
-def test_four_channels_a_colour_in_polarized_variants():
-    for variant, channels in (("llvm_ad_mono_polarized", 4), ("llvm_ad_spectral_polarized", 12)):
-        with mi.variant_context(variant):
-            plugins.sync()
-            assert make_film().channel_count() == channels
 
 

@@ -127,8 +127,6 @@ def derivatives(key, face_normals):
     ("key", "face_normals"),
     [
         ("cube.vertex_positions", False),
-        ("cube.vertex_normals", False),
-        ("cube.to_world", False),
         ("cube.to_world", True),
     ],
 )

@@ -64,18 +64,6 @@ def test_normals_of_an_instance_are_detached():
     assert slope(copy, "copy.to_world", turn, tilt) == 0
 
 
-def test_an_instance_and_its_shapes_have_no_derivatives_together():
-    scene = copied({"type": "rectangle"})
-    params = mi.traverse(scene)
-    for key in ("copy.to_world", "group.part.to_world"):
-        pose = mi.AffineTransform4f(params[key])
-        dr.enable_grad(pose)
-        params[key] = pose
-    params.update()
-    with pytest.raises(RuntimeError):
-        scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 4), mi.Vector3f(0, 0, -1)))
-
-
 def ellipsoid(extent=1.0):
     data = mi.TensorXf(np.array([[0, 0, -2, 2, 2, 2, 0, 0, 0, 1]], dtype=np.float32))
     return {"type": "ellipsoids", "data": data, "extent": extent}
@@ -125,34 +113,6 @@ def test_the_slope_of_a_bump_map_is_one_for_a_texel():
     assert slopes[0] > 3 * slopes[2]
     assert compat.is_bump_map(mi.load_dict({"type": "bumpmap", "a": bitmap, "b": {"type": "diffuse"}}))
     assert not compat.is_bump_map(mi.load_dict({"type": "diffuse"}))
-
-
-def test_coordinates_alone_do_not_renew_the_map_that_patterns_are_sampled_by():
-    lamp = mi.load_dict({"type": "cube"})
-    uv = mi.Point2f(0.3, 0.4)
-    before = np.array(lamp.eval_parameterization(uv).p)
-    params = mi.traverse(lamp)
-    params["vertex_texcoords"] = params["vertex_texcoords"] * 0.5
-    params.update()
-    np.testing.assert_array_equal(np.array(lamp.eval_parameterization(uv).p), before)
-    params.set_dirty("vertex_positions")
-    params.set_dirty("vertex_normals")
-    params.update()
-    assert np.abs(np.array(lamp.eval_parameterization(uv).p) - before).max() > 0.1
-
-
-def test_grids_that_turn_are_not_drawn():
-    z = np.abs(np.linspace(-1, 1, 8, dtype=np.float32)) - 0.5
-    grid = np.ascontiguousarray(np.broadcast_to(z, (8, 8, 8)).transpose(2, 1, 0)[..., None])
-    pose = mi.ScalarTransform4f().scale([4, 4, 1]).translate([-0.5, -0.5, -0.5])
-    seen = []
-    for turned in (pose, pose @ mi.ScalarTransform4f().rotate([0, 1, 0], 1.0)):
-        scene = mi.load_dict(
-            {"type": "scene", "it": {"type": "sdfgrid", "grid": mi.TensorXf(grid), "to_world": turned}}
-        )
-        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, 4), mi.Vector3f(0, 0, -1))
-        seen.append(bool(scene.ray_intersect_preliminary(ray).is_valid()[0]))
-    assert seen == [True, False]
 
 
 def test_attributes_of_lights_read_as_zero_where_they_are_sampled():

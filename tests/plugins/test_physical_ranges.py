@@ -114,37 +114,12 @@ NESTED = {"type": "checkerboard", "color0": {"type": "checkerboard", "color1": {
 # Where a number comes from: (objects, key of what supplies it, largest number in its range).
 SUPPLIERS = {
     "texture of its own": lambda x: (on_a_disk(a={"type": "diffuse", "reflectance": bitmap(x)}), "reflectance.data", 1),
-    "texture that is shared": lambda x: (
-        {"shared": bitmap(x), **on_a_disk(
-            a={"type": "roughconductor", "alpha": {"type": "ref", "id": "shared"}},
-            b={"type": "diffuse", "reflectance": {"type": "ref", "id": "shared"}},
-        )},
-        ".data", 1,
-    ),
     "texture in textures": lambda x: (
         {"shared": bitmap(x), **on_a_disk(a={"type": "twosided", "b": {"type": "diffuse", "reflectance": NESTED}})},
         ".data", 1,
     ),
-    "surface that is shared": lambda x: (
-        {"paint": {"type": "diffuse", "reflectance": x}, **on_a_disk(a={"type": "ref", "id": "paint"})},
-        "reflectance.value", 1,
-    ),
-    "weight of a blend": lambda x: (
-        on_a_disk(a={"type": "blendbsdf", "weight": bitmap(x), "a": DIFFUSE, "b": DIFFUSE}), "weight.data", 1,
-    ),
-    "opacity of a mask": lambda x: (
-        on_a_disk(a={"type": "mask", "opacity": {"type": "checkerboard", "color1": x}, "a": DIFFUSE}),
-        "color1.value", 1,
-    ),
-    "volume as a texture": lambda x: (
-        on_a_disk(a={"type": "diffuse", "reflectance": {"type": "volume", "volume": grid(x)}}), "volume.data", 1,
-    ),
     "attribute of a mesh": lambda x: (
         {"mesh": triangle(x, {"type": "diffuse", "reflectance": attribute()})}, "vertex_share", 1,
-    ),
-    "attribute in a texture": lambda x: (
-        {"mesh": triangle(x, {"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": attribute()}})},
-        "vertex_share", 1,
     ),
     "scaled attribute": lambda x: (
         {"mesh": triangle(x, {"type": "diffuse", "reflectance": attribute(scale=1 / 255)})}, "vertex_share", 255,

@@ -154,18 +154,3 @@ def test_a_specfilm_becomes_a_film_with_its_bands():
 # ------------------------------------------------------------------------------------------- samples and channels
 
 
-def light(rng):
-    """A Stokes vector of spectra, or a spectrum, of some numbers."""
-    if mi.is_polarized:
-        return mi.SpectrumEntry(*(spectrum(rng) for _ in range(4)))
-    return spectrum(rng)
-
-
-def spectrum(rng):
-    return mi.UnpolarizedSpectrum(*(mi.Float(row) for row in rng.uniform(-1, 1, (len(mi.UnpolarizedSpectrum()), 3))))
-
-
-def numbers(value):
-    """A sample as an array (components, wavelengths, lanes)."""
-    parts = [value[i] for i in range(4)] if mi.is_polarized else [value]
-    return np.array([[np.broadcast_to(np.array(part[k], dtype=float), 3) for k in range(len(part))] for part in parts])

@@ -20,11 +20,6 @@ def described():
     return room({"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.5}}, area_light())
 
 
-def name_in(integrator, name):
-    """What a module of the active variant calls so."""
-    return type(integrator).strategies.__globals__[name]
-
-
 def gradient(scene, key):
     """The gradient of the transient times a pattern that differs from bin to bin."""
     params = mi.traverse(scene)
@@ -37,20 +32,6 @@ def gradient(scene, key):
     pattern = mi.TensorXf(1 + dr.sin(dr.arange(mi.Float, size) * 0.01), shape)
     scene.integrator().render_backward(scene, params, (None, pattern), seed=3, spp=256)
     return np.array(dr.grad(value)).ravel()
-
-
-@pytest.mark.slow
-def test_paths_are_those_of_any_surface(monkeypatch):
-    """Same seed, same transient and gradient, whether BSDFs are asked or not."""
-    scene = mi.load_dict(described())
-    lambertian = name_in(scene.integrator(), "Lambertian")
-    assert lambertian.fits(scene.integrator().contents(scene, scene.sensors()[0]))
-    found = np.array(scene.integrator().render(scene, seed=1, spp=64)[1]), gradient(scene, ALBEDO)
-    monkeypatch.setattr(lambertian, "fits", staticmethod(lambda contents: False))
-    asked = np.array(scene.integrator().render(scene, seed=1, spp=64)[1]), gradient(scene, ALBEDO)
-    assert asked[0].max() > 0
-    np.testing.assert_allclose(found[0], asked[0], rtol=1e-4, atol=1e-5 * asked[0].max())
-    np.testing.assert_allclose(found[1], asked[1], rtol=1e-4)
 
 
 def test_black_texels_of_a_lamp_have_derivatives():

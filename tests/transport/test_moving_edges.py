@@ -13,7 +13,7 @@ import pytest
 
 from tools.boundary_cases.closed_rooms import ROOMS
 from tools.boundary_cases.edge_derivatives import PASSES, EdgeProblem
-from tools.boundary_cases.moving_edges import CASES, RGB, SPECTRAL
+from tools.boundary_cases.moving_edges import CASES, SPECTRAL
 
 SIGMAS = 4.0
 # Both modes add the same float32 terms in another order.
@@ -41,14 +41,10 @@ def test_outlines_and_shadows(name):
 @pytest.mark.parametrize(
     ("name", "spp", "fd_spp"),
     [
-        ("cube", 256, 4096), ("plate4_area", 256, 4096), ("vertex4", 256, 4096), ("ball_shadow", 256, 4096),
-        ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096), ("point_moves", 512, 4096),
-        ("camera_moves", 256, 4096), ("camera_zooms", 256, 4096), ("instance4", 256, 8192),
-        ("torus_shadow", 512, 4096), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
-        ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192), ("mirror", 256, 8192),
-        ("mirror_shadow", 512, 8192), ("mirror_moves", 1024, 4096), ("mirror_camera", 4096, 32768),
-        ("sun_turns4", 256, 4096), ("flash_parallel", 256, 8192), ("in_line", 256, 4096),
-        ("glass_rims", 512, 8192), ("glass_moves", 1024, 8192),
+        ("cube", 256, 4096), ("ball_shadow", 256, 4096), ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096),
+        ("camera_zooms", 256, 4096), ("instance4", 256, 8192), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
+        ("polar_plate", 256, 8192), ("mirror_shadow", 512, 8192), ("mirror_camera", 4096, 32768),
+        ("sun_turns4", 256, 4096), ("glass_moves", 1024, 8192),
     ],
 )  # fmt: skip
 def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
@@ -56,9 +52,8 @@ def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", [RGB, SPECTRAL])
-def test_colours(variant):
-    compare(replace(CASES["indirect4_area"], variant=variant), 256, 16384)
+def test_colours():
+    compare(replace(CASES["indirect4_area"], variant=SPECTRAL), 256, 16384)
 
 
 def test_rays_edge_on_to_a_meter():
@@ -87,9 +82,7 @@ def test_forward_mode_of_every_pass(name, passes):
 @pytest.mark.parametrize(
     ("name", "passes"),
     [
-        ("mirror_camera", ("light", "specular")), ("glass_moves", ("primary", "light", "specular")),
-        ("indirect4_wall", ("vertex", "light")), ("camera_moves4", PASSES), ("bulb_moves", ("light",)),
-        ("sphere", ("primary", "light")), ("instance4", PASSES),
+        ("glass_moves", ("primary", "light", "specular")), ("camera_moves4", PASSES), ("instance4", PASSES),
     ],
 )  # fmt: skip
 def test_forward_mode(name, passes):

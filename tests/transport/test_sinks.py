@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long
 from support.plain_scenes import as_mitsuba
 from support.walks import AdjointSumSink, Sink, primary_rays, trace
 from torchtransient.scenes import cornell_box
@@ -40,7 +39,7 @@ def traced(scene, sink_of):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", long(["plain", "fog", "glass"], ["fog"]))
+@pytest.mark.parametrize("kind", ["fog", "glass"])
 def test_adjoint_sum_is_the_product_with_the_render(kind):
     scene = scene_of(kind)
     _, cube = scene.integrator().render(scene, seed=SEED, spp=SPP)
