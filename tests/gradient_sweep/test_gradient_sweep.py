@@ -20,13 +20,13 @@ from tools.gradient_sweep import compare, runner
 from tools.gradient_sweep.bsdfs import HOLDERS
 from tools.gradient_sweep.compare import QUICK, Runs, judge
 from tools.gradient_sweep.measure import Subject, Tangent, tangents_of
-from tools.gradient_sweep.page import PAGE, page, read_rows, swept, with_rows_of_the_page
+from tools.gradient_sweep.page import PAGE, page, read_rows, swept
 from tools.gradient_sweep.runner import ResultFile
 from tools.gradient_sweep.settings import all_settings
 from tools.gradient_sweep.stages import between_lights, matte
 from torchtransient.plugins import _registry
 from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
-from torchtransient.plugins.parameter_effect import FILE, is_checked
+from torchtransient.plugins.parameter_effect import FILE
 
 DOCS = Path(__file__).parents[2] / "docs"
 SETTINGS = {setting.name: setting for setting in all_settings()}
@@ -140,14 +140,6 @@ def test_hardly_anything_is_unresolved(rows):
     assert len(undecided) <= 0.05 * len(verdicts), undecided
 
 
-def test_what_is_not_checked_is_said():
-    scene = tt.load(between_lights({"type": "roughplastic", "alpha": 0.2}), variant="llvm_ad_rgb")
-    for info in scene.parameters().values():
-        assert info.checked == (not info.differentiable or is_checked(info.place))
-        assert info.checked != ("unchecked" in info.reason)
-    assert not is_checked(("NewBSDF.colour", "Rectangle.bsdf"))
-
-
 # ------------------------------------------------------------------------------------------ what is compared, and how
 
 
@@ -230,18 +222,6 @@ def test_results_are_taken_up_again(tmp_path):
     file.write(row(first, "x", "contradict", []))
     file.write({"done": first})
     assert [(line["setting"], line["verdict"]) for line in file.results()] == [(first, "contradict"), (second, "agree")]
-
-
-def test_one_plugin_is_swept_and_the_page_keeps_the_others(rows, tmp_path):
-    """In the order of the sweep; rows of a setting that was done again are not those of before."""
-    name = "bsdf retroreflector"
-    again = [{**old, "reverse": 2.0, "verdict": "contradict"} for old in rows if old["setting"] == name][:1]
-    merged = with_rows_of_the_page(again, {name}, DOCS)
-    assert [one for one in merged if one["setting"] == name] == again
-    others = [[one for one in some if one["setting"] != name] for some in (merged, rows)]
-    assert json.dumps(others[0]) == json.dumps(others[1]) and len(others[0]) > 2000
-    assert list(dict.fromkeys(one["setting"] for one in merged)) == list(dict.fromkeys(one["setting"] for one in rows))
-    assert with_rows_of_the_page(again, {name}, tmp_path) == again
 
 
 def test_a_process_that_dies_is_a_result(tmp_path, monkeypatch):

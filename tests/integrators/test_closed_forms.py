@@ -104,11 +104,3 @@ def test_light_over_plane_bins():
     check_bins(transient, expected, minimum=3e-3)
 
 
-def test_etalon_orders():
-    description = scenes.etalon_slab(
-        0.5, 1.5, light="front", num_bins=160, start_opl=0.025, bin_width_opl=0.05, spp=16384, max_depth=12
-    )
-    _, transient, _ = runs(description)
-    expected = cf.etalon_slab(edges_of(description), 0.5, 1.5, 1.0, 3.0, "reflected")
-    check_bins(transient, expected, minimum=1e-3)
-    assert np.all(transient[:, expected == 0] == 0)

@@ -6,7 +6,6 @@ light is the same only if what is sampled and what has a density are all that sh
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -185,20 +184,3 @@ def test_derivatives_by_brightness(name, key):
     assert (np.abs(found - total) < SIGMAS * np.hypot(error, own)).all()
 
 
-def test_mitsuba_draws_one_of_two_points_of_a_texture():
-    """Fails when Mitsuba mends it: then ``sampling/sphere_lights.py`` can go."""
-    shape = mi.load_dict(area(mesh([PIECE] * 4), bitmap(), to_world=T()))
-    light = shape.emitter()
-    ref = mi.Interaction3f(0.0, 0.0, [], mi.Point3f(0, 0, 2))
-    grid = mi.Point2f(*np.stack(np.meshgrid(*[np.linspace(0.01, 0.99, 30)] * 2)).reshape(2, -1).astype(np.float32))
-    drawn, _ = light.sample_direction(ref, grid)
-    # The same place of the texture on all four triangles.
-    density = []
-    for p in ([0, -0.5, 0], [0.5, 0, 0], [0, 0.5, 0], [-0.5, 0, 0]):
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.p, ds.uv, ds.n = mi.Point3f(*p), mi.Point2f(0.5, 0.5), mi.Normal3f(0, 0, 1)
-        ds.d, ds.dist = dr.normalize(ds.p - ref.p), dr.norm(ds.p - ref.p)
-        density.append(float(light.pdf_direction(ref, ds)[0]))
-    p = np.array(drawn.p)[:, np.array(drawn.pdf) > 0]
-    quarters = np.unique(np.where(np.abs(p[0]) > np.abs(p[1]), 1 + np.sign(p[0]), 4 + np.sign(p[1])))
-    assert min(density) > 0 and len(quarters) == 1

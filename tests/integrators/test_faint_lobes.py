@@ -125,13 +125,3 @@ def test_two_surfaces_with_one_texture(kind, slot, value):
     assert abs(rates[1]) > 1e-3 and rates[0] == pytest.approx(rates[1], rel=1e-3)
 
 
-@pytest.mark.slow
-def test_renders_are_sampled_as_by_mitsuba():
-    """Whatever derivatives were asked for before, and although the value is attached."""
-    scene = scene_of({"type": "diff_principled", "spec_trans": number(1e-4)})
-    key = "wall.bsdf.spec_trans.value"
-    image = np.array(scene.integrator().render(scene, spp=64)[0])
-    derivative_in_place(scene, key)
-    with dr.suspend_grad():
-        again = np.array(scene.integrator().render(scene, spp=64)[0])
-    np.testing.assert_allclose(again, image, rtol=1e-5)

@@ -157,16 +157,6 @@ def test_wavelengths():
 
 
 @pytest.mark.slow
-def test_response_curves():
-    scene = room()
-    scene["sensor"]["film"] |= {
-        name: {"type": "regular", "wavelength_min": 400.0, "wavelength_max": 700.0, "values": values}
-        for name, values in (("short", "1, 0.5, 0, 0"), ("long", "0, 0, 0.4, 1"))
-    }
-    check_same_light(scene, "llvm_ad_spectral")
-
-
-@pytest.mark.slow
 def test_means_are_those_of_plain_paths_to_a_thousandth():
     """Energy to 1e-3, Student's t of blocks with mean 0 and deviation 1.
 

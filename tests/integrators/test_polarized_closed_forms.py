@@ -172,47 +172,6 @@ def test_retardance_of_total_reflection(plugin, angle_deg, sign):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("side", "angle_deg"), [("reflected", 40.0), ("transmitted", 65.0)])
-def test_slab_order_by_order(side, angle_deg):
-    """A glass plate in time, for each polarization: R, then T^2 R^(2m - 1) after 2 m crossings; T^2 R^(2m) behind it
-    after 2 m + 1. A crossing takes n d / cos(theta_t). Per order, power and S1 follow from the sum and the difference.
-    """
-    thickness, above, below = 0.51, 2.0, 1.0
-    theta = math.radians(angle_deg)
-    cos_i, cos_t = math.cos(theta), math.sqrt(1 - (math.sin(theta) / INDEX) ** 2)
-    crossing = INDEX * thickness / cos_t
-    r = np.array(fresnel_reflectances(INDEX, angle_deg))
-    if side == "transmitted":
-        z, air = -thickness - below, (above + below) / cos_i
-        orders = [(air + (2 * m + 1) * crossing, (1 - r) ** 2 * r ** (2 * m)) for m in range(3)]
-    else:
-        z, air = above + below, (2 * above + below) / cos_i
-        orders = [(air, r)] + [(air + 2 * m * crossing, (1 - r) ** 2 * r ** (2 * m - 1)) for m in range(1, 3)]
-    orders = [(opl, powers) for opl, powers in orders if powers.mean() > 1e-3]
-    start, bins = 2.5, 800
-    facing = -1 if z > 0 else 1
-    plane = {
-        "type": "rectangle",
-        "to_world": pose().translate([0, 0, z]) @ pose().rotate([0, 1, 0], 90 - 90 * facing) @ pose().scale(200),
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": 1.0},
-    }
-    back = pose().translate([0, 0, -thickness]).rotate([0, 1, 0], 180).scale(200)
-    scene = scene_of(
-        camera([above * math.tan(theta) + 3, 0.1, above], [3, 0.1, 0], start, bins), 8,
-        lamp=plane, front={"type": "rectangle", "to_world": pose().scale(200), "bsdf": glass()},
-        back={"type": "rectangle", "to_world": back, "bsdf": glass()},
-    )  # fmt: skip
-    runs = np.stack([stokes_in_time(scene, 8192, seed) for seed in range(RUNS)])
-    for opl, (p_s, p_p) in orders:
-        k = int((opl - start) / BIN)
-        result = z_test(
-            runs[:, :, k - 1 : k + 2].sum(2), [0.5 * (p_s + p_p), 0.5 * (p_p - p_s), 0, 0], rounding=ROUNDING
-        )
-        assert result.passed, f"order at {opl}: {result}"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "metal",
     [
@@ -291,22 +250,3 @@ def test_chain_of_elements(name, prefix):
 # --------------------------------------------------------------------------------------------------- depolarizers
 
 
-@pytest.mark.slow
-def test_depolarising_walls_leave_nothing():
-    """Inside a diffuse box light is unpolarized, bounce after bounce; through a polarizer it is so completely, at half
-    the power, at every time.
-    """
-    box = {"type": "cube", "to_world": pose().scale([1, 1.2, 1.4]), "flip_normals": True,
-           "bsdf": {"type": "diffuse", "reflectance": 0.7}}  # fmt: skip
-    bulb = {"type": "point", "position": [0.4, 0.5, 0.2], "intensity": 1.0}
-    screen = {"type": "rectangle", "to_world": pose().translate([0.1, 0, 0.5]).scale(0.1),
-              "bsdf": {"type": "polarizer", "theta": 30.0}}  # fmt: skip
-    sensor = camera([0.1, 0, 0.9], [0.1, 0, 0], 0.0, 600)
-    plain = stokes_in_time(scene_of(sensor, 6, box=box, bulb=bulb), 1024)
-    assert plain[0].sum() > 0.01 and not plain[1:].any()
-    seen = stokes_in_time(scene_of(sensor, 7, box=box, bulb=bulb, screen=screen), 4096)
-    bright = seen[0] > 0
-    assert bright.sum() > 50
-    expected = np.array([1.0, math.cos(math.radians(-60)), math.sin(math.radians(-60)), 0])
-    # Float32 sums of up to 4096 terms, whose order is chance: some sqrt(4096) ulp.
-    np.testing.assert_allclose(seen[:, bright], expected[:, None] * seen[0, bright], atol=2e-5 * seen[0].max())

@@ -195,19 +195,6 @@ def test_each_sensor_of_a_batch():
 
 
 @pytest.mark.slow
-def test_irradiance_meter_in_glass():
-    """A patch inside that looks at the wall: its first light is that along the axis."""
-    patch = {"type": "rectangle", "to_world": T().scale(1e-3), "meter": {"type": "irradiancemeter", "film": film()}}
-    loaded = mi.load_dict({
-        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3}, "patch": patch,
-        "body": CUBE | {"bsdf": glass()},
-        "lamp": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([0, 1, 0], 180).scale(0.05),
-                 "emitter": {"type": "area", "radiance": 1.0}},
-    }, optimize=False)  # fmt: skip
-    assert arrivals(loaded, 1 << 17)[0] == pytest.approx(N + 2.0, abs=2 * BIN)
-
-
-@pytest.mark.slow
 def test_meter_on_the_outside_of_glass_stands_in_air():
     sphere = ball(1.0, sensor={"type": "irradiancemeter", "film": film()})
     loaded = mi.load_dict({

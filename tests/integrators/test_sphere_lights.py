@@ -97,13 +97,6 @@ def stripes():
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
 
 
-@pytest.mark.slow
-def test_texture_seen_from_the_pole():
-    """From below all meridians are seen alike."""
-    light = lamp(0.1, emitter={"type": "area", "radiance": stripes()})
-    close_to(steady(over_a_plane(light), 8, 1 << 16), RHO * 0.01, slack=1e-4)
-
-
 def on_its_side(weight):
     turned = T().translate([0, 0, 1]).rotate([0.6, 0.8, 0.0], 70).scale(0.4)
     emitter = {"type": "area", "radiance": stripes(), "sampling_weight": weight}

@@ -14,7 +14,6 @@ from support.moving_scenes import (
     PER_METRE,
     corner,
     moving_scene,
-    plate,
     wall,
     wall_phasor,
 )
@@ -104,39 +103,6 @@ def test_differences_in_a_corner(name):
     assert error < 0.1 * abs(float(found.mean))
     forward = float(torch.func.jvp(lambda x: image(x, 100), (torch.tensor(0.0),), (torch.tensor(1.0),))[1])
     assert forward == pytest.approx(reverse[0], rel=2e-2)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "step"), [("velocity", 1.0), ("pose", 1e-3)])
-def test_differences_where_an_outline_crosses_pixels(name, step):
-    """The light that the outline hides and uncovers is in the derivative of each pose. Of a pose it jumps where the
-    outline crosses the border of a pixel, which steps as large as the motion do not see.
-    """
-    scene, motion = plate()
-    key = "front.to_world"
-    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), [key], spp=2048, frequencies=FREQUENCIES)
-    pose, along = renderer.values[key].detach(), torch.tensor([1.0, 0.3, 0.5])
-    weights = torch.randn(8, 8, generator=torch.Generator().manual_seed(0))
-
-    def image(x, seed):
-        by_velocity, by_pose = (x, 0 * x) if name == "velocity" else (0 * x, x)
-        moving = {"front": tt.Motion(linear=torch.tensor(motion["linear"]) + by_velocity * along)}
-        shift = torch.cat([torch.zeros(4, 3), torch.cat([along, torch.zeros(1)])[:, None]], 1)
-        out = tt.over_time(renderer, moving, HETERODYNE, values={key: pose + by_pose * shift}, seed=seed)
-        return 1e4 * (weights * (0.3 * out.phasor.real + 0.8 * out.phasor.imag)).mean()
-
-    def gradient(seed):
-        x = torch.tensor(0.0, requires_grad=True)
-        return float(torch.autograd.grad(image(x, seed), x)[0])
-
-    with torch.no_grad():
-        found = finite_differences.central_difference(
-            lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, step, range(12)
-        )
-    reverse = np.array([gradient(seed) for seed in range(100, 112)])
-    error = np.hypot(float(found.standard_error), reverse.std(ddof=1) / 12**0.5)
-    assert abs(reverse.mean() - float(found.mean)) < 3 * error
-    assert error < 0.1 * abs(float(found.mean))
 
 
 def test_velocities_of_a_rolling_shutter_by_vmap_and_reverse_mode():

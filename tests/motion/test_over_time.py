@@ -254,10 +254,3 @@ def test_motions_further_than_the_scene_is_large(name):
         look(exposure, "warn")
 
 
-def test_videos_may_leave_the_scene():
-    """As may what turns between frames."""
-    renderer = renderer_of(
-        moving_scene(wall=wall((0, 0, 2), (0, 0, 0))), "wall.to_world", spp=1, frequencies=FREQUENCIES, physics="error"
-    )
-    away = tt.Motion(linear=(0.0, 0.0, 10.0), angular=(0.0, 0.0, 20.0))
-    assert tt.over_time(renderer, {"wall": away}, tt.Frames([0.0, 0.2, 0.4, 0.6, 0.8]), seed=0).phasor.shape[0] == 5

@@ -74,16 +74,6 @@ def shapes_with_lights():
     return [mi.load_dict({"type": "rectangle", "to_world": pose, "emitter": light}) for light in lights]
 
 
-def test_mitsubas_lacks_a_method():
-    mi.set_variant("llvm_ad_rgb")
-    plugins.sync()
-    ref, ds = dr.zeros(mi.Interaction3f), dr.zeros(mi.DirectionSample3f)
-    theirs, ours = shapes_with_lights()
-    with pytest.raises(RuntimeError, match="not implemented"):
-        theirs.emitter().eval_direction(ref, ds)
-    assert not np.any(np.array(ours.emitter().eval_direction(ref, ds)))
-
-
 def test_rays_that_leave_it_are_those_of_mitsuba():
     mi.set_variant("llvm_ad_mono_polarized")
     plugins.sync()

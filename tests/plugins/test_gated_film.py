@@ -13,7 +13,7 @@ from support.film_storage import storage
 from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.errors import ArgumentError, GradientError, SceneError
+from torchtransient.errors import GradientError, SceneError
 from torchtransient.files import read_result, write_result
 
 VARIANT = "llvm_ad_rgb"
@@ -140,20 +140,6 @@ def test_gated_render_is_the_full_one_gated_afterwards():
 
 
 @pytest.mark.slow
-def test_a_histogram_without_steady_image():
-    scene = tt.load(mirrored(), variant=VARIANT)
-    axis = tt.TimeAxis(8.0, 0.1, 12)
-    cut, steady = runs(tt.TransientRenderer(scene, time_axis=axis, spp=512, steady=False))
-    full, complete = runs(tt.TransientRenderer(scene, time_axis=axis, spp=512))
-    # the same paths, some of them shorter
-    np.testing.assert_allclose(cut, full, rtol=1e-4, atol=1e-6 * full.max())
-    assert full.mean() > 0
-    np.testing.assert_allclose(steady, cut.sum(2), rtol=1e-5)
-    # there is light that the window misses, and the cut render does not speak of it
-    assert complete.mean() > 1.05 * steady.mean()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("spread", [{"temporal_filter": "gaussian"}, {"pulse": tt.Pulse.gaussian(0.8, 0.3)}])
 def test_cut_windows_keep_what_is_spread_into_them(spread):
     room = mirrored()
@@ -205,26 +191,6 @@ def test_output_and_file(tmp_path):
         back = read_result(write_result(tmp_path / name, out))
         assert back.gates == GATES and back.axis is None and torch.equal(back.gated, out.gated)
         assert back.transient is None and back.phasor is None
-
-
-def test_arguments():
-    scene = tt.load(make_room(), variant=VARIANT)
-    with pytest.raises(ArgumentError, match="give one of them"):
-        tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
-    with pytest.raises(ArgumentError, match=r"tt\.Gate objects"):
-        tt.TransientRenderer(scene, gates=[3.0])
-    with pytest.raises(SceneError, match=r"does not read .steady."):
-        tt.TransientRenderer(scene, gates=GATES, steady=False)
-    with pytest.raises(ArgumentError, match="gated film has none"):
-        tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")
-    pulsed = tt.load({**make_room(), "sensor": {**make_room()["sensor"], "film": _pulsed()}}, variant=VARIANT)
-    with pytest.raises(SceneError, match="would lose"):
-        tt.TransientRenderer(pulsed, frequencies=[1.0])
-    assert tt.TransientRenderer(pulsed, gates=GATES, spp=1)(seed=0).gates == GATES
-
-
-def _pulsed():
-    return {**make_room()["sensor"]["film"], "pulse": "gaussian", "pulse_fwhm_opl": 0.2}
 
 
 @pytest.mark.slow

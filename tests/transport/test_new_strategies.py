@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import torchtransient.plugins as plugins
-from support import toy_strategies
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.scenes import room, transform
 from support.gradient_cases.unknowns import move, set_color
@@ -148,23 +147,6 @@ def test_own_light_equals_the_scene_s(plugin):
     centers = np.arange(theirs.shape[-2])
     mean_a, mean_b = ((x.sum((0, 1, 2, 4)) * centers).sum() / x.sum() for x in (ours, theirs))
     assert mean_a == pytest.approx(mean_b, abs=0.1)
-
-
-def test_a_strategy_is_one_class():
-    """What the toys know of the library: the interface, the geometry of a connection and the algebra of light. None
-    of them is named anywhere in the library.
-    """
-    tree = ast.parse(Path(toy_strategies.__file__).read_text(encoding="utf-8"))
-    used = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-    allowed = ("strategy", "carry", "geometry_terms", "emitter_connections")
-    expected = {f"torchtransient.plugins.transport.{name}" for name in allowed}
-    assert used <= expected | {"__future__", "torchtransient.plugins.polarized"}
-    package = Path(plugins.__file__).parent
-    names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    assert len(names) == 4
-    for path in package.rglob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        assert not [name for name in names if name in text]
 
 
 def test_every_connection_is_asked_by_an_integrator():
