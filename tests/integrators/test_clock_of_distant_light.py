@@ -113,18 +113,6 @@ def test_scene_without_an_integrator_of_its_own():
         assert integrator.reference(scene).center[2] == pytest.approx(-1.5)
 
 
-def test_sensor_at_infinity():
-    sensor = {"type": "distant", "film": film(**AXIS), **looking_down(4.0), "target": [0.0, 0.0, 0.0]}
-    lamp = {"type": "point", "position": [0.0, 0.0, 1.0]}
-    scene = load(lamp, sensor)
-    other_values_first(scene)
-    move(scene, 10.0)
-    expected = load(lamp, sensor)
-    arrival(expected)
-    move(expected, 10.0)
-    assert arrival(scene) == pytest.approx(arrival(expected), abs=1e-4)
-
-
 def layer_arrival(renderer, distance, **call):
     value = torch.tensor(square(0, -distance, 0.1)["to_world"], dtype=torch.float32)
     out = renderer({"far.to_world": value}, seed=0, spp=256, **call)
@@ -143,15 +131,5 @@ def test_layer_does_not_depend_on_what_it_rendered_first():
     expected = layer_arrival(first, 3.0)  # the values described
     assert layer_arrival(second, 40.0) == pytest.approx(expected, abs=0.02)
     assert layer_arrival(second, 3.0) == pytest.approx(expected, abs=1e-4)
-
-
-def test_batch_starts_with_the_description():
-    renderer, alone = layer(), layer()
-    expected = layer_arrival(alone, 3.0)
-    values = torch.tensor(np.stack([square(0, -d, 0.1)["to_world"] for d in (40.0, 3.0)]), dtype=torch.float32)
-    out = renderer({"far.to_world": values}, seed=0, spp=256)
-    bins = out.transient.double().sum((1, 3, 4))
-    centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
-    np.testing.assert_allclose((bins @ centers / bins.sum(-1)).detach(), expected, atol=0.02)
 
 

@@ -115,26 +115,3 @@ def test_kinds_of_glass_that_become_different():
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
 
 
-TILTED, FLAT = (0.85, 0.5, 0.85), (0.5, 0.5, 1.0)
-def around_metal(normals, paint, flags):
-    """A normal map, constant by four texels, around a blend with a delta lobe."""
-    bitmap = {"type": "bitmap", "data": mi.TensorXf(np.tile(np.float32(normals), (4, 4, 1))), "raw": True}
-    parts = {**DIFFUSE, "reflectance": paint}, {"type": "conductor", "specular_reflectance": paint}
-    return {"type": "normalmap", "normalmap": bitmap, "nested": blend(*parts, 0.5), **flags}
-
-
-@pytest.mark.slow
-def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first():
-    """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""
-    images, flags = [], {"flip_invalid_normals": True, "use_shadowing_function": False}
-    for normals, paint in ((FLAT, 0.0), (TILTED, 0.8)):
-        scene = mi.load_dict(mirror_room(around_metal(normals, paint, flags)), optimize=False)
-        scene.integrator().render(scene, seed=0, spp=4)
-        params = mi.traverse(scene)
-        params["wall.bsdf.normalmap.data"] = mi.TensorXf(np.tile(np.float32(TILTED), (4, 4, 1)))
-        for key in ("bsdf_0.reflectance.value", "bsdf_1.specular_reflectance.value"):
-            params[f"wall.bsdf.nested_bsdf.{key}"] = 0.8
-        params.update()
-        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
-    assert images[0].max() > 0
-    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())

@@ -108,14 +108,6 @@ def test_roulette_does_not_change_the_mean():
     assert np.abs(a - b).max() > 1e-3
 
 
-@pytest.mark.slow
-def test_hidden_area_lights_and_sky():
-    sky = {"sky": {"type": "constant", "radiance": 0.7}}
-    objects = lit_wall(**sky) | {"wall": lit_wall()["wall"] | {"to_world": T().scale([3, 0.4, 1])}}
-    steady, _ = runs(load(camera(), objects, hide_emitters=True), 6, 128)
-    check(steady, mitsuba_runs(camera(transient=False), objects, 6, 128, hide_emitters=True))
-
-
 def test_what_lies_behind_a_hidden_light_is_seen_at_its_own_distance():
     # rectangles take their hit point from the distance along the ray, so a wrong distance would be a wrong time
     lamp = {
@@ -161,17 +153,6 @@ def test_camera_unwarp_shifts_by_the_last_leg():
     assert noise < 2e-4
     assert spectra[0] - spectra[1] == pytest.approx(expected, abs=noise)
     assert spectra[1] == pytest.approx((4 / cosine * weight).sum() / weight.sum(), abs=noise)
-
-
-@pytest.mark.slow
-def test_discard_direct_light():
-    kept, discarded = (
-        runs(load(camera(), lit_wall(), discard_direct_light=flag, max_depth=3), 6, 128, 100 * flag)[0]
-        for flag in (False, True)
-    )
-    only_emission, _ = runs(load(camera(), lit_wall(), max_depth=1), 6, 128, 200)
-    assert only_emission.max() == pytest.approx(3.0, rel=1e-5)
-    check(discarded + only_emission, kept)
 
 
 def test_scene_of_mitransient_loads():

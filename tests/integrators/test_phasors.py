@@ -61,11 +61,6 @@ def test_at_frequency_zero_it_is_the_steady_image():
     np.testing.assert_allclose(phasors[:, :, zero].imag, 0, atol=2e-6 * steady.max())
 
 
-def test_negative_frequencies_are_the_conjugate():
-    steady, phasors = render(scene_of(phasor_camera()))
-    np.testing.assert_allclose(phasors[:, :, :3], np.conj(phasors[:, :, 6:3:-1]), atol=ROUNDING * steady.max())
-
-
 def test_grid_and_list_give_the_same():
     listed = " ".join(str(f) for f in FREQUENCIES + 1e-9 * np.arange(10) ** 2)
     (steady, a), (_, b) = render(scene_of(phasor_camera())), render(scene_of(phasor_camera(frequencies=listed)))

@@ -72,20 +72,6 @@ def test_irradiance_inside_a_sphere(kind):
 
 
 @pytest.mark.slow
-def test_lights_beside_it():
-    """Choice by weights, among lights of other kinds."""
-    lights = [
-        lamp(1e-4, emitter={"type": "area", "radiance": 1e8, "sampling_weight": 3.0}),
-        lamp(1e-3, 2.0, emitter={"type": "area", "radiance": 1e6, "sampling_weight": 0.5}) | {"center": [0, 2.0, 2.0]},
-        {"type": "point", "position": [0, -5.0, 5.0], "intensity": 10.0},
-        {"type": "constant", "radiance": 0.3},
-    ]
-    slanted = 0.5**1.5  # the cosine, over twice the squared height
-    E_over_pi = 1.0 + slanted + slanted * 10.0 / 25.0 / np.pi + 0.3
-    close_to(steady(over_a_plane(*lights), 8, 1 << 16), RHO * E_over_pi, slack=1e-4)
-
-
-@pytest.mark.slow
 def test_polarized():
     images = runs(over_a_plane(lamp(0.1)), 8, 1 << 14)[0][:, 0, 0]
     close_to(images[:, 0], RHO * RADIANCE * 0.01, slack=5e-5)

@@ -232,16 +232,6 @@ def test_two_bounces_in_a_corner():
 # ----------------------------------------------------------------------------------- the same motion, said differently
 
 
-def test_velocities_of_vertices_are_a_rigid_motion():
-    vertices = np.array([[-1, -1, 2.0], [1, -1, 2.2], [1, 1, 2.1], [-1, 1, 1.9]])
-    v, w, c = np.array([0.3, -0.4, 1.2]), np.array([0.5, 1.0, -0.7]), np.array([0.2, 0.1, 2.0])
-    sheet = {"type": "mesh_arrays", "vertices": vertices, "faces": np.array([[0, 2, 1], [0, 3, 2]])}
-    bends = rates_of(scene(4, 30, sheet=sheet | {"vertex_velocity": v + np.cross(w, vertices - c)}))
-    rigid = rates_of(scene(4, 30, sheet=sheet), {"sheet": tt.Motion(linear=v, angular=w, center=c)})
-    assert float((bends - rigid).abs().max() / rigid.max()) < 1e-4
-    assert float(mean_rate(rigid).max() - mean_rate(rigid).min()) > 0.3
-
-
 def corner_of_three(depth=4):
     lamp = {"type": "point", "position": [-0.3, 0.3, 0.1], "intensity": 1.0}
     return scene(4, 50, depth, lamp=lamp, a=plate((0, 0, 2), (0, 0, 0), half=2), b=plate((1, 0, 1), (0, 0, 1), half=2),

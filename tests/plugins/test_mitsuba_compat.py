@@ -125,22 +125,6 @@ def test_derivatives_at_normal_incidence_are_not_numbers(plugin):
 # ------------------------------------------------------------------------------------------- samples, lobes and tables
 
 
-def test_the_sun_shows_its_angle_in_its_description_alone():
-    activate(RGB)
-    sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8], "sun_aperture": 2.5, "sky_scale": 0.0})
-    assert not any("aperture" in key for key in mi.traverse(sky).properties)
-    half = compat.sun_half_angle(sky)
-    assert half == pytest.approx(np.radians(1.25), rel=1e-5)
-
-    def light_at(angle):
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        towards = np.arctan2(0.6, 0.8) + angle
-        si.wi = -mi.Vector3f(0, float(np.sin(towards)), float(np.cos(towards)))
-        return float(dr.max(sky.eval(si))[0])
-
-    assert light_at(0.99 * half) > 0 and light_at(1.01 * half) == 0
-
-
 # --------------------------------------------------------------------------------------------- indices, sides, spectra
 
 
@@ -158,6 +142,7 @@ def test_colours_are_kept_as_coefficients_in_spectral_variants():
 
 @pytest.mark.parametrize("size", [1, 3, 4])
 def test_attributes_of_another_size_read_as_zero(size):
+    activate(RGB)
     mesh = mi.load_dict({"type": "cube"})
     mesh.add_attribute("vertex_color", size, [0.5] * (size * mesh.vertex_count()))
     si = dr.zeros(mi.SurfaceInteraction3f)

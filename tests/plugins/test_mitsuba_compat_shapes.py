@@ -102,26 +102,3 @@ def test_ellipsoids_do_not_show_what_they_are_made_of():
     assert "SmoothConductor" not in [bsdf.class_name() for bsdf in bsdfs_below(scene)]
 
 
-def test_the_slope_of_a_bump_map_is_one_for_a_texel():
-    """Moving its coordinates changes it by jumps alone, which no derivative sees."""
-    pixels = np.array([[0.0, 0.2, 0.9, 1.0]] * 4, dtype=np.float32)[..., None]
-    bitmap = mi.load_dict({"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True})
-    si = dr.zeros(mi.SurfaceInteraction3f, 4)
-    si.uv = mi.Point2f([0.40, 0.55, 0.70, 0.80], 0.5)
-    slopes = np.array(bitmap.eval_1_grad(si))[0]
-    assert slopes[0] == pytest.approx(slopes[1], rel=1e-3) and slopes[2] == pytest.approx(slopes[3], rel=1e-3)
-    assert slopes[0] > 3 * slopes[2]
-    assert compat.is_bump_map(mi.load_dict({"type": "bumpmap", "a": bitmap, "b": {"type": "diffuse"}}))
-    assert not compat.is_bump_map(mi.load_dict({"type": "diffuse"}))
-
-
-def test_attributes_of_lights_read_as_zero_where_they_are_sampled():
-    """When this fails, lights may have them: `texture_uses.py`."""
-    glow = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_glow"}}
-    pose = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([0, 1, 0], 180)
-    lamp = {"type": "rectangle", "to_world": pose, "emitter": glow, "vertex_glow": {"type": "uniform", "value": 5.0}}
-    scene = mi.load_dict({"type": "scene", "lamp": lamp})
-    sample, weight = scene.sample_emitter_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.4, 0.6), False)
-    found = scene.ray_intersect(mi.Ray3f(mi.Point3f(0), sample.d))
-    assert sample.pdf[0] > 0 and found.emitter(scene).eval(found)[0][0] == 5
-    assert weight[0][0] == 0

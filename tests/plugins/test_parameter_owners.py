@@ -6,10 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import torch
 
-import torchtransient as tt
-from support.gradient_cases.scenes import area_light, room
 from torchtransient.errors import GradientError
 from torchtransient.plugins.parameters import ALMOST_BLACK, ParameterTracker
 
@@ -93,30 +90,3 @@ def test_black_inside_a_normal_map_is_refused(source):
 # -------------------------------------------------------------------------------------------------- against differences
 
 
-@pytest.mark.slow
-def test_slope_where_a_lobe_vanishes():
-    """The plugin is exchanged for what its texture reads off the shape, and numbers that are zero are lifted."""
-    paint = {"type": "principled", "roughness": 0.5, "base_color": 0.7, "spec_trans": READER}
-    paint = {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.55, 0.48, 0.98]}, "nested": paint}
-    described = room(bsdf=paint, light=area_light(), side_reflectance=0.95)
-    described["wall"][NAME] = {"type": "uniform", "value": 0.0}
-    scene = tt.load(described, variant=VARIANT)
-    key = f"wall.{NAME}.value"
-    assert "diff_principled" in scene.parameters()[key].reason
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=8192, grad_seed="same")
-
-    def brightness(x, seed):
-        return renderer(values={key: x}, seed=seed).steady.double().sum()
-
-    found, expected = [], []
-    for seed in range(6):
-        x = torch.zeros((), requires_grad=True)
-        brightness(x, seed).backward()
-        found.append(float(x.grad))
-        with torch.no_grad():
-            here, near, far = (brightness(torch.tensor(0.1 * k), seed) for k in range(3))
-        expected.append(float(4 * near - 3 * here - far) / 0.2)
-    found, expected = np.array(found), np.array(expected)
-    error = (found - expected).std(ddof=1) / np.sqrt(6)
-    assert abs(found.mean() - expected.mean()) < 4 * error + 0.02 * abs(expected.mean())
-    assert error < 0.1 * abs(expected.mean())

@@ -53,13 +53,6 @@ def test_another_bsdf_is_seen():
     assert_change_is_seen(lambda: mi.load_dict(room(depth=3), optimize=False), change)
 
 
-def test_one_integrator_renders_several_scenes():
-    first, second = (mi.load_dict(room(bsdf=bsdf, depth=3), optimize=False) for bsdf in (None, {"type": "conductor"}))
-    integrator = mi.load_dict({"type": "transient_path", "max_depth": 3, "rr_depth": 100})
-    for scene in (first, second, first):
-        np.testing.assert_allclose(rendered(scene, integrator=integrator), rendered(scene), rtol=1e-5)
-
-
 def test_keeps_no_scene_alive():
     """The scene owns the integrator: one that kept the scene would never be freed."""
     scene = mi.load_dict(room(depth=3), optimize=False)

@@ -204,16 +204,23 @@ def test_a_ray_along_a_surface_has_no_slope(kind):
     assert dr.grad(x)[0] == 0
 
 
-def test_distance_of_where_a_ray_leaves():
-    """Of the far side of a sphere, for a ray that starts before the near one: sqrt(r^2 - x^2) + 3, by x and by r."""
-    mi.set_variant("llvm_ad_mono")
-    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 1.5}})
+@pytest.mark.parametrize("copied", [False, True])
+def test_distance_of_where_a_ray_leaves(copied):
+    """Of the far side of a sphere, alone or in an instance, for a ray that starts before the near one:
+    sqrt(r^2 - x^2) + 3, by x and by r.
+    """
+    ball, key = {"type": "sphere", "radius": 1.5}, "copy.to_world" if copied else "ball.to_world"
+    objects = {"ball": ball}
+    if copied:
+        copy = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+        objects = {"group": {"type": "shapegroup", "ball": ball}, "copy": copy}
+    scene = mi.load_dict({"type": "scene", **objects}, optimize=False)
     x, scale = mi.Float(0.9), mi.Float(1.0)
     pi = scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(x, 0, 0), mi.Vector3f(0, 0, 1)))
     pi.t += 3
     dr.enable_grad(x, scale)
     params = mi.traverse(scene)
-    params["ball.to_world"] = mi.Transform4f(params["ball.to_world"]) @ mi.Transform4f().scale(mi.Vector3f(scale))
+    params[key] = mi.AffineTransform4f(params[key]) @ mi.AffineTransform4f().scale(mi.Vector3f(scale))
     params.update()
     t = attached_distance(scene, pi, mi.Ray3f(mi.Point3f(x, 0, -3), mi.Vector3f(0, 0, 1)))
     dr.backward(t)

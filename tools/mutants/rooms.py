@@ -48,7 +48,7 @@ ROOMS = {
     "sensing": _same("sensing"),
     "films": Room(
         ("plugins/films", "rendering/films.py"),
-        ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py", "plugins/test_pulse*.py",
+        ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py",
          "plugins/test_response.py", "plugins/test_wrong_options.py", "rendering/films",
          "integrators/test_*phasor*.py", "integrators/test_*film*.py"),
     ),

@@ -6,7 +6,7 @@ from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import room, transform
 from support.gradient_cases.unknowns import rotate, set_color
 
-PIGMENTS = {"eumelanin": 0.3, }
+PIGMENTS = {"eumelanin": 0.3, "pheomelanin": 0.4}
 GREY = {"sigma_a": {"type": "uniform", "value": 0.3}}
 COLOURED = {"sigma_a": {"type": "rgb", "value": [0.2, 0.3, 0.4]}}
 # Each case compiles kernels of its own.

@@ -17,7 +17,7 @@ POLARIZER = {"type": "polarizer", "theta": 20.0}
 PLATE = {"type": "retarder", "theta": 30.0, "delta": 90.0}
 
 
-SLOW = {"polar_camera_rolls", }
+SLOW = {"polar_camera_rolls"}
 
 
 def polar(name, row, scene, apply, value, step, variant=VARIANT, spp=2048, fd_spp=2048):
