@@ -103,16 +103,6 @@ def test_order_of_calls(order, light):
     assert got == pytest.approx(arrival(expected), abs=1e-4)
 
 
-def test_scene_without_an_integrator_of_its_own():
-    """The film keeps the sphere for every integrator."""
-    scene = load(integrator=False)
-    integrators = [mi.load_dict({"type": kind, "max_depth": 2}) for kind in ("transient_path", "transient_prbvolpath")]
-    for distance, integrator in ((20.0, integrators[0]), (5.0, integrators[1]), (3.0, integrators[0])):
-        move(scene, distance)
-        arrival(scene, integrator)
-        assert integrator.reference(scene).center[2] == pytest.approx(-1.5)
-
-
 def layer_arrival(renderer, distance, **call):
     value = torch.tensor(square(0, -distance, 0.1)["to_world"], dtype=torch.float32)
     out = renderer({"far.to_world": value}, seed=0, spp=256, **call)

@@ -9,10 +9,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
-import torch
 
-import torchtransient as tt
-from support.marks import long, long_rows
+from support.marks import long
 from support.runs import T
 from torchtransient import plugins
 
@@ -159,28 +157,5 @@ def test_sampled_lights_are_those_that_paths_find(name):
     )
     assert (error < 0.04 * found).all()
     assert (np.abs(both - found) < SIGMAS * np.hypot(error, own)).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "key"),
-    long_rows(
-        [
-            ("mesh of repeated texture", "light.emitter.radiance.data"),
-            ("sky of the first row", "light.data"),
-        ],
-        [("mesh of repeated texture", "light.emitter.radiance.data")],
-    ),
-)
-def test_derivatives_by_brightness(name, key):
-    """What is lit is linear in the image, so that the image times the derivative by it is what is lit."""
-    total, error = lit_by(LIGHTS[name](), "transient_found_lights")
-    scene = tt.load(scene_of(LIGHTS[name]()), variant=VARIANT)
-    image = torch.tensor(scene.parameters()[key].value, requires_grad=True)
-    out = tt.render(scene, {key: image}, spp=512, seed=5)
-    _, own = mean_of(out.steady.detach().movedim(0, -1))
-    (slope,) = torch.autograd.grad(out.steady.sum() / PIXELS**2, image)
-    found = (slope.double() * image.detach().double()).sum(dim=(0, 1)).numpy()
-    assert (error < 0.04 * total).all()
-    assert (np.abs(found - total) < SIGMAS * np.hypot(error, own)).all()
 
 

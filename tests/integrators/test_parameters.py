@@ -21,42 +21,29 @@ def room():
     """
     picture = np.random.default_rng(1).uniform(0.1, 0.9, (6, 6, 3)).astype(np.float32)
     sky = np.random.default_rng(2).uniform(0.1, 0.6, (4, 8, 3)).astype(np.float32)
+    textured = {"type": "diffuse", "reflectance": {"type": "bitmap", "data": mi.TensorXf(picture)}}
+    painted = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}
+    gold = {"type": "roughconductor", "material": "Au", "alpha": 0.2}
+    radiance = {"type": "rgb", "value": [4.0, 3.0, 2.0]}
     return {
         "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-        "back": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 0, -1]).scale(1.4),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "data": mi.TensorXf(picture)}},
-        },
+        "back": {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale(1.4), "bsdf": textured},
         "floor": {
-            "type": "rectangle",
-            "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(1.4),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}},
+            "type": "rectangle", "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(1.4),
+            "bsdf": painted,
         },
         "lamp": {
-            "type": "cube",
-            "to_world": T().translate([0.3, 1.0, 0.2]).scale([0.4, 0.05, 0.4]),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 3.0, 2.0]}},
+            "type": "cube", "to_world": T().translate([0.3, 1.0, 0.2]).scale([0.4, 0.05, 0.4]),
+            "emitter": {"type": "area", "radiance": radiance},
         },
         "glass": {"type": "sphere", "center": [0.5, -0.6, 0.3], "radius": 0.35, "bsdf": {"type": "dielectric"}},
-        "mirror": {
-            "type": "cube",
-            "to_world": T().translate([-0.6, -0.6, -0.1]).rotate([0, 1, 0], 30).scale(0.3),
-            "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.2},
-        },
-        "ball": {
-            "type": "sphere",
-            "center": [0.0, -0.75, 0.8],
-            "radius": 0.22,
-            "bsdf": {"type": "roughplastic", "alpha": 0.15},
-        },
-        "steel": {
-            "type": "sphere",
-            "center": [-0.5, 0.3, -0.2],
-            "radius": 0.25,
-            "bsdf": {"type": "conductor", "material": "Al"},
-        },
-    }
+        "gold": {"type": "cube", "to_world": T().translate([-0.6, -0.6, -0.1]).rotate([0, 1, 0], 30).scale(0.3),
+                 "bsdf": gold},
+        "ball": {"type": "sphere", "center": [0.0, -0.75, 0.8], "radius": 0.22,
+                 "bsdf": {"type": "roughplastic", "alpha": 0.15}},
+        "steel": {"type": "sphere", "center": [-0.5, 0.3, -0.2], "radius": 0.25,
+                  "bsdf": {"type": "conductor", "material": "Al"}},
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("variant", long(["llvm_ad_mono", "llvm_ad_spectral"], ["llvm_ad_mono"]))

@@ -61,12 +61,6 @@ def test_at_frequency_zero_it_is_the_steady_image():
     np.testing.assert_allclose(phasors[:, :, zero].imag, 0, atol=2e-6 * steady.max())
 
 
-def test_grid_and_list_give_the_same():
-    listed = " ".join(str(f) for f in FREQUENCIES + 1e-9 * np.arange(10) ** 2)
-    (steady, a), (_, b) = render(scene_of(phasor_camera())), render(scene_of(phasor_camera(frequencies=listed)))
-    np.testing.assert_allclose(a, b, atol=ROUNDING * steady.max())
-
-
 def test_the_origin_of_the_phase_shifts_it():
     start = 3.217
     steady, a = render(scene_of(phasor_camera()))

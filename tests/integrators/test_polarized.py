@@ -26,37 +26,24 @@ def t():
 def everything():
     """Metal, glass, plastic, a wave plate and a polarizer; a point light and an area light; a tilted camera."""
     view = t().look_at(origin=[0.3, 1.1, 4], target=[0, 0.2, 0], up=[0.1, 1, 0])
+    floor = t().rotate([1, 0, 0], -90).rotate([0, 0, 1], 30).scale(3)
+    plate = {"type": "retarder", "theta": number(30.0), "delta": number(70.0)}
     return {
         "type": "scene",
         "sensor": {"type": "perspective", "fov": 40, "to_world": view},
         "light": {"type": "point", "position": [1, 2, 1.5], "intensity": 10.0},
-        "lamp": {
-            "type": "rectangle",
-            "to_world": t().translate([0, 3, 1]).rotate([1, 0, 0], 90).scale(0.5),
-            "emitter": {"type": "area", "radiance": 3.0},
-        },
-        "floor": {
-            "type": "rectangle",
-            "to_world": t().rotate([1, 0, 0], -90).rotate([0, 0, 1], 30).scale(3),
-            "bsdf": {"type": "roughconductor", "alpha": 0.3, "material": "Al"},
-        },
+        "lamp": {"type": "rectangle", "to_world": t().translate([0, 3, 1]).rotate([1, 0, 0], 90).scale(0.5),
+                 "emitter": {"type": "area", "radiance": 3.0}},
+        "floor": {"type": "rectangle", "to_world": floor,
+                  "bsdf": {"type": "roughconductor", "alpha": 0.3, "material": "Al"}},
         "glass": {"type": "sphere", "center": [0.3, 0.7, 0.2], "radius": 0.6, "bsdf": {"type": "dielectric"}},
-        "back": {
-            "type": "rectangle",
-            "to_world": t().translate([0, 0, -1.5]).scale(3),
-            "bsdf": {"type": "pplastic", "alpha": 0.2},
-        },
-        "plate": {
-            "type": "rectangle",
-            "to_world": t().translate([-0.6, 0.5, 1.5]).rotate([0, 1, 0], 20).scale(0.4),
-            "bsdf": {"type": "retarder", "theta": number(30.0), "delta": number(70.0)},
-        },
-        "polarizer": {
-            "type": "rectangle",
-            "to_world": t().translate([0.5, 0.2, 1.5]).rotate([1, 0, 0], 20).scale(0.3),
-            "bsdf": {"type": "polarizer", "theta": number(-20.0)},
-        },
-    }
+        "back": {"type": "rectangle", "to_world": t().translate([0, 0, -1.5]).scale(3),
+                 "bsdf": {"type": "pplastic", "alpha": 0.2}},
+        "plate": {"type": "rectangle", "to_world": t().translate([-0.6, 0.5, 1.5]).rotate([0, 1, 0], 20).scale(0.4),
+                  "bsdf": plate},
+        "polarizer": {"type": "rectangle", "to_world": t().translate([0.5, 0.2, 1.5]).rotate([1, 0, 0], 20).scale(0.3),
+                      "bsdf": {"type": "polarizer", "theta": number(-20.0)}},
+    }  # fmt: skip
 
 
 def loaded(scene, integrator, film):

@@ -79,3 +79,15 @@ def test_drawn_directions_do_not_turn_with_the_ray(name):
     assert dr.grad_enabled(weight) and dr.grad_enabled(bs.wo) == mirrored and not dr.grad_enabled(bs.pdf)
 
 
+@pytest.mark.parametrize("number", [0.0, 1 - 2.0**-24])
+@pytest.mark.parametrize("name", ["plastic", "retroreflector", "dielectric", "rough plastic", "rough dielectric"])
+def test_a_lobe_that_is_asked_for_alone_is_drawn(name, number):
+    """Whatever number decides; and the other one never is."""
+    rough = {"type": "diff_" + name.replace(" ", "_"), "int_ior": 1.4, "alpha": 0.2}
+    bsdf = mi.load_dict(SURFACES[name][0] if name in SURFACES else rough)
+    si = interaction(mi.Vector3f(0.28, 0, 0.96))
+    for component in (0, 1):
+        ctx = mi.BSDFContext()
+        ctx.component = component
+        bs, weight = bsdf.sample(ctx, si, mi.Float(number), mi.Point2f(0.4, 0.3))
+        assert list(bs.sampled_component) == [component] and weight[0][0] > 0 and bs.pdf[0] > 0

@@ -135,12 +135,3 @@ def test_lengths_are_those_of_all_edges_and_limbs(scene):
         assert found[name] == pytest.approx(length, rel=5e-3), name
 
 
-def test_flat_creases_are_not_drawn():
-    """The diagonals of a rectangle and of the six sides of a cube; of two bodies, which may differ, they are."""
-    flat = lambda s: int((np.array(EdgeTable(Topology(s), frozenset()).by_length.weight) > 0).sum())  # noqa: E731
-    plates = {f"r{i}": {"type": "rectangle", "to_world": placed(0, 0, 0).translate([2.0 * i, 0, 0])} for i in (0, 1)}
-    kinds = {"rectangle": (4, {"a": {"type": "rectangle"}}), "cube": (24, {"a": {"type": "cube"}}), "two": (8, plates)}
-    for _, (count, shapes) in kinds.items():
-        assert flat(mi.load_dict({"type": "scene", **shapes}, optimize=False)) == count
-
-

@@ -14,7 +14,6 @@ from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import GradientError, SceneError
-from torchtransient.files import read_result, write_result
 
 VARIANT = "llvm_ad_rgb"
 START = 2.0
@@ -178,19 +177,6 @@ def test_a_rectangular_gate_has_no_derivative_in_time():
     )
     with pytest.raises(GradientError, match=r"rectangular gate.*rise from zero"):
         renderer(seed=0)
-
-
-def test_output_and_file(tmp_path):
-    scene = tt.load(make_room(), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, gates=GATES, spp=4)
-    out = renderer(seed=0)
-    assert out.axis is None and out.phasor is None and out.transient is None and out.gates == GATES
-    assert out.gated.shape == (3, 3, 3, 4) and "gates=3" in repr(renderer)
-    assert out.stats.energy_before == out.stats.energy_after == (0.0,)
-    for name in ("a.h5", "a.npz"):
-        back = read_result(write_result(tmp_path / name, out))
-        assert back.gates == GATES and back.axis is None and torch.equal(back.gated, out.gated)
-        assert back.transient is None and back.phasor is None
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ def derivatives(key, face_normals):
 @pytest.mark.parametrize(
     ("key", "face_normals"),
     [
-        ("cube.vertex_positions", False),
+        pytest.param("cube.vertex_positions", False, marks=pytest.mark.slow),
         ("cube.to_world", True),
     ],
 )

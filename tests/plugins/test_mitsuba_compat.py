@@ -140,25 +140,6 @@ def test_colours_are_kept_as_coefficients_in_spectral_variants():
         assert keeps_coefficients(mi.load_dict({"type": "bitmap", "bitmap": pixels, "raw": False}), "data") == kept
 
 
-@pytest.mark.parametrize("size", [1, 3, 4])
-def test_attributes_of_another_size_read_as_zero(size):
-    activate(RGB)
-    mesh = mi.load_dict({"type": "cube"})
-    mesh.add_attribute("vertex_color", size, [0.5] * (size * mesh.vertex_count()))
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.shape = mi.ShapePtr(mesh)
-    texture = mi.load_dict({"type": "mesh_attribute", "name": "vertex_color"})
-    read = {
-        "base_color": dr.max(texture.eval(si))[0],
-        "roughness": texture.eval_1(si)[0],
-        "normalmap": dr.max(texture.eval_3(si))[0],
-    }
-    holders = dict.fromkeys(read, mi.load_dict({"type": "principled"}))
-    holders["normalmap"] = mi.load_dict({"type": "normalmap", "normalmap": texture, "nested": {"type": "diffuse"}})
-    for slot, value in read.items():
-        assert (value > 0) == (size in compat.attribute_sizes(holders[slot], slot)), slot
-
-
 # ------------------------------------------------------------------------------------------------------ shapes, sensors
 
 

@@ -50,14 +50,6 @@ def test_every_plugin_belongs_to_the_active_variant(variant):
     assert isinstance(build("diff_rough_dielectric"), mi.BSDF)
 
 
-def test_variant_context_there_and_back():
-    rgb = type(build("transient_path"))
-    with mi.variant_context("llvm_ad_mono"):
-        assert isinstance(build("transient_path"), mi.Integrator)
-        assert not isinstance(build("transient_path"), rgb)
-    assert isinstance(build("transient_path"), mi.Integrator)
-
-
 def test_a_plugin_is_imported_at_its_first_use():
     """Hair is built on the class of plastic: both are imported by one use, and belong to each later variant."""
     found = run(

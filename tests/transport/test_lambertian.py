@@ -9,17 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.gradient_cases.scenes import area_light, room, transform
+from support.gradient_cases.scenes import room, transform
 
 VARIANT = "llvm_ad_rgb"
 pytestmark = pytest.mark.usefixtures("no_leftovers")
-ALBEDO = "side.bsdf.reflectance.value"
-
-
-def described():
-    return room({"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.5}}, area_light())
-
-
 def gradient(scene, key):
     """The gradient of the transient times a pattern that differs from bin to bin."""
     params = mi.traverse(scene)
@@ -50,13 +43,3 @@ def test_black_texels_of_a_lamp_have_derivatives():
     np.testing.assert_allclose(by_texel(chequered), expected, rtol=1e-4, atol=1e-5 * expected.max())
 
 
-def test_a_black_albedo_has_its_derivative():
-    """The derivative by an albedo, linear in the light that falls on a surface, has no jump at zero."""
-
-    def at(reflectance):
-        scene = mi.load_dict(described() | {"side": room(side_reflectance=reflectance)["side"]})
-        return gradient(scene, ALBEDO)
-
-    black, dark = at(0.0), at(1e-3)
-    assert (black > 0).all()
-    np.testing.assert_allclose(black, dark, rtol=0.01)
