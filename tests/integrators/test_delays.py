@@ -11,10 +11,10 @@ from scipy.stats import gamma
 
 import torchtransient as tt
 from support.gradient_cases.scenes import camera, film, room
+from support.runs import steady_runs
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test, z_test
 from torchtransient.errors import SceneError
-from torchtransient.plugins.guards import no_collection
 from torchtransient.pulses import Pulse
 from torchtransient.units import SPEED_OF_LIGHT
 
@@ -124,8 +124,7 @@ def test_the_sum_is_what_steady_integrators_see(extra):
     node = {**LATE, **extra}
     ours = np.array([runs(scene(node, 4), 1, 8192, seed=k)[0][0] for k in range(8)])
     target = scene(node, 4, integrator="path")
-    with no_collection():
-        theirs = np.array([np.array(mi.render(target, seed=90 + k, spp=8192), dtype=float).mean() for k in range(8)])
+    theirs = steady_runs(target, 8, 8192, 90).mean((1, 2, 3))
     result = two_sample_z_test(ours[:, None], theirs[:, None])
     assert result.passed, str(result)
     assert not two_sample_z_test(ours[:, None], 1.05 * theirs[:, None]).passed

@@ -25,10 +25,9 @@ from support.lights_and_sensors import (
     scene,
 )
 from support.marks import long, long_rows
-from support.runs import T
+from support.runs import T, steady_runs
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.plugins.guards import no_collection
 
 VARIANT = "llvm_ad_rgb"  # the sky of Mitsuba knows no monochromatic variant
 # Half a bin, and what float32 makes of lengths of ten metres.
@@ -221,8 +220,7 @@ def test_sum_over_time_is_what_mitsuba_renders(sensor, light):
         steady, transient = np.array(steady, float), np.array(transient, float)
         np.testing.assert_allclose(transient.sum(2), steady, rtol=1e-4, atol=1e-6 * max(steady.max(), 1e-3))
         sums.append(transient.sum(2))
-    with no_collection():
-        images = np.array([np.array(mi.render(theirs, seed=900 + k, spp=spp), float) for k in range(count)])
+    images = steady_runs(theirs, count, spp, 900)
     assert images.max() > 0
     result = two_sample_z_test(np.array(sums), images, rounding=1e-5 * images.max())
     assert result.passed, str(result)

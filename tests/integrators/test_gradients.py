@@ -42,6 +42,8 @@ ALIKE = {
     "smooth_plastic_index", "mirror_reflectance", "polar_polarizer_angle", "polar_albedo", "linear_curve_bends",
     "conductor_eta", "side_moves", "medium_sigma_t", "index_of_masked_thin_glass", "banded_albedo_spectrum", "lifetime",
     "gated_wall", "ellipsoid_changes", "instance_turns", "mirror_normals",
+    "gap_plates", "sky_texture", "wall_under_long_pulse", "medium_flakes_in_clouds", "mirror_normals_in_an_attribute",
+    "mirror_tilts",
 }  # fmt: skip
 
 

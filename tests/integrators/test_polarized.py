@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
+from support.runs import mitsuba_image
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.plugins.guards import no_collection
 
 VARIANT = "llvm_ad_mono_polarized"
 SPP = 1024
@@ -64,9 +64,7 @@ def mitsubas(scene):
 
 def stokes_of(scene, seed):
     """Mitsuba's image as (4, 4, 4, C): rows, columns, Stokes components, channels. Mono is repeated in three."""
-    with no_collection():
-        image = np.array(mi.render(scene, seed=seed, spp=SPP), dtype=np.float64)[..., -12:].reshape(4, 4, 4, 3)
-    return image[..., :1] if mi.is_monochromatic else image
+    return mitsuba_image(scene, seed, SPP)[..., -12:].reshape(4, 4, 4, 3)[..., :1]
 
 
 def test_the_sum_over_time_is_mitsubas_stokes_image():

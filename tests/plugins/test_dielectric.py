@@ -14,6 +14,7 @@ import torch
 from support.dielectric_reference import fresnel_reflectance, refracted_direction, rough_dielectric
 from support.marks import long, long_rows
 from support.surface_samples import activate
+from support.sweeps import together
 
 LANES = 4000
 
@@ -171,6 +172,40 @@ def test_smooth_sample_is_attached():
         np.testing.assert_allclose(
             np.broadcast_to(dr.grad(got).numpy(), slope.shape), slope.numpy(), rtol=1e-3, atol=2e-5
         )
+
+
+@together("n", [0.5, 0.9, 1.1, 1.5, 2.4])
+def test_reflectance_at_all_angles(n):
+    """Fresnel's, from both sides, by the probability of the reflected lobe, and its slopes by index and cosine; all
+    light and no slope where reflection is total.
+    """
+    activate("llvm_ad_mono")
+    bsdf = mi.load_dict({"type": "diff_dielectric", "int_ior": n, "ext_ior": 1.0})
+    cosines = np.linspace(0.005, 1, 400, dtype=np.float32)
+    cosines = np.concatenate([-cosines, cosines])
+    n = np.float32(mi.traverse(bsdf)["eta"][0])
+    inside = np.where(cosines > 0, n, 1 / n)
+    beyond = cosines**2 + inside**2 - 1
+    cosines, beyond = cosines[np.abs(beyond) > 1e-3], beyond[np.abs(beyond) > 1e-3]
+    c = torch.tensor(cosines.astype(np.float64), requires_grad=True)
+    eta = torch.full_like(c, float(n)).detach().requires_grad_()
+    expected = fresnel_reflectance(c, eta)
+    slopes = [slope.numpy() for slope in torch.autograd.grad(expected.sum(), (c, eta))]
+    expected = expected.detach().numpy()
+    assert (expected[beyond < 0] == 1).all() and (beyond < 0).any()
+    unknowns = mi.Float(cosines), dr.full(mi.Float, n, len(cosines))
+    dr.enable_grad(*unknowns)
+    params = mi.traverse(bsdf)
+    params["eta"] = unknowns[1]
+    params.update()
+    wi = mi.Vector3f(dr.sqrt(1 - dr.square(dr.detach(unknowns[0]))), 0, unknowns[0])
+    bs, weight = bsdf.sample(mi.BSDFContext(), interaction(wi), mi.Float(0), mi.Point2f(0.5))
+    np.testing.assert_allclose(bs.pdf.numpy(), expected, rtol=2e-5, atol=1e-7)
+    dr.backward(weight[0])  # its value over the detached probability
+    for x, slope in zip(unknowns, slopes, strict=True):
+        found = dr.grad(x).numpy() * expected
+        np.testing.assert_allclose(found, slope, rtol=1e-3, atol=1e-5 * np.abs(slope).max())
+        assert (found[beyond < 0] == 0).all()
 
 
 ATTACHED = [(True, (0.1, 0.5)), (False, (0.02, 0.02))]

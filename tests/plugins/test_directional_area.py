@@ -15,7 +15,6 @@ from tools.gradient_sweep.shapes import lamp_shapes
 from tools.gradient_sweep.stages import lit_by, matte, move, stretch, turn
 from torchtransient import plugins
 from torchtransient.errors import GradientError
-from torchtransient.plugins.mitsuba_compat import COMPLETED_PLUGINS
 
 VARIANT = "llvm_ad_rgb"
 REFLECTANCE = "plate.bsdf.reflectance.value"
@@ -69,7 +68,7 @@ def shapes_with_lights():
     """With Mitsuba's, with ours."""
     radiance = {"type": "d65", "scale": 5.0}
     pose = mi.ScalarTransform4f().scale(2)
-    names = ("directionalarea", COMPLETED_PLUGINS["directionalarea"])
+    names = ("directionalarea", "diff_directionalarea")
     lights = [{"type": name, "radiance": radiance} for name in names]
     return [mi.load_dict({"type": "rectangle", "to_world": pose, "emitter": light}) for light in lights]
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.plain_scenes import as_mitsuba
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.scene.edits import BuildOptions
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
@@ -88,14 +88,15 @@ def test_coordinates_that_are_turned(tmp_path):
 
 def test_points_of_a_mesh_move_with_it(tmp_path):
     """They are material points, for vertices that move and in derivatives by them."""
-    scene = tt.load(on(wall_file(tmp_path, UPRIGHT)), variant=VARIANT).built(BuildOptions(transient=True))
-    sensor, key = scene.scene.sensors()[0], "wall.vertex_positions"
+    mi.set_variant(VARIANT)
+    scene = mi.load_dict(as_mitsuba(on(wall_file(tmp_path, UPRIGHT))), optimize=False)
+    sensor, key, params = scene.sensors()[0], "wall.vertex_positions", mi.traverse(scene)
     before = np.array(sensor.scanned())
-    start, way = mi.Point3f(dr.unravel(mi.Point3f, scene.params[key])), mi.Vector3f(0.1, -0.2, 0.3)
+    start, way = mi.Point3f(dr.unravel(mi.Point3f, params[key])), mi.Vector3f(0.1, -0.2, 0.3)
     far = mi.Float(1.0)
     dr.enable_grad(far)
-    scene.params[key] = dr.ravel(start + far * way)
-    scene.params.update()
+    params[key] = dr.ravel(start + far * way)
+    params.update()
     after = sensor.scanned()
     dr.forward(far)
     np.testing.assert_allclose(np.array(after) - before, np.tile([[0.1], [-0.2], [0.3]], 6), atol=1e-6)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tools.boundary_cases.closed_rooms import ROOMS
-from tools.boundary_cases.edge_derivatives import PASSES, EdgeProblem
+from tools.boundary_cases.edge_derivatives import EdgeProblem
 from tools.boundary_cases.moving_edges import CASES, SPECTRAL
 
 SIGMAS = 4.0
@@ -57,37 +57,32 @@ def test_colours():
 
 
 def test_rays_edge_on_to_a_meter():
-    """Of 4e6 paths none counts by one over a cosine that is rounding: no run is far from the others."""
+    """Of 2e6 paths none counts by one over a cosine that is rounding: no run is far from the others."""
     problem = EdgeProblem(ROOMS["meter"](2))
-    found = np.array([problem.reverse(seed, 1 << 18, ()) for seed in range(300, 316)])
+    found = np.array([problem.reverse(seed, 1 << 18, ()) for seed in range(300, 308)])
     off = np.abs(found - np.median(found))
     assert off.max() < 10 * np.median(off)
 
 
-def both_modes(name, passes):
-    """(reverse, forward) of each pass alone at one seed."""
+def check_modes(name, *passes):
+    """Forward mode is reverse mode, of the given passes at one seed."""
     problem = EdgeProblem(CASES[name])
-    modes = problem.reverse, problem.forward
-    return np.array([[mode(5, 64, (one,), interior=False) for mode in modes] for one in passes])
+    reverse, forward = (mode(5, 64, passes, interior=False) for mode in (problem.reverse, problem.forward))
+    assert abs(reverse) > 1e-3
+    assert forward == pytest.approx(reverse, rel=ROUNDING)
 
 
-@pytest.mark.parametrize(("name", "passes"), [("contact4", ("primary", "vertex", "light")), ("mirror", ("specular",))])
-def test_forward_mode_of_every_pass(name, passes):
-    found = both_modes(name, passes)
-    assert (abs(found[:, 0]) > 1e-3).all()
-    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+def test_forward_mode():
+    check_modes("contact4", "primary", "vertex", "light")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "passes"),
-    [
-        ("glass_moves", ("primary", "light", "specular")), ("camera_moves4", PASSES), ("instance4", PASSES),
-    ],
-)  # fmt: skip
-def test_forward_mode(name, passes):
-    found = both_modes(name, passes)
-    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+    ("name", "passes"), [("mirror", ["specular"]), ("glass_moves", ["primary", "light", "specular"])]
+)
+def test_forward_mode_of_every_pass(name, passes):
+    for one in passes:
+        check_modes(name, one)
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ ADJOINT = torch.linspace(0, 1, 24)[None, :, None, None]
 
 def gradients(room, keys, depth=3, spp=16, seed=0):
     room["integrator"]["max_depth"] = depth
-    renderer = tt.TransientRenderer(room, keys, spp=spp, temporal_filter="tent")
+    renderer = tt.TransientRenderer(room, keys, spp=spp, temporal_filter="tent", boundary=False)
     for _ in range(2):
         renderer.zero_grad()
         out = renderer(seed=seed)

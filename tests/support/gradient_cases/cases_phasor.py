@@ -31,6 +31,7 @@ def glass():
 
 
 CASES = [
+    Case("phasor_albedo", ROW, lambda: seen_as_phasors(room()), set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
     Case(
         "phasor_wall_distance",
         ROW,
