@@ -30,7 +30,7 @@ def test_closed_forms_of_a_wall_in_both_modes():
     are rounded as the phasors are, 260 times the signal.
     """
     scene = tt.load(moving_scene(wall=wall((0, 0, 2), (0, 0, 0))), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, [POSE, ALBEDO], spp=64, frequencies=FREQUENCIES)
+    renderer = tt.TransientRenderer(scene, [POSE, ALBEDO], spp=64, frequencies=FREQUENCIES, boundary=False)
     pose, along = renderer.values[POSE].detach(), torch.zeros(4, 4)
     along[2, 3] = 1.0
 
@@ -107,7 +107,8 @@ def test_differences_in_a_corner(name):
 
 def test_velocities_of_a_rolling_shutter_by_vmap_and_reverse_mode():
     """Of several velocities at once, as of each; gradients of parameters of the renderer too."""
-    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), ["box.to_world"], spp=8, grad_seed="same")
+    settings = {"spp": 8, "grad_seed": "same", "boundary": False}
+    renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), ["box.to_world"], **settings)
     shutter = tt.RollingShutter(2e-3, poses=2)
 
     def light(velocity):
