@@ -20,7 +20,6 @@ from support.gradient_cases.cases_mixtures import (
     transform,
     two_sided,
 )
-from support.marks import long
 from torchtransient import plugins
 from torchtransient.errors import GradientError, SceneError
 
@@ -42,8 +41,8 @@ def load(bsdf, behind=False):
     return mi.load_dict(scene, optimize=False)
 
 
-def tint(nested, plugin="tint"):
-    return {"type": plugin, "inner": nested}
+def tint(nested):
+    return {"type": "tint", "inner": nested}
 
 
 def image(bsdf, behind=False):
@@ -65,10 +64,9 @@ def slope(bsdf, key, value=None, spp=256):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plugin", long(["tint", "mended_tint"], ["tint"]))
-def test_lobe_probabilities_that_a_nested_bsdf_hides(plugin):
+def test_lobe_probabilities_that_a_nested_bsdf_hides():
     activate(MONO)
-    assert slope(tint(THIN_GLASS, plugin), "inner.eta") == pytest.approx(0.5 * slope(THIN_GLASS, "eta"), rel=1e-4)
+    assert slope(tint(THIN_GLASS), "inner.eta") == pytest.approx(0.5 * slope(THIN_GLASS, "eta"), rel=1e-4)
 
 
 @pytest.mark.slow
