@@ -12,7 +12,7 @@ import pytest
 
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
-from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability
+from torchtransient.plugins.bsdfs.mixtures import hides_lobe_probability, mirrors_matrices
 from torchtransient.plugins.node_walk import objects_below, objects_of
 from torchtransient.plugins.spectral_colours import keeps_coefficients
 
@@ -32,6 +32,10 @@ def interaction(wi):
 
 def unit(x, y, z):
     return dr.normalize(mi.Vector3f(x, y, z))
+
+
+def matrix(value):
+    return np.array([[float(value[i, j][0][0]) for j in range(4)] for i in range(4)])
 
 
 # ------------------------------------------------------------------------------------------------- lobes and their pdf
@@ -125,6 +129,87 @@ def test_derivatives_at_normal_incidence_are_not_numbers(plugin):
 # ------------------------------------------------------------------------------------------- samples, lobes and tables
 
 
+def clearcoat_slope(weight):
+    """(derivative of a principled surface by its clearcoat, forward difference)."""
+    bsdf = mi.load_dict({"type": "principled", "clearcoat": {"type": "uniform", "value": weight}})
+    params = mi.traverse(bsdf)
+
+    def value(x):
+        params["clearcoat.value"] = x
+        params.update()
+        wi, wo = unit(0.3, 0.1, 0.9), unit(-0.3, -0.1, 0.9)
+        return dr.sum(bsdf.eval(mi.BSDFContext(), interaction(wi), wo))
+
+    x = mi.Float(weight)
+    dr.enable_grad(x)
+    dr.backward(value(x))
+    return float(dr.grad(x)[0]), float(((value(mi.Float(weight + 0.1)) - value(mi.Float(weight))) / 0.1)[0])
+
+
+def test_a_lobe_of_weight_zero_is_skipped():
+    activate(RGB)
+    at_zero, difference = clearcoat_slope(0.0)
+    assert at_zero == 0 and difference > 0.1
+    beside, difference = clearcoat_slope(1e-6)
+    assert beside == pytest.approx(difference, rel=1e-3)
+    assert 0 in compat.LOST_AT["Principled"]["clearcoat"]
+
+
+@pytest.mark.parametrize("plugin", compat.METALS.values())
+@pytest.mark.parametrize(("slot", "index"), [("eta", (0.0, 2.0)), ("k", (0.4, 0.0))])
+def test_metals_lose_their_slopes_without_index_or_absorption(plugin, slot, index):
+    activate("llvm_ad_mono")
+
+    def reflected(x):
+        numbers = {"eta": index[0], "k": index[1]}
+        textures = {name: {"type": "uniform", "value": value} for name, value in numbers.items()}
+        params = mi.traverse(bsdf := mi.load_dict({"type": plugin, **textures}))
+        params[f"{slot}.value"] = x
+        params.update()
+        # Every facet that light reaches here is beyond the angle of total reflection.
+        ctx, si = mi.BSDFContext(), interaction(unit(0.6, 0.0, 0.8))
+        smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+        return bsdf.sample(ctx, si, 0.5, mi.Point2f(0.5))[1] if smooth else bsdf.eval(ctx, si, unit(-0.6, 0.0, 0.8))
+
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    dr.backward(reflected(x)[0], flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    change = float((reflected(mi.Float(0.01))[0] - reflected(mi.Float(0))[0])[0]) / 0.01
+    assert dr.grad(x)[0] == 0 and abs(change) > 0.3
+    assert compat.loses_slope_of_metal(slot, (index[0],) * 2, (index[1],) * 2)
+
+
+@pytest.mark.parametrize(("cls", "black"), [(cls, n % 2) for n, cls in enumerate(compat.PLASTICS)])
+def test_black_lobes_of_plastics_are_never_sampled(cls, black):
+    activate(RGB)
+    lobes = ("specular_reflectance", "diffuse_reflectance")
+    samples = {}
+    for plugin in (compat.PLASTICS[cls], compat.DIFFERENTIABLE_PLUGINS[compat.PLASTICS[cls]]):
+        colours = {name: {"type": "uniform", "value": float(i != black)} for i, name in enumerate(lobes)}
+        bsdf = mi.load_dict({"type": plugin, **colours})
+        si = dr.zeros(mi.SurfaceInteraction3f, 1000)
+        si.wi = unit(0.3, 0.1, 0.9)
+        u = dr.linspace(mi.Float, 0, 1, 1000, endpoint=False)
+        samples[plugin], _ = bsdf.sample(mi.BSDFContext(), si, u, mi.Point2f(0.3, 0.6))
+    theirs, ours = (np.mean(np.array(bs.sampled_component) == black) for bs in samples.values())
+    assert theirs == 0 and ours > 0.01
+    assert compat.lost_at(mi.load_dict({"type": compat.PLASTICS[cls]}), lobes[black]) == (0,)
+
+
+def test_two_sided_matrices_from_behind_are_those_of_the_front():
+    activate(POLARIZED)
+    metal = {"type": "roughconductor", "alpha": 0.3}
+    one, both = mi.load_dict(metal), mi.load_dict({"type": "twosided", "bsdf": metal})
+    wi, wo = unit(0.5, 0.2, 0.8), unit(-0.3, 0.4, 0.7)
+    mirrored = [mi.Vector3f(v.x, v.y, -v.z) for v in (wi, wo)]
+    front = matrix(one.eval(mi.BSDFContext(), interaction(wi), wo))
+    behind = matrix(both.eval(mi.BSDFContext(), interaction(mirrored[0]), mirrored[1]))
+    np.testing.assert_allclose(behind, front, rtol=1e-5)
+    assert abs(front[3, 1]) > 0.1 * front[0, 0], "this pair of directions would not tell the hands apart"
+    assert mirrors_matrices(both) and not mirrors_matrices(one)
+    assert mirrors_matrices(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
+
+
 # --------------------------------------------------------------------------------------------- indices, sides, spectra
 
 
@@ -158,8 +243,3 @@ def test_merged_rectangles_have_no_bounds():
     (shape,) = scene.shapes()
     assert not shape.bbox().valid() and not scene.bbox().valid()
     np.testing.assert_allclose(np.array(compat.bounds_of(shape).max), [1, 1, 1])
-
-
-# -------------------------------------------------------------------------------------------------------- sphere lights
-
-

@@ -95,7 +95,6 @@ def test_polarized_plastic_is_that_of_mitsuba():
 @pytest.mark.slow
 def test_a_texture_without_a_mean():
     """An attribute of the shape, under a checkerboard, gives the light and the slope of what it stands for."""
-
     kind, lobe = "roughplastic", LOBES[1]
 
     def moments(texture, key, **attributes):
