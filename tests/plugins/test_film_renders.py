@@ -73,6 +73,22 @@ def check(a, b, rounding=1e-5):
     assert abs(result.chi2_z) < 4.5, str(result)
 
 
+CROP = {"crop_offset_x": 5, "crop_offset_y": 1, "crop_width": 3, "crop_height": 4}
+
+
+@pytest.mark.slow
+def test_crop_is_the_crop_of_the_full_render():
+    whole, part = glowing_wall(film()), glowing_wall(film(**CROP))
+    steady, transient = runs(part)
+    assert steady.shape[1:] == (4, 3, 3) and transient.shape[1:] == (4, 3, 40, 3)
+    full_steady, full_transient = runs(whole, 7)
+    check(steady, full_steady[:, 1:5, 5:8])
+    check(transient.mean(-1), full_transient[:, 1:5, 5:8].mean(-1))
+    # a window displaced by one pixel would not pass
+    assert not two_sample_z_test(steady, full_steady[:, 1:5, 4:7]).passed
+    assert not two_sample_z_test(steady, full_steady[:, 2:6, 5:8]).passed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
 def test_spatial_filters_converge_to_splatting(rfilter):

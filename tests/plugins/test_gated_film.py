@@ -13,7 +13,7 @@ from support.film_storage import storage
 from tools.small_room import GREY, WALL_POSE, make_room
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.errors import GradientError, SceneError
+from torchtransient.errors import ArgumentError, GradientError, SceneError
 
 VARIANT = "llvm_ad_rgb"
 START = 2.0
@@ -102,6 +102,8 @@ def test_a_pulse_opens_a_gate_softly():
 def test_errors(arguments, message):
     with pytest.raises(SceneError, match=message):
         make_film(**arguments)
+    with pytest.raises(SceneError, match="expected gates, .* got none"), plugins.plugin_errors():
+        mi.load_dict({"type": "gated_hdr_film"})
 
 
 # ------------------------------------------------------------------------------------------------ in renders
@@ -177,6 +179,16 @@ def test_a_rectangular_gate_has_no_derivative_in_time():
     )
     with pytest.raises(GradientError, match=r"rectangular gate.*rise from zero"):
         renderer(seed=0)
+
+
+def test_arguments():
+    scene = tt.load(make_room(), variant=VARIANT)
+    with pytest.raises(ArgumentError, match="give one of them"):
+        tt.TransientRenderer(scene, gates=GATES, time_axis=FINE)
+    with pytest.raises(ArgumentError, match=r"tt\.Gate objects"):
+        tt.TransientRenderer(scene, gates=[3.0])
+    with pytest.raises(ArgumentError, match="gated film has none"):
+        tt.TransientRenderer(scene, gates=GATES, temporal_filter="tent")
 
 
 @pytest.mark.slow
