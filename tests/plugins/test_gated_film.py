@@ -102,7 +102,7 @@ def test_a_pulse_opens_a_gate_softly():
 def test_errors(arguments, message):
     with pytest.raises(SceneError, match=message):
         make_film(**arguments)
-    with pytest.raises(SceneError, match="expected gates, .* got none"), plugins.plugin_errors():
+    with pytest.raises(SceneError, match=r"expected gates, .* got none"), plugins.plugin_errors():
         mi.load_dict({"type": "gated_hdr_film"})
 
 
