@@ -94,17 +94,29 @@ def test_it_is_the_transform_of_the_histogram():
 
 
 def test_one_bounce_in_closed_form():
-    """Light to the wall and back along the axis: amplitude of the steady image, phase of the length."""
-    frequencies = np.array([0.31, 1.7, 8.25])
+    """Light to the wall and back along the axis: amplitude of the steady image, phase of the length; and in forward
+    mode its derivative by the distance h of the lamp, of an amplitude 1 / h^2.
+    """
+    frequencies, h = np.array([0.31, 1.7, 8.25]), 2.75
     sensor = phasor_camera(1, 1, frequencies=" ".join(map(repr, frequencies.tolist()))) | {"fov": 1e-3}
     objects = {
         "wall": {"type": "rectangle", "to_world": T().scale(2)},
-        "light": {"type": "point", "position": [0.0, 0.0, 2.75], "intensity": 5.0},
+        "light": {"type": "point", "position": [0.0, 0.0, h], "intensity": 5.0},
     }
     scene = load(sensor, objects, max_depth=2)
     steady, phasors = render(scene)
-    expected = steady[0, 0] * np.exp(-2j * np.pi * frequencies * 6.75)[:, None]
+    expected = steady[0, 0] * np.exp(-2j * np.pi * frequencies * (4 + h))[:, None]
     np.testing.assert_allclose(phasors[0, 0], expected, atol=2e-5 * steady.max())
+
+    params, x = mi.traverse(scene), mi.Float(h)
+    dr.enable_grad(x)
+    params["light.position"] = mi.Point3f(0, 0, x)
+    params.update()
+    dr.set_grad(x, 1)
+    _, tangent = scene.integrator().render_forward(scene, params, seed=0, spp=64)
+    pairs = np.array(tangent, dtype=np.float64).reshape(len(frequencies), -1, 2)
+    slope = expected * (-2 / h - 2j * np.pi * frequencies)[:, None]
+    np.testing.assert_allclose(pairs[..., 0] + 1j * pairs[..., 1], slope, atol=1e-4 * np.abs(slope).max())
 
 
 def test_the_derivative_by_the_light_is_the_render():

@@ -25,11 +25,11 @@ FILTERS = {
 }
 MEASURED = {"pulse": "tabulated", "pulse_opl": "-0.2 0.1, 0.9", "pulse_values": "0 1 0"}
 TABULATED = Pulse.tabulated([-0.2, 0.1, 0.9], [0, 1, 0])
-LATE = {"pulse": "rectangular", "pulse_width_opl": 0.6, "pulse_center_opl": 1.1}
+LATE = {"pulse": "rectangular", "pulse_width_opl": 0.6, "pulse_center_opl": 1.27}
 KERNELS = {
     "short gaussian": ({"pulse": "gaussian", "pulse_fwhm_opl": 0.2}, [Pulse.gaussian(0.2)]),
     "long gaussian": ({"irf": "gaussian", "irf_fwhm_opl": 1.5}, [Pulse.gaussian(1.5)]),
-    "box, late": (LATE, [Pulse.rectangular(0.6, 1.1)]),
+    "box, late": (LATE, [Pulse.rectangular(0.6, 1.27)]),
     "measured": (MEASURED, [TABULATED]),
     "both": ({**MEASURED, "irf": "gaussian", "irf_fwhm_opl": 0.5}, [TABULATED, Pulse.gaussian(0.5)]),
     "far shorter than a bin": ({"pulse": "gaussian", "pulse_fwhm_opl": 0.01}, [Pulse.gaussian(0.01)]),
