@@ -50,7 +50,7 @@ ROOMS = {
         ("plugins/films", "rendering/films.py"),
         ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py",
          "plugins/test_response.py", "plugins/test_wrong_options.py", "rendering/films",
-         "integrators/test_*phasor*.py", "motion/test_beat_lines.py"),
+         "integrators/test_*phasor*.py", "integrators/test_plain_images.py", "motion/test_beat_lines.py"),
     ),
     "integrators": Room(
         ("plugins/integrators", "plugins/transport"),
