@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from support.plain_scenes import camera, load
-from support.runs import T, runs
+from support.runs import T
 
 VARIANT = "llvm_ad_rgb"
 
@@ -48,24 +48,3 @@ def test_visible_sky_arrives_from_the_sphere_around_the_scene(sky, z):
     assert arrival == pytest.approx(np.sqrt(2.0) - (z + 1.0), abs=6e-4)
 
 
-def test_clock_of_a_second_scene_is_its_own():
-    """One integrator for many scenes: a scene that is gone must not lend its sphere to another at its address."""
-    integrator = mi.load_dict({"type": "transient_path"})
-    for size in (1.0, 2.0, 3.0, 1.5):
-        scene = mi.load_dict({"type": "scene", "wall": wall(size=size), "sky": {"type": "constant"}})
-        assert integrator.reference(scene).radius == pytest.approx(size * np.sqrt(2), rel=1e-6)
-        del scene
-
-
-def test_sky_through_both_strategies():
-    """Under a uniform sky the first bounce arrives at known times whichever strategy found the light."""
-    objects = {"wall": wall(size=1.0), "sky": {"type": "constant", "radiance": 1.0}}
-    scene = load(narrow(bins=60, bin_width=0.1, start=3.0), objects, max_depth=2)
-    _, transient = runs(scene, 8, 4096)
-    edges = 3.0 + 0.1 * np.arange(61)
-    # arrival 4 + sqrt(2) - 0 for a wall through the centre: the same for every direction from the centre of the wall
-    bins = transient[:, 0, 0, :, 0].mean(0)
-    inside = int((4 + np.sqrt(2) - 3.0) / 0.1)
-    assert edges[inside] < 4 + np.sqrt(2) < edges[inside + 1]
-    np.testing.assert_allclose(bins[inside], 0.5, rtol=2e-2)
-    assert np.delete(bins, inside).max() == 0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from support.gradient_cases.unknowns import move, set_color
-from support.marks import long, long_rows
+from support.marks import long
 from support.runs import T
 from torchtransient import plugins
 
@@ -131,28 +131,27 @@ def albedo_of(key, value):
     return set_color(f"{key}.bsdf.reflectance.value"), value
 
 
-@pytest.mark.parametrize(("weight", "reflectance"), [(0.0, 0.0), (1.0, 0.0)])
-def test_light_beyond_a_wall_by_its_reflectance(weight, reflectance):
-    """In a shell of radiance L a wall looks like ρ L, the black one too: the derivative is L either way."""
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_light_beyond_a_wall_by_its_reflectance(weight):
+    """In a shell of radiance L a wall looks like ρ L: the derivative by the reflectance of a black one is L."""
     lit = scene_of(
-        beam((0, 0, 1), (0, 0, -1)), 2, wall=wall(reflectance, T().scale(0.5)), **shell(weight),
+        beam((0, 0, 1), (0, 0, -1)), 2, wall=wall(0.0, T().scale(0.5)), **shell(weight),
         properties={"discard_direct_light": True},
     )  # fmt: skip
-    rows = np.array([forward(lit, albedo_of("wall", reflectance), 512, seed)[0] for seed in range(8)])
-    back = np.array([reverse(lit, albedo_of("wall", reflectance), spp=512, seed=seed)[0] for seed in range(8)])
+    rows = np.array([forward(lit, albedo_of("wall", 0.0), 512, seed)[0] for seed in range(8)])
+    back = np.array([reverse(lit, albedo_of("wall", 0.0), spp=512, seed=seed)[0] for seed in range(8)])
     np.testing.assert_allclose(back, rows, rtol=2e-3)
     check_mean(rows, 3.0, 0.02)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("weight", long([0.0, 1.0], [0.0]))
-def test_mirrors_and_roulette(weight):
+def test_mirrors_and_roulette():
     """A beam between two mirrors comes to the shell after five bounces, with L r^5; few of its samples live so long."""
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": 0.7}
     low, high = ({"type": "rectangle", "to_world": pose, "bsdf": mirror} for pose in (
         T().translate([0, 0, -0.5]), T().translate([0, 0, 0.5]).rotate([1, 0, 0], 180)))  # fmt: skip
     lit = scene_of(
-        beam((-0.9, 0, 0), (0.2, 0, -0.5)), 8, low=low, high=high, **shell(weight), properties={"rr_depth": 1}
+        beam((-0.9, 0, 0), (0.2, 0, -0.5)), 8, low=low, high=high, **shell(0.0), properties={"rr_depth": 1}
     )
     unknown = set_color("low.bsdf.specular_reflectance.value"), 0.7
     rows = np.array([forward(lit, unknown, 4096, seed)[0] for seed in range(8)])
@@ -162,42 +161,7 @@ def test_mirrors_and_roulette(weight):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("weight", "black"), [(0.0, "first"), (1.0, "second")])
-def test_light_beyond_one_black_wall_of_two(black, weight):
-    """Two plates that face each other, near enough to see nothing else: light comes over both or none, I = ρ1 ρ2 ...,
-    and the derivative by the black one's reflectance is what the other one sends on.
-    """
-    values = {"first": 0.7, "second": 0.4, black: 0.0}
-    # The second plate fills half the sky of the first one, and the shell the other half.
-    box = {
-        "first": wall(values["first"], T().scale(0.6)),
-        "second": wall(values["second"], T().translate([0.6, 0, 0.3]).rotate([0, 1, 0], -90).scale(0.3)),
-    }
-    lit = scene_of(
-        beam((0, 0, 1), (0, 0, -1)), 3, **box, **shell(weight), properties={"discard_direct_light": True}
-    )
-    unknown = albedo_of(black, 0.0)
-    # The derivative at zero of what is a polynomial of first order in each reflectance (but for second, first, second,
-    # which is deeper): a difference over a wide step is exact.
-    differences = []
-    for seed in range(8):
-        sides = []
-        for value in (0.5, 0.0):
-            params = mi.traverse(lit)
-            unknown[0](params, mi.Float(value))
-            params.update()
-            sides.append(moments(lit, lit.integrator().render(lit, seed=100 + seed, spp=16384)[1])[0])
-        differences.append((sides[0] - sides[1]) / 0.5)
-    rows = np.array([forward(lit, unknown, 16384, seed)[0] for seed in range(8)])
-    back = np.array([reverse(lit, unknown, spp=16384, seed=seed)[0] for seed in range(8)])
-    np.testing.assert_allclose(back, rows, rtol=2e-3)
-    error = np.sqrt((rows.var(ddof=1) + np.var(differences, ddof=1)) / 8)
-    assert error < 0.03 * abs(rows.mean())
-    assert abs(rows.mean() - np.mean(differences)) < 4 * error
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("weight", long([0.0, 1.0], [0.0]))
+@pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_a_light_that_moves_leaves_the_other_derivatives_as_they_are(weight):
     """Which derivatives are asked for together does not change them. Where the shape of a light moves, its light is
     counted one vertex before the one that finds it: what all vertices before owe to it has to come through there.
@@ -247,10 +211,7 @@ def test_a_wall_that_moves_under_either_clock(unwarp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("unwarp", "unknown"),
-    long_rows([(True, "field of view"), (True, "place"), (False, "place")], [(True, "field of view")]),
-)
+@pytest.mark.parametrize(("unwarp", "unknown"), [(True, "field of view"), (False, "place")])
 def test_a_camera_that_changes_under_either_clock(unwarp, unknown):
     """Rays begin at the near clip plane, and the clock at the pinhole: how long that part is changes with the field of
     view. The film has one pixel, and renders of one seed look at the same points of it: their difference is exact.
@@ -276,7 +237,7 @@ def test_a_camera_that_changes_under_either_clock(unwarp, unknown):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lamp_inside", long([True, False], [True]))
+@pytest.mark.parametrize("lamp_inside", [True, False])
 def test_the_index_of_a_block_counts_along_the_shadow_ray(lamp_inside):
     """A beam enters a block of index n upright and meets a wall in it, which a point lights from inside of the block:
     I = T(n) / n^2 ..., τ = 2 + n (1 + r), all of which change with n. Or the beam leaves the block by its back side,
@@ -329,12 +290,11 @@ def test_the_index_that_the_sensor_stands_in():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", long([0.3, 0.9], [0.9]))
-def test_a_large_sphere_over_a_wall_that_moves(ratio):
+def test_a_large_sphere_over_a_wall_that_moves():
     """I = ρ L (r / d)^2: rays find a large sphere as often as connections do. Where lengths change, derivatives come by
     connections alone; those of the reflectance, too, and nothing is counted twice.
     """
-    d, radiance = 3.0, 2.0
+    d, radiance, ratio = 3.0, 2.0, 0.9
     lamp = {"type": "sphere", "center": [0, 0, d], "radius": ratio * d}
     lamp["emitter"] = {"type": "area", "radiance": radiance}
     lit = scene_of(beam((0.05, 0, 0.05), (-1, 0, -1), bins=200, width=0.05), 2, wall=wall(), lamp=lamp)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long, long_pairs, long_rows
+from support.marks import long, long_rows
 from torchtransient.accuracy import two_sample_z_test
 from torchtransient.errors import SceneError
 from torchtransient.scenes import look_at, rotate, scale, translate
@@ -94,15 +94,6 @@ def many_triangles():
     return with_object(cloth={"type": "mesh_arrays", "vertices": vertices, "faces": faces, "bsdf": bsdf})
 
 
-def cloth_alone():
-    """Of all that scatters, no mesh is small enough to be looked through."""
-    kept = ("type", "integrator", "sensor", "cloth")
-    scene = {name: node for name, node in many_triangles().items() if name in kept}
-    lamp = {"to_world": translate([0, 0.9, 0]) @ rotate([1, 0, 0], 90) @ scale(0.2), "bsdf": {"type": "null"}}
-    scene["light"] = {"type": "rectangle", **lamp, "emitter": {"type": "area", "radiance": 10.0}}
-    return scene
-
-
 def far_away(by=60.0):
     """The box far from the origin, where rays start millimetres off surfaces."""
     scene = room(gates="gaussian 6.0 0.1; rectangular 7.2 7.3; rectangular 8.5 8.7")
@@ -124,40 +115,22 @@ def rug():
     return with_object(rug={"type": "cube", "to_world": pose, "bsdf": DIFFUSE})
 
 
-def listed_twice():
-    """Walls at the same place."""
-    return with_object(more=room()["back"], again=room()["floor"])
-
-
 SCENES = {
-    "gates": room,
-    "window": histogram,
-    "tent": lambda: histogram(temporal_filter="tent"),
     "pulse": lambda: histogram(pulse="gaussian", pulse_fwhm_opl=0.1),
     "mirror": lambda: box_of({"type": "conductor", "material": "none"}),
-    "glass": lambda: box_of({"type": "dielectric"}),
     "metal": lambda: box_of({"type": "roughconductor", "alpha": 0.3}),
-    "plastic": lambda: box_of({"type": "plastic"}),
     "mask": lambda: box_of({"type": "mask", "opacity": 0.5, "nested": DIFFUSE}),
-    "blend": lambda: box_of({"type": "blendbsdf", "weight": 0.4, "a": DIFFUSE, "b": {"type": "roughconductor"}}),
-    "both sides": lambda: box_of({"type": "twosided", "nested": DIFFUSE}),
     "lamps": lamps,
     "many triangles": many_triangles,
     "sky": lambda: with_object(sky={"type": "constant", "radiance": 0.3}),
     "hidden lamp": lambda: room(hide_emitters=True),
     "unwarped": lambda: room(gates="rectangular 1.5 1.6; rectangular 4.5 4.7", camera_unwarp=True),
-    "cloth alone": cloth_alone,
     "rug": rug,
-    "listed twice": listed_twice,
     "far away": far_away,
     "glossy mask": glossy_mask,
-    "unwarped fog": lambda: fog() | {"integrator": fog()["integrator"] | {"camera_unwarp": True}},
-    "two bounces": lambda: room(max_depth=3),
     "fog": fog,
     "low fog": low_fog,
-    "coloured fog": lambda: fog(sigma_t={"type": "rgb", "value": [0.3, 0.6, 1.0]}),
     "heterogeneous": heterogeneous,
-    "fog, hidden lamp": lambda: fog() | {"integrator": fog()["integrator"] | {"hide_emitters": True}},
 }
 
 
@@ -178,7 +151,7 @@ def runs(one, count, seed=0):
     return cubes.unfold(3, 8, 8).unfold(4, 8, 8).sum((-1, -2)).numpy()
 
 
-@pytest.mark.parametrize("name", long(SCENES, ("gates", "lamps", "fog")))
+@pytest.mark.parametrize("name", long(SCENES, ["lamps"]))
 def test_it_is_the_light_of_ordinary_connections(name):
     scene = SCENES[name]()
     plain, ellipsoidal = runs(renderer(scene, "ordinary", spp=256), 24), runs(renderer(scene, spp=128), 24, 5000)
@@ -187,8 +160,9 @@ def test_it_is_the_light_of_ordinary_connections(name):
     assert result.chi2_z < 4.5, str(result)
 
 
-@pytest.mark.parametrize("variant", long(("llvm_ad_mono", "llvm_ad_spectral"), ("llvm_ad_mono",)))
-def test_in_other_variants(variant):
+@pytest.mark.slow
+def test_wavelengths():
+    variant = "llvm_ad_spectral"
     with mi.variant_context(variant):
         plain, ellipsoidal = (
             runs(renderer(room(), kind, variant), 16, seed) for kind, seed in (("ordinary", 0), ("ellipsoidal", 5000))
@@ -244,7 +218,7 @@ def test_a_corner_by_quadrature():
 
 @pytest.mark.parametrize(
     ("scene", "gate", "gain"),
-    long_rows([(room, "8.5 8.6", 10), (room, "6.0 6.06", 5), (low_fog, "8.5 8.6", 5)], [(room, "8.5 8.6", 10)]),
+    long_rows([(room, "8.5 8.6", 10), (low_fog, "8.5 8.6", 5)], [(room, "8.5 8.6", 10)]),
 )
 def test_narrow_gates_have_less_noise(scene, gate, gain):
     variance = {}
@@ -266,23 +240,7 @@ def test_derivatives_are_those_of_ordinary_connections():
     torch.testing.assert_close(*gradients, rtol=1e-5, atol=0)
 
 
-def test_calls_are_recorded():
-    recorded, traced = (renderer(room(), parameters=[COLOUR], spp=16, freeze=freeze) for freeze in (True, False))
-    colours = torch.tensor([[0.9, 0.1, 0.3], [0.2, 0.8, 0.5], [0.5, 0.5, 0.5]])
-    with torch.no_grad():
-        for seed, colour in enumerate(colours):
-            out = recorded({COLOUR: colour}, seed=seed)
-            expected = traced({COLOUR: colour}, seed=seed)
-            torch.testing.assert_close(out.gated, expected.gated, rtol=2e-5, atol=2e-5)
-    assert out.stats.recorded == ("launched",)
-
-
-@pytest.mark.parametrize(
-    ("key", "freeze"),
-    long_pairs(
-        ["back.to_world", "light.to_world"], [True, False], [("back.to_world", True), ("light.to_world", False)]
-    ),
-)
+@pytest.mark.parametrize(("key", "freeze"), [("back.to_world", True), ("light.to_world", False)])
 def test_walls_and_lights_that_move(key, freeze):
     """Faces follow the scene from call to call, there and back, and stay where it stays."""
     one, first = (renderer(room(), parameters=[key], spp=16, freeze=freeze) for _ in range(2))
@@ -307,8 +265,6 @@ def without_lamp():
     [
         (lambda: histogram(steady=True), VARIANT, "steady=False"),
         (lambda: box_of({"type": "roughdielectric", "alpha": 0.3}), VARIANT, "refracts"),
-        (lambda: box_of({"type": "delayed", "lifetime": 1.0, "nested": DIFFUSE}), VARIANT, "scatters late"),
-        (lambda: fog(sample_emitters=False), VARIANT, "sample_emitters"),
         (without_lamp, VARIANT, "area light"),
         (room, "llvm_ad_mono_polarized", "polarized"),
         (lambda: room(type="transient_path_reuse"), VARIANT, "connections='ordinary'"),
@@ -319,6 +275,3 @@ def test_what_it_cannot_do_is_refused(scene, variant, words):
         renderer(scene(), variant=variant)(seed=0)
 
 
-def test_names_of_connections():
-    with pytest.raises(SceneError, match="expected one of ordinary, ellipsoidal"):
-        renderer(room(), "elliptical")(seed=0)

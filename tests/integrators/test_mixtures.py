@@ -21,7 +21,6 @@ from support.gradient_cases.cases_mixtures import (
     bump,
     mask,
     mirror_room,
-    normal_map,
     seen_through,
     two_sided,
 )
@@ -50,27 +49,19 @@ def masked(nested, opacity=0.7):
 
 
 MIXTURES = {
-    "diffuse and mirror": lambda: around_a_blend(bare),
-    "mirror and diffuse": lambda: around_a_blend(bare, MIRROR, DIFFUSE),
     "diffuse and glass": lambda: around_a_blend(bare, DIFFUSE, GLASS),
     "plastic and mirror": lambda: around_a_blend(bare, PLASTIC, MIRROR),
     "two-sided": lambda: around_a_blend(two_sided),
     "under bumps": lambda: around_a_blend(bump),
-    "under normals": lambda: around_a_blend(normal_map),
     "weight 0": lambda: around_a_blend(bare, weight=0.0),
-    "weight 1": lambda: around_a_blend(bare, weight=1.0),
     "blend of blends": blend_of_blends,
-    "mask of a mirror": lambda: masked(MIRROR),
     "mask of plastic": lambda: masked(PLASTIC),
     "mask of a blend": lambda: masked(blend(DIFFUSE, MIRROR)),
 }
 
 
 THROUGH = {
-    "paint and rough glass": lambda: around_a_blend(bare, DIFFUSE, ROUGH_GLASS),
     "rough glass and metal": lambda: around_a_blend(bare, ROUGH_GLASS, METAL),
-    "two kinds of rough glass": lambda: around_a_blend(bare, ROUGH_GLASS, {**ROUGH_GLASS, "int_ior": 1.2}),
-    "under normals, seen through": lambda: around_a_blend(normal_map, DIFFUSE, ROUGH_GLASS),
     "mask of rough glass and paint": lambda: masked(blend(DIFFUSE, ROUGH_GLASS)),
     "thin sheet and paint": lambda: around_a_blend(
         bare, {"type": "principledthin", "roughness": 0.4, "spec_trans": 0.5, "diff_trans": 0.8}, DIFFUSE
@@ -124,33 +115,3 @@ def test_kinds_of_glass_that_become_different():
     np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())
 
 
-TILTED, FLAT = (0.85, 0.5, 0.85), (0.5, 0.5, 1.0)
-FLAGS = [{"flip_invalid_normals": flips, "use_shadowing_function": shadows} for flips in (0, 1) for shadows in (0, 1)]
-FLAGS = [{name: bool(value) for name, value in flags.items()} for flags in FLAGS]
-
-
-def around_metal(normals, paint, flags):
-    """A normal map, constant by four texels, around a blend with a delta lobe."""
-    bitmap = {"type": "bitmap", "data": mi.TensorXf(np.tile(np.float32(normals), (4, 4, 1))), "raw": True}
-    parts = {**DIFFUSE, "reflectance": paint}, {"type": "conductor", "specular_reflectance": paint}
-    return {"type": "normalmap", "normalmap": bitmap, "nested": blend(*parts, 0.5), **flags}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("first", "flags"), [((FLAT, 0.8), FLAGS[1]), ((TILTED, 0.0), FLAGS[2])], ids=["flat", "black"]
-)
-def test_wrappers_of_parts_do_not_depend_on_what_was_rendered_first(first, flags):
-    """Flags of a normal map show in no parameter, and not in what a flat one or a black surface scatters."""
-    images = []
-    for normals, paint in (first, (TILTED, 0.8)):
-        scene = mi.load_dict(mirror_room(around_metal(normals, paint, flags)), optimize=False)
-        scene.integrator().render(scene, seed=0, spp=4)
-        params = mi.traverse(scene)
-        params["wall.bsdf.normalmap.data"] = mi.TensorXf(np.tile(np.float32(TILTED), (4, 4, 1)))
-        for key in ("bsdf_0.reflectance.value", "bsdf_1.specular_reflectance.value"):
-            params[f"wall.bsdf.nested_bsdf.{key}"] = 0.8
-        params.update()
-        images.append(np.array(scene.integrator().render(scene, seed=0, spp=256)[1]))
-    assert images[0].max() > 0
-    np.testing.assert_allclose(*images, rtol=1e-4, atol=1e-6 * images[0].max())

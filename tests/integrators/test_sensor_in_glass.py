@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long, long_rows
+from support.marks import long
 from support.runs import T
 from torchtransient import plugins
 
@@ -84,17 +83,12 @@ def flat_heights():
 
 
 BODIES = {
-    "cube": lambda: {"body": CUBE | {"bsdf": glass()}},
     "ball": lambda: {"body": ball(1.0)},
     "far away": lambda: {"body": ball(1.0), "other": ball(0.4, center=[5, 0, 0]), "more": ball(0.4, center=[0, 4, 1])},
     "instance": lambda: in_a_group(glass()),
-    "differentiable": lambda: {"body": CUBE | {"bsdf": glass("diff_dielectric")}},
     "masked": lambda: {"body": CUBE | {"bsdf": {"type": "mask", "opacity": 0.9, "nested": glass()}}},
-    "blended": lambda: {"body": CUBE | {"bsdf": {"type": "blendbsdf", "weight": 0.3, "a": glass(), "b": glass()}}},
     "bumpy": lambda: {"body": CUBE | {"bsdf": {"type": "bumpmap", "flat": flat_heights(), "nested": glass()}}},
     "turned inside out": lambda: {"body": ball(1.0, glass("dielectric", 1.0, N), flip_normals=True)},
-    "behind a window": lambda: {"body": CUBE | {"bsdf": glass()}, "window": {
-        "type": "rectangle", "to_world": T().translate([0, 0, 1.5]), "bsdf": {"type": "thindielectric"}}},
 }  # fmt: skip
 
 
@@ -104,10 +98,9 @@ def test_bodies(body):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plugin", long(["roughdielectric", "diff_rough_dielectric"], ["diff_rough_dielectric"]))
-def test_rough_body(plugin):
+def test_rough_body():
     """Nearly smooth: the first light comes from a point of the wall a little nearer to the lamp."""
-    rough = glass(plugin, alpha=0.005)
+    rough = glass("diff_rough_dielectric", alpha=0.005)
     first = arrivals(scene(at(), body=CUBE | {"bsdf": rough}), 4096)[0]
     assert N * 1.0 + 2.0 + TO_LAMP - 0.01 < first < N * 1.0 + 2.0 + TO_LAMP + BIN
 
@@ -141,13 +134,10 @@ BEHIND = {"behind": ball(0.3, glass(), center=[0, 0.05, -1.0])}
 # Where the sensor stands, what is around it, the length to the wall.
 PLACES = {
     "in a drop": ({}, drop, WATER * 0.4 + N * 0.6 + 2.0),
-    "beside a drop": ({"z": 0.6}, drop, N * 0.4 + 2.0),
     "near clip plane in glass": ({"near": 0.9}, lambda: {"body": CUBE | {"bsdf": glass()}}, N * 1.0 + 2.0),
-    "before a ball": ({}, lambda: BEHIND, 3.0),
     "between balls": ({}, lambda: BEHIND | {"ahead": ball(0.3, center=[0, 0, 1.0])}, 3.0 + 0.6 * (N - 1)),
     "in a lake": ({"z": -0.5}, lambda: {"lake": across(20.0)}, WATER * 1.5 + 2.0),
     "under a window": ({"z": -0.5}, lambda: {"window": across(0.1)}, WATER * 1.5 + 2.0),
-    "before a pane": ({}, pane, 1.0 + N * 0.5 + 1.5),
     "in a pane": ({"z": 1.2}, pane, N * 0.3 + 1.5),
 }
 
@@ -156,14 +146,6 @@ PLACES = {
 def test_places(place):
     where, objects, length = PLACES[place]
     check(scene(at(**where), depth=4, **objects()), length)
-
-
-@pytest.mark.slow
-def test_above_an_open_surface():
-    """Entered and never left: air around the sensor, water below."""
-    surface = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).rotate([0, 1, 0], 180).scale(20.0)}
-    loaded = scene(at(), lake=surface | {"bsdf": glass(inside=WATER)})
-    np.testing.assert_allclose(arrivals(loaded), 1.0 + WATER * (2.0 + TO_LAMP), atol=1.5 * BIN)
 
 
 # -------------------------------------------------------------------------------------------------- what is remembered
@@ -180,18 +162,11 @@ def test_sensor_that_moves():
         check(loaded, length)
 
 
-MOVED = {"cube": "body.vertex_positions", "ball": "body.to_world", "instance": "copy.to_world"}
-
-
-@pytest.mark.parametrize(("body", "key"), long_rows(MOVED.items(), [("instance", "copy.to_world")]))
-def test_body_that_moves(body, key):
-    loaded = scene(at(), depth=4, **BODIES[body]())
+def test_body_that_moves():
+    loaded, key = scene(at(), depth=4, **BODIES["instance"]()), "copy.to_world"
     params = mi.traverse(loaded)
     check(loaded, N * 1.0 + 2.0)
-    if key.endswith("vertex_positions"):
-        params[key] = dr.ravel(dr.unravel(mi.Point3f, params[key]) + mi.Vector3f(0, 5, 0))
-    else:
-        params[key] = mi.Transform4f().translate([0, 5, 0]) @ params[key]
+    params[key] = mi.Transform4f().translate([0, 5, 0]) @ params[key]
     params.update()
     check(loaded, 3.0)
 
@@ -203,11 +178,10 @@ def kinds():
     pose = at()["to_world"]
     lens = at(type="thinlens", aperture_radius=1e-4, focus_distance=3.0)
     plane = {"type": "orthographic", "near_clip": 0.1, "to_world": pose @ T().scale([1e-3, 1e-3, 1]), "film": film()}
-    meter = {"type": "radiancemeter", "to_world": pose, "film": film()}
-    return {"thinlens": lens, "orthographic": plane, "radiancemeter": meter}
+    return {"thinlens": lens, "orthographic": plane}
 
 
-@pytest.mark.parametrize("kind", long(["thinlens", "orthographic", "radiancemeter"], ["orthographic"]))
+@pytest.mark.parametrize("kind", long(["thinlens", "orthographic"], ["orthographic"]))
 def test_sensors(kind):
     check(scene(kinds()[kind], body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0)
 
@@ -218,19 +192,6 @@ def test_each_sensor_of_a_batch():
         sensor["film"] = {"type": "hdrfilm", "rfilter": {"type": "box"}}
     batch = {"type": "batch", "film": film(2), "inside": inside, "outside": outside}
     check(scene(batch, depth=4, body=CUBE | {"bsdf": glass()}), N * 1.0 + 2.0, 1.0 + N * 2.0 + 2.0)
-
-
-@pytest.mark.slow
-def test_irradiance_meter_in_glass():
-    """A patch inside that looks at the wall: its first light is that along the axis."""
-    patch = {"type": "rectangle", "to_world": T().scale(1e-3), "meter": {"type": "irradiancemeter", "film": film()}}
-    loaded = mi.load_dict({
-        "type": "scene", "integrator": {"type": "transient_path", "max_depth": 3}, "patch": patch,
-        "body": CUBE | {"bsdf": glass()},
-        "lamp": {"type": "rectangle", "to_world": T().translate([0, 0, 3]).rotate([0, 1, 0], 180).scale(0.05),
-                 "emitter": {"type": "area", "radiance": 1.0}},
-    }, optimize=False)  # fmt: skip
-    assert arrivals(loaded, 1 << 17)[0] == pytest.approx(N + 2.0, abs=2 * BIN)
 
 
 @pytest.mark.slow
@@ -268,13 +229,6 @@ def test_light_in_glass(where):
     z, expected = (-2.0, 1.0 + N * 1.5) if where == "outside" else (-0.8, N * 1.3)
     loaded = scene(at(z), body=CUBE | {"bsdf": glass()}, light=lamp)
     assert arrivals(loaded)[0] == pytest.approx(expected, abs=1.5 * BIN)
-
-
-@pytest.mark.slow
-def test_polarized():
-    mi.set_variant("llvm_ad_mono_polarized")
-    plugins.sync()
-    check(scene(at(), body=CUBE | {"bsdf": glass("diff_dielectric")}), N * 1.0 + 2.0)
 
 
 def test_path_lengths_without_the_leg_to_the_sensor():

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.marks import long, long_rows
+from support.marks import long_rows
 from support.runs import T, runs
 from support.surface_samples import start
 from torchtransient.accuracy import two_sample_z_test
 
 RHO, DISTANCE, RADIANCE = 0.5, 3.0, 2.0
-RATIOS = [1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 0.99]
-EVERY_RATIO = [(r, (3.0, 300.0)[n % 2]) for n, r in enumerate(RATIOS)]
-
-
 @pytest.fixture(autouse=True)
 def _variant(request):
-    start(request, "llvm_ad_mono")
+    start(request, "llvm_ad_mono_polarized" if request.node.name == "test_polarized" else "llvm_ad_mono")
 
 
 def film(bins=400, width=0.02, start=2.0):
@@ -62,9 +56,7 @@ def steady(scene, count=6, spp=1 << 14):
     return runs(scene, count, spp)[0].mean((1, 2, 3))
 
 
-@pytest.mark.parametrize(
-    ("ratio", "distance"), long_rows(EVERY_RATIO, [(1e-6, 3.0), (1e-3, 300.0), (0.5, 3.0), (0.9, 300.0)])
-)
+@pytest.mark.parametrize(("ratio", "distance"), [(1e-6, 3.0), (1e-3, 300.0), (0.5, 3.0), (0.99, 300.0)])
 def test_irradiance_below_a_sphere(ratio, distance):
     """E = pi L (r / d)^2, for any sphere that is above the horizon."""
     close_to(steady(over_a_plane(lamp(ratio, distance))), RHO * RADIANCE * ratio**2)
@@ -80,45 +72,15 @@ def test_irradiance_inside_a_sphere(kind):
 
 
 @pytest.mark.slow
-def test_lights_beside_it():
-    """Choice by weights, among lights of other kinds."""
-    lights = [
-        lamp(1e-4, emitter={"type": "area", "radiance": 1e8, "sampling_weight": 3.0}),
-        lamp(1e-3, 2.0, emitter={"type": "area", "radiance": 1e6, "sampling_weight": 0.5}) | {"center": [0, 2.0, 2.0]},
-        {"type": "point", "position": [0, -5.0, 5.0], "intensity": 10.0},
-        {"type": "constant", "radiance": 0.3},
-    ]
-    slanted = 0.5**1.5  # the cosine, over twice the squared height
-    E_over_pi = 1.0 + slanted + slanted * 10.0 / 25.0 / np.pi + 0.3
-    close_to(steady(over_a_plane(*lights), 8, 1 << 16), RHO * E_over_pi, slack=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("variant", "ratio"),
-    [("llvm_ad_mono_polarized", 0.1), ("llvm_ad_rgb", 1e-5), ("llvm_ad_spectral", 0.1)],
-)
-def test_other_variants(variant, ratio):
-    scene = over_a_plane(lamp(ratio))
-    images = runs(scene, 8, 1 << 14)[0][:, 0, 0]
-    intensity = images[:, 0] if "polarized" in variant else images.mean(-1)
-    expected = RHO * RADIANCE * ratio**2
-    spectral = "spectral" in variant  # its white point is a quadrature
-    close_to(intensity, expected, slack=1e-2 if spectral else 5e-5)
+def test_polarized():
+    images = runs(over_a_plane(lamp(0.1)), 8, 1 << 14)[0][:, 0, 0]
+    close_to(images[:, 0], RHO * RADIANCE * 0.01, slack=5e-5)
 
 
 def stripes():
     """A texture whose mean over the sphere is one, since it changes along the equator alone."""
     data = np.tile(np.array([0.5, 1.5, 0.2, 1.8], dtype=np.float32)[None, :, None], (2, 1, 3))
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("ratio", long([1e-5, 0.1], [0.1]))
-def test_texture_seen_from_the_pole(ratio):
-    """From below all meridians are seen alike."""
-    light = lamp(ratio, emitter={"type": "area", "radiance": stripes()})
-    close_to(steady(over_a_plane(light), 8, 1 << 16), RHO * ratio**2, slack=1e-4)
 
 
 def on_its_side(weight):
@@ -139,7 +101,7 @@ def test_texture_of_a_turned_sphere():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [1e-5, 1e-3, 1e-2])
+@pytest.mark.parametrize("ratio", [1e-5, 1e-2])
 def test_angular_light(ratio):
     """Emission into a cone of half angle c: as if the sphere had the radius r sin(c), up to r / d."""
     emitter = {"type": "angulararea", "radiance": RADIANCE, "cutoff_angle": 30.0}
@@ -147,28 +109,21 @@ def test_angular_light(ratio):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ratio", "alpha"),
-    list(itertools.product([1e-4, 0.1, 0.7, 0.95], [0.02, 0.5])),
-)
+@pytest.mark.parametrize(("ratio", "alpha"), [(0.1, 0.02), (0.7, 0.5), (0.95, 0.02)])
 def test_found_and_sampled_light_share_the_weight(ratio, alpha):
     """A rough mirror finds the light by itself, too: the sum over both does not depend on who does."""
-    if ratio < 1e-3 and alpha < 0.1:
-        alpha = 0.1
     bsdf = {"type": "roughconductor", "alpha": alpha, "distribution": "ggx", "material": "none"}
     alone = over_a_plane(lamp(ratio), bsdf=bsdf)
     unsampled = {"type": "area", "radiance": RADIANCE, "sampling_weight": 0.0}
     found = over_a_plane(lamp(ratio, emitter=unsampled), DARK, bsdf=bsdf)
-    spp = 1 << 18 if ratio > 1e-3 else 1 << 12
-    both = steady(alone, 8, spp)
-    if ratio > 1e-3:
-        assert two_sample_z_test(both[:, None], steady(found, 8, spp)[:, None]).passed
+    both = steady(alone, 8, 1 << 18)
     assert both.mean() > 0
+    assert two_sample_z_test(both[:, None], steady(found, 8, 1 << 18)[:, None]).passed
 
 
-@pytest.mark.parametrize("number", long([1, 2], [2]))
-def test_lights_that_move(number):
-    """What is kept of the lights is looked up again: one alone and several are kept in different ways."""
+def test_lights_that_move():
+    """What is kept of the lights is looked up again."""
+    number = 2
     scene = over_a_plane(*[lamp(0.01, center=[0.3 * n, 0, DISTANCE]) for n in range(number)])
     before = steady(scene, 8, 1 << 14).mean()
     params = mi.traverse(scene)
@@ -178,20 +133,8 @@ def test_lights_that_move(number):
     assert steady(scene, 8, 1 << 14).mean() == pytest.approx(4 * before, rel=1e-2)
 
 
-def densities(table, scene, p, u):
-    """Samples towards a light from ``p``, their weights, and the densities that are asked for."""
-    ref = dr.zeros(mi.Interaction3f, dr.width(u))
-    ref.p = p
-    ds, weight = table.sample(scene, ref, u, mi.Bool(True))
-    return ds, weight, table.pdf(scene, ref, ds, mi.Bool(True))
-
-
 @pytest.mark.parametrize(
-    ("ratio", "key"),
-    long_rows(
-        [(1e-5, "radius"), (1e-3, "height"), (0.1, "radiance"), (0.9, "radius"), (0.9, "height")],
-        [(1e-3, "height")],
-    ),
+    ("ratio", "key"), long_rows([(1e-3, "height"), (0.1, "radiance"), (0.9, "radius")], [(1e-3, "height")])
 )
 def test_derivatives(ratio, key):
     """Of rho L (r / d)^2, in both modes."""

@@ -12,7 +12,6 @@ import torch
 
 import torchtransient as tt
 from support.film_storage import storage
-from support.marks import long_pairs
 from support.rates import plate, scene
 from torchtransient.errors import StorageError
 from torchtransient.pulses import Pulse, cumulative_of_sum
@@ -57,25 +56,20 @@ def compare(out, chirps, axis, temporal_filter="box"):
     assert beats.mean(0).sum() / 2 + sum(outside) == pytest.approx(whole, rel=1e-5)
 
 
-QUICK = [("rectangular", "tent"), ("hann", "box"), ("blackmanharris", "tent")]
-
-
 @pytest.mark.parametrize(
-    ("window", "temporal_filter"), long_pairs(("rectangular", "hann", "blackmanharris"), ("box", "tent"), QUICK)
+    ("window", "temporal_filter"), [("rectangular", "tent"), ("hann", "box"), ("blackmanharris", "tent")]
 )
 def test_windows_and_widths_of_bins(window, temporal_filter):
     """From a quarter of a line to a width of eight lines, with the arrival anywhere in its bin."""
     chirps, moving = tt.Chirps(1e9, 10e-6, 1550e-9, window=window), wall()
     line = chirps.resolution_opl
-    for lines in (1 / 4, 1, 8):
-        count = round(60 / lines)
-        for shift in (0.13, 0.71):
-            axis = tt.TimeAxis(-2.0 - shift * lines * line, lines * line, count)
-            settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": temporal_filter}
-            compare(tt.render(moving, seed=0, spp=16, **settings), chirps, axis, temporal_filter)
+    for lines, shift in ((1 / 4, 0.13), (1, 0.71), (1, 0.13), (8, 0.71)):
+        axis = tt.TimeAxis(-2.0 - shift * lines * line, lines * line, round(60 / lines))
+        settings = {"chirps": chirps, "time_axis": axis, "temporal_filter": temporal_filter}
+        compare(tt.render(moving, seed=0, spp=16, **settings), chirps, axis, temporal_filter)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono_polarized"])
 def test_what_the_window_cuts_off(variant):
     """Both spectra have their middle near a rim of the axis, which lets part of the line through."""
     chirps = tt.Chirps(1e9, 10e-6, 1550e-9)

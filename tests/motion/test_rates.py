@@ -12,7 +12,6 @@ import torchtransient as tt
 from support.rates import AXIS, RATES, VARIANT, close, hidden_plate, mean_length, mean_rate, plate, rates_of, scene
 from torchtransient.scenes import look_at, rotate, scale, translate
 
-VARIANTS = ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"]
 SPEED, WAVELENGTH = 1.37, 1550e-9
 
 
@@ -24,7 +23,7 @@ def rate_of(description, motions=None, **settings):
 # ----------------------------------------------------------------------------------------------------------- one wall
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
 def test_a_wall_head_on_has_the_doppler_shift_of_lidars(variant):
     """f_D = 2 v / wavelength; the light arrives after twice the distance and is that of the wall at rest."""
     nodes = scene(wall=plate((0, 0, 2), (0, 0, 0)))
@@ -36,8 +35,7 @@ def test_a_wall_head_on_has_the_doppler_shift_of_lidars(variant):
     assert float(light.sum()) == pytest.approx(float(still.transient.reshape(-1, AXIS.num_bins)[0].sum()), rel=1e-4)
 
 
-@pytest.mark.parametrize("speed", [1e-6, 1.0, 1e6])
-@pytest.mark.parametrize("distance", [1e-2, 1e5])
+@pytest.mark.parametrize(("distance", "speed"), [(1e-2, 1e6), (1e5, 1e-6)])
 def test_near_and_far_walls_that_creep_and_fly(distance, speed):
     """Mean rate, its derivative by the velocity in both modes, relative to the speed."""
     nodes = scene(wall=plate((0, 0, distance), (0, 0, 0), half=distance))
@@ -233,16 +231,6 @@ def test_two_bounces_in_a_corner():
 # ----------------------------------------------------------------------------------- the same motion, said differently
 
 
-def test_velocities_of_vertices_are_a_rigid_motion():
-    vertices = np.array([[-1, -1, 2.0], [1, -1, 2.2], [1, 1, 2.1], [-1, 1, 1.9]])
-    v, w, c = np.array([0.3, -0.4, 1.2]), np.array([0.5, 1.0, -0.7]), np.array([0.2, 0.1, 2.0])
-    sheet = {"type": "mesh_arrays", "vertices": vertices, "faces": np.array([[0, 2, 1], [0, 3, 2]])}
-    bends = rates_of(scene(4, 30, sheet=sheet | {"vertex_velocity": v + np.cross(w, vertices - c)}))
-    rigid = rates_of(scene(4, 30, sheet=sheet), {"sheet": tt.Motion(linear=v, angular=w, center=c)})
-    assert float((bends - rigid).abs().max() / rigid.max()) < 1e-4
-    assert float(mean_rate(rigid).max() - mean_rate(rigid).min()) > 0.3
-
-
 def corner_of_three(depth=4):
     lamp = {"type": "point", "position": [-0.3, 0.3, 0.1], "intensity": 1.0}
     return scene(4, 50, depth, lamp=lamp, a=plate((0, 0, 2), (0, 0, 0), half=2), b=plate((1, 0, 1), (0, 0, 1), half=2),
@@ -357,12 +345,11 @@ def test_a_hidden_plate_that_moves_and_turns(kind):
 CHIRPS = tt.Chirps(1e9, 10e-6, WAVELENGTH)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_range_and_speed_of_a_wall_from_two_beats(variant):
+def test_range_and_speed_of_a_wall_from_two_beats():
     """Of walls that come nearer and go away; a bin is c / B, 0.15 m of distance and 0.08 m/s."""
     axis = CHIRPS.time_axis((0.5, 6.0), (-3.0, 3.0))
     for distance, speed in ((3.217, 1.83), (1.45, -2.6)):
-        loaded = tt.load(scene(wall=plate((0, 0, distance), (0, 0, 0))), variant=variant)
+        loaded = tt.load(scene(wall=plate((0, 0, distance), (0, 0, 0))), variant="llvm_ad_spectral")
         loaded = loaded.moving({"wall": tt.Motion(linear=(0, 0, -speed))})
         out = tt.TransientRenderer(loaded, chirps=CHIRPS, time_axis=axis, temporal_filter="box", spp=64)(seed=0)
         beats = out.beats.reshape(-1, *out.beats.shape[-4:])[0]
@@ -415,44 +402,3 @@ def test_a_chirp_simulated_in_time():
         assert beat == pytest.approx(simulated_beat(CHIRPS, distance, speed, sign, 2000), abs=1e-3 * line)
 
 
-@pytest.mark.slow
-def test_chirps_simulated_in_time_of_a_turning_disc():
-    """Mean power of 400 chirps of 4000 paths with random phases: the film's spectra, within the speckle of so many."""
-    chirps, n, repeats, paths = tt.Chirps(1e9, 20e-6, WAVELENGTH), 256, 400, 4000
-    center, turns, drift = np.array([0.0, 0.0, 2.0]), 2.0, np.array([0, 0, 0.3])
-    normal = np.array([0.7, 0.0, -math.sqrt(0.51)])
-    pose = look_at(tuple(center), tuple(center + normal)) @ scale(0.4)
-    disc = {"type": "disk", "to_world": pose, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    motion = tt.Motion(linear=drift, angular=turns * normal, center=center)
-    loaded = tt.load(scene(fov=20, disc=disc), variant=VARIANT).moving({"disc": motion})
-    axis = tt.TimeAxis(-12.0, chirps.resolution_opl / 8, 960)
-    out = tt.TransientRenderer(loaded, chirps=chirps, time_axis=axis, temporal_filter="box", spp=1 << 16)(seed=0)
-    film = out.beats[0, :, :, 0, 0].double().numpy()
-
-    t = ((np.arange(n) + 0.5) / n - 0.5) * chirps.duration_s
-    window = 0.5 + 0.5 * np.cos(2 * np.pi * t / chirps.duration_s)
-    rng, k = np.random.default_rng(0), math.tan(math.radians(10))
-    power = np.zeros((2, 8 * n))
-    for _ in range(repeats):
-        d = np.stack([rng.uniform(-k, k, paths), rng.uniform(-k, k, paths), np.ones(paths)], -1)
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        s = (center @ normal) / (d @ normal)
-        p = d * s[:, None]
-        inside = np.linalg.norm(p - center, axis=1) < 0.4
-        weight = np.where(inside, 0.5 / math.pi * np.abs(d @ normal) / s**2, 0) / paths
-        rate = 2 * ((drift + np.cross(turns * normal, p - center)) * d).sum(1)
-        field = np.sqrt(weight) * np.exp(2j * np.pi * rng.random(paths))
-        for row, sign in enumerate((1, -1)):
-            beat = chirps.hertz_per_metre * (2 * s + sign * chirps.rate_scale_s * rate)
-            signal = np.exp(2j * np.pi * t[:, None] * beat) @ field
-            power[row] += np.abs(np.fft.fft(signal * window, 8 * n)) ** 2 / repeats
-    power /= (window**2).sum() * 8 * n  # Parseval: sums to the energy
-    at = np.fft.fftshift(np.fft.fftfreq(8 * n, chirps.duration_s / n)) / chirps.hertz_per_metre
-    for expected, simulated in zip(film, np.fft.fftshift(power, axes=1), strict=True):
-        got = np.interp(axis.centers_opl.numpy(), at, simulated)
-        assert got.sum() == pytest.approx(expected.sum(), rel=0.05)
-        assert (got * axis.centers_opl.numpy()).sum() / got.sum() == pytest.approx(
-            (expected * axis.centers_opl.numpy()).sum() / expected.sum(), abs=0.05
-        )
-        # A bin of N chirps deviates by 0.8 / sqrt(N) in the mean; without rates the difference is near 2.
-        assert np.abs(got / got.sum() - expected / expected.sum()).sum() < 2 * 0.8 / repeats**0.5

@@ -31,7 +31,7 @@ def scene(variant="llvm_ad_mono", **film):
     return tt.load(description, variant=variant)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_mono_polarized"])
 def test_the_phase_of_each_pulse(variant):
     """That of a length of `6 - 2 v t`, and at t = 0 that of a phasor film."""
     moving = scene(variant)

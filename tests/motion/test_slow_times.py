@@ -53,14 +53,6 @@ def test_the_beat_is_the_light_over_the_sensor(beat_hz):
         assert tap == pytest.approx(0.5 * (phasor * np.exp(-1j * phase)).real, abs=3e-4)
 
 
-def test_the_steady_image_has_no_beat():
-    """Real tensors are averaged, complex ones with the beat."""
-    exposure = tt.Exposure(DURATION_S, beat_hz=1 / DURATION_S)
-    still = torch.ones(3, 2, 2)
-    assert exposure.combine(still).sub(1).abs().max() < 1e-6
-    assert exposure.combine(still.to(torch.complex64)).abs().max() < 1e-15
-
-
 @together("row_s, rows, poses", [(2e-5, 16, 3), (-2e-5, 7, 4), (1e-3, 1, 3), (2e-5, 5, 1)])
 def test_rows_see_their_own_times(row_s, rows, poses):
     shutter = tt.RollingShutter(row_s, poses=poses)
@@ -72,17 +64,6 @@ def test_rows_see_their_own_times(row_s, rows, poses):
     assert at[0] == pytest.approx(-1e3 * row_s * (rows - 1) / 2, abs=1e-12)
     expected = polynomial(at)[:, None].expand(2, rows, 3)
     torch.testing.assert_close(shutter.combine(pictures), expected, atol=1e-11, rtol=0)
-
-
-@pytest.mark.parametrize("poses", [2, 3, 8])
-def test_rows_lie_between_the_poses(poses):
-    """The first and the last row are poses, and no pose counts with much more than one."""
-    shutter = tt.RollingShutter(1e-5, poses=poses)
-    pictures = torch.eye(poses).double()[:, :, None, None].expand(poses, poses, 65, 1)
-    weights = shutter.combine(pictures)[..., 0]
-    assert weights[0, 0] == pytest.approx(1) and weights[-1, -1] == pytest.approx(1)
-    assert weights.abs().max() < 1.0 + 1e-9
-    assert shutter.poses_s(65)[-1] == pytest.approx(shutter.rows_s(65)[-1])
 
 
 def test_phase_steps_take_each_tap_from_its_own_exposure():
@@ -123,23 +104,3 @@ def test_a_motion_has_its_velocity():
     assert np.linalg.norm((far @ p)[:3] - moved_center) == pytest.approx(np.linalg.norm(p[:3] - center), rel=1e-7)
 
 
-def test_gradients_of_a_motion():
-    """Of no rotation as well, where the axis has no direction."""
-    for turn in (torch.zeros(3), torch.tensor([0.4, -0.3, 2.0])):
-        given = [x.double().requires_grad_(True) for x in (torch.tensor([1.0, 2.0, 3.0]), turn, torch.ones(3))]
-
-        def matrices(linear, angular, center):
-            motion = tt.Motion(linear=linear.float(), angular=angular.float(), center=center.float())
-            return motion.matrices(torch.tensor([-0.2, 0.0, 0.5]))[:, :3]
-
-        jacobians = torch.autograd.functional.jacobian(matrices, tuple(given))
-        for k, jacobian in enumerate(jacobians):
-            for axis in range(3):
-                sides = []
-                for step in (0.05, -0.05):
-                    moved = [x.detach().clone() for x in given]
-                    moved[k][axis] += step
-                    sides.append(matrices(*moved))
-                # Central differences of a turn by 0.025 rad: 1e-3 of it.
-                expected = (sides[0] - sides[1]) / 0.1
-                torch.testing.assert_close(jacobian[..., axis], expected, atol=1e-3, rtol=0)

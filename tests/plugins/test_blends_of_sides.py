@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -20,28 +19,6 @@ GLASS = {"type": "roughdielectric", **ROUGH_GLASS}
 def rgb():
     mi.set_variant("llvm_ad_rgb")
     plugins.sync()
-
-
-def light_from_below(bsdf, n=2**18):
-    """(mean weight of samples, its standard error) for light that arrives from below."""
-    rng = mi.PCG32(n)
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.wi = dr.normalize(mi.Vector3f(0.1, 0.0, -0.9))
-    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
-    u = mi.Point2f(rng.next_float32(), rng.next_float32())
-    weight = np.array(bsdf.sample(mi.BSDFContext(), si, rng.next_float32(), u)[1])[0]
-    return weight.mean(), weight.std() / np.sqrt(n)
-
-
-def test_mitsuba_counts_light_twice():
-    """Black paint over rough glass: from below the paint does nothing, and its samples are weighed as if they were
-    those of the glass.
-    """
-    glass, _ = light_from_below(mi.load_dict(GLASS))
-    blended, error = light_from_below(
-        mi.load_dict({"type": "blendbsdf", "weight": 0.4, "a": GLASS, "b": matte(0.0)})
-    )
-    assert blended > 0.6 * glass * 1.03 + 5 * error
 
 
 def total(bsdf, spp):

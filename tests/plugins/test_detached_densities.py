@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from support.surface_samples import directions, interaction, start
-from torchtransient.plugins.mitsuba_compat import DIFFERENTIABLE_PLUGINS
 
 
 def uniform(value):
@@ -80,29 +79,15 @@ def test_drawn_directions_do_not_turn_with_the_ray(name):
     assert dr.grad_enabled(weight) and dr.grad_enabled(bs.wo) == mirrored and not dr.grad_enabled(bs.pdf)
 
 
-TWINS = {"plastic": {}, "roughplastic": {"alpha": 0.2}, "pplastic": {"alpha": 0.2}, "conductor": {},
-         "roughconductor": {}, "dielectric": {}, "roughdielectric": {}, "principled": {"spec_trans": 0.5, "sheen": 0.1},
-         "principledthin": {"diff_trans": 0.5, "spec_trans": 0.5}}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", TWINS)
-def test_twins_have_the_lobes_of_mitsubas(kind):
-    ours, theirs = (mi.load_dict({"type": name, **TWINS[kind]}) for name in (DIFFERENTIABLE_PLUGINS[kind], kind))
-    lobes = [[bsdf.flags(i) for i in range(bsdf.component_count())] for bsdf in (ours, theirs)]
-    assert len(lobes[0]) == len(lobes[1]) >= 1
-    for one, other in zip(*lobes, strict=True):
-        for flag in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission, mi.BSDFFlags.Delta, mi.BSDFFlags.Glossy,
-                     mi.BSDFFlags.Diffuse, mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide):  # fmt: skip
-            assert mi.has_flag(one, flag) == mi.has_flag(other, flag)
-            assert mi.has_flag(ours.flags(), flag) == mi.has_flag(theirs.flags(), flag)
-
-
-@pytest.mark.parametrize("kind", ["plastic", "roughplastic", "pplastic", "dielectric", "roughdielectric"])
-@pytest.mark.parametrize("given", [{}, {"specular_reflectance": 0.4}])
-def test_twins_show_the_parameters_of_mitsubas(kind, given):
-    ours, theirs = (
-        {key.removesuffix(".value") for key in mi.traverse(mi.load_dict({"type": name, **given})).properties}
-        for name in (DIFFERENTIABLE_PLUGINS[kind], kind)
-    )
-    assert ("specular_reflectance" in ours) == bool(given)
-    assert theirs - {"specular_reflectance", "specular_transmittance"} <= ours
+@pytest.mark.parametrize("number", [0.0, 1 - 2.0**-24])
+@pytest.mark.parametrize("name", ["plastic", "retroreflector", "dielectric", "rough plastic", "rough dielectric"])
+def test_a_lobe_that_is_asked_for_alone_is_drawn(name, number):
+    """Whatever number decides; and the other one never is."""
+    rough = {"type": "diff_" + name.replace(" ", "_"), "int_ior": 1.4, "alpha": 0.2}
+    bsdf = mi.load_dict(SURFACES[name][0] if name in SURFACES else rough)
+    si = interaction(mi.Vector3f(0.28, 0, 0.96))
+    for component in (0, 1):
+        ctx = mi.BSDFContext()
+        ctx.component = component
+        bs, weight = bsdf.sample(ctx, si, mi.Float(number), mi.Point2f(0.4, 0.3))
+        assert list(bs.sampled_component) == [component] and weight[0][0] > 0 and bs.pdf[0] > 0

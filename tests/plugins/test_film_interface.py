@@ -5,11 +5,10 @@ is still one of ours.
 from __future__ import annotations
 
 import mitsuba as mi
-import numpy as np
 import pytest
 
 from torchtransient import plugins
-from torchtransient.errors import PluginRegistrationError, SceneError
+from torchtransient.errors import PluginRegistrationError
 from torchtransient.interfaces import is_time_resolved, missing_members
 from torchtransient.plugins import _registry
 from torchtransient.rendering import films
@@ -81,31 +80,6 @@ def test_a_film_without_a_member_is_refused():
 # ------------------------------------------------------------------------------------------ temporal filters
 
 
-def test_films_without_a_temporal_filter():
-    for kind in ("phasor_hdr_film", "gated_hdr_film"):
-        film = make(kind)
-        film.take_filter("tent", 2.0)
-        assert film.temporal_filter == ""
-        with pytest.raises(AttributeError):
-            film.temporal_filter = "tent"
-
-
 # -------------------------------------------------------------------------------------------------------- pictures
 
 
-def test_the_picture_of_a_steady_image():
-    film = make("transient_hdr_film")
-    with pytest.raises(SceneError, match="nothing was rendered yet"):
-        film.bitmap()
-    film.schedule_storage()  # of nothing yet
-    film.start_render()
-    film.add_steady(mi.UInt32([0, 1, 2, 3]), [mi.Float([3, 5, 7, 11])])
-    film.add_outside(mi.UInt32([1, 2]), mi.Float([1, 2]), mi.Float([10, 20]))
-    film.schedule_storage()
-    film.finish_render()
-    assert np.array(film.bitmap()).squeeze().tolist() == [[3, 5], [7, 11]]
-    assert film.energies_outside() == (3, 30)
-    assert (film.energy_before, film.energy_after) == (3, 30)
-    assert film.base_channels_count() == 1
-    with mi.variant_context("llvm_ad_rgb"):
-        assert make("transient_hdr_film").base_channels_count() == 3

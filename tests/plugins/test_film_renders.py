@@ -12,7 +12,7 @@ import pytest
 from support.marks import long
 from torchtransient import plugins
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.errors import SceneError, StorageError
+from torchtransient.errors import StorageError
 
 LANES = "torchtransient.plugins.integrators.job.MAX_LANES"
 ENTRIES = "torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES"
@@ -90,7 +90,7 @@ def test_crop_is_the_crop_of_the_full_render():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rfilter", long(["gaussian", "tent", "mitchell", "catmullrom", "lanczos"], ["mitchell"]))
+@pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
 def test_spatial_filters_converge_to_splatting(rfilter):
     steady, transient = runs(glowing_wall(film(rfilter=rfilter)), 8, 1024)
     # splatting divides by the sum of the weights: a bias of order 1 / spp, a tenth of the noise here
@@ -141,12 +141,12 @@ def gradient_of_radiance(scene, seed, spp=16):
     return slope, loss
 
 
-@pytest.mark.parametrize("what", long(["bands", "rows", "samples"], ["bands"]))
+@pytest.mark.parametrize("what", long(["bands", "rows"], ["bands"]))
 def test_adjoint_of_every_layout(monkeypatch, what):
     if what == "bands":
         monkeypatch.setattr(ENTRIES, 4 * 9 * 40 * 3)
     else:
-        monkeypatch.setattr(LANES, 20 if what == "rows" else 54 * 7)
+        monkeypatch.setattr(LANES, 20)
     scene = glowing_wall(film(), radiance={"type": "rgb", "value": [1.0, 1.0, 1.0]})
     slope, loss = gradient_of_radiance(scene, seed=11)
     # the render is linear in the radiance, which is 1
@@ -154,8 +154,8 @@ def test_adjoint_of_every_layout(monkeypatch, what):
     assert abs(loss) > 0.1
 
 
-@pytest.mark.parametrize("lanes, spp", [(54 * 7, 64), pytest.param(20, 8, marks=pytest.mark.slow)])
-def test_many_passes(monkeypatch, lanes, spp):
+def test_many_passes(monkeypatch):
+    lanes, spp = 54 * 7, 64
     full, transient = runs(glowing_wall(film()))
     monkeypatch.setattr(LANES, lanes)
     scene = glowing_wall(film())
@@ -179,12 +179,11 @@ def test_seeds():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lanes", [2**26, 54 * 11, 30])
 @pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
-def test_total_weight_with_any_sampler_and_count(monkeypatch, sampler, lanes):
-    monkeypatch.setattr(LANES, lanes)
+def test_total_weight_with_any_sampler_and_count(monkeypatch, sampler):
+    monkeypatch.setattr(LANES, 54 * 11)
     scene = glowing_wall(film(), radiance=1.0, sampler=sampler)
-    for spp in (1, 7) if lanes == 30 else (1, 7, 23, 30):
+    for spp in (1, 7, 23, 30):
         steady, transient = (np.array(t) for t in scene.integrator().render(scene, spp=spp, seed=spp))
         np.testing.assert_allclose(steady, 1, rtol=1e-5)
         np.testing.assert_allclose(transient.sum(2), 1, rtol=1e-5)
@@ -214,7 +213,7 @@ def cornell(start, bins, filter):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("filter", long(["box", "tent", "gaussian"], ["tent"]))
+@pytest.mark.parametrize("filter", ["tent", "gaussian"])
 def test_energy_outside_is_that_of_a_wider_window(filter):
     wide, narrow = cornell(0.0, 120, filter), cornell(5.0, 16, filter)
     cube = np.array(wide.integrator().render(wide, seed=2, spp=64)[1], dtype=float)
@@ -228,29 +227,3 @@ def test_energy_outside_is_that_of_a_wider_window(filter):
     assert part.mean(-1).sum() + before + after == pytest.approx(steady.mean(-1).sum(), rel=1e-5)
 
 
-@pytest.mark.slow
-def test_film_of_several_variants():
-    means = []
-    for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_rgb"):
-        with mi.variant_context(variant):
-            plugins.sync()
-            scene = glowing_wall(film(), radiance=1.0)
-            steady, transient = (np.array(t, dtype=float) for t in scene.integrator().render(scene, spp=256))
-            assert steady.shape[-1] == (1 if "mono" in variant else 3)
-            np.testing.assert_allclose(transient.sum(2), steady, atol=1e-5)
-            means.append(steady.mean())
-    plugins.sync()
-    np.testing.assert_allclose([means[0], means[1], means[3]], 1, rtol=1e-5)
-    # radiance 1 is white light D65 in spectral variants, seen through sampled wavelengths
-    assert means[2] == pytest.approx(1, abs=0.05)
-
-
-def test_needs_its_own_film_and_a_jit_variant():
-    scene = glowing_wall(film("hdrfilm"))
-    with pytest.raises(SceneError, match="transient_hdr_film"):
-        scene.integrator().render(scene)
-    scene = glowing_wall(film(exhaustive_scan=True, laser_scan_width=2, laser_scan_height=2))
-    with pytest.raises(SceneError, match="laser"):
-        scene.integrator().render(scene)
-    with pytest.raises(SceneError, match="sensor"):
-        scene.integrator().render(scene, sensor=3)

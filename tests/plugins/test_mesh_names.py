@@ -126,9 +126,7 @@ def derivatives(key, face_normals):
 @pytest.mark.parametrize(
     ("key", "face_normals"),
     [
-        ("cube.vertex_positions", False),
-        ("cube.vertex_normals", False),
-        ("cube.to_world", False),
+        pytest.param("cube.vertex_positions", False, marks=pytest.mark.slow),
         ("cube.to_world", True),
     ],
 )

@@ -5,15 +5,11 @@ Then the entry of ``plugins/mitsuba_compat.py`` and what asks for it can go. Bel
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hair_model import scattered
 from torchtransient import plugins
 from torchtransient.plugins import mitsuba_compat as compat
 from torchtransient.plugins import mitsuba_shapes
@@ -109,20 +105,6 @@ def adds_up_wrongly(bsdf):
 # -------------------------------------------------------------------------------------------------------- polarization
 
 
-def test_two_sided_matrices_from_behind_are_those_of_the_front():
-    activate(POLARIZED)
-    metal = {"type": "roughconductor", "alpha": 0.3}
-    one, both = mi.load_dict(metal), mi.load_dict({"type": "twosided", "bsdf": metal})
-    wi, wo = unit(0.5, 0.2, 0.8), unit(-0.3, 0.4, 0.7)
-    mirrored = [mi.Vector3f(v.x, v.y, -v.z) for v in (wi, wo)]
-    front = matrix(one.eval(mi.BSDFContext(), interaction(wi), wo))
-    behind = matrix(both.eval(mi.BSDFContext(), interaction(mirrored[0]), mirrored[1]))
-    np.testing.assert_allclose(behind, front, rtol=1e-5)
-    assert abs(front[3, 1]) > 0.1 * front[0, 0], "this pair of directions would not tell the hands apart"
-    assert mirrors_matrices(both) and not mirrors_matrices(one)
-    assert mirrors_matrices(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
-
-
 def slope_at_the_normal(bsdf):
     x = mi.Float(0)
     dr.enable_grad(x)
@@ -145,40 +127,7 @@ def test_derivatives_at_normal_incidence_are_not_numbers(plugin):
     assert np.isfinite(slope_at_the_normal(mi.load_dict({"type": compat.POLARIZED_PLUGINS[plugin]})))
 
 
-def test_rough_dielectric_depolarises():
-    activate(POLARIZED)
-    wi, wo = unit(0.5, 0.2, 0.8), unit(-0.3, 0.4, 0.7)
-    theirs, ours = (
-        matrix(mi.load_dict({"type": name, "alpha": 0.3}).eval(mi.BSDFContext(), interaction(wi), wo))
-        for name in ("roughdielectric", compat.POLARIZED_PLUGINS["roughdielectric"])
-    )
-    assert theirs[0, 0] == pytest.approx(ours[0, 0], rel=1e-4)
-    assert not theirs[1:, 1:].any() and abs(ours[1, 1]) > 0.5 * ours[0, 0]
-
-
 # ------------------------------------------------------------------------------------------- samples, lobes and tables
-
-
-def many_samples(bsdf, count=20000):
-    """(samples, their weights, interaction) for directions from behind the surface."""
-    rng = mi.PCG32(count)
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.wi = -mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-    return *bsdf.sample(mi.BSDFContext(), si, u, v), si
-
-
-@pytest.mark.parametrize("plugin", ["principled", "principledthin", "roughdielectric"])
-def test_samples_that_are_thrown_away_have_a_density(plugin):
-    """What asks for it: ``discarded`` in the attached form of scattering by surfaces."""
-    activate(RGB)
-    rough = {"alpha": 0.7} if plugin == "roughdielectric" else {"roughness": 0.8, "spec_trans": 0.5}
-    thin = {"diff_trans": 0.5} if plugin == "principledthin" else {}
-    bsdf = mi.load_dict({"type": plugin, **rough, **thin})
-    sample, weight, si = many_samples(bsdf)
-    value = dr.max(bsdf.eval(mi.BSDFContext(), si, sample.wo))
-    lost = (dr.max(weight) == 0) & (sample.pdf > 0) & (value > 0)
-    assert dr.count(lost)[0] > 20
 
 
 def clearcoat_slope(weight):
@@ -231,9 +180,7 @@ def test_metals_lose_their_slopes_without_index_or_absorption(plugin, slot, inde
     assert compat.loses_slope_of_metal(slot, (index[0],) * 2, (index[1],) * 2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cls", compat.PLASTICS)
-@pytest.mark.parametrize("black", [0, 1])
+@pytest.mark.parametrize(("cls", "black"), [(cls, n % 2) for n, cls in enumerate(compat.PLASTICS)])
 def test_black_lobes_of_plastics_are_never_sampled(cls, black):
     activate(RGB)
     lobes = ("specular_reflectance", "diffuse_reflectance")
@@ -250,74 +197,18 @@ def test_black_lobes_of_plastics_are_never_sampled(cls, black):
     assert compat.lost_at(mi.load_dict({"type": compat.PLASTICS[cls]}), lobes[black]) == (0,)
 
 
-@pytest.mark.slow
-def test_rough_plastic_has_no_derivative_through_its_tables():
-    activate(RGB)
-    context = mi.BSDFContext()
-    context.component = 1  # of the diffuse base, where roughness acts through the tables alone
-
-    def derivative(plugin):
-        bsdf = mi.load_dict({"type": plugin, "alpha": 0.3})
-        params = mi.traverse(bsdf)
-        x = mi.Float(0.3)
-        dr.enable_grad(x)
-        params["alpha"] = x
-        params.update()
-        value = dr.sum(bsdf.eval(context, interaction(unit(0.3, 0.1, 0.9)), unit(-0.3, -0.1, 0.9)))
-        if not dr.grad_enabled(value):
-            return 0.0
-        dr.backward(value)
-        return float(dr.grad(x)[0])
-
-    assert derivative("roughplastic") == 0
-    assert derivative(compat.DIFFERENTIABLE_PLUGINS["roughplastic"]) < -0.01
-
-
-def test_lobes_of_hair_are_not_those_of_its_samples():
-    """Too dark where the series of the Bessel function ends, of another slope, and flat past three crossings."""
-    activate(RGB)
-    absorbing = {"sigma_a": {"type": "uniform", "value": 0.5}, "int_ior": 1.55, "ext_ior": 1.0}
-    wi, wo = unit(0.1, 0.0, 1.0), unit(0.1, 0.02, 1.0)
-
-    def value(plugin, roughness):
-        bsdf = mi.load_dict({"type": plugin, "longitudinal_roughness": roughness, **absorbing})
-        return float(bsdf.eval(mi.BSDFContext(), interaction(wi), wo)[0][0])
-
-    def truth(roughness):
-        return scattered(np.array(wi), np.array(wo), 0.5, (roughness, 0.3))[0]
-
-    ours = compat.DIFFERENTIABLE_PLUGINS["hair"]
-    for plugin, largest in (("hair", 0.005), (ours, 1e-4)):
-        # The reflected lobe has a concentration of 12 there.
-        error = value(plugin, 0.296) / truth(0.296) - 1
-        assert (abs(error) > 0.003) == (plugin == "hair") and abs(error) < 2 * largest
-
-    samples = {}
-    for plugin in ("hair", ours):
-        bsdf = mi.load_dict({"type": plugin, "sigma_a": 0.0, "int_ior": 3.0})
-        rng = mi.PCG32(20000)
-        points = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        si = dr.zeros(mi.SurfaceInteraction3f, 20000)
-        si.wi = unit(0.3, 0.5, 0.8)
-        samples[plugin] = np.array(bsdf.sample(mi.BSDFContext(), si, *points)[0].wo.y)
-    assert np.mean(np.abs(samples["hair"]) < 1e-6) > 0.03
-    assert np.mean(np.abs(samples[ours]) < 1e-6) < 1e-3
-
-
-def test_the_sun_shows_its_angle_in_its_description_alone():
-    activate(RGB)
-    sky = mi.load_dict({"type": "sunsky", "sun_direction": [0.0, 0.6, 0.8], "sun_aperture": 2.5, "sky_scale": 0.0})
-    assert not any("aperture" in key for key in mi.traverse(sky).properties)
-    half = compat.sun_half_angle(sky)
-    assert half == pytest.approx(np.radians(1.25), rel=1e-5)
-
-    def light_at(angle):
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        towards = np.arctan2(0.6, 0.8) + angle
-        si.wi = -mi.Vector3f(0, float(np.sin(towards)), float(np.cos(towards)))
-        return float(dr.max(sky.eval(si))[0])
-
-    assert light_at(0.99 * half) > 0 and light_at(1.01 * half) == 0
+def test_two_sided_matrices_from_behind_are_those_of_the_front():
+    activate(POLARIZED)
+    metal = {"type": "roughconductor", "alpha": 0.3}
+    one, both = mi.load_dict(metal), mi.load_dict({"type": "twosided", "bsdf": metal})
+    wi, wo = unit(0.5, 0.2, 0.8), unit(-0.3, 0.4, 0.7)
+    mirrored = [mi.Vector3f(v.x, v.y, -v.z) for v in (wi, wo)]
+    front = matrix(one.eval(mi.BSDFContext(), interaction(wi), wo))
+    behind = matrix(both.eval(mi.BSDFContext(), interaction(mirrored[0]), mirrored[1]))
+    np.testing.assert_allclose(behind, front, rtol=1e-5)
+    assert abs(front[3, 1]) > 0.1 * front[0, 0], "this pair of directions would not tell the hands apart"
+    assert mirrors_matrices(both) and not mirrors_matrices(one)
+    assert mirrors_matrices(mi.load_dict({"type": "mask", "bsdf": {"type": "twosided", "bsdf": metal}}))
 
 
 # --------------------------------------------------------------------------------------------- indices, sides, spectra
@@ -333,38 +224,6 @@ def test_colours_are_kept_as_coefficients_in_spectral_variants():
         assert keeps_coefficients(texture, "value") == kept
         pixels = mi.Bitmap(np.full((2, 2, 3), 0.3, dtype=np.float32))
         assert keeps_coefficients(mi.load_dict({"type": "bitmap", "bitmap": pixels, "raw": False}), "data") == kept
-
-
-def test_attributes_of_meshes_do_not_say_that_they_vary():
-    activate(RGB)
-    texture = mi.load_dict({"type": "mesh_attribute", "name": "vertex_color", "scale": 2.0})
-    mesh = mi.load_dict({"type": "cube"})
-    mesh.add_attribute("vertex_color", 1, np.linspace(0, 1, mesh.vertex_count()).tolist())
-    rays = mi.Ray3f(mi.Point3f([-0.5, 0.5], 0.0, 3.0), mi.Vector3f(0, 0, -1))
-    values = np.array(texture.eval_1(mi.load_dict({"type": "scene", "mesh": mesh}).ray_intersect(rays)))
-    assert values[0] != values[1]
-    assert not texture.is_spatially_varying() and compat.varies(texture)
-    assert not compat.varies(mi.load_dict({"type": "uniform", "value": 0.5}))
-    assert compat.attribute_name(texture) == "vertex_color"
-    assert compat.attribute_name(mi.load_dict({"type": "checkerboard"})) is None
-
-
-@pytest.mark.parametrize("size", [1, 3, 4])
-def test_attributes_of_another_size_read_as_zero(size):
-    mesh = mi.load_dict({"type": "cube"})
-    mesh.add_attribute("vertex_color", size, [0.5] * (size * mesh.vertex_count()))
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.shape = mi.ShapePtr(mesh)
-    texture = mi.load_dict({"type": "mesh_attribute", "name": "vertex_color"})
-    read = {
-        "base_color": dr.max(texture.eval(si))[0],
-        "roughness": texture.eval_1(si)[0],
-        "normalmap": dr.max(texture.eval_3(si))[0],
-    }
-    holders = dict.fromkeys(read, mi.load_dict({"type": "principled"}))
-    holders["normalmap"] = mi.load_dict({"type": "normalmap", "normalmap": texture, "nested": {"type": "diffuse"}})
-    for slot, value in read.items():
-        assert (value > 0) == (size in compat.attribute_sizes(holders[slot], slot)), slot
 
 
 # ------------------------------------------------------------------------------------------------------ shapes, sensors
@@ -385,103 +244,3 @@ def test_merged_rectangles_have_no_bounds():
     (shape,) = scene.shapes()
     assert not shape.bbox().valid() and not scene.bbox().valid()
     np.testing.assert_allclose(np.array(mitsuba_shapes.bounds_of(shape).max), [1, 1, 1])
-
-
-def round_shape(plugin):
-    shapes = {
-        "sphere": {"type": "sphere", "radius": 0.8},
-        "cylinder": {"type": "cylinder", "p0": [-2, 0, 0], "p1": [2, 0.1, 0], "radius": 0.7},
-    }
-    if plugin in shapes:
-        return {"shape": shapes[plugin]}
-    group = {"type": "shapegroup", "ball": shapes["sphere"]}
-    pose = mi.ScalarTransform4f().translate([0.1, 0, 0])
-    return {"group": group, "copy": {"type": "instance", "to_world": pose, "group": {"type": "ref", "id": "group"}}}
-
-
-def slopes_of_the_way_out(plugin):
-    """Where a ray that shifts and turns leaves a shape: derivative of the distance by finite differences and by
-    Mitsuba.
-    """
-    activate("llvm_ad_mono")
-    scene = mi.load_dict({"type": "scene", **round_shape(plugin)}, optimize=False)
-
-    def ray(x):
-        return mi.Ray3f(mi.Point3f(0.3 + x, 0.2, -4 - 0.5 * x), dr.normalize(mi.Vector3f(0.01 - 0.2 * x, 0.02, 1)))
-
-    def way_out(x):
-        line = ray(mi.Float(x))
-        start = scene.ray_intersect_preliminary(line).t + 1e-3
-        onward = mi.Ray3f(line)
-        onward.o = line(start)
-        pi = scene.ray_intersect_preliminary(onward)
-        pi.t += start
-        return pi
-
-    def slope(distance):
-        x = mi.Float(0)
-        dr.enable_grad(x)
-        t = distance(way_out(0.0), ray(x))
-        dr.forward(x)
-        return float(dr.grad(t)[0])
-
-    h = 1e-2
-    expected = float((way_out(h).t - way_out(-h).t)[0]) / (2 * h)
-    return expected, slope(lambda pi, line: pi.compute_surface_interaction(line, mi.RayFlags.Minimal).t)
-
-
-@pytest.mark.parametrize("plugin", ["sphere", "cylinder", "instance"])
-def test_distances_behind_round_shapes_have_the_derivative_of_those_before(plugin):
-    expected, theirs = slopes_of_the_way_out(plugin)
-    assert abs(theirs - expected) > 5e-3
-
-
-BATCH = """
-import torchtransient  # finds an LLVM
-import drjit as dr, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-film = {"type": "hdrfilm", "width": 2, "height": 1, "rfilter": {"type": "box"}}
-cameras = {"a": {"type": "perspective"}, "b": {"type": "perspective"}}
-sensor = mi.load_dict({"type": "batch", "film": film, **cameras} if %r else {"type": "perspective", "film": film})
-params = mi.traverse(sensor)
-key = "a.x_fov" if "a.x_fov" in params else "x_fov"
-x = mi.Float(params[key])
-dr.enable_grad(x)
-params[key] = x
-params.update()
-dr.set_grad(x, 1.0)
-place = mi.Point2f([0.2, 0.7], [0.3, 0.3])
-ray, _ = sensor.sample_ray_differential(time=0.0, sample1=0.5, sample2=place, sample3=mi.Point2f(0.5))
-dr.enqueue(dr.ADMode.Forward, x)
-dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
-assert dr.all(dr.isfinite(dr.grad(ray.d)), axis=None)
-"""
-
-
-@pytest.mark.slow
-def test_forward_mode_through_a_batch_of_sensors_ends_the_process():
-    for batch, ends in ((False, False), (True, True)):
-        run = subprocess.run([sys.executable, "-c", BATCH % batch], capture_output=True, text=True, timeout=300)
-        assert (run.returncode != 0) == ends, run.stderr
-        assert not ends or "unrecoverable" in run.stderr
-
-
-# -------------------------------------------------------------------------------------------------------- sphere lights
-
-
-def towards_sphere(radius, height, p=(0, 0, 0), u=(0.3, 0.4), radiance=1.0, **more):
-    """(direction sample, emission over density, density that is asked for) of Mitsuba's area light on a sphere."""
-    activate("llvm_ad_mono")
-    light = {"type": "sphere", "center": [0, 0, height], "radius": radius, **more}
-    shape = mi.load_dict(light | {"emitter": {"type": "area", "radiance": radiance}})
-    it = dr.zeros(mi.Interaction3f, max(dr.width(p), dr.width(u)))
-    it.p = mi.Point3f(p)
-    ds, weight = shape.emitter().sample_direction(it, mi.Point2f(u))
-    return ds, weight.x, shape.emitter().pdf_direction(it, ds)
-
-
-def test_cone_of_a_small_sphere_has_no_digits_left():
-    """pi L (r / d)^2 of a sphere of 1 mm, and of one of 0.3 mm, at 3 m."""
-    weights = [float(towards_sphere(radius, 3.0)[1][0]) / (np.pi * (radius / 3.0) ** 2) for radius in (1e-3, 3e-4)]
-    assert weights[0] == pytest.approx(1.07, abs=0.06) and abs(weights[0] - 1) > 0.01
-    assert weights[1] == 0

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.plain_scenes import as_mitsuba
 from torchtransient import plugins
 from torchtransient.errors import SceneError
-from torchtransient.scene.edits import BuildOptions
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
@@ -88,14 +88,15 @@ def test_coordinates_that_are_turned(tmp_path):
 
 def test_points_of_a_mesh_move_with_it(tmp_path):
     """They are material points, for vertices that move and in derivatives by them."""
-    scene = tt.load(on(wall_file(tmp_path, UPRIGHT)), variant=VARIANT).built(BuildOptions(transient=True))
-    sensor, key = scene.scene.sensors()[0], "wall.vertex_positions"
+    mi.set_variant(VARIANT)
+    scene = mi.load_dict(as_mitsuba(on(wall_file(tmp_path, UPRIGHT))), optimize=False)
+    sensor, key, params = scene.sensors()[0], "wall.vertex_positions", mi.traverse(scene)
     before = np.array(sensor.scanned())
-    start, way = mi.Point3f(dr.unravel(mi.Point3f, scene.params[key])), mi.Vector3f(0.1, -0.2, 0.3)
+    start, way = mi.Point3f(dr.unravel(mi.Point3f, params[key])), mi.Vector3f(0.1, -0.2, 0.3)
     far = mi.Float(1.0)
     dr.enable_grad(far)
-    scene.params[key] = dr.ravel(start + far * way)
-    scene.params.update()
+    params[key] = dr.ravel(start + far * way)
+    params.update()
     after = sensor.scanned()
     dr.forward(far)
     np.testing.assert_allclose(np.array(after) - before, np.tile([[0.1], [-0.2], [0.3]], 6), atol=1e-6)
@@ -107,7 +108,6 @@ def test_points_of_a_mesh_move_with_it(tmp_path):
     [
         (None, "a mesh without texture coordinates.*Give the points"),
         (HALF, r"texture coordinates of the mesh .* got none at 2 of 6 places of the film.*Give the points"),
-        ({"type": "disk"}, "got the shape Disk.*Give the points"),
         ({"type": "sphere"}, "got the shape Sphere.*Give the points"),
     ],
 )
@@ -117,29 +117,25 @@ def test_walls_that_have_no_grid(tmp_path, wall, message):
         simulate(on(shape))
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_a_sensor_without_a_shape(kind):
-    described = complete(kind)
+def test_a_sensor_without_a_shape():
+    described = complete()
     sensor = described["wall"].pop("sensor")
     del sensor["points"]
-    sensor.pop("laser_points", None)
-    described["meter"] = sensor | ({"laser_lookat_pixel": [1.0, 1.0, 0.0]} if kind == "single" else {})
+    described["meter"] = sensor
     with pytest.raises(SceneError, match="expected a shape to scan or 'points', got neither"):
         simulate(described)
 
 
 # ------------------------------------------------------------------------------------------------------------ numbers
 
-NAN, INF = math.nan, math.inf
 
-
-@pytest.mark.parametrize("place", [[NAN, 0.0, 0.0], [-1.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 2.5, 0.0]])
+@pytest.mark.parametrize("place", [[math.nan, 0.0, 0.0], [4.0, 0.0, 0.0]])
 def test_places_beside_the_film(place):
     with pytest.raises(SceneError, match="laser_lookat_pixel"):
         simulate(on({"type": "rectangle"}, "single", laser_lookat_pixel=place))
 
 
-@pytest.mark.parametrize("fov", [0.0, -3.0, 180.0, 1e9, NAN])
+@pytest.mark.parametrize("fov", [0.0, 180.0])
 def test_fields_of_view_of_lasers(fov):
     described = complete(
         "exhaustive", integrator={"force_equal_illumination_scanning": False, "illumination_scan_fov": fov}

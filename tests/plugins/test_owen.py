@@ -12,8 +12,6 @@ import torch
 import torchtransient as tt
 from torchtransient.errors import PhysicsWarning
 
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized")
-
 
 def points(count, pixels=50, seed=0, calls=4, name="owen"):
     """Points (calls, pixels, count, 2) of ``next_2d``."""
@@ -24,10 +22,9 @@ def points(count, pixels=50, seed=0, calls=4, name="owen"):
     return np.array([np.array(sampler.next_2d()).T.reshape(pixels, count, 2) for _ in range(calls)])
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_every_pair_is_a_net(variant):
+def test_every_pair_is_a_net():
     """Of 32 points every box of 2^-a by 2^(a - 5) holds one."""
-    mi.set_variant(variant)
+    mi.set_variant("llvm_ad_spectral")
     sampler = mi.load_dict({"type": "owen", "sample_count": 32})
     sampler.set_samples_per_wavefront(32)
     sampler.seed(3, 20 * 32)
@@ -65,7 +62,7 @@ def test_any_number_of_samples():
     assert all(len(set(row)) == 8 for row in np.floor(both * 8))
 
 
-@pytest.mark.parametrize("count", [1, 4, 7, 64])
+@pytest.mark.parametrize("count", [1, 7])
 def test_numbers_are_uniform_and_independent(count):
     """Products of waves along two dimensions have the mean zero, over pixels as over seeds: 5 standard errors.
 
@@ -118,11 +115,8 @@ def room(sampler, resolution=8):
 
 @pytest.mark.parametrize(
     "named, asked, used",
-    [
-        (None, None, "owen"), ("independent", None, "owen"), ("multijitter", None, "multijitter"),
-        ("independent", "independent", "independent"), ("multijitter", "owen", "owen"), ("owen", None, "owen"),
-    ],
-)  # fmt: skip
+    [(None, None, "owen"), ("multijitter", None, "multijitter"), ("multijitter", "owen", "owen")],
+)
 def test_which_sampler_is_used(named, asked, used):
     out = tt.TransientRenderer(room(named), spp=4, sampler=asked, physics="ignore")(seed=0)
     assert out.stats.sampler == used and out.stats.spp == 4
@@ -146,9 +140,8 @@ def test_less_noise_and_the_same_mean():
     for name in ("independent", "owen"):
         renderer = tt.TransientRenderer(room(None, 16), spp=64, sampler=name, physics="ignore")
         with torch.no_grad():
-            found[name] = torch.stack([renderer(seed=seed).steady.mean((0, 1, 2)) for seed in range(24)])
-            images = torch.stack([renderer(seed=seed).steady for seed in range(8)])
-        found[name + " variance"] = float(images.var(0).mean())
+            images = torch.stack([renderer(seed=seed).steady for seed in range(16)])
+        found[name], found[name + " variance"] = images.mean((1, 2, 3)), float(images.var(0).mean())
     a, b = found["independent"], found["owen"]
-    assert abs(a.mean() - b.mean()) < 4 * torch.sqrt((a.var() + b.var()) / 24)
+    assert abs(a.mean() - b.mean()) < 4 * torch.sqrt((a.var() + b.var()) / 16)
     assert found["owen variance"] < 0.25 * found["independent variance"]

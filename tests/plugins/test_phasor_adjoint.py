@@ -62,7 +62,7 @@ def worst(film, lengths=LENGTHS):
     return found
 
 
-@pytest.mark.parametrize("count", [1, 2, 17, 1025])
+@pytest.mark.parametrize("count", [1, 2, 1025])
 def test_phases_of_a_grid(count):
     film = make_film(frequency_first=0.1, frequency_step=99.9 / 1024, frequency_count=count)
     assert film.step is not None and worst(film) < CYCLES
@@ -73,7 +73,7 @@ def test_a_grid_on_both_sides_of_zero():
     assert film.step is not None and worst(film) < CYCLES
 
 
-@pytest.mark.parametrize("deviation, is_grid", [(5e-15, True), (1e-12, False), (1e-9, False), (1e-3, False)])
+@pytest.mark.parametrize("deviation, is_grid", [(5e-15, True), (1e-12, False), (1e-3, False)])
 def test_spacing_that_is_only_almost_equal(deviation, is_grid):
     """Taken for a grid where no phase could show the difference, else frequency by frequency."""
     noise = np.random.default_rng(0).uniform(-1, 1, 301)

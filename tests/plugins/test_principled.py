@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.gradient_cases.scenes import area_light, camera, glass_slab, room
-from support.marks import long, long_rows
+from support.gradient_cases.scenes import area_light, glass_slab, room
+from support.marks import long
 from support.surface_samples import start
 from support.sweeps import together
 from torchtransient.errors import GradientError
@@ -60,7 +60,7 @@ def interactions(count):
 
 @together("kind, settings", SETTINGS)
 @pytest.mark.parametrize(
-    "variant", long(["llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"], ["llvm_ad_mono"])
+    "variant", long(["llvm_ad_mono", "llvm_ad_mono_polarized"], ["llvm_ad_mono"])
 )
 def test_values_densities_and_samples_are_those_of_mitsuba(kind, settings, variant):
     theirs, ours = (mi.load_dict({"type": name, **settings}) for name in (kind, TWINS[kind]))
@@ -115,11 +115,8 @@ def test_slopes_at_the_ends(kind, slot, end, others, wi, wo):
     assert float(bsdf.pdf(mi.BSDFContext(), si, at(wo))[0]) > 1e-3
 
 
-OF_ENDS = [entry[:3] for entry in ENDS]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "slot", "end"), long_rows(OF_ENDS, OF_ENDS[2::5]))
+@pytest.mark.parametrize(("kind", "slot", "end"), [entry[:3] for entry in ENDS[2::3]])
 def test_samples_at_the_ends_fit_their_density(kind, slot, end):
     """Share of the samples in each of two times two parts of the sphere, against the integral of the density."""
     bsdf = mi.load_dict({"type": TWINS[kind], slot: {"type": "uniform", "value": end}, "roughness": 0.6})
@@ -168,7 +165,7 @@ def arrival(image):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("around", ["nothing", "mask", "twosided"])
+@pytest.mark.parametrize("around", ["nothing", "twosided"])
 def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     """Light behind the surface counts with its index, although the description lacks the lobe."""
 
@@ -176,7 +173,6 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
         glass = {"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9, **more}
         wrapped = {
             "nothing": glass,
-            "mask": {"type": "mask", "opacity": 1.0, "nested": glass},
             "twosided": {"type": "twosided", "allow_transmission": True, "nested": glass},
         }
         return tt.load(glass_slab(wrapped[around]), variant="llvm_ad_mono")
@@ -193,23 +189,14 @@ def test_a_lobe_of_transmission_that_is_asked_for_refracts(around):
     assert arrival(found.detach()) == pytest.approx(arrival(expected), rel=1e-4)
 
 
-BETWEEN = ["normalmap", "bumpmap", "blendbsdf", "blendbsdf of a bumpmap", "reference"]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("between", BETWEEN)
+@pytest.mark.parametrize("between", ["blendbsdf of a bumpmap", "reference"])
 def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     """Mitsuba refuses transmission under ``twosided`` unless it is told that it is meant."""
     paint = {"type": "principled", "base_color": 0.6}
-    heights, normals = (
-        {"type": "bitmap", "raw": True, "data": np.full((2, 2, len(texel)), texel, dtype=np.float32)}
-        for texel in ((0.5,), (0.5, 0.5, 1.0))
-    )
+    heights = {"type": "bitmap", "raw": True, "data": np.full((2, 2, 1), 0.5, dtype=np.float32)}
     bumpy = {"type": "bumpmap", "heights": heights, "nested": paint}
     nested = {
-        "normalmap": {"type": "normalmap", "normalmap": normals, "nested": paint},
-        "bumpmap": bumpy,
-        "blendbsdf": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": paint},
         "blendbsdf of a bumpmap": {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": bumpy},
         "reference": {"type": "bumpmap", "heights": heights, "nested": {"type": "ref", "id": "paint"}},
     }[between]
@@ -219,24 +206,6 @@ def test_a_lobe_of_transmission_deep_inside_two_sides(between):
     renderer = tt.TransientRenderer(scene, parameters=[key], spp=16)
     renderer(seed=0).steady.sum().backward()
     assert float(renderer.values[key].grad) < 0
-
-
-@pytest.mark.slow
-def test_a_lobe_that_is_added_to_a_scene_that_was_rendered_refracts():
-    """Of a scene of Mitsuba, where a changed weight adds the lobe."""
-    description = glass_slab({"type": "principled", "eta": 1.4, "roughness": 0.3, "base_color": 0.9})
-    description["sensor"] = camera(fov=6.0, start=0.0, bins=300, width=0.05)
-    images = []
-    for first in (True, False):
-        scene = mi.load_dict(description, optimize=False)
-        if first:
-            scene.integrator().render(scene, seed=0, spp=4)
-        params = mi.traverse(scene)
-        params["slab.bsdf.spec_trans.value"] = mi.Float(0.9)
-        params.update()
-        _, image = scene.integrator().render(scene, seed=0, spp=256)
-        images.append(np.array(image))
-    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5 * images[1].max())
 
 
 @pytest.mark.parametrize(("kind", "slot"), [("principled", "spec_trans"), ("principledthin", "diff_trans")])

@@ -16,7 +16,6 @@ from torchtransient.plugins import _registry
 JIT_VARIANTS = (
     "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized",
 )  # fmt: skip
-OWN = [(kind, name) for module in _registry.PLUGIN_MODULES for kind, name in module.plugins]
 
 
 @pytest.fixture(autouse=True)
@@ -51,14 +50,6 @@ def test_every_plugin_belongs_to_the_active_variant(variant):
     assert isinstance(build("diff_rough_dielectric"), mi.BSDF)
 
 
-def test_variant_context_there_and_back():
-    rgb = type(build("transient_path"))
-    with mi.variant_context("llvm_ad_mono"):
-        assert isinstance(build("transient_path"), mi.Integrator)
-        assert not isinstance(build("transient_path"), rgb)
-    assert isinstance(build("transient_path"), mi.Integrator)
-
-
 def test_a_plugin_is_imported_at_its_first_use():
     """Hair is built on the class of plastic: both are imported by one use, and belong to each later variant."""
     found = run(
@@ -79,26 +70,6 @@ def test_a_plugin_is_imported_at_its_first_use():
         """
     )
     assert found == ["0", "2", "True", "False", "True", "False"]
-
-
-def test_scalar_variants_register_and_refuse():
-    with mi.variant_context("scalar_rgb"):
-        assert plugins.sync() == "scalar_rgb"
-        assert len(OWN) > 20
-        for _, name in OWN:
-            with pytest.raises(VariantError, match=f"'{name}'.*llvm_ad.*scalar_rgb"):
-                build(name)
-
-
-@pytest.mark.slow
-def test_no_variant_at_import_and_after():
-    out = run("""
-        import torchtransient, mitsuba as mi
-        print(torchtransient.plugins.sync())
-        mi.set_variant("llvm_ad_mono")
-        print(type(mi.load_dict({"type": "transient_path"})).__name__)
-    """)
-    assert out == ["None", "TransientPath"]
 
 
 THIRD_PARTY = """

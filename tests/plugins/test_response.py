@@ -102,19 +102,6 @@ def test_channels_are_integrals_over_wavelength():
     assert result.passed, str(result)
 
 
-@pytest.mark.slow
-def test_less_noise_than_wavelengths_drawn_for_the_eye():
-    far_red = {"far": {"type": "regular", "wavelength_min": 760, "wavelength_max": 800, "values": "0, 1, 0"}}
-    ours, _ = runs(mi.load_dict(description(film(bands=far_red))))
-    relative = ours.std(0) / ours.mean(0)
-    response = mi.load_dict(film(bands=far_red)).curves
-    # drawn for the eye, one wavelength in 40 would meet this curve: 4 x 1024 of them leave 10 percent of noise
-    lengths, inverse = mi.sample_rgb_spectrum(mi.sample_shifted(mi.Float(np.random.default_rng(0).random(1 << 14))))
-    rows = np.array([np.array(row[0]) for row in response.matrix(lengths)]) * 4
-    one = (rows * np.array(inverse)).ravel()
-    assert relative.max() < 0.25 * one.std() / one.mean() / np.sqrt(4096)
-
-
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"])
 def test_a_variant_without_wavelengths_is_refused(variant):
     mi.set_variant(variant)
@@ -154,18 +141,3 @@ def test_a_specfilm_becomes_a_film_with_its_bands():
 # ------------------------------------------------------------------------------------------- samples and channels
 
 
-def light(rng):
-    """A Stokes vector of spectra, or a spectrum, of some numbers."""
-    if mi.is_polarized:
-        return mi.SpectrumEntry(*(spectrum(rng) for _ in range(4)))
-    return spectrum(rng)
-
-
-def spectrum(rng):
-    return mi.UnpolarizedSpectrum(*(mi.Float(row) for row in rng.uniform(-1, 1, (len(mi.UnpolarizedSpectrum()), 3))))
-
-
-def numbers(value):
-    """A sample as an array (components, wavelengths, lanes)."""
-    parts = [value[i] for i in range(4)] if mi.is_polarized else [value]
-    return np.array([[np.broadcast_to(np.array(part[k], dtype=float), 3) for k in range(len(part))] for part in parts])

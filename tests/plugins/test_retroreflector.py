@@ -27,7 +27,7 @@ def seen_at(angle, count):
 
 
 @pytest.mark.parametrize(
-    ("alpha", "share"), [(0.3, 0.6), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((0.15, 1.0), (0.6, 0.0)))]
+    ("alpha", "share"), [(0.3, 0.6), pytest.param(0.15, 1.0, marks=pytest.mark.slow)]
 )
 def test_samples_have_the_density(alpha, share):
     from mitsuba.python.chi2 import BSDFAdapter, ChiSquareTest, SphericalDomain
@@ -40,8 +40,7 @@ def test_samples_have_the_density(alpha, share):
     assert test.run(), test.messages
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.7, 1.4])
-@pytest.mark.parametrize(("alpha", "share"), [(0.02, 1.0), (0.3, 0.5), (1.0, 1.0)])
+@pytest.mark.parametrize(("angle", "alpha", "share"), [(0.0, 0.02, 1.0), (0.7, 0.3, 0.5), (1.4, 1.0, 1.0)])
 def test_energy_and_weights(angle, alpha, share):
     """No more comes back than the reflectance says, and of narrow lobes all of it; value is weight times density."""
     bsdf, count = surface(alpha=alpha, share=share, reflectance=0.9), 1 << 16
@@ -111,10 +110,7 @@ def test_a_plate_seen_from_the_lamp_is_as_bright_as_the_closed_form(tilt):
     assert seen / brightness(type="diffuse") == pytest.approx(masked**2 / (4 * alpha**2 * cosine**2), rel=2e-3)
 
 
-_SLOW = [pytest.param(*pair, marks=pytest.mark.slow) for pair in (("alpha", 0.2), ("share", 0.5), ("share", 0.0))]
-
-
-@pytest.mark.parametrize(("key", "value"), [("share", 1.0), *_SLOW])
+@pytest.mark.parametrize(("key", "value"), [("share", 1.0), pytest.param("alpha", 0.2, marks=pytest.mark.slow)])
 def test_derivatives_against_finite_differences(key, value):
     """With several bounces between the plate and the wall behind it."""
     room = make_room()
@@ -134,7 +130,7 @@ def test_derivatives_against_finite_differences(key, value):
     assert found == pytest.approx((high - low) / (ends[1] - ends[0]), rel=0.04) and abs(found) > 1e-3
 
 
-@pytest.mark.parametrize("wrong", [{"share": 1.2}, {"share": -0.1}, {"alpha": 0.0}, {"alpha": 2.0}])
+@pytest.mark.parametrize("wrong", [{"share": 1.2}, {"alpha": 0.0}])
 def test_wrong_numbers_are_refused(wrong):
     room = make_room()
     room["wall"]["bsdf"] = {"type": "retroreflector", **wrong}
@@ -150,8 +146,8 @@ def test_it_depolarizes():
     assert stokes[0].sum() > 0 and stokes[1:].abs().max() == 0
 
 
-@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
-def test_its_diffuse_reflectance_is_that_of_the_rest(share):
+def test_its_diffuse_reflectance_is_that_of_the_rest():
+    share = 0.7
     bsdf, count = surface(share=share, reflectance=0.8), 1 << 12
     ctx, rng = mi.BSDFContext(mi.TransportMode.Radiance, int(mi.BSDFFlags.Diffuse), 1), mi.PCG32(count)
     si = seen_at(0.5, count)

@@ -114,10 +114,7 @@ def test_principled_surfaces_without_an_index_are_the_limit(end, beside):
 
 METAL = {"type": "principled", "metallic": 0.5, "specular": 0.0}
 HAIR = {"type": "hair", "sigma_a": 0.5, "longitudinal_roughness": 0.0}
-ASKED = [
-    (METAL, "metallic.value"), (METAL, "base_color.value"), (METAL, "specular"), (HAIR, "sigma_a.value"),
-    (HAIR, "longitudinal_roughness"),
-]  # fmt: skip
+ASKED = [(METAL, "metallic.value"), (METAL, "specular"), (HAIR, "longitudinal_roughness")]
 
 
 @pytest.mark.parametrize(("bsdf", "key"), long_rows(ASKED, ASKED[:1]))

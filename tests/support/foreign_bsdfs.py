@@ -7,9 +7,8 @@ import mitsuba as mi
 
 
 def register():
-    """Their plugins, for the active variant: ``tint``, ``mended_tint`` and ``nameless``."""
-    tint = _tint()
-    for name, kind in (("tint", tint), ("mended_tint", _mended(tint)), ("nameless", _nameless())):
+    """Their plugins, for the active variant: ``tint`` and ``nameless``."""
+    for name, kind in (("tint", _tint()), ("nameless", _nameless())):
         mi.register_bsdf(name, kind)
 
 
@@ -46,23 +45,6 @@ def _tint():
             return "Tint[]"
 
     return Tint
-
-
-def _mended(tint):
-    class MendedTint(tint):
-        """Weights divide by the detached probability, and it shows what it holds."""
-
-        hides_lobe_probability = False
-
-        def sample(self, ctx, si, u, v, active=True):
-            bs, weight = super().sample(ctx, si, u, v, active)
-            delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            return bs, weight * dr.select(delta, dr.relative_grad(bs.pdf), 1)
-
-        def to_string(self):
-            return f"MendedTint[{self.inner}]"
-
-    return MendedTint
 
 
 def _nameless():

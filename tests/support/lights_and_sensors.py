@@ -72,13 +72,6 @@ def from_above(direction=(0.6, 0.0, 0.8)):
     return np.array(direction) / np.linalg.norm(direction)
 
 
-def bright_texel():
-    """An environment map of 64 x 32 with one bright texel."""
-    image = np.zeros((32, 64, 3), np.float32)
-    image[12, 39] = 100.0
-    return image
-
-
 LIGHTS = {
     "point": Light(
         lambda: {"type": "point", "position": [0.6, 0.0, 0.8], "intensity": 3.0},

@@ -19,8 +19,13 @@ def runs(scene, count=6, spp=256, seed=0):
     return [np.array([np.array(r[i]) for r in results], dtype=float) for i in (0, 1)]
 
 
+def mitsuba_image(scene, seed, spp):
+    """Image of one of Mitsuba's integrators, with all its channels."""
+    with no_collection():
+        return np.array(mi.render(scene, seed=seed, spp=spp), dtype=float)
+
+
 def steady_runs(scene, count=6, spp=256, seed=700):
     """Independent images of one of Mitsuba's integrators."""
-    with no_collection():
-        images = np.array([np.array(mi.render(scene, seed=seed + k, spp=spp)) for k in range(count)], dtype=float)
+    images = np.array([mitsuba_image(scene, seed + k, spp) for k in range(count)])
     return images[..., :1] if mi.is_monochromatic else images

@@ -3,14 +3,10 @@ of `plugins/transport`.
 
 Renders, their gradients and errors are the first choice. Each name stands for a reason that they do not serve:
 
-- the loop alone, on strategies and sinks of a test's own: `trace`, `primary_rays`, `Connection`, `Event`, `Step`,
-  `Vertex`, `Sink`;
-- what a walk hands to another sink than a film: `AdjointSumSink`; and `recorded_paths`, the random walk itself, before
-  any light;
+- the loop alone, on the first launch of a render and before any light: `primary_rays`, `recorded_paths`;
 - mathematics with a closed form, at single points: `attached_interaction` and `attached_distance`, hits of curves,
   ellipsoids and instances with the derivatives that Mitsuba lacks; `varies_by_place`, a property of every
   plugin that costs time or derivatives where it is wrong;
-- what an author of strategies gets wrong: `Guide`, `Surface`;
 - the same numbers by another way: `limit_records`;
 - moments in the middle of a trace, for interrupts, errors and scenes that are dropped there: `before_each_turn`.
 
@@ -30,8 +26,6 @@ from torchtransient.plugins.integrators.job import passes_of
 from torchtransient.plugins.transport import scene_contents, walk
 from torchtransient.plugins.transport.context import Wanted
 from torchtransient.plugins.transport.record import RecordedVertex, RecordSink
-from torchtransient.plugins.transport.sinks import AdjointSumSink, Sink
-from torchtransient.plugins.transport.strategy import Connection, Event, Guide, Step, Vertex
 from torchtransient.plugins.transport.surface_interactions import (
     AttachedSurfaces,
     DetachedHits,
@@ -39,24 +33,14 @@ from torchtransient.plugins.transport.surface_interactions import (
     distance_to,
     surface_interaction,
 )
-from torchtransient.plugins.transport.surface_scattering import Surface
 
 __all__ = [
-    "AdjointSumSink",
-    "Connection",
-    "Event",
-    "Guide",
-    "Sink",
-    "Step",
-    "Surface",
-    "Vertex",
     "attached_distance",
     "attached_interaction",
     "before_each_turn",
     "limit_records",
     "primary_rays",
     "recorded_paths",
-    "trace",
     "varies_by_place",
 ]
 
@@ -65,26 +49,6 @@ CORE = "torchtransient.plugins.transport"
 
 # --------------------------------------------------------------------------------------------------------------------
 # The loop.
-
-def trace(context, sampler, ray, first_opl, sink, η=1, pi=None):
-    """Trace the paths of primary rays into a sink.
-
-    Args:
-        context: ``RenderContext`` of a job, or a namespace of what the loop reads of it.
-        sampler: Mitsuba sampler of the lanes.
-        ray: primary rays, Ray3f.
-        first_opl: optical path length before their origins, minus the film's start, metres (Float64).
-        sink: sink of events and vertices.
-        η: index of refraction at their origins.
-        pi: PreliminaryIntersection3f of their first surface, None if unknown.
-
-    Returns:
-        (number of vertices, UInt32; state of the sink).
-    """
-    path = walk.start(context, ray, first_opl, η)
-    path.leg = walk.first_leg(context, sampler, ray, pi)
-    return walk.walk(context, sampler, path, sink)
-
 
 def primary_rays(scene, seed, spp):
     """Return the first launch of a render: ``integrator, sensor, film, contents, context, job, rays``."""
@@ -116,7 +80,9 @@ def recorded_paths(scene, lanes, seed):
         ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(0.5), mi.Point2f(0.5))
         ray.o, ray.d = [dr.repeat(x, lanes) if dr.width(x) == 1 else x for x in (ray.o, ray.d)]
         sink = RecordSink()
-        count, store = trace(context, sampler, ray, mi.Float64(0), sink)
+        path = walk.start(context, ray, mi.Float64(0), 1)
+        path.leg = walk.first_leg(context, sampler, ray, None)
+        count, store = walk.walk(context, sampler, path, sink)
         points, lengths, weights = [], [], []
         for k in range(integrator.max_depth):
             there = mi.UInt32(k) < count

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tools.boundary_cases.closed_rooms import ROOMS
-from tools.boundary_cases.edge_derivatives import PASSES, EdgeProblem
-from tools.boundary_cases.moving_edges import CASES, RGB, SPECTRAL
+from tools.boundary_cases.edge_derivatives import EdgeProblem
+from tools.boundary_cases.moving_edges import CASES, SPECTRAL
 
 SIGMAS = 4.0
 # Both modes add the same float32 terms in another order.
@@ -41,14 +41,10 @@ def test_outlines_and_shadows(name):
 @pytest.mark.parametrize(
     ("name", "spp", "fd_spp"),
     [
-        ("cube", 256, 4096), ("plate4_area", 256, 4096), ("vertex4", 256, 4096), ("ball_shadow", 256, 4096),
-        ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096), ("point_moves", 512, 4096),
-        ("camera_moves", 256, 4096), ("camera_zooms", 256, 4096), ("instance4", 256, 8192),
-        ("torus_shadow", 512, 4096), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
-        ("phasor_shadow", 256, 4096), ("polar_plate", 256, 8192), ("mirror", 256, 8192),
-        ("mirror_shadow", 512, 8192), ("mirror_moves", 1024, 4096), ("mirror_camera", 4096, 32768),
-        ("sun_turns4", 256, 4096), ("flash_parallel", 256, 8192), ("in_line", 256, 4096),
-        ("glass_rims", 512, 8192), ("glass_moves", 1024, 8192),
+        ("cube", 256, 4096), ("ball_shadow", 256, 4096), ("indirect4_area", 256, 16384), ("wall_moves", 512, 4096),
+        ("camera_zooms", 256, 4096), ("instance4", 256, 8192), ("fog_shadow", 256, 8192), ("gated_plate4", 256, 4096),
+        ("polar_plate", 256, 8192), ("mirror_shadow", 512, 8192), ("mirror_camera", 4096, 32768),
+        ("sun_turns4", 256, 4096), ("glass_moves", 1024, 8192),
     ],
 )  # fmt: skip
 def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
@@ -56,45 +52,37 @@ def test_edges_seen_by_sensors_lights_and_surfaces(name, spp, fd_spp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", [RGB, SPECTRAL])
-def test_colours(variant):
-    compare(replace(CASES["indirect4_area"], variant=variant), 256, 16384)
+def test_colours():
+    compare(replace(CASES["indirect4_area"], variant=SPECTRAL), 256, 16384)
 
 
 def test_rays_edge_on_to_a_meter():
-    """Of 4e6 paths none counts by one over a cosine that is rounding: no run is far from the others."""
+    """Of 2e6 paths none counts by one over a cosine that is rounding: no run is far from the others."""
     problem = EdgeProblem(ROOMS["meter"](2))
-    found = np.array([problem.reverse(seed, 1 << 18, ()) for seed in range(300, 316)])
+    found = np.array([problem.reverse(seed, 1 << 18, ()) for seed in range(300, 308)])
     off = np.abs(found - np.median(found))
     assert off.max() < 10 * np.median(off)
 
 
-def both_modes(name, passes):
-    """(reverse, forward) of each pass alone at one seed."""
+def check_modes(name, *passes):
+    """Forward mode is reverse mode, of the given passes at one seed."""
     problem = EdgeProblem(CASES[name])
-    modes = problem.reverse, problem.forward
-    return np.array([[mode(5, 64, (one,), interior=False) for mode in modes] for one in passes])
+    reverse, forward = (mode(5, 64, passes, interior=False) for mode in (problem.reverse, problem.forward))
+    assert abs(reverse) > 1e-3
+    assert forward == pytest.approx(reverse, rel=ROUNDING)
 
 
-@pytest.mark.parametrize(("name", "passes"), [("contact4", ("primary", "vertex", "light")), ("mirror", ("specular",))])
-def test_forward_mode_of_every_pass(name, passes):
-    found = both_modes(name, passes)
-    assert (abs(found[:, 0]) > 1e-3).all()
-    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+def test_forward_mode():
+    check_modes("contact4", "primary", "vertex", "light")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "passes"),
-    [
-        ("mirror_camera", ("light", "specular")), ("glass_moves", ("primary", "light", "specular")),
-        ("indirect4_wall", ("vertex", "light")), ("camera_moves4", PASSES), ("bulb_moves", ("light",)),
-        ("sphere", ("primary", "light")), ("instance4", PASSES),
-    ],
-)  # fmt: skip
-def test_forward_mode(name, passes):
-    found = both_modes(name, passes)
-    np.testing.assert_allclose(found[:, 1], found[:, 0], rtol=ROUNDING)
+    ("name", "passes"), [("mirror", ["specular"]), ("glass_moves", ["primary", "light", "specular"])]
+)
+def test_forward_mode_of_every_pass(name, passes):
+    for one in passes:
+        check_modes(name, one)
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ it stands in for something that the library has, with that.
 from __future__ import annotations
 
 import ast
-import itertools
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 
 import torchtransient.plugins as plugins
-from support import toy_strategies
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.scenes import room, transform
 from support.gradient_cases.unknowns import move, set_color
@@ -56,24 +54,12 @@ def scene(plugin, media=False, **changes):
 CASES = [
     Case("two_samples_wall", "", lambda: scene("transient_two_emitter_samples", light=area_light()),
          move("wall.to_world", (0, 0, 1)), 0.0, 4e-3, spp=2048, seeds=6),
-    Case("two_samples_albedo", "", lambda: scene("transient_two_emitter_samples"),
-         set_color("side.bsdf.reflectance.value"), 0.8, 0.02, spp=1024, seeds=6),
     Case("two_samples_light", "", lambda: scene("transient_two_emitter_samples", light=area_light()),
          move("light.to_world", (0, 0, 1)), 0.0, 4e-3, spp=2048, seeds=6),
-    Case("two_samples_fog", "", lambda: scene("transient_two_emitter_samples", media=True),
-         set_color("block.interior_medium.sigma_t.value.value"), 0.4, 0.02, spp=2048, seeds=6),
-    Case("own_light_wall", "", lambda: scene("transient_with_point_light"),
-         move("wall.to_world", (0, 0, 1)), 0.0, 4e-3, spp=1024, seeds=6),
     Case("own_light_fog", "", lambda: scene("transient_with_point_light", media=True),
          set_color("block.interior_medium.sigma_t.value.value"), 0.4, 0.02, spp=2048, seeds=6),
-    Case("guided_wall", "", lambda: scene("transient_guided"),
-         move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, spp=2048, seeds=6),
-    Case("guided_area_light", "", lambda: scene("transient_guided", light=area_light()),
-         move("wall.to_world", (0, 0, 1)), 0.0, 1e-3, spp=2048, seeds=6),
     Case("guided_fog", "", lambda: scene("transient_guided", media=True, light=area_light()),
          set_color("block.interior_medium.sigma_t.value.value"), 0.4, 0.03, spp=2048, seeds=6),
-    Case("guided_albedo", "", lambda: scene("transient_guided"),
-         set_color("side.bsdf.reflectance.value"), 0.8, 0.02, spp=1024, seeds=6),
 ]  # fmt: skip
 
 
@@ -112,7 +98,8 @@ HARD = {
         "type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": {"type": "conductor"}}},
 }  # fmt: skip
 # Films do not care about surfaces.
-PAIRS = [("histogram", hard) for hard in HARD] + [(film, "area light") for film in FILMS if film != "histogram"]
+PAIRS = [("histogram", "something before the panel"), ("histogram", "glossy and mirror")]
+PAIRS += [(film, "area light") for film in FILMS if film != "histogram"]
 
 
 def hard_scene(plugin, film, hard):
@@ -124,14 +111,10 @@ def hard_scene(plugin, film, hard):
 
 
 TOYS = ("transient_guided", "transient_three_emitter_samples")
+ROWS = [(TOYS[(n + 1) % 2], pair) for n, pair in enumerate(PAIRS)]
 
 
-QUICK = [
-    ("transient_three_emitter_samples", ("phasors", "area light")),
-]
-
-
-@pytest.mark.parametrize(("toy", "pair"), long_rows(itertools.product(TOYS, PAIRS), QUICK))
+@pytest.mark.parametrize(("toy", "pair"), long_rows(ROWS, ROWS[2:3]))
 def test_same_mean(toy, pair):
     """Other strategies, the same light: sums over the steady image and over the film's array agree within 4 sigma."""
     count, (film, hard) = 8, pair
@@ -164,23 +147,6 @@ def test_own_light_equals_the_scene_s(plugin):
     centers = np.arange(theirs.shape[-2])
     mean_a, mean_b = ((x.sum((0, 1, 2, 4)) * centers).sum() / x.sum() for x in (ours, theirs))
     assert mean_a == pytest.approx(mean_b, abs=0.1)
-
-
-def test_a_strategy_is_one_class():
-    """What the toys know of the library: the interface, the geometry of a connection and the algebra of light. None
-    of them is named anywhere in the library.
-    """
-    tree = ast.parse(Path(toy_strategies.__file__).read_text(encoding="utf-8"))
-    used = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-    allowed = ("strategy", "carry", "geometry_terms", "emitter_connections")
-    expected = {f"torchtransient.plugins.transport.{name}" for name in allowed}
-    assert used <= expected | {"__future__", "torchtransient.plugins.polarized"}
-    package = Path(plugins.__file__).parent
-    names = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    assert len(names) == 4
-    for path in package.rglob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        assert not [name for name in names if name in text]
 
 
 def test_every_connection_is_asked_by_an_integrator():

@@ -48,9 +48,9 @@ ROOMS = {
     "sensing": _same("sensing"),
     "films": Room(
         ("plugins/films", "rendering/films.py"),
-        ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py", "plugins/test_pulse*.py",
+        ("plugins/test_*film*.py", "plugins/test_*gate*.py", "plugins/test_phasor*.py",
          "plugins/test_response.py", "plugins/test_wrong_options.py", "rendering/films",
-         "integrators/test_*phasor*.py", "integrators/test_*film*.py"),
+         "integrators/test_*phasor*.py", "integrators/test_plain_images.py", "motion/test_beat_lines.py"),
     ),
     "integrators": Room(
         ("plugins/integrators", "plugins/transport"),

@@ -7,7 +7,6 @@ import pytest
 
 from support.hidden_shapes import mannequin, mesh, plate, scene_of, wall_grid
 from support.marks import long
-from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 
 VARIANT = "llvm_ad_rgb"
@@ -22,15 +21,10 @@ def turned(*scale):
 SHAPES = {
     "rectangle": ({"type": "rectangle", "to_world": (0.5, 1.5, 2.0)}, 4 * 0.75),
     "mirrored rectangle": ({"type": "rectangle", "to_world": (-0.5, 1.5, 2.0)}, 4 * 0.75),
-    "flipped rectangle": ({"type": "rectangle", "to_world": (0.5, 1.5, 1.0), "flip_normals": True}, 4 * 0.75),
     "disk": ({"type": "disk", "to_world": (0.5, 1.5, 2.0)}, np.pi * 0.75),
-    "mirrored disk": ({"type": "disk", "to_world": (0.5, -1.5, 1.0)}, np.pi * 0.75),
-    "flipped disk": ({"type": "disk", "to_world": (0.5, 0.5, 1.0), "flip_normals": True}, np.pi * 0.25),
     "sphere": ({"type": "sphere", "to_world": (0.5, 0.5, 0.5)}, np.pi),
     "flipped sphere": ({"type": "sphere", "to_world": (0.5, 0.5, 0.5), "flip_normals": True}, np.pi),
-    "mirrored sphere": ({"type": "sphere", "to_world": (-0.5, -0.5, -0.5)}, np.pi),
     "cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, 2.0)}, 2 * np.pi),
-    "flipped cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, 2.0), "flip_normals": True}, 2 * np.pi),
     "mirrored cylinder": ({"type": "cylinder", "to_world": (0.5, 0.5, -2.0)}, 2 * np.pi),
     "cube": ({"type": "cube", "to_world": (0.5, 1.0, 2.0)}, 8 * (0.5 + 1 + 2)),
 }  # fmt: skip
@@ -70,21 +64,6 @@ def test_draws_lie_on_the_shape_with_its_normals(name):
     assert abs(inverse.mean() - area) < 4 * inverse.std() / COUNT**0.5 + 2e-3 * area * (hit.mean() < 1) + 1e-5 * area
 
 
-@pytest.mark.parametrize("name", ["disk", "sphere", "cylinder", "rectangle"])
-def test_draws_are_uniform_over_an_element(name):
-    """Mean and second moments of a uniform density, by Mitsuba's own points (which are right in place)."""
-    shape, _ = shape_of(name)
-    table = HiddenElements([shape], *wall_grid(3), defensive=1.0)
-    u = random_points(1 << 16)
-    ours = np.array(table.draw(u)[0], dtype=float)
-    theirs = np.array(shape.sample_position(0.0, u).p, dtype=float)
-    error = np.sqrt((ours.var(1) + theirs.var(1)) / ours.shape[1])
-    assert np.all(np.abs(ours.mean(1) - theirs.mean(1)) < 4 * error)
-    spread = [(x - x.mean(1, keepdims=True)) ** 2 for x in (ours, theirs)]
-    error = np.sqrt(sum(s.var(1) for s in spread) / ours.shape[1])
-    assert np.all(np.abs(spread[0].mean(1) - spread[1].mean(1)) < 4 * error)
-
-
 def scene_with_many():
     shapes = [
         mesh("body", mannequin(1)), mesh("plate", plate(0.5, 0.5, (0, 0, 2.0), 3), two_sided=True),
@@ -116,34 +95,6 @@ def test_frequencies_are_the_densities_and_densities_integrate_to_one():
         assert np.abs(count - p * 2**18).max() < 2
         assert dr.min(rest)[0] >= 0 and dr.max(rest)[0] < 1
     assert not np.allclose(table._probabilities(tiles[:1], normals[None]), p)
-
-
-def test_copies_of_groups_are_named():
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "group": {"type": "shapegroup", "inner": {"type": "sphere"}},
-            "copy": {"type": "instance", "ref": {"type": "ref", "id": "group"}},
-            "plate": {"type": "rectangle"},
-        }
-    )
-    shapes = scene.shapes()
-    table = HiddenElements(shapes, *wall_grid(3))
-    assert table.left_out == ["copy"] and set(table.elements.primitive) == {0, 1}
-    with pytest.raises(SceneError, match="copy"):
-        HiddenElements([s for s in shapes if s.id() == "copy"], *wall_grid(3))
-
-
-def test_triangles_without_area_are_dropped():
-    v, f = plate(1, 1, (0, 0, 1))
-    flat = mesh("m", (v, np.concatenate([[[0, 0, 1]], f])))
-    table = HiddenElements([flat], *wall_grid(3))
-    assert set(table.elements.primitive) == {1, 2}
-    place = mi.Point3f(0.1, 0.1, 1)
-    density = np.array(table.per_area(mi.ShapePtr(flat), mi.UInt32([0, 1, 2]), place))
-    assert density[0] == 0 and density[1] > 0
-    with pytest.raises(SceneError):
-        HiddenElements([mesh("n", (v, f[:, [0, 0, 1]]))], *wall_grid(3))
 
 
 def test_large_triangles_are_cut():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import scene_of, wall_grid
-from torchtransient.errors import SceneError
 from torchtransient.plugins.sampling.hidden_elements import HiddenElements
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
@@ -54,17 +53,3 @@ def test_both_sides_and_both_albedos():
     assert np.allclose(samples.front, 0.2 / np.pi) and np.allclose(samples.back, 0.6 / np.pi)
 
 
-@pytest.mark.parametrize(
-    "bsdf",
-    [
-        {"type": "roughconductor"},
-        {"type": "mask", "nested": {"type": "diffuse"}, "opacity": 0.5},
-        {"type": "twosided", "nested": {"type": "plastic"}},
-        {"type": "bumpmap", "nested_texture": {"type": "checkerboard"}, "nested_bsdf": {"type": "diffuse"}},
-    ],
-    ids=lambda b: b["type"],
-)
-def test_other_surfaces_are_refused(bsdf):
-    table = HiddenElements([mi.load_dict({"type": "rectangle", "id": "shiny", "bsdf": bsdf})], *wall_grid(3))
-    with pytest.raises(SceneError, match="shiny"):
-        draw_samples(table, 8, 0)

@@ -31,14 +31,11 @@ def of_hair(name, key, value, step, variant="llvm_ad_mono", spp=4096, **settings
 # Light is absorbed again and again: differences over larger steps see the curvature.
 CASES = [
     of_hair("longitudinal_roughness", "longitudinal_roughness", 0.3, 0.003),
-    of_hair("smooth_along", "longitudinal_roughness", 0.15, 0.0015, **GREY, longitudinal_roughness=0.15),
     of_hair("azimuthal_roughness", "azimuthal_roughness", 0.3, 0.005, spp=8192),
     of_hair("scale_tilt", "scale_tilt", 2.0, 0.5),
     of_hair("index", "eta", 1.55, 0.006, spp=8192),
     of_hair("eumelanin", "eumelanin", 0.3, 0.01, "llvm_ad_rgb", **PIGMENTS),
-    of_hair("pheomelanin", "pheomelanin", 0.4, 0.015, "llvm_ad_rgb", **PIGMENTS),
     of_hair("pigments_in_wavelengths", "eumelanin", 0.3, 0.01, "llvm_ad_spectral", **PIGMENTS),
-    of_hair("grey_absorption", "sigma_a.value", 0.3, 0.008),
     of_hair("coloured_absorption", "sigma_a.value", 0.3, 0.008, "llvm_ad_rgb", **COLOURED),
     Case(
         "hair_turns",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from support.gradient_cases.problem import Case
-from support.gradient_cases.scenes import camera, film, room, transform
+from support.gradient_cases.scenes import camera, room, transform
 from support.gradient_cases.unknowns import move, set_color
 
 SMOOTH = {"type": "diff_dielectric", "int_ior": 1.5}
@@ -28,26 +28,10 @@ def drop():
     return in_a_cube(drop=water, depth=4)
 
 
-def batch():
-    """One camera in the glass, the other in front of it."""
-    first, second = camera(origin=(0, 0, 4), near=0.3), camera(origin=(0.1, 0.2, 2.0))
-    for sensor in (first, second):
-        sensor["film"] = {"type": "hdrfilm", "rfilter": {"type": "box"}}
-    shared = film(start=2.0, bins=500)
-    return in_a_cube(sensor={"type": "batch", "film": shared, "first": first, "second": second})
-
-
-def lens():
-    sensor = {**camera(origin=(0, 0, 4), near=0.3, start=4.0, bins=400), "type": "thinlens"}
-    return in_a_cube(sensor={**sensor, "aperture_radius": 0.05, "focus_distance": 3.0})
-
-
 ROW = "dielectric index, smooth"
 CASES = [
     Case("glass_around_camera_index", ROW, in_a_cube, set_color("body.bsdf.eta"), 1.5, 2e-3, spp=4096),
     Case("glass_around_drop_index", ROW, drop, set_color("drop.bsdf.eta"), 1.33 / 1.5, 1e-3, spp=8192),
-    Case("glass_around_lens_index", ROW, lens, set_color("body.bsdf.eta"), 1.5, 2e-3, spp=8192),
-    Case("glass_around_batch_index", ROW, batch, set_color("body.bsdf.eta"), 1.5, 2e-3, spp=8192),
     Case(
         "glass_around_polarized_camera_index", ROW, in_a_cube, set_color("body.bsdf.eta"), 1.5, 2e-3,
         variant="llvm_ad_mono_polarized", spp=4096,

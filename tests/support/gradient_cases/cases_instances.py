@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from support.gradient_cases.cases_normals import MIRROR, distance_grid, mirror_mesh, tilt_normals
+from support.gradient_cases.cases_normals import distance_grid, mirror_mesh, tilt_normals
 from support.gradient_cases.cases_polar import VARIANT, metal_room
 from support.gradient_cases.problem import Case
 from support.gradient_cases.scenes import camera, instances, mirror_room, room, transform
@@ -40,22 +40,6 @@ def glass_plate():
 
 CASES = [
     Case("instance_turns", ROW, lambda: grouped(room()), rotate("copy.to_world", (0, 1, 0)), 0.0, 0.1, fd_spp=16384),
-    Case(
-        "instance_of_a_mirror_turns",
-        ROW,
-        lambda: grouped(mirror_room(), to_world=squashed()),
-        rotate("copy.to_world", (0.3, 1, 0.4)),
-        0.0,
-        0.05,
-    ),
-    Case(
-        "instance_of_a_round_mirror_moves",
-        ROW,
-        lambda: ball(MIRROR, mirror_room()),
-        move("copy.to_world", (1, 0, 0.3)),
-        0.0,
-        2e-3,
-    ),
     Case("instance_of_glass_turns", ROW, glass_plate, rotate("copy.to_world", (0, 1, 0)), 0.0, 0.1, fd_spp=4096),
     Case(
         "ball_in_an_instance_moves",
@@ -84,14 +68,6 @@ CASES = [
     ),
     Case(
         "instance_of_a_grid_turns", ROW, lambda: grouped(distance_grid()), rotate("copy.to_world", (0, 1, 0)), 0.0, 0.1
-    ),
-    Case(
-        "camera_before_an_instance",
-        ROW,
-        lambda: ball(MIRROR, mirror_room()),
-        move("sensor.to_world", (0.3, 1, 0.4)),
-        0.0,
-        2e-3,
     ),
     Case(
         "polar_instance_turns",

@@ -59,22 +59,8 @@ def plastic(kind, **reflectances):
     return room(bsdf={"type": kind, **lobes}, light=area_light())
 
 
-def rough_metal(**rates):
-    """A room with a wall of rough metal."""
-    index = {name: {"type": "uniform", "value": value} for name, value in rates.items()}
-    return room(bsdf={"type": "diff_rough_conductor", "alpha": 0.3, **index}, light=area_light())
-
-
 CASES = [
     Case("diffuse_albedo", "diffuse albedo", room, set_color("side.bsdf.reflectance.value"), 0.8, 0.02),
-    Case(
-        "zero_albedo",
-        "diffuse albedo",
-        lambda: room(side_reflectance=0.0),
-        set_color("side.bsdf.reflectance.value"),
-        0.0,
-        0.02,
-    ),
     Case(
         "texture",
         "textured albedo",
@@ -157,27 +143,6 @@ CASES = [
         side=1,
         spp=16384,
         fd_spp=16384,
-    ),
-    Case(
-        "black_base_of_a_plastic",
-        "reflectance of a black lobe of a plastic",
-        lambda: plastic("diff_plastic", diffuse_reflectance=0.0),
-        set_color("wall.bsdf.diffuse_reflectance.value"),
-        0.0,
-        0.1,
-        side=1,
-        spp=4096,
-        fd_spp=65536,
-    ),
-    Case(
-        "black_base_of_a_rough_plastic",
-        "reflectance of a black lobe of a plastic",
-        lambda: plastic("diff_rough_plastic", diffuse_reflectance=0.0),
-        set_color("wall.bsdf.diffuse_reflectance.value"),
-        0.0,
-        0.05,
-        side=1,
-        spp=4096,
     ),
     Case(
         "principled_glass_index",
@@ -263,15 +228,6 @@ CASES = [
         4e-3,
         spp=8192,
     ),
-    Case(
-        "albedo_spectral",
-        "diffuse albedo",
-        room,
-        set_color("side.bsdf.reflectance.value"),
-        0.8,
-        0.02,
-        "llvm_ad_spectral",
-    ),
     at_an_end(
         "no_clearcoat",
         lambda: principled("diff_principled", coated_wall, "clearcoat", 0.0),
@@ -299,24 +255,6 @@ CASES = [
         fd_spp=65536,
     ),
     at_an_end(
-        "all_transmission",
-        lambda: principled("diff_principled", glass_slab, "spec_trans", 1.0, eta=1.4),
-        "slab.bsdf.spec_trans",
-        1.0,
-        0.05,
-        spp=4096,
-        fd_spp=16384,
-    ),
-    at_an_end(
-        "no_transmission_of_a_sheet",
-        lambda: principled("diff_principled_thin", sheet, "spec_trans", 0.0, eta=1.4, diff_trans=0.7),
-        "slab.bsdf.spec_trans",
-        0.0,
-        0.05,
-        spp=8192,
-        fd_spp=65536,
-    ),
-    at_an_end(
         "no_light_through_paper",
         lambda: principled("diff_principled_thin", sheet, "diff_trans", 0.0, eta=1.4),
         "slab.bsdf.diff_trans",
@@ -324,62 +262,5 @@ CASES = [
         0.1,
         spp=8192,
         fd_spp=65536,
-    ),
-    Case(
-        "black_base_of_a_sheet",
-        "colour of a thin principled sheet",
-        lambda: principled("diff_principled_thin", sheet, "base_color", 0.0, eta=1.4, spec_trans=0.5, diff_trans=0.7),
-        set_color("slab.bsdf.base_color.value"),
-        0.0,
-        0.02,
-        side=1,
-        spp=16384,
-        fd_spp=65536,
-    ),
-    Case(
-        "rough_metal_of_index_zero",
-        "complex index of a conductor",
-        lambda: rough_metal(eta=0.0, k=2.0),
-        set_color("wall.bsdf.eta.value"),
-        0.0,
-        0.01,
-        side=1,
-        spp=4096,
-    ),
-    Case(
-        "rough_metal_without_absorption",
-        "complex index of a conductor",
-        lambda: rough_metal(eta=0.02, k=0.0),
-        set_color("wall.bsdf.k.value"),
-        0.0,
-        # Next to the critical angle, which is 1 degree, the reflectance bends sharply.
-        1e-3,
-        side=1,
-        spp=4096,
-    ),
-    Case(
-        "metal_of_index_zero",
-        "complex index of a conductor",
-        lambda: mirror_room({"type": "diff_conductor", "eta": {"type": "uniform", "value": 0.0}, "k": 2.0}),
-        set_color("wall.bsdf.eta.value"),
-        0.0,
-        0.01,
-        side=1,
-        spp=2048,
-    ),
-    Case(
-        "black_transmission_of_rough_glass",
-        "specular transmittance (rough glass)",
-        lambda: sheet(
-            {
-                "type": "roughdielectric", "alpha": 0.7, "int_ior": 1.3, "ext_ior": 1.0,
-                "specular_transmittance": {"type": "uniform", "value": 0.0},
-            }
-        ),
-        set_color("slab.bsdf.specular_transmittance.value"),
-        0.0,
-        0.3,
-        side=1,
-        spp=8192,
     ),
 ]

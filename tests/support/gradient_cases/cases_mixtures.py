@@ -14,7 +14,6 @@ from support.gradient_cases.unknowns import move, rotate, set_color
 
 DIFFUSE = {"type": "diffuse", "reflectance": 0.5}
 MIRROR = {"type": "conductor", "material": "none", "specular_reflectance": 0.9}
-DIM_MIRROR = {**MIRROR, "specular_reflectance": 0.4}
 GLASS = {"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}
 THIN_GLASS = {"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0}
 PLASTIC = {"type": "plastic", "int_ior": 1.5, "diffuse_reflectance": 0.5}
@@ -124,24 +123,16 @@ def weight_of_the_shape(name, bsdf, value, **options):
 SLOW = {"tags": ("slow",)}
 CASES = [
     weight("blend_of_diffuse_and_mirror", partial(blend, DIFFUSE, MIRROR)),
-    weight("blend_of_mirrors", partial(blend, MIRROR, DIM_MIRROR)),
     weight("blend_of_diffuse_and_glass", partial(blend, DIFFUSE, GLASS), seeds=16, **SLOW),
-    weight("bumpy_blend", lambda w: bump(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
     weight("blend_of_normals", lambda w: normal_map(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
     weight("two_sided_blend", lambda w: two_sided(blend(DIFFUSE, MIRROR, w)), key="brdf_0.weight.value", **SLOW),
-    weight("blend_of_a_bumpy_mirror", lambda w: blend(bump(MIRROR), DIFFUSE, w), **SLOW),
-    weight("blend_of_a_mask", partial(blend, mask(MIRROR), DIFFUSE), **SLOW),
     weight("mask_of_a_blend", lambda w: mask(blend(DIFFUSE, MIRROR, w)), key="nested_bsdf.weight.value", **SLOW),
-    opacity("mask_of_a_mirror", MIRROR, **SLOW),
     opacity("mask_of_thin_glass", THIN_GLASS, **SLOW),
     weight("no_mirror_yet", partial(blend, DIFFUSE, MIRROR), 0.0, side=1),
-    weight("mirror_alone", partial(blend, DIFFUSE, MIRROR), 1.0, side=-1, **SLOW),
     weight("no_metal_yet", partial(blend, DIFFUSE, METAL), 0.0, side=1, **SLOW),
-    weight("no_dim_mirror_yet", partial(blend, MIRROR, DIM_MIRROR), 0.0, side=1, **SLOW),
     weight_of_the_shape("no_metal_yet_by_an_attribute", partial(blend, DIFFUSE, METAL), 0.0, side=1),
     weight_of_the_shape("nothing_of_paint_by_an_attribute", partial(mask, DIFFUSE), 0.0, side=1, seeds=16, **SLOW),
     opacity("nothing_of_a_mirror", MIRROR, 0.0, side=1),
-    opacity("all_of_a_mirror", MIRROR, 1.0, side=-1, **SLOW),
     Case(
         "roughness_of_blended_glass",
         "roughness",
@@ -152,16 +143,6 @@ CASES = [
         spp=4096,
     ),
     Case(
-        "index_of_blended_glass",
-        "eta of diff_rough_dielectric",
-        lambda: seen_through(blend(ROUGH_GLASS, DIFFUSE)),
-        set_color("wall.bsdf.bsdf_0.eta"),
-        1.5,
-        0.02,
-        spp=4096,
-        **SLOW,
-    ),
-    Case(
         "index_of_masked_thin_glass",
         "eta of thindielectric",
         lambda: mirror_room(mask(THIN_GLASS)),
@@ -170,12 +151,8 @@ CASES = [
         0.02,
         spp=2048,
     ),
-    moving("masked_thin_glass_moves", lambda: mask(THIN_GLASS), **SLOW),
-    moving("masked_plastic_moves", lambda: mask(PLASTIC), seeds=16, **SLOW),
     moving("blended_plastic_moves", lambda: blend(PLASTIC, DIFFUSE), seeds=16, **SLOW),
-    moving("bumpy_plastic_moves", lambda: bump(PLASTIC, 0.49, 0.51), seeds=16, **SLOW),
     moving("textured_blend_moves", lambda: blend(DIFFUSE, MIRROR, texture(0.1, 0.9)), **SLOW),
-    moving("textured_mask_moves", lambda: mask(MIRROR, texture(0.1, 0.9)), **SLOW),
     Case(
         "masked_thin_glass_tilts",
         "shape to_world",

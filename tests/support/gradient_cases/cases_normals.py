@@ -59,21 +59,6 @@ def distance_grid():
     return scene
 
 
-def tilt_volume():
-    """A mirror whose normals a volume holds."""
-    data = np.full((2, 2, 2, 3), (0.5, 0.5, 1.0), dtype=np.float32)
-    normals = {"type": "volume", "volume": {"type": "gridvolume", "grid": mi.VolumeGrid(data), "raw": True}}
-    return mirror_room({"type": "normalmap", "normalmap": normals, "nested": MIRROR})
-
-
-def tilt_grid(key):
-    def apply(params, x):
-        up = mi.Float(np.tile([0.0, 1.0, 0.0], 8).astype(np.float32))
-        params[key] = mi.TensorXf(params[key].array + up * x, params[key].shape)
-
-    return apply
-
-
 def with_numbers(scene, bsdf, numbers):
     """The wall of a scene as a mesh with numbers at its vertices, which its surface reads."""
     pose = transform().translate([0, 0, -0.1]).scale([1, 1, 0.1])
@@ -97,15 +82,6 @@ def tilt_numbers(key):
 
 
 CASES = [
-    Case(
-        "mirror_normals_in_a_volume",
-        "normal map of a mirror",
-        tilt_volume,
-        tilt_grid("wall.bsdf.normalmap.volume.data"),
-        0.0,
-        2e-3,
-        spp=2048,
-    ),
     Case(
         "mirror_normals_in_an_attribute",
         "normal map of a mirror",

@@ -45,15 +45,6 @@ def meter():
 
 CASES = [
     Case(
-        "sensor_translation",
-        "sensor pose",
-        lambda: room(sensor=camera(near=1.0)),
-        move("sensor.to_world", (0.5, 0, 1)),
-        0.0,
-        2e-3,
-        spp=2048,
-    ),
-    Case(
         "sensor_rotation",
         "sensor pose",
         lambda: room(sensor=camera(near=1.0)),
@@ -71,16 +62,6 @@ CASES = [
         10.0,
         0.05,
         spp=2048,
-    ),
-    Case(
-        "thin_lens_moves",
-        "sensor pose",
-        lambda: room(sensor={**camera(near=0.5), "type": "thinlens", "aperture_radius": 0.02, "focus_distance": 4.0}),
-        move("sensor.to_world", (0.5, 0, 1)),
-        0.0,
-        2e-3,
-        spp=2048,
-        fd_spp=4096,
     ),
     Case(
         "lens_aperture",
@@ -112,7 +93,6 @@ CASES = [
         spp=2048,
         fd_spp=4096,
     ),
-    Case("orthographic_turns", "sensor pose", plane_camera, rotate("sensor.to_world", (0, 1, 0)), 0.0, 0.1, spp=4096),
     Case(
         "batch_child_moves",
         "sensor pose",

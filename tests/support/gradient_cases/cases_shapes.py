@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from support.gradient_cases.problem import Case
-from support.gradient_cases.scenes import area_light, camera, glass_slab, instances, mirror_room, room, transform
+from support.gradient_cases.scenes import camera, glass_slab, mirror_room, room, transform
 from support.gradient_cases.unknowns import move, move_vertices, rotate
 
 CASES = [
@@ -35,24 +35,6 @@ CASES = [
         spp=2048,
     ),
     Case(
-        "wall_near_sphere_light",
-        "shape to_world",
-        lambda: room(light=area_light("sphere", 0.15), side_reflectance=0.2),
-        move("wall.to_world", (0, 0, 1)),
-        0.0,
-        2e-3,
-        spp=2048,
-    ),
-    Case(
-        "glass_moves",
-        "shape to_world behind or of glass",
-        lambda: glass_slab({"type": "diff_dielectric", "int_ior": 1.5, "ext_ior": 1.0}),
-        move("wall.to_world", (0, 0, 1)),
-        0.0,
-        4e-3,
-        spp=4096,
-    ),
-    Case(
         "wall_under_sky",
         "shape to_world",
         lambda: room(light={"type": "constant", "radiance": 1.0}, sensor=camera(start=2.0)),
@@ -73,9 +55,6 @@ CASES = [
         spp=2048,
     ),
     Case(
-        "mirror_moves", "mirror: to_world", lambda: mirror_room(), move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, spp=4096
-    ),
-    Case(
         "mirror_tilts",
         "mirror: to_world",
         lambda: mirror_room(),
@@ -92,16 +71,6 @@ CASES = [
         0.0,
         4e-3,
         spp=32768,
-    ),
-    Case(
-        "plastic_moves",
-        "shape to_world",
-        lambda: room(bsdf={"type": "plastic", "diffuse_reflectance": 0.4}, light=area_light()),
-        move("wall.to_world", (0, 0, 1)),
-        0.0,
-        4e-3,
-        spp=4096,
-        fd_spp=16384,
     ),
     Case(
         "thin_glass_tilts",
@@ -128,29 +97,5 @@ CASES = [
         0.0,
         2e-3,
         spp=2048,
-    ),
-    Case(
-        "instance_moves",
-        "shape to_world",
-        lambda: instances({"type": "diffuse", "reflectance": 0.5}),
-        move("copy.to_world", (0, 0, 1)),
-        0.0,
-        2e-3,
-        spp=2048,
-        fd_spp=4096,
-    ),
-    Case(
-        "cylinder_moves",
-        "shape to_world",
-        lambda: room(pipe={"type": "cylinder", "p0": [0, -2, -1.8], "p1": [0, 2, -1.8], "radius": 2.0}),
-        move("pipe.to_world", (0, 0, 1)),
-        0.0,
-        2e-3,
-        spp=2048,
-        fd_spp=4096,
-    ),
-    Case("wall_rgb", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, "llvm_ad_rgb", 2048),
-    Case(
-        "wall_spectral", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, "llvm_ad_spectral", 2048
     ),
 ]

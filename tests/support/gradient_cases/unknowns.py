@@ -31,13 +31,6 @@ def rotate(key, axis):
     return apply
 
 
-def stretch(key):
-    def apply(params, x):
-        params[key] = mi.AffineTransform4f(params[key]) @ mi.AffineTransform4f().scale(mi.Vector3f(x))
-
-    return apply
-
-
 def move_vertices(key, direction):
     def apply(params, x):
         p = dr.unravel(mi.Point3f, params[key])
