@@ -50,8 +50,8 @@ def test_the_layer_renders_what_mitsuba_renders():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", KEYS)
-def test_derivatives(key):
+def test_derivatives():
+    key = KEYS[1]
     renderer = tt.TransientRenderer(room(), parameters=[key], spp=64, physics="ignore", grad_seed="same")
     renderer(seed=0).transient.sum().backward()
     found, start = float(renderer.values[key].grad), renderer.values[key].detach()

@@ -40,6 +40,8 @@ def test_statistics(room_scene):
     assert (stats.spp, stats.variant, stats.integrator, stats.seeds) == (16, VARIANT, "transient_path", (5,))
     assert stats.temporal_filter == "box" and stats.seconds > 0
     assert stats.samples_per_second == pytest.approx(16 * 12 / stats.seconds)
+    batch = tt.render(room_scene, {GREY: torch.rand(3)}, spp=4, seed=0).stats  # all pixels of all films
+    assert batch.samples_per_second == pytest.approx(3 * 4 * 12 / batch.seconds)
     outside = stats.energy_before[0] + stats.energy_after[0]
     inside = float(out.transient.mean(0).sum())
     assert outside > 0
@@ -72,17 +74,13 @@ def test_a_number_of_samples_that_a_sampler_rounds_is_said_once(room_scene, capf
 def test_function_and_module_agree(room_scene):
     x = torch.tensor([0.3, 0.6, 0.9])
     module = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)
+    assert not tt.render(make_room(), spp=4, seed=0).steady.requires_grad
     assert torch.equal(
         module({COLOUR: x}, seed=4).transient, tt.render(room_scene, {COLOUR: x}, spp=16, seed=4).transient
     )
     y = x.clone().requires_grad_()
     tt.render(room_scene, {COLOUR: y}, spp=16, seed=4).transient.sum().backward()
     assert y.grad.abs().min() > 0
-
-
-def test_function_takes_a_dictionary_and_no_values():
-    out = tt.render(make_room(), spp=4, seed=0)
-    assert out.steady.min() > 0 and not out.steady.requires_grad
 
 
 # ------------------------------------------------------------------------------------------------- seeds, batches
@@ -104,7 +102,7 @@ def test_entries_of_a_batch_have_their_own_noise(room_scene):
         assert torch.equal(entry, renderer({COLOUR: x}, seed=seed).transient)
 
 
-@pytest.mark.parametrize(("key", "shape"), [(GREY, ()), (COLOUR, (3,)), (WALL_POSE, (4, 4)), ("light.position", (3,))])
+@pytest.mark.parametrize(("key", "shape"), [(GREY, ()), (WALL_POSE, (4, 4)), ("light.position", (3,))])
 def test_batches_of_every_shape(room_scene, key, shape):
     renderer = tt.TransientRenderer(room_scene, parameters=[key], spp=4)
     x = renderer.values[key].detach()
@@ -211,12 +209,6 @@ def test_wrong_shapes(room_scene):
         tt.TransientRenderer(room_scene, parameters={COLOUR: torch.rand(2, 3)})
 
 
-def test_gradients_reach_numbers_inside_lists(room_scene):
-    red = torch.tensor(0.25, requires_grad=True)
-    tt.render(room_scene, {COLOUR: [red, 0.5, 0.75]}, spp=4, seed=0).steady.sum().backward()
-    assert red.grad > 0
-
-
 def test_parameters_are_set_by_their_keys(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     before = renderer.values[COLOUR]
@@ -229,14 +221,10 @@ def test_parameters_are_set_by_their_keys(room_scene):
     assert "box.colour" not in renderer.values and renderer.values.get("box.colour") is None
 
 
-def test_values_that_are_not_finite(room_scene):
+def test_values_that_are_not_finite_or_not_declared(room_scene):
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     with pytest.raises(tt.errors.UnitError, match="1 of 3 that are NaN or infinite"):
         renderer({COLOUR: torch.tensor([0.1, math.nan, 0.2])}, seed=0)
-
-
-def test_undeclared_value(room_scene):
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=4)
     with pytest.raises(tt.errors.SceneError, match=r"no parameter 'wall\.bsdf\.reflectance\.value'.*parameters=\["):
         renderer({GREY: torch.tensor(0.1)}, seed=0)
 

@@ -49,18 +49,6 @@ def test_a_spad_behind_the_renderer(renderer):
         device.sensor(device.axis())(renderer(seed=0))
 
 
-@pytest.mark.slow
-def test_phasor_image_and_histogram_give_the_same_taps(renderer):
-    frequencies = tt.FrequencyAxis.from_hertz([0.0, 30e6])
-    phasors = tt.TransientRenderer(renderer.scene, spp=1024, frequencies=frequencies)
-    wide = tt.TransientRenderer(renderer.scene, spp=1024, time_axis=tt.TimeAxis(0.0, 0.02, 1500))
-    with torch.no_grad():
-        image, film = phasors(seed=0), wide(seed=0)
-    camera = sensing.Compose([sensing.ItofCorrelation(sensing.sine_code(3), 30e6, film.axis, contrast=0.7)])
-    a, b = camera(image), camera(film)
-    torch.testing.assert_close(a.mean((-2, -1)), b.mean((-2, -1)), rtol=0.02, atol=0.0)
-
-
 def test_stokes_vectors_behind_a_polarized_variant():
     box = tt.scenes.cornell_box(8, start_opl=3.5, bin_width_opl=0.5, num_bins=12, max_depth=3)
     with torch.no_grad():

@@ -33,7 +33,11 @@ _SIZES = ("width", "height", "crop_width", "crop_height")
 
 
 def check_nodes(state: Any) -> None:
-    """Raise ``SceneError`` for nodes nested too deeply, and for numbers of samples and sizes of films below one."""
+    """Raise ``SceneError`` for nodes nested too deeply, and for numbers of samples and sizes of films below one.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     check_nesting(state)
     for node in state.nodes:
         if node_kind(node) == "Sampler":
@@ -106,7 +110,11 @@ def _size(node: Any, inside: int) -> int:
 
 
 def check_finite(state: Any) -> None:
-    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
+    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     bad: dict[str, str] = {}
     waiting, seen, by_id = [(state.root, "")], set(), state.id_to_index
     while waiting:
@@ -137,6 +145,9 @@ def check_mesh_files(state: Any) -> None:
 
     Mitsuba reads memory beyond the vertices for such faces, and a pipe without an end. Called where Mitsuba finds the
     files; files that cannot be read are left to Mitsuba.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
     """
     import mitsuba as mi
 
@@ -182,7 +193,11 @@ def _file_state(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...
 
 
 def check_meshes(objects: Any) -> None:
-    """Raise ``SceneError`` for faces without vertices of loaded meshes, those of loaded scenes included."""
+    """Raise ``SceneError`` for faces without vertices of loaded meshes, those of loaded scenes included.
+
+    Args:
+        objects: loaded objects and scenes of a description.
+    """
     import mitsuba as mi
 
     for one in objects:

@@ -53,7 +53,12 @@ _FLAT_SHAPES = ("rectangle", "disk")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a scene contains, and the label of its node: plugin, name and place in the file."""
+    """Something that a scene contains, and the label of its node: plugin, name and place in the file.
+
+    Args:
+        what: description of the finding.
+        where: label of its node.
+    """
 
     what: str
     where: str
@@ -146,6 +151,9 @@ def _parsed(scene: Scene, what: str, read: Callable[[Any], _Found]) -> _Found:
 def described_samplers(scene: Scene) -> list[str | None]:
     """Return what names the sampler of each sensor of a scene, None for a sensor without one.
 
+    Args:
+        scene: the scene.
+
     Raises:
         SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
     """
@@ -188,7 +196,11 @@ def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -
 
 
 def like_mitsuba(plugin: str) -> str:
-    """Return the plugin of Mitsuba that one of this library stands in for: ``dielectric`` for ``diff_dielectric``."""
+    """Return the plugin of Mitsuba that one of this library stands in for: ``dielectric`` for ``diff_dielectric``.
+
+    Args:
+        plugin: plugin name.
+    """
     name = plugin.removeprefix(_TWIN)
     return name.replace("rough_", "rough")
 
@@ -410,7 +422,12 @@ _COLOURED_PLUGINS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """Colour of a value or plugin: ``kind`` COLOUR or MEASURED, and the property or plugin that has it."""
+    """Colour of a value or plugin.
+
+    Args:
+        kind: COLOUR or MEASURED.
+        why: property or plugin that has it.
+    """
 
     kind: str
     why: str

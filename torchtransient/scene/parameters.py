@@ -79,7 +79,11 @@ class ParameterInfo:
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
-    """Parameters of a scene by key. ``str(table)`` is a readable table."""
+    """Parameters of a scene by key. ``str(table)`` is a readable table.
+
+    Args:
+        entries: the parameters, in order.
+    """
 
     def __init__(self, entries: list[ParameterInfo]):
         self._entries = {entry.key: entry for entry in entries}
@@ -157,7 +161,11 @@ def _short(value: Any) -> str:
 
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
-    """Return the table of a built scene (unmerged, real bitmaps, no substitutions). Called inside its variant."""
+    """Return the table of a built scene (unmerged, real bitmaps, no substitutions). Called inside its variant.
+
+    Args:
+        built: the built scene.
+    """
     tracker = ParameterTracker(built.scene)
     edges = moving_edges_of(built.scene, built.scene.sensors())
     entries = []
@@ -294,6 +302,9 @@ def is_transform(value: Any) -> bool:
     """Return whether a value is a transform of Mitsuba.
 
     By name of its class: Dr.Jit arrays answer to any attribute made of component letters.
+
+    Args:
+        value: any value.
     """
     return "Transform" in type(value).__name__
 

@@ -441,6 +441,10 @@ class XmlWriter:
 
     Mitsuba's own writer (``mi.parser.write_file``) drops the names of most nodes, and with them the keys of parameters,
     and decomposes transforms with errors of 1e-6.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        folder: folder of the files.
     """
 
     def __init__(self, state: Any, folder: Path) -> None:
@@ -453,7 +457,12 @@ class XmlWriter:
         self._count = 0
 
     def note_kind(self, index: int, built: Any) -> None:
-        """Note the kind of a node by its built object: the parser does not know that of plugins in Python."""
+        """Note the kind of a node by its built object: the parser does not know that of plugins in Python.
+
+        Args:
+            index: index of the node.
+            built: the object that was built of it.
+        """
         import mitsuba as mi
 
         kinds = (kind for kind in _KINDS if isinstance(built, getattr(mi, kind)))
@@ -469,7 +478,12 @@ class XmlWriter:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
     def file(self, name: str, ending: str) -> Path:
-        """Return the path of a new file in the folder."""
+        """Return the path of a new file in the folder.
+
+        Args:
+            name: name of the file; other characters than letters, digits, "-" and "_" are replaced.
+            ending: ending with its dot.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         safe = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "data"
         path = self.folder / f"{safe}{ending}"
@@ -479,7 +493,11 @@ class XmlWriter:
         return path
 
     def name_of(self, path: Path) -> str:
-        """Return the name of a file in the folder, as the scene refers to it."""
+        """Return the name of a file in the folder, as the scene refers to it.
+
+        Args:
+            path: path of the file.
+        """
         return f"{self.folder.name}/{path.name}"
 
     # ------------------------------------------------------------------------------------------------------- nodes
