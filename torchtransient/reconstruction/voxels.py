@@ -473,10 +473,8 @@ class HiddenVolume(TensorRecord):
         StorageError: for metadata that is not plain.
 
     Two volumes are equal when all but ``metadata`` is. ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as
-    in
-    captures and results of renders: they concern values and directions; grid and times stay on the CPU, and are the
-        same in
-    a batch.
+    in captures and results of renders: they concern values and directions; grid and times stay on the CPU, and are the
+    same in a batch.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)

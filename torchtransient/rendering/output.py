@@ -160,8 +160,7 @@ class RenderOutput(ErrorBars, TensorRecord):
     Leading dimensions come in the order (batch, sensor), each present only when asked for. In polarized variants the
     Stokes components S0, S1, S2, S3 come before C in all measurements, as (4, C, T, H, W), in the sensor's frame: x to
     the right of the picture, y up, as the sensor sees it. All but ``steady`` are views of the film's own memory with
-    the rows
-    first: ``.contiguous()`` makes a copy in torch's order.
+    the rows first: ``.contiguous()`` makes a copy in torch's order.
 
     ``to``, ``cpu``, ``detach``, ``clone`` and ``map`` make copies; ``stack`` and ``cat`` put several together, as
     ``torch.utils.data.default_collate`` does. Torch's pytrees see the tensors.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,6 +143,8 @@ def test_what_is_refused():
         range_and_speed(beats[:1], chirps, axis)
     with pytest.raises(ShapeError, match="up and down"):
         range_and_speed(beats[:, 1:], chirps, axis)
+    with pytest.raises(ShapeError, match="chirps="):
+        range_and_speed(SimpleNamespace(beats=None, transient=beats, chirps=None, axis=axis))
     with pytest.raises(ArgumentError, match="Chirps"):
         range_and_speed(beats, axis, axis)
     with pytest.raises(ArgumentError, match="sums, samples"):
