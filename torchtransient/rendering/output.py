@@ -63,7 +63,7 @@ class RenderStats:
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
-        """Return the statistics of a job that has run; ``pixels``: number of pixels of each film.
+        """Return the statistics of a job that has run.
 
         Args:
             job: the job, with the log of its runs.

@@ -38,7 +38,7 @@ def check_nodes(state: Any) -> None:
     Args:
         state: parsed scene (``mitsuba.parser.ParserState``).
     """
-    check_nesting(state)
+    _check_nesting(state)
     for node in state.nodes:
         if node_kind(node) == "Sampler":
             _check_whole(node, "sample_count")
@@ -65,7 +65,7 @@ def _name(node: Any) -> str:
     return f"{name!r} ({plugin})" if name else plugin
 
 
-def check_nesting(state: Any) -> None:
+def _check_nesting(state: Any) -> None:
     """Raise ``SceneError`` for nodes inside of nodes more than 32 deep, and for surfaces of more than 256 nodes.
 
     Each node of a surface counts as often as it is reached. Circles of references are left to Mitsuba, which names
@@ -236,12 +236,18 @@ _END = re.compile(rb"^end_header\s*?\n", re.MULTILINE)
 Element = tuple[str, int, list[tuple[str, str, bool]]]
 
 
-def smallest_vertex(path: str) -> int:
+def _smallest(path: str) -> int:
     """Return the smallest vertex number of the faces of a PLY file; 0 where none is negative.
 
     Mitsuba reads negative numbers as 0. It has read the file before: all faces are triangles.
     """
-    data = Path(path).read_bytes()
+    try:
+        return _smallest_vertex(Path(path).read_bytes())
+    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
+        return 0
+
+
+def _smallest_vertex(data: bytes) -> int:
     end = _END.search(data)
     if end is None:
         return 0
@@ -294,10 +300,3 @@ def _rows(
         rows[name] = numbers[:, column : column + 3] if listed else numbers[:, column]
         column += 3 if listed else 1
     return rows
-
-
-def _smallest(path: str) -> int:
-    try:
-        return smallest_vertex(path)
-    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
-        return 0

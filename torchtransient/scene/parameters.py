@@ -167,7 +167,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
         built: the built scene.
     """
     tracker = ParameterTracker(built.scene)
-    edges = moving_edges_of(built.scene, built.scene.sensors())
+    edges = _moving_edges_of(built.scene, built.scene.sensors())
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
@@ -178,7 +178,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
     return ParameterTable(entries)
 
 
-def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
+def _moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what derivatives lack at moving edges that some sensors see, by the scene's integrator.
 
     Args:
@@ -204,7 +204,7 @@ def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]
         Keys by gap.
     """
     every = built.scene.sensors()
-    edges = moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
+    edges = _moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
     tracker = built.scene.integrator().parameters(built.scene)
     found: dict[Gap, list[str]] = {}
     for key in keys:

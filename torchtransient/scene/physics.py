@@ -172,7 +172,7 @@ def scene_findings(
         transforms: matrices (4, 4) by key.
         dark: names of lights that no path meets.
     """
-    found = {name: dark_message(name) for name in dark}
+    found = {name: _dark_message(name) for name in dark}
     for key, limits, low, high in ranges:
         if limits.below(low) or limits.above(high):
             found[key] = outside_message(key, limits, low, high)
@@ -182,7 +182,7 @@ def scene_findings(
     return found
 
 
-def dark_message(name: str) -> str:
+def _dark_message(name: str) -> str:
     """Return the message for a light that paths from a sensor never meet."""
     return (
         f"{name!r} is black here: a directionalarea shines in one direction alone, which no path from a sensor ever "

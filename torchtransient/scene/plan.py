@@ -232,7 +232,7 @@ def _depth_text(depth: int) -> str:
     return "no limit" if depth == NO_LIMIT else str(depth)
 
 
-def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
+def _depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
     """Return the depth at which little of the emitted power is left, if the albedos bound it, and the reason.
 
     Args:
@@ -440,11 +440,11 @@ class Finder:
             )
             return None
         if self.arrivals is None:
-            bound, reason = depth_by_albedo(self.inventory, self.tail)
+            bound, reason = _depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(reason)
             return bound
         if self.arrivals.dark:
-            bound, reason = depth_by_albedo(self.inventory, self.tail)
+            bound, reason = _depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(f"{reason}; the pilot run saw no light")
             return bound
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH

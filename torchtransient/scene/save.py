@@ -208,8 +208,8 @@ _TEXTS = ("values", "wavelengths")
 _DERIVED = {("spot", "cutoff_angle"): ("beam_width",)}
 
 
-class Place(NamedTuple):
-    """Place of a built object in the description.
+class _Place(NamedTuple):
+    """_Place of a built object in the description.
 
     Attributes:
         node: index of the node that the object was made of, or of one above it.
@@ -223,10 +223,10 @@ class Place(NamedTuple):
     made: Any = None
 
 
-def _places(scene: Any, state: Any) -> dict[int, Place]:
+def _places(scene: Any, state: Any) -> dict[int, _Place]:
     """Return the places of the objects of a built scene in the list of nodes, by address."""
-    found: dict[int, Place] = {}
-    waiting = [(scene, Place(0))]
+    found: dict[int, _Place] = {}
+    waiting = [(scene, _Place(0))]
     while waiting:
         value, place = waiting.pop()
         for inner, its in _places_in(value, place, state):
@@ -236,7 +236,7 @@ def _places(scene: Any, state: Any) -> dict[int, Place]:
     return found
 
 
-def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
+def _places_in(value: Any, place: _Place, state: Any) -> list[tuple[Any, _Place]]:
     """Return the objects inside an object with their places."""
     index = place.node
     if place.names:
@@ -251,14 +251,14 @@ def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
             unmatched.append((name, inner))
         else:
             free.pop(match, None)
-            found.append((inner, Place(match)))
+            found.append((inner, _Place(match)))
     for name, inner in unmatched:
         match = next((c for c in free if _may_be(inner, state.nodes[c])), None)
         if name in state.nodes[index].props or match is None:
-            found.append((inner, Place(index, (name,), inner)))
+            found.append((inner, _Place(index, (name,), inner)))
         else:
             free.pop(match)
-            found.append((inner, Place(match)))
+            found.append((inner, _Place(match)))
     return found
 
 
@@ -270,7 +270,7 @@ def _may_be(value: Any, node: Any) -> bool:
     return kind is not None and isinstance(value, kind)
 
 
-def _write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: Slot, value: np.ndarray) -> None:
+def _write_value(writer: XmlWriter, built: Any, places: dict[int, _Place], slot: Slot, value: np.ndarray) -> None:
     """Write an installed value into its node. Raises ``SceneError`` for a node without a property for it."""
     import mitsuba as mi
 
@@ -337,7 +337,7 @@ def _number_property(props: Any, name: str, value: np.ndarray) -> tuple[str, np.
     return ("scale", value) if plugin == "d65" and name == "value" else (name, value)
 
 
-def _write_made(state: Any, place: Place, owner: Any, value: np.ndarray, key: str) -> None:
+def _write_made(state: Any, place: _Place, owner: Any, value: np.ndarray, key: str) -> None:
     """Write a value of an object that Mitsuba has made of a number or of a default."""
     import mitsuba as mi
 

@@ -48,12 +48,12 @@ def at_work() -> Iterator[bool]:
     check_process()  # before the lock: a thread that did not come along in a fork may hold it
     # Private, but what threading.Condition asks: there is no other way to ask whether this thread holds it.
     outermost = not engine_lock._is_owned()  # type: ignore[attr-defined]
-    with engine_lock, interrupts_pass():
+    with engine_lock, _interrupts_pass():
         yield outermost
 
 
 @contextmanager
-def interrupts_pass() -> Iterator[None]:
+def _interrupts_pass() -> Iterator[None]:
     """Raise the interrupt that ended the block, in place of the RuntimeError that C++ makes of it."""
     # Read before the block: a call in an except block has not failed because of the exception that is handled there.
     interrupt, handled = None, sys.exc_info()[1]
