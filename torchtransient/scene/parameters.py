@@ -173,7 +173,9 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
         node = built.params.properties[key][2]
         found = [_describe(built, tracker, key, node)]
         if key.endswith(f".{POSITIONS}"):
-            found.append(_mesh_to_world(built, tracker, key, node))
+            matrix = built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
+            effect = tracker.effect_of(node, "to_world")
+            found.append(_info(f"{key.rsplit('.', 1)[0]}.to_world", "mesh_transform", (4, 4), matrix, effect))
         entries += [_placed(_with_gaps(info, edges, tracker, node), tracker, node) for info in found]
     return ParameterTable(entries)
 
@@ -250,11 +252,6 @@ def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect
         always_biased=effect.biased,
         is_velocity=effect.role == "velocity",
     )
-
-
-def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
-    name, value = f"{key.rsplit('.', 1)[0]}.to_world", built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
-    return _info(name, "mesh_transform", (4, 4), value, tracker.effect_of(node, "to_world"))
 
 
 def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:

@@ -342,20 +342,17 @@ def _write_made(state: Any, place: _Place, owner: Any, value: np.ndarray, key: s
     import mitsuba as mi
 
     node, (first, *rest) = state.nodes[place.node], place.names
+    is_emitter = node_kind(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
     surface = isinstance(place.made, mi.BSDF) and place.made.class_name() == "SmoothDiffuse" and len(rest) == 1
     if surface:
         _write_numbers(_child(state, place.node, first, "diffuse", mi.ObjectType.BSDF), rest[0], value, key)
-    elif not rest and first not in node.props and isinstance(owner, mi.Texture) and _is_emitter(node):
+    elif not rest and first not in node.props and isinstance(owner, mi.Texture) and is_emitter:
         # Light that is not described is that of daylight.
         _write_numbers(_child(state, place.node, first, "d65", mi.ObjectType.Texture), "scale", value, key)
     elif not rest or (isinstance(place.made, mi.Volume) and len(rest) == 1):
         _write_numbers(node.props, first, value, key)
     else:
         raise SceneError(f"scene.save: {key!r} has no place in the description, and cannot be said in XML.")
-
-
-def _is_emitter(node: Any) -> bool:
-    return node_kind(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
 
 
 def _child(state: Any, index: int, name: str, plugin: str, kind: Any) -> Any:
