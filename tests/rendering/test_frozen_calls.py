@@ -16,7 +16,6 @@ from support.marks import long
 from tools.gradient_sweep.measure import Subject, quiet
 from tools.gradient_sweep.settings import all_settings
 from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
-from torchtransient.scene.variant import active_variant
 
 # The same kernels but for the order of atomic sums: the last digits of single precision.
 TOLERANCE = 2e-5
@@ -57,7 +56,7 @@ def compared(scene, key):
 
 def check(setting, folder):
     """Return the words of the last calls of one parameter, after a comparison of their numbers."""
-    with active_variant(setting.variant), quiet(), warnings.catch_warnings():
+    with mi.variant_context(setting.variant), quiet(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = tt.load(setting.make(folder), variant=setting.variant)
         every = scene.parameters().differentiable()
@@ -70,14 +69,14 @@ def check(setting, folder):
 
 def settings():
     """Every plugin alone, which is a sweep, and a few that stand for a kind of arrays each."""
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         found = all_settings()
     for one in found:
         if one.is_bare or one.name in FEW:
             yield pytest.param(one, id=one.name, marks=pytest.mark.slow if one.name in FEW else pytest.mark.soak)
 
 
-@pytest.mark.parametrize("setting", settings())
+@pytest.mark.parametrize("setting", list(settings()))
 def test_numbers_of_traced_calls(setting, tmp_path):
     """Some plugins do not show Dr.Jit all of their arrays: their scenes are traced (docs/speed.md has a list)."""
     if setting.plugin == "timed_sunsky":
@@ -144,12 +143,12 @@ def test_what_is_said():
     # Other samples are other kernels; coming back needs nothing.
     assert kinds(8, 8, 8, 4) == ["traced", "recorded", "launched", "launched"]
     assert renderer(seed=0, progress=True).stats.recorded[0] == "traced: progress is reported"
-    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+    with mi.variant_context(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
         assert kinds(4, 4, 4) == ["traced"] * 3
     renderer.freeze = False
     assert kinds(4) == ["traced"]
     with (
-        active_variant(VARIANT),
+        mi.variant_context(VARIANT),
         dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
         pytest.raises(tt.errors.VariantError, match="SymbolicLoops"),
     ):
@@ -247,7 +246,7 @@ def test_what_dr_jit_cannot_record_is_traced(monkeypatch):
     """A plugin that reads numbers while it is traced: said once, right every time."""
     scene = tt.load(make_room(), variant=VARIANT)
     traced, recorded = pair(scene, parameters=[COLOUR, GREY], spp=4)
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         cls = type(recorded.scene.built(recorded._options).scene.integrator())
     offset = cls.offset_in_pixel
 

@@ -13,7 +13,6 @@ import torchtransient as tt
 from support.walks import before_each_turn
 from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
 from torchtransient.errors import SceneError, ShapeError
-from torchtransient.scene.variant import active_variant
 
 
 def interrupt(*args, **kwargs):
@@ -109,7 +108,7 @@ def test_an_interrupted_call_leaves_nothing_behind(kind, place, monkeypatch):
     mi.set_variant("llvm_ad_mono")
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), [WALL_POSE], spp=2, physics="ignore")
     expected = step(renderer, kind)
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         described = renderer.scene.built(renderer._options)
         integrator, at = type(described.scene.integrator()), mi.traverse(described.scene)
         before = {key: str(at[key]) for key in at.properties if "wall" in key}
@@ -127,7 +126,7 @@ def test_an_interrupted_call_leaves_nothing_behind(kind, place, monkeypatch):
                 step(renderer, kind)
     assert mi.variant() == "llvm_ad_mono" and gc.isenabled()
     assert torch.equal(step(renderer, kind), expected)
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         now = mi.traverse(renderer.scene.built(renderer._options).scene)
         assert {key: str(now[key]) for key in before} == before
 

@@ -7,7 +7,6 @@ import torch
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.errors import UnitError
 
 VARIANT = "llvm_ad_rgb"
 KEY = "red.reflectance.value"
@@ -37,16 +36,6 @@ def test_gradient_of_a_noisy_depth_camera_reaches_the_scene(renderer):
     (wanted,) = torch.autograd.grad(1e4 * renderer(seed=0).transient.sum(), renderer.values[KEY])
     assert float(gradient[0]) > 0
     torch.testing.assert_close(gradient, wanted, rtol=0.1, atol=0.02 * float(wanted.abs().max()))
-
-
-def test_a_spad_behind_the_renderer(renderer):
-    device = sensing.device("mpd_spad_like").changed("PhotonBudget", pulse_energy_j=1e-13)
-    sensor = device.sensor(renderer.axis, grad="straight_through")
-    with torch.no_grad():
-        counts = sensor(renderer(seed=0), generator=torch.Generator().manual_seed(0))
-    assert counts.shape == (3, 60, 8, 8) and float(counts.sum()) > 0
-    with pytest.raises(UnitError, match="axis of stage"):
-        device.sensor(device.axis())(renderer(seed=0))
 
 
 def test_stokes_vectors_behind_a_polarized_variant():

@@ -6,13 +6,13 @@ import subprocess
 import sys
 import textwrap
 
+import mitsuba as mi
 import pytest
 import torch
 
 import torchtransient as tt  # isort: skip
 
 from tools.small_room import COLOUR, VARIANT, make_room
-from torchtransient.scene.variant import active_variant
 
 
 def run(script: str, *arguments: str) -> str:
@@ -49,8 +49,6 @@ def test_import_scenes_and_load_need_no_variant():
 
 
 def test_other_active_variant_is_restored_and_does_not_matter(room_scene):
-    import mitsuba as mi
-
     renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=16)
 
     def run_once():
@@ -60,9 +58,9 @@ def test_other_active_variant_is_restored_and_does_not_matter(room_scene):
         out.square().sum().backward()
         return out.detach(), x.grad, during
 
-    with active_variant(VARIANT):
+    with mi.variant_context(VARIANT):
         expected, slope, _ = run_once()
-    with active_variant("llvm_ad_mono"):
+    with mi.variant_context("llvm_ad_mono"):
         for _ in range(2):
             out, other_slope, during = run_once()
             assert during == "llvm_ad_mono" and mi.variant() == "llvm_ad_mono"
@@ -72,9 +70,7 @@ def test_other_active_variant_is_restored_and_does_not_matter(room_scene):
 
 def test_variant_is_restored_after_an_error(room):
     room["wall"]["type"] = "rectangel"
-    with active_variant("llvm_ad_mono"):
-        import mitsuba as mi
-
+    with mi.variant_context("llvm_ad_mono"):
         with pytest.raises(tt.errors.SceneError, match="rectangel"):
             tt.TransientRenderer(tt.load(room, variant=VARIANT))
         assert mi.variant() == "llvm_ad_mono"

@@ -49,20 +49,15 @@ def test_nameless_xml_children_have_stable_names(xml):
     assert not any(key.startswith("object_") for key in first)
 
 
-def test_files_beside_the_xml_are_found(xml, tmp_path, monkeypatch):
+def test_files_are_found_beside_the_xml_and_where_a_dictionary_was_loaded(xml, tmp_path, monkeypatch):
     (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     shape = '<shape type="obj" id="tri"><string name="filename" value="tri.obj"/></shape></scene>'
     xml.write_text(SCENE.replace("</scene>", shape))
-    monkeypatch.chdir("/")
-    assert tt.load(xml, variant=VARIANT).parameters()["tri.vertex_positions"].shape == (3, 3)
-
-
-def test_relative_files_of_a_dictionary(tmp_path, monkeypatch):
-    (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     monkeypatch.chdir(tmp_path)
-    scene = tt.load({**make_room(), "tri": {"type": "obj", "filename": "tri.obj"}}, variant=VARIANT)
+    described = tt.load({**make_room(), "tri": {"type": "obj", "filename": "tri.obj"}}, variant=VARIANT)
     monkeypatch.chdir("/")
-    assert "tri.vertex_positions" in scene.parameters()
+    for scene in (tt.load(xml, variant=VARIANT), described):
+        assert scene.parameters()["tri.vertex_positions"].shape == (3, 3)
 
 
 @pytest.mark.parametrize(

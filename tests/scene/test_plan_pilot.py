@@ -2,6 +2,7 @@
 
 import json
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -11,14 +12,13 @@ import torchtransient as tt
 from support import plan_scenes
 from torchtransient.__main__ import main
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.scene.variant import active_variant
 
 VARIANT = "llvm_ad_mono"
 
 
 def means(renderer, count=8, **settings):
     """Image means over all channels of independent renders (K,)."""
-    with torch.no_grad(), active_variant(renderer.scene.variant):
+    with torch.no_grad(), mi.variant_context(renderer.scene.variant):
         steady = [renderer(seed=100 + k, **settings).steady for k in range(count)]
     # Of Stokes vectors the first component is the intensity.
     return np.array([float((s[0] if s.ndim == 4 else s).mean()) for s in steady])

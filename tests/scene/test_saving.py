@@ -13,7 +13,6 @@ import torch
 import torchtransient as tt
 from tools.every_plugin import every_plugin
 from tools.small_room import COLOUR, VARIANT, make_room, pose
-from torchtransient.scene.variant import active_variant
 
 TEXTURE, VERTICES, PLACE = "wall.bsdf.reflectance.data", "box.vertex_positions", "wall.to_world"
 
@@ -59,9 +58,9 @@ def test_an_optimised_scene_has_the_same_picture(tmp_path):
     again = tt.load(path, variant=variant)
     assert list(again.parameters()) == list(scene.parameters())
     torch.testing.assert_close(picture(again), expected, rtol=1e-4, atol=1e-5)
-    with active_variant(variant), tt.threads(2):  # one alone waits for ever for the pictures that Mitsuba reads
+    with mi.variant_context(variant), tt.threads(2):  # one alone waits for ever for the pictures that Mitsuba reads
         ready = mi.load_file(str(path))
-    with active_variant(variant):
+    with mi.variant_context(variant):
         torch.testing.assert_close(picture(ready), expected, rtol=1e-4, atol=1e-5)
     # Once more to the same place, with nothing left of before.
     again.save(path)
@@ -104,7 +103,7 @@ def test_spectral_colours_that_were_found(tmp_path):
         "type": "bitmap", "bitmap": np.random.default_rng(0).uniform(0.1, 0.9, (4, 4, 3)).astype(np.float32)
     }  # fmt: skip
     scene = tt.load(room, variant=variant)
-    with active_variant(variant):
+    with mi.variant_context(variant):
         colour = np.array(mi.srgb_model_fetch(mi.ScalarColor3f(0.2, 0.55, 0.4))).ravel()
     texture = tt.TransientRenderer(scene, parameters=[TEXTURE], physics="ignore").values[TEXTURE].detach()
     values = {COLOUR: torch.tensor(colour), TEXTURE: texture.flip(0)}

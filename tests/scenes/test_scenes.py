@@ -17,12 +17,10 @@ def variant():
 
 
 def steady_dict(description):
-    """The same scene for Mitsuba's own plugins: arrays become transforms, film and integrator become steady ones."""
+    """The same scene for Mitsuba's own plugins: film and integrator become steady ones."""
     converted = {}
     for key, value in description.items():
-        if isinstance(value, np.ndarray):
-            value = mi.ScalarTransform4f(value)
-        elif isinstance(value, dict) and value.get("type") == "transient_hdr_film":
+        if isinstance(value, dict) and value.get("type") == "transient_hdr_film":
             value = {k: v for k, v in value.items() if k in ("width", "height", "rfilter")} | {"type": "hdrfilm"}
         elif isinstance(value, dict) and value.get("type") == "transient_path":
             value = {**value, "type": "path"}
