@@ -69,6 +69,8 @@ def check(setting, folder):
 
 def settings():
     """Every plugin alone, which is a sweep, and a few that stand for a kind of arrays each."""
+    if mi.variant() is None:
+        mi.set_variant(VARIANT)
     with mi.variant_context(VARIANT):
         found = all_settings()
     for one in found:
@@ -111,9 +113,9 @@ def step(renderer, seed, **values):
     return out, [parameter.grad.clone() for parameter in renderer.parameters() if parameter.grad is not None]
 
 
-def same(a, b, black=False):
+def same(a, b):
     scale = float(a.detach().abs().max())
-    assert black or scale > 0
+    assert scale > 0
     torch.testing.assert_close(b, a, rtol=TOLERANCE, atol=TOLERANCE * scale)
 
 
@@ -195,33 +197,6 @@ def two_views():
     pose = np.array(second["to_world"]).copy()
     pose[0, 3] += 0.2
     return tt.load(room | {"sensor_b": second | {"to_world": pose}}, variant=VARIANT)
-
-
-# -------------------------------------------------------------------------------------------------- orders of calls
-
-
-@pytest.mark.slow
-def test_other_flags_of_gradients(room_scene):
-    """Which values need a derivative changes from call to call; so do the adjoint's layout and what it is of."""
-    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
-    losses = (
-        lambda out: out.steady.sum(),
-        lambda out: (out.transient.permute(3, 2, 1, 0).contiguous() ** 2).sum() + out.steady.square().sum(),
-        lambda out: out.transient[:, 3:9, 1].sum(),
-    )
-    for round_ in range(3):
-        for n, loss in enumerate(losses):
-            grads = []
-            for renderer in (traced, recorded):
-                renderer.zero_grad()
-                for k, parameter in enumerate(renderer.parameters()):
-                    parameter.requires_grad_(k != n)
-                loss(renderer(seed=10 * round_ + n)).backward()
-                grads.append([p.grad for p in renderer.parameters() if p.grad is not None])
-            assert len(grads[0]) == len(grads[1]) >= 1
-            assert sum(float(a.abs().sum()) for a in grads[0]) > 0
-            for a, b in zip(*grads, strict=True):
-                same(a, b, black=True)
 
 
 # --------------------------------------------------------------------------------------------- what is not recorded

@@ -30,12 +30,10 @@ def _own():
     plugins.sync()
 
 
-def room(integrator="walker"):
+def room():
     made = make_room()
     made["sensor"]["film"] |= FILM | {"rfilter": {"type": "box"}}
-    made["integrator"] = {"type": integrator}
-    if integrator == "walker":
-        made["integrator"]["max_depth"] = 3
+    made["integrator"] = {"type": "walker", "max_depth": 3}
     made["light"] = {"type": "spark", "power": 4.0}
     made["wall"]["bsdf"] = {"type": "paint", "colour": {"type": "stripes", "level": 0.6}}
     return made

@@ -12,7 +12,7 @@ import torch
 
 import torchtransient as tt  # isort: skip
 
-from tools.small_room import COLOUR, VARIANT, make_room
+from tools.small_room import COLOUR, VARIANT
 
 
 def run(script: str, *arguments: str) -> str:
@@ -74,18 +74,6 @@ def test_variant_is_restored_after_an_error(room):
         with pytest.raises(tt.errors.SceneError, match="rectangel"):
             tt.TransientRenderer(tt.load(room, variant=VARIANT))
         assert mi.variant() == "llvm_ad_mono"
-
-
-@pytest.mark.slow
-def test_scenes_of_several_variants_side_by_side(room_scene):
-    variant = "llvm_ad_spectral"
-    other = tt.TransientRenderer(tt.load(make_room(), variant=variant), parameters=["light.position"], spp=64)
-    rgb = tt.TransientRenderer(room_scene, parameters=["light.position"], spp=64)
-    a, b = other(seed=0), rgb(seed=0)
-    assert a.stats.variant == variant and a.transient.shape[0] == 3
-    (a.transient.square().sum() + b.transient.square().sum()).backward()
-    for renderer in (other, rgb):
-        assert renderer.values["light.position"].grad.abs().max() > 0
 
 
 @pytest.mark.slow
