@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long
 from tools.small_room import pose
 from torchtransient.errors import GradientError, GradientWarning
 
@@ -65,10 +64,9 @@ def reverse(renderer, seed=0, **settings):
     return float((renderer.values[BODY].grad * SIDEWAYS).sum())
 
 
-@pytest.mark.parametrize("depth", long([2, 3], [2]))
-def test_both_modes_agree(depth):
+def test_both_modes_agree():
     """They draw the same samples."""
-    renderer = tt.TransientRenderer(plate(), [BODY], spp=16, max_depth=depth)
+    renderer = tt.TransientRenderer(plate(), [BODY], spp=16, max_depth=2)
     expected, base = reverse(renderer), renderer.values[BODY].detach()
     assert abs(expected) > 1e-3
 
@@ -97,26 +95,12 @@ def test_what_moves_as_one_has_no_derivative(boundary):
         assert (shifts.sum(0).abs() < 1e-4 * shifts.abs().sum(0)).all()
 
 
-@pytest.mark.slow
 def test_every_entry_of_a_batch_has_the_term():
     renderer = tt.TransientRenderer(plate(), [BODY, PAINT], spp=16)
     alone, base = reverse(renderer), renderer.values[BODY].detach()
     shifts, paint = torch.zeros(2, 1, 1, requires_grad=True), torch.full((2,), 0.4, requires_grad=True)
     weighed(renderer({BODY: base + shifts * SIDEWAYS, PAINT: paint}, seed=[0, 0])).backward()
     torch.testing.assert_close(shifts.grad.flatten(), torch.full((2,), alone), rtol=1e-4, atol=0)
-
-    def loss(shift, color):
-        return weighed(renderer({BODY: base + shift * SIDEWAYS, PAINT: color}, seed=0))
-
-    each = torch.func.vmap(torch.func.grad(loss), in_dims=(0, None))(torch.zeros(2), torch.tensor(0.4))
-    torch.testing.assert_close(each, torch.full((2,), alone), rtol=1e-4, atol=0)
-
-
-def test_second_derivatives_are_refused():
-    renderer = tt.TransientRenderer(plate(), [BODY], spp=4)
-    (grad,) = torch.autograd.grad(weighed(renderer(seed=0)), [renderer.values[BODY]], create_graph=True)
-    with pytest.raises(GradientError, match="second derivatives"):
-        grad.sum().backward()
 
 
 @pytest.mark.slow
@@ -134,24 +118,6 @@ def test_plate_against_finite_differences():
     error = np.hypot(np.std(found, ddof=1), np.std(expected, ddof=1)) / np.sqrt(8)
     assert np.mean(found) == pytest.approx(np.mean(expected), abs=4 * error)
     assert error < 0.25 * abs(np.mean(expected))
-
-
-@pytest.mark.slow
-def test_a_fit_of_the_plate_comes_home():
-    """From 8 cm off to 2 mm: six times the deviation of where fits with 5 seeds end, 0.3 mm."""
-    renderer = tt.TransientRenderer(plate(), [BODY], spp=512)
-    base = renderer.values[BODY].detach()
-    with torch.no_grad():
-        target = renderer({BODY: base}, seed=1_000_003, spp=4096).transient
-    shift = torch.tensor(0.08, requires_grad=True)
-    optimizer = torch.optim.Adam([shift], 0.01, betas=(0.8, 0.95))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.92)
-    for step in range(50):
-        optimizer.zero_grad()
-        (renderer({BODY: base + shift * SIDEWAYS}, seed=step).transient - target).square().sum().backward()
-        optimizer.step()
-        schedule.step()
-    assert abs(float(shift)) < 2e-3
 
 
 def test_left_out_it_is_said_once():
@@ -205,20 +171,15 @@ def box(z, tilt=UPRIGHT):
 
 @pytest.mark.parametrize(("more", "key", "words"), [
     ({"mirror": MIRROR}, BODY, "mirrors.*'mirror'"),
-    ({"mirror": MIRROR}, "light.position", "mirrors"),
     ({"sensor": DISTANT}, BODY, "'sensor'"),
     ({"light": SPOT | {"beam_width": 20}}, BODY, "rim.*'light'"),
     ({"light": SPOT | {"texture": STEPS}}, "light.to_world", "steps in the light of 'light'"),
     ({"sensor": SHORT, "ball": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.3}}, "ball.to_world",
      "clip planes.*'ball'"),
-    ({"sensor": SHORT, "ball": {"type": "sphere", "center": [0, 0, 1.5], "radius": 0.3}}, "sensor.to_world",
-     "clip planes.*'ball'"),
     ({"lamp": LAMP}, BODY, "rim of the light of 'lamp'"),
     ({"wall": STRIPED}, "wall.to_world", "steps.*'wall'"),
-    ({"wall": STRIPED}, "sensor.to_world", "steps.*'wall'"),
     ({"body": mapped(STEEP, TILT)}, BODY, "normals away from the camera"),
     ({"body": mapped(STEEP, TILT)}, "body.bsdf.normalmap.data", "normals away from the camera"),
-    ({"body": mapped(STEEP, TILT)}, "sensor.to_world", "normals away from the camera"),
     ({"body": shaded((0.9, 0, 0.5), (0.9, 0, -0.9))}, "body.vertex_normals", "rim of 'body'"),
     ({"box": box(0.1)}, "box.vertex_positions", "where 'box' and 'wall' run into each other"),
 ])  # fmt: skip
@@ -272,10 +233,6 @@ def ball(z, radius=0.5):
     return {"type": "sphere", "center": [2.0, 0.2, z], "radius": radius}
 
 
-def tube(low, high):
-    return {"type": "cylinder", "p0": [2.0, 0.2, low], "p1": [2.0, 0.2, high], "radius": 0.3}
-
-
 def several(*poses):
     """A group of a cube in several places."""
     copies = {f"copy{i}": {"type": "instance", "to_world": p, "g": {"type": "ref", "id": "group"}}
@@ -288,11 +245,9 @@ NEAR = pose(0, 0, 2.0)
 
 @pytest.mark.parametrize(("parts", "names"), [
     ({"a": box(0.1)}, "'a' and 'wall'"),
-    ({"a": box(0.399)}, "'a' and 'wall'"),
     ({"wall": wall(OBLIQUE), "a": box(0.2, OBLIQUE)}, "'a' and 'wall'"),
     ({"a": ball(0.0)}, "'a' and 'wall'"),
     ({"a": ball(0.49)}, "'a' and 'wall'"),
-    ({"a": tube(-0.1, 0.5)}, "'a' and 'wall'"),
     ({"a": {"type": "disk", "to_world": pose(2) @ OBLIQUE}}, "'a' and 'wall'"),
     (several(pose(0, 0, 0.2), NEAR), "'copy0' and 'wall'"),
 ])  # fmt: skip

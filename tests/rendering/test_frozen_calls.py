@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-import threading
 import warnings
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -13,12 +14,9 @@ import torch
 import torchtransient as tt
 from support.marks import long
 from tools.gradient_sweep.measure import Subject, quiet
-from tools.gradient_sweep.settings import Setting, all_settings
+from tools.gradient_sweep.settings import all_settings
 from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, make_room
-from torchtransient.rendering import recording
-from torchtransient.scene.variant import active_variant
 
-FIRST, RECORDED, LAUNCHED = recording.FIRST, recording.RECORDED, recording.LAUNCHED
 # The same kernels but for the order of atomic sums: the last digits of single precision.
 TOLERANCE = 2e-5
 # One of each kind of thing that a scene can have, where recordings could go wrong in a way of its own.
@@ -26,12 +24,6 @@ FEW = (
     "bsdf roughdielectric in blendbsdf", "shape ply", "emitter area in sphere",
     "spectrum regular in reflectance, spectral", "phase hg in homogeneous", "bsdf conductor, mono_polarized",
 )  # fmt: skip
-
-
-def settings(bare: bool) -> list[Setting]:
-    with active_variant(VARIANT):
-        found = all_settings()
-    return [one for one in found if (one.is_bare if bare else one.name in FEW)]
 
 
 def response(out):
@@ -64,7 +56,7 @@ def compared(scene, key):
 
 def check(setting, folder):
     """Return the words of the last calls of one parameter, after a comparison of their numbers."""
-    with active_variant(setting.variant), quiet(), warnings.catch_warnings():
+    with mi.variant_context(setting.variant), quiet(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = tt.load(setting.make(folder), variant=setting.variant)
         every = scene.parameters().differentiable()
@@ -75,41 +67,36 @@ def check(setting, folder):
     return said
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("setting", settings(bare=False), ids=lambda one: one.name)
-def test_numbers_of_traced_calls(setting, tmp_path):
-    assert check(setting, tmp_path) == {LAUNCHED}
-
-
-def marked(found):
-    """A plugin shows Dr.Jit the same arrays whatever its numbers are: its first setting is in the set of slow tests."""
-    seen = set()
+def settings():
+    """Every plugin alone, which is a sweep, and a few that stand for a kind of arrays each."""
+    if mi.variant() is None:
+        mi.set_variant(VARIANT)
+    with mi.variant_context(VARIANT):
+        found = all_settings()
     for one in found:
-        what = one.name.split(" (")[0]
-        yield pytest.param(one, id=one.name, marks=pytest.mark.soak if what in seen else pytest.mark.slow)
-        seen.add(what)
+        if one.is_bare or one.name in FEW:
+            yield pytest.param(one, id=one.name, marks=pytest.mark.slow if one.name in FEW else pytest.mark.soak)
 
 
-@pytest.mark.parametrize("setting", list(marked(settings(bare=True))))
-def test_numbers_of_traced_calls_for_every_plugin(setting, tmp_path):
+@pytest.mark.parametrize("setting", list(settings()))
+def test_numbers_of_traced_calls(setting, tmp_path):
     """Some plugins do not show Dr.Jit all of their arrays: their scenes are traced (docs/speed.md has a list)."""
     if setting.plugin == "timed_sunsky":
         # Not in Mitsuba's kernels either: it evaluates arrays while they are built.
         with pytest.raises(tt.errors.SceneError, match="describe a 'sunsky' at its time"):
             check(setting, tmp_path)
-    else:
-        assert all(words == LAUNCHED or words.startswith("traced") for words in check(setting, tmp_path))
+        return
+    others = check(setting, tmp_path) - {"launched"}
+    assert all(words.startswith("traced") for words in others) and not (others and setting.name in FEW)
 
 
 # ------------------------------------------------------------------------------------------- films, batches, sensors
 
 FILMS = {
     "histogram": {},
-    "gaussian": {"temporal_filter": "gaussian"},
     "pulse": {"pulse": tt.Pulse.gaussian(0.3)},
     "phasors": {"frequencies": [0.0, 0.25, 0.5, 1.0]},
     "gates": {"gates": [tt.Gate.gaussian(8.0, 2.0), tt.Gate.gaussian(10.0, 2.0)]},
-    "without a steady image": {"steady": False},
 }
 
 
@@ -126,9 +113,9 @@ def step(renderer, seed, **values):
     return out, [parameter.grad.clone() for parameter in renderer.parameters() if parameter.grad is not None]
 
 
-def same(a, b, black=False):
+def same(a, b):
     scale = float(a.detach().abs().max())
-    assert black or scale > 0
+    assert scale > 0
     torch.testing.assert_close(b, a, rtol=TOLERANCE, atol=TOLERANCE * scale)
 
 
@@ -143,20 +130,31 @@ def test_every_film(room_scene, film):
         for a, b in zip(of_traced, of_recorded, strict=True):
             same(a, b)
         assert got.stats.energy_after == pytest.approx(expected.stats.energy_after, rel=1e-4)
-    assert got.stats.recorded == (LAUNCHED,) and got.stats.derivatives_recorded == [LAUNCHED]
-    off = recording.SWITCHED_OFF
+    assert got.stats.recorded == ("launched",) and got.stats.derivatives_recorded == ["launched"]
+    off = "traced: freeze=False"
     assert expected.stats.recorded == (off,) and expected.stats.derivatives_recorded == [off]
 
 
-def test_what_is_said(room_scene):
+def test_what_is_said():
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR], spp=4)
-    said = [renderer(seed=seed).stats.recorded[0] for seed in range(4)]
-    assert said == [FIRST, RECORDED, LAUNCHED, LAUNCHED]
+
+    def kinds(*samples, **more):
+        return [renderer(seed=0, spp=n, **more).stats.recorded[0].split(":")[0] for n in samples]
+
+    assert kinds(4, 4, 4, 4) == ["traced", "recorded", "launched", "launched"]
     # Other samples are other kernels; coming back needs nothing.
-    assert [renderer(seed=0, spp=n).stats.recorded[0] for n in (8, 8, 8, 4)] == [FIRST, RECORDED, LAUNCHED, LAUNCHED]
-    assert renderer(seed=0, progress=True).stats.recorded[0] == recording.PROGRESS
+    assert kinds(8, 8, 8, 4) == ["traced", "recorded", "launched", "launched"]
+    assert renderer(seed=0, progress=True).stats.recorded[0] == "traced: progress is reported"
+    with mi.variant_context(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        assert kinds(4, 4, 4) == ["traced"] * 3
     renderer.freeze = False
-    assert renderer(seed=0).stats.recorded[0] == recording.SWITCHED_OFF
+    assert kinds(4) == ["traced"]
+    with (
+        mi.variant_context(VARIANT),
+        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
+        pytest.raises(tt.errors.VariantError, match="SymbolicLoops"),
+    ):
+        renderer(seed=0)
 
 
 @pytest.mark.slow
@@ -171,8 +169,8 @@ def test_batches_and_sensors(two_views):
             out.transient.square().sum().backward()
         same(x.grad, y.grad)
         same(traced.values[GREY].grad, recorded.values[GREY].grad)
-    assert set(got.stats.recorded) == {LAUNCHED} and len(got.stats.recorded) == 6
-    assert set(got.stats.derivatives_recorded) == {LAUNCHED}
+    assert set(got.stats.recorded) == {"launched"} and len(got.stats.recorded) == 6
+    assert set(got.stats.derivatives_recorded) == {"launched"}
 
 
 def test_forward_mode(room_scene):
@@ -201,75 +199,6 @@ def two_views():
     return tt.load(room | {"sensor_b": second | {"to_world": pose}}, variant=VARIANT)
 
 
-# -------------------------------------------------------------------------------------------------- orders of calls
-
-
-@pytest.mark.slow
-def test_two_scenes_by_turns():
-    rooms = [tt.load(make_room(), variant=VARIANT) for _ in range(2)]
-    pairs = [pair(room, parameters=[COLOUR, GREY], spp=4) for room in rooms]
-    with torch.no_grad():
-        for renderer in pairs[1]:
-            renderer.values[COLOUR].fill_(0.2)
-    for seed in range(4):
-        for traced, recorded in pairs:
-            expected, got = step(traced, seed), step(recorded, seed)
-            same(expected[0].transient, got[0].transient)
-            same(expected[1][0], got[1][0])
-
-
-@pytest.mark.slow
-def test_other_flags_of_gradients(room_scene):
-    """Which values need a derivative changes from call to call; so do the adjoint's layout and what it is of."""
-    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
-    losses = (
-        lambda out: out.steady.sum(),
-        lambda out: (out.transient.permute(3, 2, 1, 0).contiguous() ** 2).sum() + out.steady.square().sum(),
-        lambda out: out.transient[:, 3:9, 1].sum(),
-    )
-    for round_ in range(3):
-        for n, loss in enumerate(losses):
-            grads = []
-            for renderer in (traced, recorded):
-                renderer.zero_grad()
-                for k, parameter in enumerate(renderer.parameters()):
-                    parameter.requires_grad_(k != n)
-                loss(renderer(seed=10 * round_ + n)).backward()
-                grads.append([p.grad for p in renderer.parameters() if p.grad is not None])
-            assert len(grads[0]) == len(grads[1]) >= 1
-            assert sum(float(a.abs().sum()) for a in grads[0]) > 0
-            for a, b in zip(*grads, strict=True):
-                same(a, b, black=True)
-
-
-def test_threads(room_scene):
-    traced, recorded = pair(room_scene, parameters=[COLOUR, GREY], spp=4)
-    expected = {seed: step(traced, seed)[0].transient for seed in range(4)}
-    got, failed = {}, []
-
-    def work(number):
-        try:
-            for seed in range(4):
-                with torch.no_grad():
-                    got[number, seed] = recorded(seed=seed).transient
-        except BaseException as error:  # noqa: BLE001
-            failed.append(error)
-
-    workers = [threading.Thread(target=work, args=(n,)) for n in range(4)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert not failed
-    for (_, seed), transient in got.items():
-        same(expected[seed], transient)
-
-
-def scene_integrator(renderer):
-    with active_variant(VARIANT):
-        return renderer.scene.built(renderer._options).scene.integrator()
-
-
 # --------------------------------------------------------------------------------------------- what is not recorded
 
 
@@ -288,16 +217,17 @@ def test_a_large_batch_is_rendered_in_place(monkeypatch, room_scene):
             assert out.stats.energy_after[n] == pytest.approx(single.stats.energy_after[0], rel=1e-4)
 
 
-def test_what_dr_jit_cannot_record_is_traced(room_scene, monkeypatch):
+def test_what_dr_jit_cannot_record_is_traced(monkeypatch):
     """A plugin that reads numbers while it is traced: said once, right every time."""
     scene = tt.load(make_room(), variant=VARIANT)
     traced, recorded = pair(scene, parameters=[COLOUR, GREY], spp=4)
-    cls = type(scene_integrator(recorded))
+    with mi.variant_context(VARIANT):
+        cls = type(recorded.scene.built(recorded._options).scene.integrator())
     offset = cls.offset_in_pixel
 
     def reading(self, film, sensor, sampler):
         found = offset(self, film, sensor, sampler)
-        _number_in_memory()
+        float(dr.opaque(mi.Float, 1.0)[0])
         return found
 
     monkeypatch.setattr(cls, "offset_in_pixel", reading)
@@ -308,34 +238,12 @@ def test_what_dr_jit_cannot_record_is_traced(room_scene, monkeypatch):
     assert got[0].stats.recorded[0].startswith("traced: Dr.Jit cannot record it")
 
 
-def _number_in_memory():
-    import drjit as dr
-    import mitsuba as mi
-
-    return float(dr.opaque(mi.Float, 1.0)[0])
-
-
-def test_numbers_of_a_plugin_in_python_count(room_scene):
-    """What is no array becomes part of the kernels: another number is another recording. Deeper light is 0.5 %."""
-    scene = tt.load(make_room(), variant=VARIANT)
-    renderer = tt.TransientRenderer(scene, parameters=[COLOUR], spp=64)
-    before = [renderer(seed=0) for _ in range(3)][-1]
-    integrator = scene_integrator(renderer)
-    integrator.max_depth = 2
-    after = [renderer(seed=0) for _ in range(3)]
-    assert before.stats.recorded == (LAUNCHED,)
-    assert [out.stats.recorded[0] for out in after] == [FIRST, RECORDED, LAUNCHED]
-    assert float(after[0].steady.detach().sum()) < 0.998 * float(before.steady.detach().sum())
-    for out in after[1:]:
-        same(after[0].transient, out.transient)
-
-
 # ------------------------------------------------------------------------------------------------ bounds and warning
 
 
 @pytest.mark.slow
 def test_recordings_are_bounded_and_said(monkeypatch):
-    monkeypatch.setattr(recording, "MAX_STRUCTURES", 3)
+    monkeypatch.setattr(sys.modules["torchtransient.rendering.recording"], "MAX_STRUCTURES", 3)
     renderer = tt.TransientRenderer(tt.load(make_room(), variant=VARIANT), parameters=[COLOUR])
 
     def take_turns():
@@ -351,17 +259,3 @@ def test_recordings_are_bounded_and_said(monkeypatch):
         warnings.simplefilter("error")
         for spp in range(1, 10):
             renderer(seed=0, spp=spp)
-
-
-def test_flags_of_dr_jit(room_scene):
-    import drjit as dr
-
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=2)
-    with active_variant(VARIANT), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
-        assert {renderer(seed=0).stats.recorded[0] for _ in range(4)} == {recording.NO_FREEZING}
-    with (
-        active_variant(VARIANT),
-        dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
-        pytest.raises(tt.errors.VariantError, match="SymbolicLoops"),
-    ):
-        renderer(seed=0)

@@ -1,4 +1,4 @@
-"""Response curves, pulses, gates and delays together with the other effects."""
+"""Response curves and delays with shifted wavelengths in polarized renders."""
 
 from __future__ import annotations
 
@@ -7,85 +7,28 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_rows
 from tools.small_room import make_room
-from torchtransient.sensing import apply_pulse
-
-BANDS = {
-    "red": {"type": "regular", "wavelength_min": 550, "wavelength_max": 750, "values": "0, 1, 0.2, 0"},
-    "blue": {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0, 1, 0"},
-}
-LATE = {"type": "delayed", "lifetime": 0.5, "elastic_fraction": 0.5, "nested": {"type": "diffuse", "reflectance": 0.5}}
-SHIFT = {
-    "excitation": {"type": "regular", "wavelength_min": 400, "wavelength_max": 500, "values": "0.2, 0.8, 0.2"},
-    "emission": {"type": "regular", "wavelength_min": 500, "wavelength_max": 700, "values": "0, 1, 0"},
-}
-AXIS = tt.TimeAxis(6.0, 0.05, 200)
 
 
-def room(bands=False, late=None):
-    node = make_room()
-    if bands:
-        node["sensor"]["film"] |= BANDS
-    if late is not None:
-        node["wall"]["bsdf"] = late
-    return node
-
-
-def render(node, variant, **settings):
-    mi.set_variant(variant)  # or every render switches there and back
-    return tt.render(tt.load(node, variant=variant), seed=2, spp=64, **settings)
+def regular(low, high, values):
+    return {"type": "regular", "wavelength_min": low, "wavelength_max": high, "values": values}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "bands, late",
-    long_rows([(True, None), (False, LATE), (True, {**LATE, **SHIFT})], [(True, {**LATE, **SHIFT})]),
-    ids=["at once", "late", "shifted"],
-)
-def test_intensity_of_polarized_renders(bands, late):
-    node = room(bands, late)
-    plain = render(node, "llvm_ad_spectral", time_axis=AXIS)
-    polarized = render(node, "llvm_ad_spectral_polarized", time_axis=AXIS)
+def test_intensity_of_polarized_renders():
+    room = make_room()
+    room["sensor"]["film"] |= {"red": regular(550, 750, "0, 1, 0.2, 0"), "blue": regular(400, 500, "0, 1, 0")}
+    room["wall"]["bsdf"] = {
+        "type": "delayed", "lifetime": 0.5, "elastic_fraction": 0.5, "nested": {"type": "diffuse", "reflectance": 0.5},
+        "excitation": regular(400, 500, "0.2, 0.8, 0.2"), "emission": regular(500, 700, "0, 1, 0"),
+    }  # fmt: skip
+    found = []
+    for variant in ("llvm_ad_spectral", "llvm_ad_spectral_polarized"):
+        mi.set_variant(variant)  # or every render switches there and back
+        scene = tt.load(room, variant=variant)
+        found.append(tt.render(scene, seed=2, spp=64, time_axis=tt.TimeAxis(6.0, 0.05, 200)))
+    plain, polarized = found
     assert polarized.channels == plain.channels and polarized.transient.shape == (4, *plain.transient.shape)
     torch.testing.assert_close(polarized.transient[0], plain.transient, rtol=1e-3, atol=1e-5)
     # diffuse surfaces depolarize
     assert polarized.transient[1:].abs().max() == 0
-
-
-@pytest.mark.slow
-def test_gates_and_steady():
-    variant = "llvm_ad_mono_polarized"
-    gates = (tt.Gate.gaussian(8.0, 0.3), tt.Gate.tabulated([8, 8.5, 12], [0, 1, 0]))
-    fine = render(room(late=LATE), variant, time_axis=tt.TimeAxis(6.0, 0.005, 2000))
-    gated = render(room(late=LATE), variant, gates=gates)
-    weights = torch.stack([torch.from_numpy(g.value(fine.axis.centers_opl.numpy())) for g in gates]).float()
-    expected = torch.einsum("...thw,gt->...ghw", fine.transient, weights)
-    torch.testing.assert_close(gated.gated, expected, rtol=0, atol=5e-3 * float(expected.max()))
-    torch.testing.assert_close(gated.steady, gated.gated.sum(-3))
-
-
-@pytest.mark.slow
-def test_phasors_of_channels_and_delays():
-    node = room(bands=True, late=LATE)
-    frequencies = [0.0, 0.25, 0.5]
-    phasor = render(node, "llvm_ad_spectral", frequencies=frequencies)
-    axis = tt.TimeAxis(6.0, 0.005, 2000)
-    cube = render(node, "llvm_ad_spectral", time_axis=axis)
-    assert phasor.channels == ("red", "blue")
-    torch.testing.assert_close(phasor.phasor[:, 0].real, phasor.steady, rtol=1e-4, atol=1e-6)
-    turns = torch.outer(torch.tensor(frequencies, dtype=torch.float64), axis.centers_opl)
-    expected = torch.einsum("cthw,ft->cfhw", cube.transient.to(torch.complex128), torch.exp(-2j * torch.pi * turns))
-    # bins of 5 mm are 1/400 of a turn; delays of more than 8 m are rare
-    difference = (phasor.phasor - expected).abs().max()
-    assert difference < 5e-3 * float(phasor.steady.max())
-
-
-@pytest.mark.slow
-def test_a_pulse_on_delayed_light():
-    pulse = tt.Pulse.tabulated([0, 0.1, 0.6], [0, 1, 0])
-    plain = render(room(late=LATE), "llvm_ad_rgb", time_axis=AXIS)
-    spread = render(room(late=LATE), "llvm_ad_rgb", time_axis=AXIS, pulse=pulse)
-    applied = apply_pulse(plain.transient, AXIS, pulse)
-    assert float((applied - spread.transient).norm() / spread.transient.norm()) < 0.05
-    assert float((plain.transient - spread.transient).norm() / spread.transient.norm()) > 0.5

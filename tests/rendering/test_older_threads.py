@@ -22,13 +22,6 @@ def older():
         yield lambda function, *args, **options: pool.submit(function, *args, **options).result()
 
 
-@pytest.fixture
-def engine_in_another_thread(older, monkeypatch):
-    """torch's engine as it works for CUDA tensors."""
-    own = torch.autograd._engine_run_backward
-    monkeypatch.setattr(torch.autograd, "_engine_run_backward", lambda *args, **options: older(own, *args, **options))
-
-
 def newer_block():
     dr.detail.new_scope(dr.JitBackend.LLVM)
 
@@ -61,14 +54,3 @@ def test_renders_read_what_is_not_evaluated(older):
     renderer.zero_grad()
     older(lambda: renderer(seed=0).transient.sum().backward())
     torch.testing.assert_close(renderer.values[COLOUR].grad, 2 * expected)
-
-
-@pytest.mark.usefixtures("engine_in_another_thread")
-def test_batches_of_gradients_are_refused():
-    @tt.wrap
-    def square(x):
-        return x * x
-
-    x = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
-    with pytest.raises(tt.errors.GradientError, match=r"torch\.func\.jacrev"):
-        torch.autograd.functional.jacobian(square, x, vectorize=True)

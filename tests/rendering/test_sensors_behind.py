@@ -7,7 +7,6 @@ import torch
 
 import torchtransient as tt
 from torchtransient import sensing
-from torchtransient.errors import UnitError
 
 VARIANT = "llvm_ad_rgb"
 KEY = "red.reflectance.value"
@@ -37,28 +36,6 @@ def test_gradient_of_a_noisy_depth_camera_reaches_the_scene(renderer):
     (wanted,) = torch.autograd.grad(1e4 * renderer(seed=0).transient.sum(), renderer.values[KEY])
     assert float(gradient[0]) > 0
     torch.testing.assert_close(gradient, wanted, rtol=0.1, atol=0.02 * float(wanted.abs().max()))
-
-
-def test_a_spad_behind_the_renderer(renderer):
-    device = sensing.device("mpd_spad_like").changed("PhotonBudget", pulse_energy_j=1e-13)
-    sensor = device.sensor(renderer.axis, grad="straight_through")
-    with torch.no_grad():
-        counts = sensor(renderer(seed=0), generator=torch.Generator().manual_seed(0))
-    assert counts.shape == (3, 60, 8, 8) and float(counts.sum()) > 0
-    with pytest.raises(UnitError, match="axis of stage"):
-        device.sensor(device.axis())(renderer(seed=0))
-
-
-@pytest.mark.slow
-def test_phasor_image_and_histogram_give_the_same_taps(renderer):
-    frequencies = tt.FrequencyAxis.from_hertz([0.0, 30e6])
-    phasors = tt.TransientRenderer(renderer.scene, spp=1024, frequencies=frequencies)
-    wide = tt.TransientRenderer(renderer.scene, spp=1024, time_axis=tt.TimeAxis(0.0, 0.02, 1500))
-    with torch.no_grad():
-        image, film = phasors(seed=0), wide(seed=0)
-    camera = sensing.Compose([sensing.ItofCorrelation(sensing.sine_code(3), 30e6, film.axis, contrast=0.7)])
-    a, b = camera(image), camera(film)
-    torch.testing.assert_close(a.mean((-2, -1)), b.mean((-2, -1)), rtol=0.02, atol=0.0)
 
 
 def test_stokes_vectors_behind_a_polarized_variant():

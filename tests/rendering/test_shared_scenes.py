@@ -15,37 +15,11 @@ from tools.small_room import VARIANT as VARIANT
 RED = torch.tensor([0.9, 0.1, 0.2])
 
 
-def whole():
+@pytest.fixture
+def shared():
+    """A scene of Mitsuba's, its parameters, and two keys."""
     scene = mi.load_dict(make_room(), optimize=False)
     return tt.load(scene), mi.traverse(scene), COLOUR, GREY
-
-
-def surface_inside():
-    """A dictionary with two surfaces of Mitsuba that are taken as they are."""
-    room = make_room()
-    colour, grey = (mi.load_dict(room[name]["bsdf"] | {"id": name}) for name in ("box", "wall"))
-    room["box"]["bsdf"], room["wall"]["bsdf"] = colour, grey
-
-    class Both:
-        def __init__(self):
-            self.of = {COLOUR: mi.traverse(colour), GREY: mi.traverse(grey)}
-
-        def __getitem__(self, key):
-            return self.of[key]["reflectance.value"]
-
-        def __setitem__(self, key, value):
-            self.of[key]["reflectance.value"] = value
-
-        def update(self):
-            for params in self.of.values():
-                params.update()
-
-    return tt.load(room), Both(), COLOUR, GREY
-
-
-@pytest.fixture(params=[whole, pytest.param(surface_inside, marks=pytest.mark.slow)], ids=lambda make: make.__name__)
-def shared(request):
-    return request.param()
 
 
 def renderer(scene, *keys, **options):

@@ -87,7 +87,7 @@ def test_the_error_is_the_formula(result, passes):
     assert str(result.passes) in result.reason
 
 
-@pytest.mark.parametrize("spp", [1, 5, 9, 20])
+@pytest.mark.parametrize("spp", [1, 9])
 def test_resuming_is_one_go(renderer, result, spp):
     """Cut anywhere, the passes and the looks are those of one go."""
     part = to_tolerance(renderer, seed=3, max_spp=SPP * spp)
@@ -179,41 +179,15 @@ def test_phasors(scene):
 
 
 def test_batches(renderer):
-    """Each entry counts its own bins with light, a dim one like a bright one."""
-    values = {KEY: torch.tensor([[0.6, 0.1, 0.1], [0.0, 0.0, 0.0]])}
+    """Each entry counts its own bins with light, a dim one like a bright one. Passes have no gradient."""
+    values = {KEY: torch.tensor([[0.6, 0.1, 0.1], [0.0, 0.0, 0.0]], requires_grad=True)}
     result = to_tolerance(renderer, values)
     assert result.output.transient.shape == (2, 3, 60, 8, 8) and result.standard_error.shape == (2, 60, 8, 8)
+    assert not result.output.transient.requires_grad
+    assert result.output.transient[1].sum() < result.output.transient[0].sum()
     assert len(result.output.stats.seeds) == 2 * result.passes == len(set(result.output.stats.seeds))
     with pytest.raises(ArgumentError, match="same values"):
         to_tolerance(renderer, {KEY: torch.zeros(2, 3)}, resume=result)
-
-
-def test_values_and_gradients(renderer):
-    """Passes have no gradient, and values of the call replace the module's."""
-    dark = to_tolerance(renderer, {KEY: torch.zeros(3, requires_grad=True)}, max_spp=SPP * 8)
-    lit = to_tolerance(renderer, max_spp=SPP * 8)
-    assert not dark.output.transient.requires_grad
-    assert dark.output.transient.sum() < lit.output.transient.sum()
-
-
-def fireflies():
-    """A wall under a lamp, and a spark in a ball of glass, which one path in some thousands finds."""
-    scene = tt.scenes.moving_wall(resolution=8, num_bins=40, bin_width_opl=0.1, spp=16)
-    ball = {"type": "sphere", "center": [0.0, 0.0, 2.0], "radius": 0.35}
-    scene["ball"] = {**ball, "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}}
-    scene["spark"] = {
-        **ball, "radius": 0.012, "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 3e4}},
-    }  # fmt: skip
-    return scene
-
-
-def test_heavy_tails_are_said():
-    """Of 12 seeds all are said to be heavy tailed after 256 passes, 7 after 64: a spark has to be found first."""
-    renderer = tt.TransientRenderer(tt.load(fireflies(), variant=VARIANT), physics="ignore")
-    result = to_tolerance(renderer, rtol=0.05, max_spp=SPP * 256)
-    assert result.heavy_tailed and not result.reached
-    assert "heavy tailed" in result.reason
 
 
 def test_a_loss_with_a_heavy_tail(renderer):
@@ -242,33 +216,19 @@ def test_going_on_for_other_bins(renderer, result):
     assert to_tolerance(renderer, seed=3, resume=of_loss).error == pytest.approx(result.error, rel=1e-4)
 
 
-def calibrated(scene, truth, seeds, rtol):
-    """Runs against a long reference: relative root mean squares of bins, squared deviations over what they are said to
-    be, and deviations of the energy.
-    """
+def test_errors_are_calibrated(scene):
+    """Against a long reference squared deviations are what they are said to be, and 90 % of the bins keep to rtol."""
     renderer = tt.TransientRenderer(scene, physics="ignore")
-    found = [to_tolerance(renderer, seed=seed, rtol=rtol) for seed in seeds]
+    with torch.no_grad():
+        truth = renderer(spp=2**16, seed=77).transient.double().mean(0).numpy()
+    found = [to_tolerance(renderer, seed=seed) for seed in range(100, 106)]
     assert all(one.reached for one in found)
     cubes = np.stack([one.output.transient.double().mean(0).numpy() for one in found])
     errors = np.stack([one.standard_error.double().numpy() for one in found])
     mean = near_mean(truth)
     lit = mean > 0.02 * truth.mean()
-    true = np.sqrt(((cubes - truth) ** 2).mean(0))[lit] / mean[lit]
-    ratio = ((cubes - truth) ** 2)[:, lit].mean() / (errors**2)[:, lit].mean()
-    return true, ratio, cubes.sum((1, 2, 3)) / truth.sum() - 1
-
-
-@pytest.fixture(scope="module")
-def truth(scene):
-    with torch.no_grad():
-        out = tt.render(scene, spp=2**16, seed=77, physics="ignore")
-    return out.transient.double().mean(0).numpy()
-
-
-@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
-def test_errors_are_calibrated(scene, truth, runs):
-    """Squared deviations are what they are said to be, and 90 % of the bins keep to rtol."""
-    true, ratio, energies = calibrated(scene, truth, range(100, 100 + runs), 0.5)
-    assert ratio == pytest.approx(1.0, abs=0.4 if runs < 10 else 0.25)
-    assert np.mean(true <= 0.5) > (0.85 if runs < 10 else 0.9)
-    assert abs(energies.mean()) < 4 * energies.std(ddof=1) / math.sqrt(runs)
+    squares = (cubes - truth) ** 2
+    assert squares[:, lit].mean() / (errors**2)[:, lit].mean() == pytest.approx(1.0, abs=0.4)
+    assert np.mean(np.sqrt(squares.mean(0))[lit] / mean[lit] <= 0.5) > 0.85
+    energies = cubes.sum((1, 2, 3)) / truth.sum() - 1
+    assert abs(energies.mean()) < 4 * energies.std(ddof=1) / math.sqrt(6)

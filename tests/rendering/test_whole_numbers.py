@@ -14,25 +14,20 @@ from tools.small_room import COLOUR, make_room
 from tools.small_room import VARIANT as VARIANT
 from torchtransient.errors import TorchTransientError, TorchTransientWarning
 
-WHOLE = [np.int64(3), np.array(3), torch.tensor(3, dtype=torch.uint8)]
-NONE = [1.5, float("nan"), "x", "3", True, torch.tensor(True), 1j, [], {}, torch.tensor(3.0)]
-
+WHOLE = [np.array(3), torch.tensor(3, dtype=torch.uint8)]
+NONE = [1.5, "3", True, torch.tensor(3.0)]
 
 CALLS = {
     "spp": lambda n: tt.TransientRenderer(make_room(), spp=n).spp,
-    "spp_grad": lambda n: tt.TransientRenderer(make_room(), spp_grad=n).spp_grad,
     "spp of a call": lambda n: tt.render(make_room(), spp=n, seed=0).stats.spp,
-    "samples_drawn": lambda n: tt.TransientRenderer(make_room()).samples_drawn(n),
     "max_depth": lambda n: tt.TransientRenderer(make_room(), max_depth=n)._options.max_depth,
     "max_depth of a plan": lambda n: tt.plan(make_room(), max_depth=n, pilot=False).max_depth,
     "grad_seed": lambda n: tt.TransientRenderer(make_room(), grad_seed=n).grad_seed,
     "seed": lambda n: tt.render(make_room(), spp=1, seed=n).stats.seeds[0],
     "seed of poses": lambda n: over_time(seed=n).stats.seeds[2],
-    "spp of poses": lambda n: over_time(spp=n, seed=0).stats.spp,
     "one seed of several": lambda n: tt.render(make_room(), spp=1, seed=[n]).stats.seeds[0],
     "batch_spp": lambda n: tolerance(batch_spp=n).spp,
     "seed of passes": lambda n: tolerance(seed=n, batch_spp=1).state.sums.seed,
-    "sensor": lambda n: tt.TransientRenderer(room_of_four(), sensors=n)._sensors[0],
     "one sensor of several": lambda n: tt.TransientRenderer(room_of_four(), sensors=[n])._sensors[0],
 }
 
@@ -56,13 +51,7 @@ def test_whole_numbers_of_other_libraries(call):
     for value in WHOLE:
         found = CALLS[call](value)
         assert found == 3 and type(found) is int
-
-
-@pytest.mark.parametrize("call", CALLS)
-def test_what_is_no_whole_number(call):
     for value in NONE:
-        if (call == "seed" and isinstance(value, dict | bytes)) or (value == "x" and "plan" in call):
-            continue
         with pytest.raises(TorchTransientError, match=r"expected .*(number|integer|index)") as failure:
             CALLS[call](value)
         assert "\n" not in str(failure.value)
@@ -91,17 +80,3 @@ def test_values_of_every_library():
         assert torch.equal(renderer({COLOUR: value}, seed=0).transient, expected)
     out = renderer({COLOUR: [[half, 0.25, 0.75], [0.5, half, 0.75]]}, seed=0).transient
     assert torch.autograd.grad(out.sum(), half)[0] > 0 and torch.equal(out[0], expected)
-
-
-# --------------------------------------------------------------------------------------------------- calls of others
-
-
-def confocal(size):
-    return tt.nlos.Scan.grid(tt.nlos.Wall.plane(1.0, 1.0), size, kind="confocal")
-
-
-def passes(n):
-    return tt.nlos.DiffusionDeconvolution(confocal(2), time_axis=AXIS, thickness=0.025, passes=n).passes
-
-
-AXIS, DEVICE = tt.TimeAxis(0.0, 0.1, 8), tt.sensing.device("mpd_spad_like")

@@ -1,9 +1,13 @@
-"""``tt.wrap`` puts back every scene that a function reaches, in whichever way, and replays it as it was at the call."""
+"""``tt.wrap`` puts back every scene that a function reaches, and replays it as it was at the call; no gradient is lost,
+and threads do not wait for one another.
+"""
 
 from __future__ import annotations
 
-import collections
 import functools
+import subprocess
+import sys
+import textwrap
 import types
 
 import drjit as dr
@@ -11,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import torchtransient as tt
 from tools.small_room import VARIANT as VARIANT
@@ -39,9 +44,6 @@ class Holder:
 
     def __call__(self, x):
         return write(self.params, x)
-
-    def again(self, x):
-        return self(x)
 
 
 class Slots:
@@ -87,13 +89,11 @@ def ways(scene, params):
         def once(self):
             return (params,)
 
-    computed, row = Computed(), collections.deque([params])
+    computed = Computed()
     return {
         "slots": Slots(params),
         "a property that is kept": lambda x: write(computed.once[0], x),
-        "a deque": lambda x: write(row[0], x),
-        "a function that it calls": lambda x: helper(x),
-        "a method of an object": lambda x: holder.again(x),
+        "a function that it calls": lambda x: holder(x),
         "an attribute of a class": lambda x: write(keeper.params, x),
         "an attribute of a module": defined_inside,
         "entries of entries": lambda x: write(deep["a"][0], x),
@@ -122,12 +122,6 @@ def test_every_way_to_a_scene(scene, way):
     assert np.all(np.array(params[KEY]) == 7.0) and not dr.grad_enabled(params[KEY]), "left behind by the derivative"
 
 
-def held(value, levels):
-    for _ in range(levels):
-        value = [value]
-    return value
-
-
 # ----------------------------------------------------------------------------------------- gradients that would be lost
 
 
@@ -137,18 +131,15 @@ def test_gradients_that_helpers_would_swallow_are_refused():
     def helper(x):
         return x * mi.TensorXf(weight)
 
-    all_of_them = [helper]
-    for calls in (lambda x: helper(x), lambda x: (all_of_them, helper(x))[1], functools.partial(helper)):
-        with pytest.raises(GradientError, match="variable 'weight', which is no argument"):
-            tt.wrap(calls)(torch.ones(2))
+    def scaled(x, *, by=weight):
+        return x
 
-    def scaled(x, factor, *, by=weight):
-        return x * factor
-
-    with pytest.raises(GradientError, match="variable 'by', which is no argument"):
-        tt.wrap(scaled)(torch.ones(2), 2.0)
-    with pytest.raises(GradientError, match="variable 'argument 0', which is no argument"):
-        tt.wrap(functools.partial(lambda factor, x: x, weight))(torch.ones(2))
+    for function, name in (
+        (lambda x: helper(x), "weight"), (functools.partial(helper), "weight"), (scaled, "by"),
+        (functools.partial(lambda factor, x: x, weight), "argument 0"),
+    ):  # fmt: skip
+        with pytest.raises(GradientError, match=f"variable '{name}', which is no argument"):
+            tt.wrap(function)(torch.ones(2))
 
 
 def test_a_scene_that_is_attached_and_not_found_is_refused(scene):
@@ -158,7 +149,7 @@ def test_a_scene_that_is_attached_and_not_found_is_refused(scene):
     dr.enable_grad(attached)
     params[KEY] = attached
     params.update()
-    hidden = held(params, 6)
+    hidden = [[[[[[params]]]]]]
 
     def read(x):
         found = hidden
@@ -171,3 +162,108 @@ def test_a_scene_that_is_attached_and_not_found_is_refused(scene):
         tt.wrap(read)(x)
     tt.wrap(read, state=params)(x).sum().backward()
     assert torch.equal(x.grad, torch.full((2, 2, 3), 0.5))
+
+
+HOLDERS = {
+    "list": lambda x: [x],
+    "namespace": lambda x: types.SimpleNamespace(x=x),
+    "parameters": lambda x: nn.ParameterList([x]),
+}
+
+
+@pytest.mark.parametrize("way", HOLDERS)
+def test_containers_of_tensors_that_want_gradients(way):
+    x, held = torch.ones(2, requires_grad=True), HOLDERS[way](nn.Parameter(torch.ones(2)))
+    with pytest.raises(GradientError, match="the variable 'held', which is no argument, wants a gradient"):
+        tt.wrap(lambda x: (x, held)[0])(x)
+    wrapped = tt.wrap(lambda x, held: x)
+    if way == "list":  # a tree
+        assert torch.equal(wrapped(x, held), x)
+        return
+    with pytest.raises(GradientError, match="an argument wants a gradient"):
+        wrapped(x, held)
+    with torch.no_grad():
+        assert torch.equal(wrapped(x, held), x)
+
+
+TRANSFORMS = {
+    "grad": lambda f: torch.func.grad(f),
+    "vmap": lambda f: torch.func.vmap(f),
+    "jvp": lambda f: lambda x: torch.func.jvp(f, (x,), (x,)),
+}
+
+
+@pytest.mark.parametrize("way", TRANSFORMS)
+def test_transforms_reach_arguments_alone(way):
+    def f(a):
+        return tt.wrap(lambda x: dr.sum(x * mi.TensorXf(a), axis=None))(torch.ones(3))
+
+    with pytest.raises(GradientError, match="the variable 'a', which is no argument, wants a gradient"):
+        TRANSFORMS[way](f)(torch.ones(2, 3) if way == "vmap" else torch.ones(3))
+
+
+def test_functions_that_differentiate_by_themselves():
+    def f(x, constant):
+        y = mi.Float(2)
+        dr.enable_grad(y)
+        dr.backward(y * y * (dr.detach(x) if constant else x).array)
+        return dr.grad(y) * x.array
+
+    x = torch.tensor([3.0], requires_grad=True)
+    assert tt.wrap(f)(x, False) == 36
+    with pytest.raises(GradientError, match="differentiates by itself"):
+        tt.wrap(f)(x, False).backward()
+    tt.wrap(f)(x, True).backward()
+    assert x.grad == 12
+    assert torch.func.jvp(lambda x: tt.wrap(f)(x, True), (x.detach(),), (x.detach(),))[1] == 36
+
+
+# ----------------------------------------------------------------------------------------------- arguments and results
+
+
+def test_structures_of_mitsuba_are_arguments():
+    ray = mi.Ray3f(mi.Point3f(1, 2, 3), mi.Vector3f(0, 0, 1))
+
+    def f(x, ray, pose):
+        ray.o *= 2  # of a copy
+        return (pose @ ray.o).z * x.array
+
+    x = torch.tensor([1.0], requires_grad=True)
+    out = tt.wrap(f)(x, ray, mi.Transform4f().translate(mi.Vector3f(0, 0, 1)))
+    out.backward()
+    assert out == 7 and x.grad == 7 and ray.o.z == 3
+    dr.enable_grad(ray.o)
+    with pytest.raises(GradientError, match=r"depends on arrays of Dr\.Jit that want a gradient"):
+        tt.wrap(f)(x, ray, mi.Transform4f())
+
+
+# ------------------------------------------------------------------------------------------------------------- threads
+
+
+@pytest.mark.slow
+def test_threads_do_not_wait_for_one_another():
+    """Graphs that are freed in one thread while another computes: a lock of Dr.Jit's and Python's own."""
+    script = """
+        import faulthandler, threading
+        faulthandler.dump_traceback_later(60, exit=True)
+        import torchtransient as tt
+        import mitsuba as mi
+        import torch
+        mi.set_variant("llvm_ad_rgb")
+        squares = tt.wrap(lambda x: x * x)
+        def work(size):
+            for _ in range(60):
+                x = torch.ones(size, requires_grad=True)
+                squares(x).sum().backward()
+                assert torch.equal(x.grad, torch.full((size,), 2.0))
+        threads = [threading.Thread(target=work, args=(size,)) for size in (3, 100)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        print("done")
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout.split() == ["done"], done.stderr[-2000:]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -93,7 +91,7 @@ def with_number(place, x):
     return result
 
 
-@together("x", [NAN, INF, -INF])
+@together("x", [NAN, -INF])
 @together("place", PLACES)
 def test_number_of_a_description(place, x):
     broken = tt.load(with_number(place, x), variant=VARIANT)
@@ -101,33 +99,11 @@ def test_number_of_a_description(place, x):
         tt.TransientRenderer(broken)
 
 
-def mesh_file(path, vertices):
-    """A binary file of two triangles over the first four vertices, rows of x, y, z, u, v."""
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyzuv")
-    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    faces = b"".join(struct.pack("<B3i", 3, *face) for face in ((0, 1, 2), (0, 2, 3)))
-    path.write_bytes(header.encode() + np.array(vertices, dtype="<f4").tobytes() + faces)
-    return {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": {"type": "diffuse"}}
-
-
-SQUARE = [[-1, -1, 0, 0, 0], [1, -1, 0, 1, 0], [1, 1, 0, 1, 1], [-1, 1, 0, 0, 1]]
-
-
-@pytest.mark.parametrize("x", [NAN, INF], ids=str)
-def test_vertices_of_a_file(tmp_path, x):
-    broken = scene()
-    broken["wall"] = mesh_file(tmp_path / "wall.ply", [[-1, -1, x, 0, 0], *SQUARE[1:]])
-    with pytest.raises(SceneError, match=r"wall\.ply.*invalid vertex position"):  # found by Mitsuba
-        tt.TransientRenderer(tt.load(broken, variant=VARIANT))
-
-
-@pytest.mark.parametrize("x", [NAN, INF], ids=str)
-def test_picture_in_a_file(tmp_path, x):
+def test_picture_in_a_file(tmp_path):
     mi.set_variant(VARIANT)
     path = tmp_path / "picture.exr"
     with tt.threads(2):
-        mi.Bitmap(pixels(x)).write(str(path))
+        mi.Bitmap(pixels(INF)).write(str(path))
     broken = scene()
     broken["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "filename": str(path), "raw": True}
     with pytest.raises(SceneError, match=r"reflectance.data' \(1 of 48\)"):
@@ -144,8 +120,7 @@ def test_grid_in_a_file(tmp_path):
         tt.TransientRenderer(tt.load(broken, variant=VARIANT))
 
 
-@pytest.mark.parametrize("own", [True, False], ids=["its own integrator", "another integrator"])
-def test_first_sight_of_a_scene_of_mitsuba(own):
+def test_first_sight_of_a_scene_of_mitsuba():
     mi.set_variant(VARIANT)
     plugins.sync()
     broken = scene()
@@ -155,9 +130,7 @@ def test_first_sight_of_a_scene_of_mitsuba(own):
     broken["sky"] = {"type": "constant"}
     broken["wall"]["bsdf"]["reflectance"]["bitmap"] = mi.Bitmap(pixels(NAN))
     broken["fog"]["interior"]["sigma_t"]["data"] = mi.TensorXf(grid(0.5))
-    integrator = broken["integrator"] if own else broken.pop("integrator")
     loaded = mi.load_dict(broken)
-    used = loaded.integrator() if own else mi.load_dict(integrator)
-    for _ in range(2):
+    for used in (loaded.integrator(), mi.load_dict(broken["integrator"])):
         with pytest.raises(SceneError, match=r"finite numbers, got NaN or infinity in .*reflectance.data' \(1 of 48\)"):
             used.render(loaded, spp=1)

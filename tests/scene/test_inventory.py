@@ -1,6 +1,5 @@
 """Lists of polarizing plugins, compared with their Mueller matrices."""
 
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -22,9 +23,9 @@ def xml(tmp_path):
     return path
 
 
-def show(scene, keys=(), **settings):
+def show(scene, keys=(), seed=0, **settings):
     renderer = tt.TransientRenderer(scene, parameters=list(keys), **{"spp": 16, **settings})
-    return renderer(seed=0).transient.detach()
+    return renderer(seed=seed).transient.detach()
 
 
 def test_peer_xml_is_the_same_scene_as_the_dictionary(xml):
@@ -48,45 +49,31 @@ def test_nameless_xml_children_have_stable_names(xml):
     assert not any(key.startswith("object_") for key in first)
 
 
-def test_files_beside_the_xml_are_found(xml, tmp_path, monkeypatch):
+def test_files_are_found_beside_the_xml_and_where_a_dictionary_was_loaded(xml, tmp_path, monkeypatch):
     (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     shape = '<shape type="obj" id="tri"><string name="filename" value="tri.obj"/></shape></scene>'
     xml.write_text(SCENE.replace("</scene>", shape))
-    monkeypatch.chdir("/")
-    assert tt.load(xml, variant=VARIANT).parameters()["tri.vertex_positions"].shape == (3, 3)
-
-
-def test_relative_files_of_a_dictionary(tmp_path, monkeypatch):
-    (tmp_path / "tri.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
     monkeypatch.chdir(tmp_path)
-    scene = tt.load({**make_room(), "tri": {"type": "obj", "filename": "tri.obj"}}, variant=VARIANT)
+    described = tt.load({**make_room(), "tri": {"type": "obj", "filename": "tri.obj"}}, variant=VARIANT)
     monkeypatch.chdir("/")
-    assert "tri.vertex_positions" in scene.parameters()
+    for scene in (tt.load(xml, variant=VARIANT), described):
+        assert scene.parameters()["tri.vertex_positions"].shape == (3, 3)
 
 
 @pytest.mark.parametrize(
     "write",
     [
-        lambda mi: pose(scale=3.0).tolist(),
-        lambda mi: mi.ScalarTransform4f(pose(scale=3.0)),
-        lambda mi: mi.Transform4f(mi.Matrix4f(pose(scale=3.0))),
-        lambda mi: torch.tensor(pose(scale=3.0)),
+        lambda: pose(scale=3.0).tolist(),
+        lambda: mi.ScalarTransform4f(pose(scale=3.0)),
+        lambda: mi.Transform4f(mi.Matrix4f(pose(scale=3.0))),
+        lambda: torch.tensor(pose(scale=3.0)),
     ],
     ids=["nested lists", "scalar transform", "transform", "torch tensor"],
 )
-def test_forms_of_a_transform(write, room_scene):
-    room = make_room()
-    import mitsuba as mi
-
-    room["wall"]["to_world"] = write(mi)
-    assert torch.equal(show(tt.load(room, variant=VARIANT)), show(room_scene))
-
-
-def test_forms_of_vectors_and_colours(room_scene):
+def test_forms_of_transforms_vectors_and_colours(write, room_scene):
     expected = show(room_scene)
     room = make_room()
-    import mitsuba as mi
-
+    room["wall"]["to_world"] = write()
     room["light"]["position"] = mi.Point3f(-0.5, 0.25, 4.0)
     room["box"]["bsdf"]["reflectance"]["value"] = mi.Color3f(0.8, 0.5, 0.2)
     room["wall"]["bsdf"]["reflectance"] = np.float64(0.5)
@@ -102,8 +89,6 @@ def test_pixels_given_as_bitmap_array_and_tensor():
         room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "raw": True, **entry}
         return show(tt.load(room, variant=VARIANT))
 
-    import mitsuba as mi
-
     bitmap, tensor = mi.Bitmap(pixels), mi.TensorXf(pixels)
     expected = with_texture(data=pixels)
     assert torch.equal(with_texture(bitmap=bitmap), expected)
@@ -111,18 +96,25 @@ def test_pixels_given_as_bitmap_array_and_tensor():
     assert torch.equal(with_texture(data=torch.tensor(pixels)), expected)
 
 
-def test_eight_bit_texture_is_decoded_and_differentiable():
+def test_eight_bit_textures_are_linear_and_have_derivatives():
+    """Of one bounce the light is linear in the albedo: albedo times derivative adds up to the light (Euler)."""
     encoded = np.full((2, 2, 3), 128, dtype=np.uint8)
     room = make_room()
-    import mitsuba as mi
-
     room["wall"]["bsdf"]["reflectance"] = {"type": "bitmap", "bitmap": mi.Bitmap(encoded)}
-    scene = tt.load(room, variant=VARIANT)
-    key = "wall.bsdf.reflectance.data"
-    assert scene.parameters()[key].differentiable
-    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16)
+    room["box"]["bsdf"] = {"type": "diffuse", "reflectance": 0.0}
+    room["integrator"]["max_depth"] = 2
+    scene, key = tt.load(room, variant=VARIANT), "wall.bsdf.reflectance.data"
+    info = scene.parameters()[key]
+    assert info.differentiable and info.value.dtype == np.float32
+    renderer = tt.TransientRenderer(scene, parameters=[key], spp=16, grad_seed="same")
+    albedo = renderer.values[key]
     # 128 / 255 in sRGB is 0.2159 linear.
-    torch.testing.assert_close(renderer.values[key].detach(), torch.full((2, 2, 3), 0.21586), rtol=0, atol=1e-4)
+    torch.testing.assert_close(albedo.detach(), torch.full((2, 2, 3), 0.21586), rtol=0, atol=1e-4)
+    image = renderer(seed=1).transient
+    image.sum().backward()
+    assert float((albedo.grad * albedo.detach()).sum()) == pytest.approx(float(image.detach().sum()), rel=1e-4)
+    # A picture that is asked for with a derivative is the same.
+    torch.testing.assert_close(image.detach(), show(scene, seed=1), rtol=1e-5, atol=1e-9)
 
 
 def test_later_changes_of_the_dictionary_have_no_effect(room_scene):
@@ -227,15 +219,15 @@ def phasor_room(frequencies):
     return room
 
 
-@together("count", [1, 2, 3, 4, 16])
-@together("kind", [list, tuple, np.array, torch.tensor, lambda row: np.array(row, dtype=np.float32)])
+@together("count", [1, 3, 16])
+@together("kind", [tuple, np.array, torch.tensor])
 def test_frequencies_as_a_list_of_any_length(count, kind):
     """Mitsuba takes lists of three only."""
     row = [0.1 * k for k in range(count)]
     scene = tt.load(phasor_room(kind(row)), variant=VARIANT)
     renderer = tt.TransientRenderer(pickle.loads(pickle.dumps(scene)), spp=1)
     assert renderer.frequencies.frequencies == pytest.approx(row, abs=1e-6)
-    if kind in (list, np.array):
+    if kind in (tuple, np.array):
         assert renderer.frequencies.frequencies == tuple(row)
         assert scene.same_description(tt.load(phasor_room(", ".join(map(repr, row)))))
     assert tt.plan(scene, "phasor", pilot=False).renderer(spp=1).frequencies == renderer.frequencies
@@ -270,3 +262,47 @@ def test_an_unknown_plugin_is_not_replaced(key):
     (scene if key == "integrator" else scene["sensor"])[key] = {"type": "transientpath"}
     with pytest.raises(tt.errors.SceneError, match=f"'{key}': expected .* got 'transientpath'"):
         tt.render(tt.load(scene, variant=VARIANT), spp=1)
+
+
+def test_tensors_of_three_rows_are_no_colours_or_points(capfd):
+    """Pixels, voxels and distances arrive as they are, and without a line of nanobind for each kind tried."""
+    rng = np.random.default_rng(0)
+    pixels = rng.random((3, 4, 3), dtype=np.float32)
+    voxels = rng.random((3, 3, 2, 1), dtype=np.float32) - np.float32(0.5)
+    grid = {"type": "gridvolume", "data": voxels, "raw": True}
+    paint = {
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+            "type": "bitmap", "data": pixels, "raw": True}}},
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {
+            "type": "volume", "volume": grid}}},
+        "ball": {"type": "sdfgrid", "grid": torch.from_numpy(voxels)},
+    }  # fmt: skip
+    scene = tt.load({"type": "scene", **paint}, variant=VARIANT)
+    values = {key: info.value for key, info in scene.parameters().items()}
+    assert np.array_equal(np.array(values["wall.bsdf.reflectance.data"]), pixels)
+    assert np.array_equal(np.array(values["floor.bsdf.reflectance.volume.data"]), voxels)
+    assert np.array_equal(np.array(values["ball.grid"]).ravel(), voxels.ravel())
+    assert capfd.readouterr().err == ""
+
+
+def test_files_in_files_count_their_levels(tmp_path):
+    outer = f"<s>{'<b>' * 3}<include filename='d.xml'/>{'</b>' * 3}</s>"
+    (tmp_path / "c.xml").write_text(outer, encoding="utf-8")
+    for levels, deep in ((59, False), (60, True)):
+        (tmp_path / "d.xml").write_text("<b>" * levels + "</b>" * levels, encoding="utf-8")
+        if deep:
+            with pytest.raises(tt.errors.SceneError, match=r"d\.xml: expected elements at most 64 levels deep"):
+                tt.load(tmp_path / "c.xml")
+        else:
+            tt.load(tmp_path / "c.xml")
+
+
+def test_response_curves_of_a_file(xml):
+    """A flat lamp and a flat wall: channels are in the ratio of the areas of their curves."""
+    film = '<film type="transient_hdr_film">'
+    curves = '<spectrum name="far" value="650:0, 700:1, 750:0"/><spectrum name="near" value="400:0, 450:2, 500:0"/>'
+    assert film in SCENE
+    xml.write_text(SCENE.replace(film, film + curves))
+    out = tt.render(tt.load(xml, variant="llvm_ad_spectral"), seed=0, spp=256)
+    assert out.channels == ("far", "near") and out.transient.shape == (2, 24, 3, 4)
+    assert float(out.steady[1].mean() / out.steady[0].mean()) == pytest.approx(2, rel=0.1)

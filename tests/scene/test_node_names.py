@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_rows
 from tools.small_room import VARIANT, make_room
 
 MERGED = """<scene version="3.0.0">
@@ -62,34 +61,9 @@ def test_keys_and_states_are_those_of_another_process(merged_file):
 
 
 @pytest.mark.slow
-def test_a_merged_scene_renders_as_one_that_is_not(room):
-    plain = make_room()
-    box = plain.pop("box")
-    merged = {**plain, "both": {"type": "merge", "box": box, "wall": {**box, "to_world": np.diag([0.1, 0.1, 0.1, 1])}}}
-    scene = tt.load(merged, variant=VARIANT)
-    keys = [key for key in scene.parameters() if key.endswith("vertex_positions")]
-    assert sorted(keys) == ["both_wall.vertex_positions", "box.vertex_positions"]
-    with_key = tt.TransientRenderer(scene, parameters=keys, spp=64)
-    apart = {**plain, "box": box, "other": merged["both"]["wall"]}
-    expected = tt.TransientRenderer(tt.load(apart, variant=VARIANT), spp=64)(seed=0)
-    with torch.no_grad():
-        found = with_key(seed=0)
-    torch.testing.assert_close(found.steady, expected.steady, rtol=0.2, atol=0.02)
-
-
-SHARED = {
-    "bitmap": ({"type": "bitmap", "data": np.full((2, 2, 3), 0.4, np.float32), "raw": True}, "data"),
-    "d65": ({"type": "d65", "scale": 0.4}, "value"),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "named"), long_rows([("bitmap", True), ("bitmap", False), ("d65", True)], [("bitmap", True)])
-)
-def test_shared_textures_that_become_other_objects(kind, named):
+def test_shared_textures_that_become_other_objects():
     """Their keys are no addresses, and the derivative is that of both places together."""
-    texture, key = SHARED[kind]
+    texture = {"type": "bitmap", "data": np.full((2, 2, 3), 0.4, np.float32), "raw": True}
     ref = {"type": "ref", "id": "ours"}
 
     def room(*surfaces, **more):
@@ -103,16 +77,7 @@ def test_shared_textures_that_become_other_objects(kind, named):
         renderer(seed=0).steady.sum().backward()
         return sum(renderer.values[k].grad for k in keys)
 
-    first = {"type": "uniform", "value": 0.2}
-    shared = room(ref, ref, first=first, ours=texture | ({"id": "ours"} if named else {}))
-    apart = room(texture, texture)
-    keys = [f"{name}.bsdf.reflectance.{key}" for name in ("wall", "box")]
-    torch.testing.assert_close(slopes(shared, f"ours.{key}"), slopes(apart, *keys), rtol=1e-4, atol=1e-5)
-
-
-
-
-
-
-
-
+    shared = room(ref, ref, first={"type": "uniform", "value": 0.2}, ours=texture)
+    apart = [f"{name}.bsdf.reflectance.data" for name in ("wall", "box")]
+    expected = slopes(room(texture, texture), *apart)
+    torch.testing.assert_close(slopes(shared, "ours.data"), expected, rtol=1e-4, atol=1e-5)

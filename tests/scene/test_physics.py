@@ -11,7 +11,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_rows
 from tools.small_room import COLOUR, GREY, VARIANT, WALL_POSE, pose
 from torchtransient.errors import PhysicsError, PhysicsWarning
 
@@ -52,7 +51,6 @@ SURFACES = {
         "wall.bsdf.opacity.value",
         "1.5",
     ),
-    "glass": ({"type": "thindielectric", "specular_transmittance": 3.0}, "specular_transmittance.value", "3"),
 }
 
 
@@ -197,18 +195,16 @@ def test_transforms_without_an_inverse(room):
 # -------------------------------------------------------------------------------------------------------------- windows
 
 
-@pytest.mark.parametrize(("start", "side"), long_rows([(9.0, "before"), (4.0, "after")], [(9.0, "before")]))
-def test_a_window_that_misses_the_light(room, start, side):
+def test_a_window_that_misses_the_light(room):
     scene = loaded(room)
-    axis = tt.TimeAxis(start, 0.25, 16)
+    axis = tt.TimeAxis(9.0, 0.25, 16)
     renderer = tt.TransientRenderer(scene, time_axis=axis, spp=64)
     out, messages = said(renderer, seed=0)
     before, after, total = out.stats.energy_before[0], out.stats.energy_after[0], float(out.steady.mean(0).sum())
     missed = (before + after) / total
     assert missed > 0.05
     assert len(messages) == 1 and f"misses {missed:.1%} of the light" in messages[0]
-    share = {"before": before, "after": after}[side] / total
-    assert f"{share:.1%}" in messages[0]
+    assert f"{before / total:.1%}" in messages[0]
     assert said(renderer, seed=1)[1] == []
     with pytest.raises(PhysicsError, match="misses"):
         tt.render(scene, time_axis=axis, spp=64, seed=0, physics="error")

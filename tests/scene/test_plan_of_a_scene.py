@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_rows
 from tools.small_room import WALL_POSE, make_room
 from torchtransient.errors import GradientError, SceneError
 from torchtransient.gates import gates_to_text
@@ -28,10 +27,6 @@ def planned(scene):
     return tt.plan(scene, pilot=False, time_axis="scene")
 
 
-def brighter(room):
-    room["light"]["intensity"] = 11.0
-
-
 def moved(room):
     room["box"]["to_world"] = np.array(room["box"]["to_world"]) + np.eye(4)[:, ::-1] * 1e-3
 
@@ -44,7 +39,7 @@ def other_film(room):
     room["sensor"]["film"]["temporal_bins"] = 25
 
 
-@pytest.mark.parametrize("change", [brighter, moved, without_box, other_film])
+@pytest.mark.parametrize("change", [moved, without_box, other_film])
 def test_a_plan_of_another_scene(change):
     plan, room = planned(make_room()), make_room()
     change(room)
@@ -61,10 +56,9 @@ def test_a_plan_of_another_scene(change):
         make_room,
         lambda: tt.load(make_room()),
         lambda: tt.load(make_room(), variant="llvm_ad_mono"),
-        lambda: copy.deepcopy(tt.load(make_room())),
         lambda: pickle.loads(pickle.dumps(tt.load(make_room(), variant=VARIANT))),
     ],
-    ids=["dictionary", "loaded", "other variant", "copy", "pickle"],
+    ids=["dictionary", "loaded", "other variant", "pickle"],
 )
 def test_the_same_scene_loaded_again(same):
     plan = planned(make_room())
@@ -121,10 +115,7 @@ def test_a_box_that_was_asked_for_stays_one():
         assert plan.renderer(gates=GATES["rectangular gate"]).gates is not None
 
 
-@pytest.mark.parametrize(
-    ("kind", "of_scene"),
-    long_rows([("rectangular gate", True), ("tabulated gate", False)], [("rectangular gate", True)]),
-)
+@pytest.mark.parametrize(("kind", "of_scene"), [("rectangular gate", True), ("tabulated gate", False)])
 def test_gates_without_a_slope_are_refused_at_once(kind, of_scene):
     room, gates = make_room(), GATES[kind]
     settings = {"pilot": False, "gates": None if of_scene else gates}

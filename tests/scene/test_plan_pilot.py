@@ -2,6 +2,7 @@
 
 import json
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import torch
@@ -9,72 +10,24 @@ from click.testing import CliRunner
 
 import torchtransient as tt
 from support import plan_scenes
-from support.marks import long
 from torchtransient.__main__ import main
 from torchtransient.accuracy import two_sample_z_test
-from torchtransient.rendering import films
-from torchtransient.scene.edits import BuildOptions
-from torchtransient.scene.variant import active_variant
 
 VARIANT = "llvm_ad_mono"
 
 
-def pilot_of(scene, seed=0):
-    """The events of a pilot run of a scene."""
-    loaded = tt.load(scene, variant=VARIANT)
-    with active_variant(VARIANT):
-        from torchtransient.plugins.integrators.pilot import pilot_events
-
-        options = BuildOptions(film=films.Histogram(tt.TimeAxis(0.0, 1.0, 1)), transient=True, merge=True)
-        built = loaded.built(options).scene
-        return pilot_events(built, built.integrator(), 0, seed=seed, pixels=256, paths=8192)
-
-
 def means(renderer, count=8, **settings):
     """Image means over all channels of independent renders (K,)."""
-    with torch.no_grad(), active_variant(renderer.scene.variant):
+    with torch.no_grad(), mi.variant_context(renderer.scene.variant):
         steady = [renderer(seed=100 + k, **settings).steady for k in range(count)]
     # Of Stokes vectors the first component is the intensity.
     return np.array([float((s[0] if s.ndim == 4 else s).mean()) for s in steady])
-
-
-# ------------------------------------------------------------------------------------------------------- the events
 
 
 def fog_room():
     fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9}
     ball = {"type": "sphere", "center": [0, 0, 1.5], "bsdf": {"type": "null"}, "interior": fog}
     return plan_scenes.grey_room(ball=ball)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", long(["plates", "fog"], ["fog"]))
-def test_events_have_the_depth_at_which_a_render_gains_them(scene):
-    """Renders of depth 1, 2, 3, ... differ by the events of that depth."""
-    description = tt.scenes.parallel_plates(resolution=2) if scene == "plates" else fog_room()
-    description["integrator"]["type"] = "transient_path" if scene == "plates" else "transient_prbvolpath"
-    runs = [pilot_of(description, seed=k) for k in range(6)]
-    loaded = tt.load(description, variant=VARIANT)
-    for depth in (2, 4):
-        pilots = [float(e.energy[e.depth <= depth].sum()) for e in runs]
-        axis = tt.TimeAxis(0.0, 1000.0, 1)
-        renders = means(tt.TransientRenderer(loaded, max_depth=depth, time_axis=axis), spp=1024)
-        assert two_sample_z_test(np.array(pilots), renders).passed
-
-
-@pytest.mark.slow
-def test_events_arrive_when_a_render_says():
-    description = tt.scenes.integrating_sphere(max_depth=20)
-    axis = tt.TimeAxis(0.0, 2.5, 6)
-    runs = []
-    for k in range(6):
-        e = pilot_of(description, seed=k)
-        kept = e.depth <= 20
-        runs.append(np.histogram(e.opl[kept], bins=axis.edges_opl.numpy(), weights=e.energy[kept])[0])
-    renderer = tt.TransientRenderer(tt.load(description, variant=VARIANT), time_axis=axis)
-    with torch.no_grad():
-        renders = [renderer(seed=k, spp=1024).transient.mean((0, 2, 3)).numpy() for k in range(6)]
-    assert two_sample_z_test(np.array(runs), np.array(renders)).passed
 
 
 # ------------------------------------------------------------------------------------------------------------ depth
@@ -91,17 +44,15 @@ def test_depth_of_a_furnace():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bounces", long([5, 12], [12]))
-def test_a_chain_of_mirrors_is_followed_to_its_end(bounces):
+def test_a_chain_of_mirrors_is_followed_to_its_end():
+    bounces = 12
     scene = plan_scenes.mirror_chain(bounces)
     axis = tt.TimeAxis(0.0, 100.0, 1)
     default = tt.TransientRenderer(tt.load(scene, variant=VARIANT), time_axis=axis)
-    assert (means(default, 1)[0] > 0) == (bounces + 1 <= 6)
+    assert means(default, 1)[0] == 0
     plan = tt.plan(scene)
     assert plan.max_depth == bounces + 1
-    assert any(f"at the scene's own 6 it would be {1 if bounces > 5 else 0}" in line for line in plan.reasons) == (
-        bounces > 5
-    )
+    assert any("at the scene's own 6 it would be 1" in line for line in plan.reasons)
     output = plan.renderer()(seed=0, spp=64)
     assert float(output.steady.mean()) > 0
     length = (bounces + 1.0 - 1.0) * np.sqrt(2)  # half a crossing at both ends
@@ -112,10 +63,7 @@ def test_a_chain_of_mirrors_is_followed_to_its_end(bounces):
 # ----------------------------------------------------------------------------------------------------------- window
 
 
-WINDOWS = ["furnace", "cornell_box", "glass_slab_before_wall", "moving_wall"]
-
-
-@pytest.mark.parametrize("name", long(WINDOWS, WINDOWS[3:]))
+@pytest.mark.parametrize("name", ["moving_wall", pytest.param("cornell_box", marks=pytest.mark.slow)])
 def test_the_window_holds_what_it_promises(name):
     # A wall that moves has a tent, which spreads light beyond its first bin and its last one.
     moving = ["wall.to_world"] if name == "moving_wall" else []
@@ -168,24 +116,11 @@ def test_pulses_widen_the_window():
 
 # ------------------------------------------------------------------------- the same numbers with the cheapest means
 
-SCENES = {
-    "furnace": {"resolution": 4},
-    "integrating_sphere": {"resolution": 4},
-    "parallel_plates": {"resolution": 4},
-    "cornell_box": {"resolution": 4},
-    "etalon_slab": {"resolution": 4},
-    "glass_slab_before_wall": {"resolution": 4},
-    "light_over_plane": {},
-    "moving_wall": {"resolution": 4},
-}
 
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if n > 0 else []) for n, name in enumerate(SCENES)]
-)
+@pytest.mark.parametrize("name", ["furnace", pytest.param("glass_slab_before_wall", marks=pytest.mark.slow)])
 def test_a_plan_renders_what_the_plain_integrator_renders(name):
     """Same depth and window, other variant and integrator: the same image mean."""
-    description = getattr(tt.scenes, name)(**SCENES[name])
+    description = getattr(tt.scenes, name)(resolution=4)
     plan = tt.plan(description, max_depth="scene", time_axis="scene", pilot=False)
     assert plan.integrator == "transient_path"
     assert not plan.variant.endswith("polarized")
@@ -197,7 +132,6 @@ def test_a_plan_renders_what_the_plain_integrator_renders(name):
 # ------------------------------------------------------------------------------------------------------- other films
 
 
-@pytest.mark.slow
 def test_a_medium_is_rendered_without_a_plan_too():
     """effects="auto": a steady integrator becomes the one that the scene's contents call for."""
     scene = fog_room()

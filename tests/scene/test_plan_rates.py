@@ -1,6 +1,5 @@
 """Plans of films of rates: the bins hold the rates and beats of a moving scene, and a scene at rest says that it is."""
 
-
 import pytest
 
 import torchtransient as tt

@@ -15,7 +15,6 @@ from tools.small_room import VARIANT, make_room
 from torchtransient import plugins
 from torchtransient.errors import SceneError
 from torchtransient.plugins import _registry
-from torchtransient.scene import load as module
 
 VERTICES = np.array([(0, 0, 1), (1, 0, 1), (0, 1, 1)], np.float32)
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian", "serialized")
@@ -83,7 +82,7 @@ def test_a_signal_is_named(deadly):
 
 @pytest.mark.slow
 def test_no_answer_is_an_error(deadly, monkeypatch):
-    monkeypatch.setattr(module, "SECONDS", 8.0)
+    monkeypatch.setattr("torchtransient.scene.load.SECONDS", 8.0)
     started = time.perf_counter()
     with pytest.raises(SceneError, match=r"within 8 s, got no answer"):
         tt.load(deadly("never_answers"), variant=VARIANT, trusted=False)

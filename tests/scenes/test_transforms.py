@@ -19,13 +19,9 @@ def matrix_of(transform):
 @pytest.mark.parametrize(
     "ours, theirs",
     [
-        (tf.identity(), lambda t: t),
         (tf.translate([1, -2, 3.5]), lambda t: t.translate([1, -2, 3.5])),
-        (tf.scale(0.3), lambda t: t.scale(0.3)),
         (tf.scale([0.3, 2, -1]), lambda t: t.scale([0.3, 2, -1])),
         (tf.rotate([0, 1, 0], -17), lambda t: t.rotate([0, 1, 0], -17)),
-        (tf.rotate([1, 0, 0], 90), lambda t: t.rotate([1, 0, 0], 90)),
-        (tf.look_at([0, 0, 3.9], [0, 0, 0], [0, 1, 0]), lambda t: t.look_at([0, 0, 3.9], [0, 0, 0], [0, 1, 0])),
         (tf.look_at([1, 2, 3], [-1, 0.5, 2], [0, 0, 2]), lambda t: t.look_at([1, 2, 3], [-1, 0.5, 2], [0, 0, 2])),
         (
             tf.translate([1, 2, 3]) @ tf.rotate([0, 0, 1], 30) @ tf.scale([1, 2, 3]),
@@ -43,12 +39,6 @@ def test_rotation_about_an_oblique_axis():
     axis = np.array([1.0, 2.0, 2.0]) / 3  # Mitsuba expects a unit axis, ours takes any length
     theirs = matrix_of(mi.ScalarTransform4f().rotate(axis.tolist(), 123))
     np.testing.assert_allclose(tf.rotate([10, 20, 20], 123), theirs, rtol=0, atol=1e-6)
-
-
-def test_rotation_is_orthogonal_in_float64():
-    matrix = tf.rotate([0.3, -0.4, 0.5], 77)[:3, :3]
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-15)
-    assert np.isclose(np.linalg.det(matrix), 1.0, rtol=0, atol=1e-15)
 
 
 @together("call, error", [

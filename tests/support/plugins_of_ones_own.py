@@ -1,4 +1,4 @@
-"""Plugins as a user writes them: an integrator through time, one of images, an emitter, a texture and a surface."""
+"""Plugins as a user writes them: an integrator through time, an emitter, a texture and a surface."""
 
 from __future__ import annotations
 
@@ -11,11 +11,6 @@ from torchtransient.plugins.integrators.path import TransientPath
 
 class Walker(TransientPath):
     pass
-
-
-class Flat(mi.SamplingIntegrator):
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        return mi.Color3f(1), mi.Mask(True), []
 
 
 class Spark(mi.Emitter):
@@ -93,7 +88,6 @@ class Paint(mi.BSDF):
 
 
 register("integrator", "walker", Walker)
-register("integrator", "flat", Flat)
 register("emitter", "spark", Spark)
 register("texture", "stripes", Stripes)
 register("bsdf", "paint", Paint)

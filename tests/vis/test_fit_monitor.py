@@ -334,6 +334,13 @@ def test_refused(tmp_path):
         monitor.save(tmp_path / "fit.foo")
     with pytest.raises(ShapeError, match="target's"):
         monitor.step(1.0, TARGET[..., :4])
+    for other in (TARGET[:, :3], types.SimpleNamespace(transient=TARGET, axis=tt.TimeAxis(9.0, 0.5, 4))):
+        seen = tt.vis.FitMonitor({}, target=TARGET, axis=AXIS, every=10, live=False)
+        with pytest.raises(ShapeError, match=r"the target's 4 bins.*monitor\.step\(loss\)"):
+            seen.step(1.0, other, step=3)  # which is not looked at
+    beats = types.SimpleNamespace(beats=torch.ones(1, 2, 4, 5, 6), transient=None)
+    with pytest.raises(ShapeError, match=r"spectra of beats.*monitor\.step\(loss\)"):
+        tt.vis.FitMonitor({}, every=10, live=False).step(1.0, beats, step=3)
     with pytest.raises(ShapeError, match="one number"):
         monitor.step(torch.ones(2))
     with pytest.raises(ArgumentError, match="one number"):

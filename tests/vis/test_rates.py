@@ -85,6 +85,9 @@ def test_beats_and_batches_are_no_times_of_arrival(tmp_path):
     beats = SimpleNamespace(beats=torch.rand(1, 2, 6, 2, 2), steady=torch.ones(1, 2, 2), axis=AXIS, transient=None)
     with pytest.raises(ShapeError, match="beats"):
         tt.vis.rainbow(beats)
+    beats.rates = None
+    with pytest.raises(ShapeError, match=r"without, whose beats tt\.sensing\.range_and_speed reads"):
+        tt.vis.range_doppler(beats)
     batch = SimpleNamespace(rates=torch.stack([light()] * 4), transient=None, polarized=False, axis=AXIS)
     with pytest.raises(ShapeError, match="batch"):
         tt.vis.rainbow(batch)

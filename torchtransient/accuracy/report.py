@@ -132,9 +132,14 @@ class Recommendation:
 
 @dataclass
 class AccuracyReport:
-    """Error against seconds and samples for every quantity and choice. Made by `cost_of_accuracy`.
+    """Error against seconds and samples for every quantity and choice. Made by :func:`cost_of_accuracy`.
 
     ``str(report)`` is `table()`.
+
+    Attributes:
+        points: one entry for each quantity, choice and number of samples.
+        method: how errors were measured.
+        settings: settings of the measurement, by name.
     """
 
     points: list[CostPoint]

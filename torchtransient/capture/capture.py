@@ -30,25 +30,32 @@ _files: list[tuple[ReadsCaptures, WritesCaptures]] = []
 class Capture(TensorRecord):
     """Capture around a corner: light that leaves each sensor point of `scan` towards the sensor's origin.
 
-    Either or both of
+    Args:
+        transient: (C, T, Sy, Sx) real, or (C, T, N) for a list of points or of pairs; exhaustive (C, T, Ly, Lx, Sy,
+            Sx), lists (C, T, M, N). Radiance per joule of the laser, summed over each bin of ``axis``. None with a
+            ``phasor`` alone.
+        axis: time axis of the transient, metres of optical path, counted as the scan's ``first_and_last_leg`` says.
+        scan: points of the capture.
+        metadata: plain data that JSON can hold; names are texts, tuples come back as lists. That of a batch is a list
+            under ``batch``.
+        phasor: complex, the shape of the transient with F frequencies in place of T: radiance times
+            ``exp(-2 pi i nu (opl - start_opl))``.
+        frequencies: frequencies of the phasor, cycles per metre.
+        steady: (C, ...) without the time, all light.
+        channels: names of the C channels.
+        polarized: the four Stokes components come before C in all of them.
 
-    - ``transient``: float32 (C, T, Sy, Sx), or (C, T, N) for a list of points or of pairs; exhaustive
-      (C, T, Ly, Lx, Sy, Sx), lists (C, T, M, N). Radiance per joule of the laser, summed over each bin of ``axis``;
-    - ``phasor``: complex64, the same with F of ``frequencies`` in place of T: radiance times
-      ``exp(-2 pi i nu (opl - start_opl))``.
+    Raises:
+        ShapeError: if tensors, scan and axis do not fit, or nothing was measured.
+        ArgumentError: for other objects.
+        StorageError: for metadata that is not plain.
 
-    ``steady``: (C, ...) without the time, all light. ``polarized``: the four Stokes components come before C in all of
-    them. Other leading dimensions are a batch. ``channels``: names of the C channels. ``metadata``: plain data (data
-    that JSON can hold; names are texts, tuples come back as lists); that of a batch is a list under ``batch``. ``axis``
-    is in metres of optical path, counted as the scan's ``first_and_last_leg`` says.
-
-    Measured arrays of numpy and lists become tensors; arrays keep their numbers' kind, and their memory if possible.
-    Two captures are equal if all but ``metadata`` is.
+    Other leading dimensions are a batch. Measured arrays of numpy and lists become tensors; arrays keep their numbers'
+    kind, and their memory if possible. Two captures are equal if all but ``metadata`` is.
 
     ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in results of renders: they concern the measured
     tensors, and ``detach`` the scan's points too; the scan stays on its device, as the axes do
-    (``capture.scan.to(device)`` moves it). Raises ShapeError if tensors, scan and axis do not fit or nothing was
-    measured, StorageError for metadata that is not plain.
+    (``capture.scan.to(device)`` moves it).
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)

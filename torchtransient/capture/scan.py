@@ -27,21 +27,27 @@ _ASIDE, _BEFORE = 0.25, 0.125
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """The points of a capture around a corner. All lengths in metres; tensors float64.
+    """Points of a capture around a corner. Most scans are made by :meth:`grid` or :meth:`points`.
 
-    ``kind``: "single", one laser spot for all sensor points; "confocal", each sensor point is lit itself;
-    "exhaustive", all pairs of a spot and a sensor point; "pairs", a spot of its own for each sensor point.
-    ``sensor_points``: (Sy, Sx, 3) or a list (N, 3), on the wall. ``laser_points``: (3,) for single, equal to the sensor
-    points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive, in the shape of the sensor points for pairs.
-    ``sensor_normals``, ``laser_normals``: unit normals of the wall in the same shapes, None until they are known.
-    ``sensor_origin``, ``laser_origin``: (3,), where the sensor and the laser stand. ``first_and_last_leg``: whether
-    optical path lengths count from the laser's origin to the sensor's; False, from the spot to the sensor point.
-    ``wall``: Mitsuba's dictionary of the relay wall, None when a scene holds it.
+    Args:
+        kind: "single", one laser spot for all sensor points; "confocal", each sensor point is lit itself; "exhaustive",
+            all pairs of a spot and a sensor point; "pairs", a spot of its own for each sensor point.
+        sensor_points: (Sy, Sx, 3) or a list (N, 3), on the wall, metres, as all lengths.
+        laser_points: (3,) for single, equal to the sensor points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive, in
+            the shape of the sensor points for pairs.
+        sensor_origin, laser_origin: (3,), where the sensor and the laser stand.
+        sensor_normals, laser_normals: unit normals of the wall in the shapes of the points, None until they are known.
+        first_and_last_leg: optical path lengths count from the laser's origin to the sensor's; False: from the spot to
+            the sensor point.
+        wall: Mitsuba's dictionary of the relay wall, None when a scene holds it.
 
-    Points may carry gradients; float64 tensors are kept, not copied: do not change them in place. Frozen and picklable;
-    two scans are equal when all of this is. Most scans are made by :meth:`grid` or :meth:`points`. Raises ShapeError
-    for shapes that do not belong together, UnitError for numbers that are not finite, ArgumentError for an unknown
-    kind, points off the wall and origins behind it.
+    Raises:
+        ShapeError: for shapes that do not belong together.
+        UnitError: for numbers that are not finite.
+        ArgumentError: for an unknown kind, points off the wall and origins behind it.
+
+    Tensors are float64. Points may carry gradients; float64 tensors are kept, not copied: do not change them in place.
+    Frozen and picklable; two scans are equal when all of this is.
     """
 
     kind: str

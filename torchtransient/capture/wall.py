@@ -31,11 +31,18 @@ _MOST_POINTS = 2**32 - 1
 class Wall:
     """Relay wall with coordinates (u, v) in [0, 1]^2, of which (0.5, 0.5) is `center`. Lengths in metres.
 
-    A flat wall is the parallelogram `center + (2u - 1) half_u + (2v - 1) half_v`. On a curved one a point is found by
-    going from that place along `normal` (the mesh's mean normal) to the mesh, from the front. `normal` points into the
-    room that the wall sees. `shape` is the Mitsuba dictionary that a renderer builds it from. Picklable.
-
     Make one with :meth:`plane`, :meth:`mesh` or, of anything that describes a wall, :meth:`of`.
+
+    Attributes:
+        center: (3,), middle of the wall.
+        half_u, half_v: (3,), from the middle to the edges at u = 1 and v = 1. A flat wall is the parallelogram
+            ``center + (2u - 1) half_u + (2v - 1) half_v``.
+        normal: (3,), unit vector into the room that the wall sees. On a curved wall a point is found by going from its
+            place in the parallelogram along the normal (the mesh's mean normal) to the mesh, from the front.
+        shape: Mitsuba dictionary that a renderer builds the wall from.
+        vertices, faces: (V, 3) and (F, 3) of a curved wall, None for a flat one.
+
+    Picklable.
     """
 
     center: Array

@@ -21,9 +21,12 @@ from torchtransient.reconstruction.voxels import VoxelGrid, checked_depths
 
 @dataclass(frozen=True)
 class DepthMap:
-    """``depth`` (..., Y, X) in metres, ``confidence`` (..., Y, X) in [0, 1], and ``mask``, True where it suffices.
+    """Result of :func:`depth_map`.
 
-    The depth is a number everywhere; outside of the mask it means nothing.
+    Attributes:
+        depth: (..., Y, X) metres; a number everywhere, which means nothing outside of the mask.
+        confidence: (..., Y, X) in [0, 1].
+        mask: (..., Y, X), True where the confidence suffices.
     """
 
     depth: Tensor

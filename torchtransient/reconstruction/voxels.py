@@ -24,10 +24,14 @@ OFF_GRID = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlanarScan:
-    """A regular grid of points on a flat wall.
+    """A regular grid of points on a flat wall. Made by :meth:`of`.
 
-    ``size`` (Y, X) points, ``pitch`` (dy, dx) metres apart along the unit vectors ``along_y`` and ``along_x`` from
-    ``first``; ``normal`` points to the hidden side. Vectors are (3,) float64 on the CPU.
+    Attributes:
+        size: (Y, X) points.
+        pitch: (dy, dx) between them, metres.
+        first: (3,), the point (0, 0), metres, float64 on the CPU as all vectors.
+        along_x, along_y: (3,), unit vectors along rows and columns.
+        normal: (3,), unit vector to the hidden side.
     """
 
     size: tuple[int, int]
@@ -176,11 +180,22 @@ ON_ONE_LINE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """Planes of voxels, one behind another. Lengths in metres, vectors (3,) and ``depths`` (Z,) float64 on the CPU.
+    """Planes of voxels, one behind another. Make one with :meth:`before`, :meth:`bounds` or :meth:`of_wall`.
 
-    Voxel (k, j, i) stands at ``first + j pitch[0] along_y + i pitch[1] along_x + depths[k] normal``. ``size``: (Y, X)
-    voxels of a plane, ``pitch``: (dy, dx) between them. ``depths`` increase, not necessarily evenly. Make one with
-    :meth:`before`, :meth:`bounds` or :meth:`of_wall`. Raises ShapeError and UnitError for what is no such grid.
+    Voxel (k, j, i) stands at ``first + j pitch[0] along_y + i pitch[1] along_x + depths[k] normal``.
+
+    Args:
+        depths: (Z,) metres, increasing, not necessarily evenly.
+        size: (Y, X) voxels of a plane.
+        pitch: (dy, dx) between them, metres.
+        first: (3,), the voxel (0, 0) of a plane at depth zero, metres.
+        along_x, along_y, normal: (3,), unit vectors at right angles.
+
+    Raises:
+        ShapeError: for other shapes, and vectors that are no such axes.
+        UnitError: for numbers that are not finite, and depths that do not increase.
+
+    Vectors and depths are float64 on the CPU.
     """
 
     depths: Tensor
@@ -443,18 +458,23 @@ def _wall_axes(scan: Scan, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class HiddenVolume(TensorRecord):
     """A hidden volume as a record of tensors: the result of a method, its voxels, and its settings.
 
-    ``values`` (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` (N,), finite metres of optical path, a
-    film (..., C, N, Z, Y, X). ``directions`` (..., C, 3, Z, Y, X): vectors in world coordinates whose lengths are the
-    values, of methods that find normals. ``method``: its name; ``metadata``: its settings and the reason for it, plain
-    data; that of a batch is a list under ``batch``. Two volumes are equal when all but ``metadata`` is.
-
-    ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as in captures and results of renders: they concern
-    values and directions; grid and times stay on the CPU, and are the same in a batch.
+    Args:
+        values: (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` a film (..., C, N, Z, Y, X).
+        grid: the voxels.
+        method: name of the method.
+        metadata: settings of the method and the reason for it, plain data; that of a batch is a list under ``batch``.
+        times: (N,), finite metres of optical path, None without a film.
+        directions: (..., C, 3, Z, Y, X), vectors in world coordinates whose lengths are the values, of methods that
+            find normals.
 
     Raises:
         ShapeError: where tensors and grid do not fit.
         UnitError: for times that are not finite.
         StorageError: for metadata that is not plain.
+
+    Two volumes are equal when all but ``metadata`` is. ``to``, ``detach``, ``clone``, ``map``, ``stack`` and ``cat`` as
+    in captures and results of renders: they concern values and directions; grid and times stay on the CPU, and are the
+    same in a batch.
     """
 
     notes: ClassVar[tuple[str, ...]] = ("metadata",)

@@ -216,6 +216,10 @@ class Values(Mapping[str, nn.Parameter]):
 
     The value of a key with a parametrization is computed at each access: setting it writes the numbers behind it, and
     operations in place on it (``clamp_``, ``fill_``, ``copy_``) are lost.
+
+    Args:
+        module: the renderer.
+        names: name of the torch parameter of each key.
     """
 
     def __init__(self, module: nn.Module, names: Mapping[str, str]):

@@ -88,7 +88,11 @@ def run(
 
 
 class Session:
-    """Built scene in use by one job, with its recordings and the slots of the job's keys."""
+    """Built scene in use by one job, with its recordings and the slots of the job's keys.
+
+    Args:
+        job: the job, whose keys and options count.
+    """
 
     def __init__(self, job: RenderJob):
         self.job = job
@@ -100,11 +104,19 @@ class Session:
         self.sensors = self.scene.sensors()
 
     def film(self, item: Item) -> Any:
-        """Return the film of an item."""
+        """Return the film of an item.
+
+        Args:
+            item: item of the job.
+        """
         return self.sensors[item.sensor].film()
 
     def entries(self, item: Item) -> int:
-        """Return the number of values behind the pixels of an item's film."""
+        """Return the number of values behind the pixels of an item's film.
+
+        Args:
+            item: item of the job.
+        """
         return math.prod(self.film(item).cube_shape())
 
     def install(self, item: Item, values: Sequence[torch.Tensor], needs: Sequence[bool]) -> list[Any]:

@@ -323,6 +323,9 @@ class ErrorBars:
         It is that of its neighbourhood, the cell of 4 x 4 pixels x 8 bins, or 3 x 3 x 3 bins with ``errors="bins"``
         (3 x 3 pixels of gates and frequencies): single dark bins have seen too few events to know their own.
 
+        Args:
+            steady: of the steady image.
+
         Raises:
             ArgumentError: for a render without ``errors=``.
         """

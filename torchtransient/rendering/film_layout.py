@@ -86,7 +86,11 @@ class FilmLayout(abc.ABC):
         return None
 
     def describe(self, temporal_filter: str) -> str:
-        """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use."""
+        """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use.
+
+        Args:
+            temporal_filter: name of the filter in use, empty for none.
+        """
         return f"{self.argument}={self.settings}"
 
     def over(self, axis: TimeAxis) -> FilmLayout:
@@ -105,7 +109,11 @@ class FilmLayout(abc.ABC):
 
     @classmethod
     def from_arguments(cls, arguments: Mapping[str, Any]) -> Self | None:
-        """Return the film that the keywords of a call ask for, None for another one."""
+        """Return the film that the keywords of a call ask for, None for another one.
+
+        Args:
+            arguments: keywords of the call.
+        """
         value = arguments.get(cls.argument)
         return None if value is None else cls(value)
 
@@ -114,11 +122,18 @@ class FilmLayout(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def from_film(cls, film: Any) -> Self:
-        """Return the settings of a film plugin that ``measures`` this."""
+        """Return the settings of a film plugin that ``measures`` this.
+
+        Args:
+            film: film of a built sensor.
+        """
 
     @classmethod
     def from_properties(cls, props: Any) -> Self | None:
         """Return the settings of a described film node, None where a plan needs none before the scene is built.
+
+        Args:
+            props: properties of the node.
 
         Raises:
             SceneError: for properties that the plugin refuses.
@@ -127,15 +142,27 @@ class FilmLayout(abc.ABC):
 
     @abc.abstractmethod
     def write(self, props: Any) -> None:
-        """Write the settings into the properties of a film node of this plugin."""
+        """Write the settings into the properties of a film node of this plugin.
+
+        Args:
+            props: ``mitsuba.Properties`` of the node, changed in place.
+        """
 
     @classmethod
     def fits(cls, plugin: str) -> bool:
-        """Return whether a film plugin takes the properties that :meth:`write` writes."""
+        """Return whether a film plugin takes the properties that :meth:`write` writes.
+
+        Args:
+            plugin: plugin name.
+        """
         return plugin == cls.plugin
 
     def describes(self, film: FilmInterface) -> bool:
-        """Return whether a built film has these settings."""
+        """Return whether a built film has these settings.
+
+        Args:
+            film: film of a built sensor.
+        """
         return bool(film.measures == self.measures) and self.from_film(film) == self
 
     # ------------------------------------------------------------------------------------------------------ tensors
@@ -154,13 +181,21 @@ class FilmLayout(abc.ABC):
         return cube_channels_first(cube, leading, components)
 
     def tensor(self, output: Any) -> torch.Tensor | None:
-        """Return the film's tensor in an output or a result."""
+        """Return the film's tensor in an output or a result.
+
+        Args:
+            output: ``RenderOutput`` or ``Result``.
+        """
         tensor: torch.Tensor | None = measured(output, self.measures)
         return tensor
 
     @classmethod
     def from_output(cls, output: Any) -> Self | None:
-        """Return the settings that an output or a result has, None where it holds nothing of this film."""
+        """Return the settings that an output or a result has, None where it holds nothing of this film.
+
+        Args:
+            output: ``RenderOutput`` or ``Result``.
+        """
         settings = measured(output, fields(cls)[0].name)
         return None if settings is None or measured(output, cls.measures) is None else cls(settings)
 
@@ -173,17 +208,30 @@ class FilmLayout(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def from_entries(cls, values: Mapping[str, Any]) -> Self | None:
-        """Return the settings that a result file holds, None for a file of another film."""
+        """Return the settings that a result file holds, None for a file of another film.
+
+        Args:
+            values: entries of the file by name.
+        """
 
     # --------------------------------------------------------------------------------------------------- pilot runs
 
     @classmethod
     def seen(cls, film: FilmInterface, arrivals: Arrivals) -> Arrivals:
-        """Return the arrivals of a pilot run, weighted by the response of a built ``film`` at their times."""
+        """Return the arrivals of a pilot run, weighted by the response of a built ``film`` at their times.
+
+        Args:
+            film: film of a built sensor.
+            arrivals: arrivals of the run.
+        """
         return arrivals
 
     def parts(self, arrivals: Arrivals) -> list[Arrivals]:
-        """Return parts of the light of a pilot run; a bound on depth has to keep enough of each."""
+        """Return parts of the light of a pilot run; a bound on depth has to keep enough of each.
+
+        Args:
+            arrivals: arrivals of the run, as the film sees them.
+        """
         return [arrivals]
 
 

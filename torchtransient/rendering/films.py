@@ -7,7 +7,7 @@ Renderer, plan and result files ask the layout and name no film.
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -553,7 +553,7 @@ def layout_of_film(film: Any) -> FilmLayout:
     """
     if not is_time_resolved(film):
         raise SceneError(
-            f"the sensor's film has no time axis; use one of {film_plugins()}, or give "
+            f"the sensor's film has no time axis; use one of {', '.join(kind.plugin for kind in FILMS)}, or give "
             f"{' or '.join(kind.example for kind in FILMS)}."
         )
     for kind in FILMS:
@@ -598,12 +598,3 @@ def layout_of_plugin(plugin: str) -> type[FilmLayout] | None:
         plugin: plugin name.
     """
     return next((kind for kind in FILMS if kind.plugin == plugin), None)
-
-
-def film_plugins(kinds: Sequence[type[FilmLayout]] | None = None) -> str:
-    """Return the names of film plugins, for messages.
-
-    Args:
-        kinds: layouts, all of them by default.
-    """
-    return ", ".join(kind.plugin for kind in (FILMS if kinds is None else kinds))

@@ -23,7 +23,13 @@ SEED_RANGE = 2**32
 
 @dataclass(frozen=True)
 class Item:
-    """One film to fill: entry of the batch, sensor, and seeds of the render and of its derivatives."""
+    """One film to fill.
+
+    Args:
+        entry: entry of the batch.
+        sensor: index of the sensor.
+        seed, grad_seed: seeds of the render and of its derivatives.
+    """
 
     entry: int
     sensor: int
@@ -46,7 +52,11 @@ class Seeding:
     grad_seed: int | str | None
 
     def items(self, seed: Any) -> tuple[Item, ...]:
-        """Return one item for each entry and sensor; ``seed`` is a whole number, or one for each entry."""
+        """Return one item for each entry and sensor; ``seed`` is a whole number, or one for each entry.
+
+        Args:
+            seed: a whole number, or one for each entry.
+        """
         per_entry = len(self.sensors)
         if (number := whole_number(seed)) is not None:
             warn_of_range([number])

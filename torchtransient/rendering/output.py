@@ -63,7 +63,7 @@ class RenderStats:
 
     @classmethod
     def of_job(cls, job: RenderJob, pixels: int) -> RenderStats:
-        """Return the statistics of a job that has run; ``pixels``: number of pixels of each film.
+        """Return the statistics of a job that has run.
 
         Args:
             job: the job, with the log of its runs.
@@ -131,29 +131,36 @@ _OF_FILMS = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RenderOutput(ErrorBars, TensorRecord):
-    """A rendered scene.
+    """A rendered scene. Made by renderers.
 
-    ``steady``: float32 (C, H, W). Beside it, what the film measures, and None for what it does not:
+    Attributes:
+        transient: float32 (C, T, H, W), radiance integrated over each bin of ``axis``, so that its sum over T is
+            ``steady`` as far as the axis reaches. None, as all measurements, if the film measures something else.
+        steady: float32 (C, H, W), light of all times.
+        phasor: complex64 (C, F, H, W), radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of
+            ``frequencies``, so that its value at zero frequency is ``steady``.
+        axis: bins of optical path length of transients, rates and beats, metres.
+        stats: statistics of the render.
+        frequencies: frequencies of phasors, cycles per metre.
+        channels: names of the C channels: 1 in monochromatic variants, the response curves of a film that has some, and
+            otherwise 3 (linear sRGB).
+        gates: gates of ``gated``.
+        gated: float32 (C, G, H, W), the light as each gate sees it; ``steady`` is the sum over the gates.
+        rates: float32 (C, R, T, H, W), the light by the bins of ``rate_axis`` and of ``axis``.
+        beats: float32 (C, 2, T, H, W), expected power spectra of the beat of ``chirps``, up and down, over ``axis``.
+        rate_axis: bins of the rate at which paths get longer, m/s.
+        chirps: chirps of beats.
+        slow_phasor: complex64 (C, S, F, H, W), phasors of ``frequencies`` at each of ``slow_times``.
+        slow_times: times of slow phasors, seconds.
+        others: tensors and settings of films that have no attribute here, by name.
+        differences, squares, steady_differences, cells: (..., T', H', W', R), (..., T', H', W') and (..., H, W, R) of
+            renders with ``errors=``: what independent batches of samples differ by, mean over channels, for
+            :meth:`standard_error` and :meth:`error_map`.
 
-    - ``transient``: float32 (C, T, H, W), radiance integrated over each bin of ``axis``, so that its sum over T is
-      ``steady`` as far as the axis reaches;
-    - ``phasor``: complex64 (C, F, H, W), radiance times ``exp(-2 pi i nu (opl - start_opl))`` for each of
-      ``frequencies``, so that its value at zero frequency is ``steady``;
-    - ``gated``: float32 (C, G, H, W), the light as each of ``gates`` sees it; ``steady`` is the sum over the gates;
-    - ``rates``: float32 (C, R, T, H, W), the light by the bins of ``rate_axis`` (how fast its path gets longer) and of
-      ``axis``;
-    - ``beats``: float32 (C, 2, T, H, W), expected power spectra of the beat of ``chirps``, up and down, over ``axis``;
-    - ``slow_phasor``: complex64 (C, S, F, H, W), phasors of ``frequencies`` at each of ``slow_times``.
-
-    Leading dimensions come in the order (batch, sensor), each present only when asked for. C is 1 in monochromatic
-    variants, the number of response curves of a film that has some, and 3 (linear sRGB) otherwise; ``channels`` holds
-    their names. In polarized variants the Stokes components S0, S1, S2, S3 come before C in all of them, as (4, C, T,
-    H, W), in the sensor's frame: x to the right of the picture, y up, as the sensor sees it. All but ``steady`` are
-    views of the film's own memory with the rows first: ``.contiguous()`` makes a copy in torch's order.
-    ``differences`` (..., T', H', W', R), ``squares`` (..., T', H', W'), ``steady_differences`` (..., H, W, R)
-    and their ``cells``, of renders with ``errors=``: what independent batches of samples differ by, mean over channels,
-    for :meth:`standard_error` and :meth:`error_map`.
-    ``others``: tensors and settings of films that have no attribute here, by name.
+    Leading dimensions come in the order (batch, sensor), each present only when asked for. In polarized variants the
+    Stokes components S0, S1, S2, S3 come before C in all measurements, as (4, C, T, H, W), in the sensor's frame: x to
+    the right of the picture, y up, as the sensor sees it. All but ``steady`` are views of the film's own memory with
+    the rows first: ``.contiguous()`` makes a copy in torch's order.
 
     ``to``, ``cpu``, ``detach``, ``clone`` and ``map`` make copies; ``stack`` and ``cat`` put several together, as
     ``torch.utils.data.default_collate`` does. Torch's pytrees see the tensors.

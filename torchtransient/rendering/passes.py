@@ -115,7 +115,12 @@ class PassSums:
         return PassSums(**{**found, "squares": (even.clone(), odd.clone()), "losses": list(self.losses)})
 
     def add(self, out: RenderOutput, loss: float | None) -> None:
-        """Add a pass, and the value of its loss."""
+        """Add a pass, and the value of its loss.
+
+        Args:
+            out: render of the pass.
+            loss: value of the loss, None without one.
+        """
         measured = self.film.tensor(out)
         assert measured is not None  # a layout finds the tensor of its own film
         bins = _channel_mean(measured, out.steady.ndim - 3, out.polarized)

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
+import torch
+
 from torchtransient import plugins
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.checks import Numbers, arguments_of, as_whole, count, is_one_of, several, shown, text
@@ -19,6 +21,8 @@ from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.gates import Gate
 from torchtransient.pulses import Pulse
 from torchtransient.rendering.arguments import checked_depth, checked_filter, checked_keys, requested_film
+from torchtransient.rendering.error_bars import local_mean
+from torchtransient.rendering.film_layout import measured
 from torchtransient.rendering.films import (
     FILMS,
     Beats,
@@ -30,8 +34,8 @@ from torchtransient.rendering.films import (
     RowsOfHistograms,
     layout_of_plugin,
 )
+from torchtransient.rendering.job import mix_seed
 from torchtransient.rendering.renderer import TransientRenderer
-from torchtransient.rendering.trial_runs import SPP, variances
 from torchtransient.scene.edits import NO_LIMIT, checked_pulse
 from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import cropped, load
@@ -54,8 +58,9 @@ _PATH, _VOLUMES, _REUSE = "transient_path", "transient_prbvolpath", "transient_p
 _TIME_OF_REUSE, _TIME_OF_ELLIPSOIDS = 2.0, 5.0
 # Depth that no path reaches.
 _NO_ROULETTE = 2**30
-# Largest side of the pictures that tell which of them pays.
-_PIXELS = 64
+# Short runs that tell which of them pays: of each renderer, samples per pixel, largest side of the pictures.
+_RUNS, _SPP, _PIXELS = 4, 64, 64
+_SEED = 0x5A4E
 # Nothing is stored in a pilot run: the film only has to be one that integrators take.
 _ANY_AXIS = TimeAxis(0.0, 1.0, 1)
 
@@ -360,17 +365,13 @@ def plan(
         outputs=wanted, film=planned_film.name, filter_is_given=temporal_filter is not None, **kept, **vars(found)
     )
     if inventory.connections == "ellipsoidal" and planned_film.kind is not Gates:
-        result = _with_ordinary_connections(result)
+        reason = "connections: ordinary, in place of the scene's ellipsoidal ones, which are for gates"
+        result = replace(result, connections="ordinary", reasons=(*result.reasons, reason))
     if error == "relative":
         result = _without_roulette(result)
     others = _other_ways(result, error == "relative", inventory.connections is None)
     chooses = integrator is None and pilot
     return _with_least_variance(result, others, error == "relative", seed) if chooses else _without(result, others)
-
-
-def _with_ordinary_connections(given: Plan) -> Plan:
-    reason = "connections: ordinary, in place of the scene's ellipsoidal ones, which are for gates"
-    return replace(given, connections="ordinary", reasons=(*given.reasons, reason))
 
 
 def _without_roulette(given: Plan) -> Plan:
@@ -413,7 +414,7 @@ def _with_least_variance(
     for name, changes, time in others:
         try:
             renderers = [p.renderer(physics="ignore") for p in (small, replace(small, **changes))]
-            plain, less = variances(renderers[0], renderers[1], seed, relative)
+            plain, less = _variances(renderers[0], renderers[1], seed, relative)
         except SceneError as error:
             found[name] = str(error)
             continue
@@ -426,7 +427,7 @@ def _with_least_variance(
             best, used, chosen = gain, name, replace(given, **changes)
         kind = "relative variance" if relative else "variance"
         found[name] = (
-            f"the {kind} with {SPP} samples per pixel is {less:.2g} with it and {plain:.2g} without, and it takes up "
+            f"the {kind} with {_SPP} samples per pixel is {less:.2g} with it and {plain:.2g} without, and it takes up "
             f"to {time:g} times the time"
         )
     reasons += [f"{name}: {'used' if name == used else 'not used'}; {why}" for name, why in found.items()]
@@ -434,6 +435,28 @@ def _with_least_variance(
         reasons = [line for line in reasons if not line.startswith("integrator: ")]
         reasons.append(f"integrator: {chosen.integrator}, see path reuse")
     return replace(chosen, reasons=tuple(reasons))
+
+
+def _variances(one: TransientRenderer, other: TransientRenderer, seed: int, relative: bool) -> tuple[float, float]:
+    """Return the mean variance of bins or gates of two renderers of one scene.
+
+    ``relative``: over the squared mean of a bin and its neighbours, and 1 % of the mean over all; gates have neighbours
+    in the picture alone.
+    """
+    runs = _runs(one, mix_seed(seed, _SEED)), _runs(other, seed)
+    size = torch.ones(())
+    if relative:
+        near = local_mean(torch.cat(runs).mean(0), (-3, -2, -1) if one.film.has_bins else (-2, -1))
+        size = near.square() + (0.01 * near.mean()).square()
+    found = [float((x.var(0) / size).mean()) for x in runs]
+    return found[0], found[1]
+
+
+def _runs(renderer: TransientRenderer, seed: int) -> torch.Tensor:
+    """Return the bins of some renders, means over channels, (runs, T, H, W)."""
+    with torch.no_grad():
+        outputs = (renderer(seed=mix_seed(seed, run), spp=_SPP) for run in range(_RUNS))
+        return torch.stack([measured(out, renderer.film.measures).mean(0) for out in outputs])
 
 
 def known_outputs() -> tuple[str, ...]:

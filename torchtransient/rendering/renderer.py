@@ -197,8 +197,10 @@ class TransientRenderer(CopiesParametrized):
             # Made for the gates of the plan.
             changes["connections"] = effects.connections if film is effects.film_choice else None
         self.sampler = checked_sampler(sampler)
-        self._options = self._build_options(max_depth, changes)
-        self._infos = self._parameter_infos()
+        options = BuildOptions(transient=True, max_depth=checked_depth(max_depth), **changes)
+        self._options = self.scene.options_for(self._keys, options)
+        table = self.scene.parameters() if self._keys else {}
+        self._infos: dict[str, ParameterInfo] = {key: table[key] for key in self._keys}
         with active_variant(self.scene.variant):
             self._read_scene(0 if sensors is None else sensors)
             if isinstance(effects, Effects):
@@ -210,19 +212,6 @@ class TransientRenderer(CopiesParametrized):
             self.register_parameter(self._names[key], nn.Parameter(start[key]))
 
     # --------------------------------------------------------------------------------------------------- set-up
-
-    def _build_options(self, max_depth: int | None, changes: dict[str, Any]) -> BuildOptions:
-        options = BuildOptions(transient=True, max_depth=checked_depth(max_depth), **changes)
-        return self.scene.options_for(self._keys, options)
-
-    def _check_sampler(self, plugin: str) -> None:
-        warning = correlation_warning(plugin)
-        if warning:
-            self._watch.warn(f"sampler {plugin}", f"{plugin!r}: {warning}.", is_error=False)
-
-    def _parameter_infos(self) -> dict[str, ParameterInfo]:
-        table = self.scene.parameters() if self._keys else {}
-        return {key: table[key] for key in self._keys}
 
     def _read_scene(self, sensors: int | Sequence[int] | str) -> None:
         """Read sensors, axis, film and samples off the built scene."""
@@ -241,7 +230,9 @@ class TransientRenderer(CopiesParametrized):
         self._channels = tuple(films[0].channel_names())
         sampler = engine.sampler_of(built.scene, found[self._sensors[0]], self.sampler)
         self._scene_spp = int(sampler.sample_count())
-        self._check_sampler(sampler_plugin(sampler))
+        plugin = sampler_plugin(sampler)
+        if warning := correlation_warning(plugin):
+            self._watch.warn(f"sampler {plugin}", f"{plugin!r}: {warning}.", is_error=False)
         self._counts = {self._scene_spp: self._scene_spp}
         self._pulsed = all(film.pulses for film in films)
         self._response = response_of(films)

@@ -18,9 +18,13 @@ MOST_THREADS = 1024
 
 @dataclass(frozen=True)
 class Threads:
-    """Numbers of threads in use, the calling one included: ``torch``'s for one operation, ``drjit``'s for one kernel.
+    """Numbers of threads in use, the calling one included. Returned by :func:`threads`.
 
     As a context manager it puts back the counts from before its call of :func:`threads`.
+
+    Attributes:
+        torch: threads of an operation of torch.
+        drjit: threads of a kernel of Dr.Jit.
     """
 
     torch: int

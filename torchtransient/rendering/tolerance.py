@@ -389,7 +389,8 @@ def render_to_tolerance(
         UnitError: if ``max_spp`` is less than a pass.
         ShapeError: for a mask of another shape, and a loss that is no scalar.
     """
-    state = _begin(sums, request) if resume is None else _goes_on(resume, sums, request)
+    first = ToleranceState(sums, request, _FIRST_LOOK, 0, False)
+    state = first if resume is None else _goes_on(resume, sums, request)
     if request.max_spp is not None and request.max_spp < sums.batch_spp:
         raise UnitError(
             f"max_spp: expected at least the {sums.batch_spp} samples per pixel of one pass, got {request.max_spp}; "
@@ -404,10 +405,6 @@ def render_to_tolerance(
         if bar is not None:
             bar.close()
     return loop.result(reason)
-
-
-def _begin(sums: PassSums, request: Request) -> ToleranceState:
-    return ToleranceState(sums, request, _FIRST_LOOK, 0, False)
 
 
 def _goes_on(resume: ToleranceResult, new: PassSums, request: Request) -> ToleranceState:

@@ -33,8 +33,12 @@ _SIZES = ("width", "height", "crop_width", "crop_height")
 
 
 def check_nodes(state: Any) -> None:
-    """Raise ``SceneError`` for nodes nested too deeply, and for numbers of samples and sizes of films below one."""
-    check_nesting(state)
+    """Raise ``SceneError`` for nodes nested too deeply, and for numbers of samples and sizes of films below one.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
+    _check_nesting(state)
     for node in state.nodes:
         if node_kind(node) == "Sampler":
             _check_whole(node, "sample_count")
@@ -61,7 +65,7 @@ def _name(node: Any) -> str:
     return f"{name!r} ({plugin})" if name else plugin
 
 
-def check_nesting(state: Any) -> None:
+def _check_nesting(state: Any) -> None:
     """Raise ``SceneError`` for nodes inside of nodes more than 32 deep, and for surfaces of more than 256 nodes.
 
     Each node of a surface counts as often as it is reached. Circles of references are left to Mitsuba, which names
@@ -106,7 +110,11 @@ def _size(node: Any, inside: int) -> int:
 
 
 def check_finite(state: Any) -> None:
-    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite."""
+    """Raise ``SceneError`` with the keys of all numbers of a parsed scene that are NaN or infinite.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     bad: dict[str, str] = {}
     waiting, seen, by_id = [(state.root, "")], set(), state.id_to_index
     while waiting:
@@ -137,6 +145,9 @@ def check_mesh_files(state: Any) -> None:
 
     Mitsuba reads memory beyond the vertices for such faces, and a pipe without an end. Called where Mitsuba finds the
     files; files that cannot be read are left to Mitsuba.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
     """
     import mitsuba as mi
 
@@ -182,7 +193,11 @@ def _file_state(path: str, plugin: str, given: dict[str, Any]) -> tuple[Any, ...
 
 
 def check_meshes(objects: Any) -> None:
-    """Raise ``SceneError`` for faces without vertices of loaded meshes, those of loaded scenes included."""
+    """Raise ``SceneError`` for faces without vertices of loaded meshes, those of loaded scenes included.
+
+    Args:
+        objects: loaded objects and scenes of a description.
+    """
     import mitsuba as mi
 
     for one in objects:
@@ -221,12 +236,18 @@ _END = re.compile(rb"^end_header\s*?\n", re.MULTILINE)
 Element = tuple[str, int, list[tuple[str, str, bool]]]
 
 
-def smallest_vertex(path: str) -> int:
+def _smallest(path: str) -> int:
     """Return the smallest vertex number of the faces of a PLY file; 0 where none is negative.
 
     Mitsuba reads negative numbers as 0. It has read the file before: all faces are triangles.
     """
-    data = Path(path).read_bytes()
+    try:
+        return _smallest_vertex(Path(path).read_bytes())
+    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
+        return 0
+
+
+def _smallest_vertex(data: bytes) -> int:
     end = _END.search(data)
     if end is None:
         return 0
@@ -279,10 +300,3 @@ def _rows(
         rows[name] = numbers[:, column : column + 3] if listed else numbers[:, column]
         column += 3 if listed else 1
     return rows
-
-
-def _smallest(path: str) -> int:
-    try:
-        return smallest_vertex(path)
-    except (ValueError, LookupError):  # a form of header that Mitsuba reads and this library does not
-        return 0

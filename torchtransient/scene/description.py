@@ -30,7 +30,14 @@ _MOST_INCLUDES = 16
 
 @dataclass(frozen=True)
 class XmlDescription(Description):
-    """XML file: path, text at the time of loading, and values of its ``$parameters``."""
+    """XML file: path, text at the time of loading, and values of its ``$parameters``.
+
+    Args:
+        path: path of the file.
+        text: its text at the time of loading.
+        parameters: names and values of its ``$parameters``.
+        motions: velocities of bodies, in place of described ones.
+    """
 
     path: str
     text: str
@@ -43,7 +50,11 @@ class XmlDescription(Description):
         return self.path
 
     def parse(self, config: Any) -> Any:
-        """Return Mitsuba's parser state of the text at the time of loading; the file may have changed since."""
+        """Return Mitsuba's parser state of the text at the time of loading; the file may have changed since.
+
+        Args:
+            config: ``mitsuba.parser.ParserConfig`` of the variant.
+        """
         import mitsuba as mi
 
         path = Path(self.path)
@@ -64,7 +75,13 @@ class XmlDescription(Description):
 
 @dataclass(frozen=True)
 class DictDescription(Description):
-    """Scene dictionary as plain data: strings, numbers, lists, and numpy arrays for transforms and pixels."""
+    """Scene dictionary as plain data: strings, numbers, lists, and numpy arrays for transforms and pixels.
+
+    Args:
+        tree: the dictionary.
+        folder: folder that was current when the scene was loaded.
+        motions: velocities of bodies, in place of described ones.
+    """
 
     tree: dict[str, Any]
     folder: str
@@ -81,7 +98,11 @@ class DictDescription(Description):
         return objects_inside(self.tree)
 
     def parse(self, config: Any) -> Any:
-        """Return Mitsuba's parser state."""
+        """Return Mitsuba's parser state.
+
+        Args:
+            config: ``mitsuba.parser.ParserConfig`` of the variant.
+        """
         import mitsuba as mi
 
         state = parsed(config, self.tree)
@@ -124,7 +145,11 @@ def _search_path(folder: str) -> Iterator[None]:
 
 
 def same_description(a: SceneDescription, b: SceneDescription) -> bool:
-    """Return whether two descriptions are of one scene: equal values, and files looked up in the same places."""
+    """Return whether two descriptions are of one scene: equal values, and files looked up in the same places.
+
+    Args:
+        a, b: the descriptions.
+    """
     if isinstance(a, LoadedScene) and isinstance(b, LoadedScene):
         return a.scene is b.scene
     if not isinstance(a, DictDescription) or not isinstance(b, DictDescription):
@@ -246,7 +271,14 @@ def _xml_value(key: str, value: Any) -> str:
 
 
 def describe_dict(scene: Mapping[str, Any]) -> DictDescription:
-    """Reduce a scene dictionary to plain data. Raises ``SceneError`` for entries that cannot be described."""
+    """Reduce a scene dictionary to plain data.
+
+    Args:
+        scene: the dictionary.
+
+    Raises:
+        SceneError: for entries that cannot be described.
+    """
     tree = _to_plain(scene, "", MOST_LEVELS)
     if tree.get("type") != "scene":
         raise SceneError(f"tt.load: expected a dictionary with 'type': 'scene', got 'type': {tree.get('type')!r}.")

@@ -121,13 +121,25 @@ class FilmRequest(Protocol):
         """The film spreads arrivals by a pulse."""
 
     def describes(self, film: Any) -> bool:
-        """Return whether a built film has the properties."""
+        """Return whether a built film has the properties.
+
+        Args:
+            film: a built film.
+        """
 
     def fits(self, plugin: str) -> bool:
-        """Return whether a film plugin takes the properties."""
+        """Return whether a film plugin takes the properties.
+
+        Args:
+            plugin: name of a film plugin.
+        """
 
     def write(self, props: Any) -> None:
-        """Write the properties into those of a film node."""
+        """Write the properties into those of a film node.
+
+        Args:
+            props: ``mitsuba.Properties`` of the node.
+        """
 
 
 @dataclass(frozen=True)
@@ -232,7 +244,11 @@ def _loaded_child(node: Any, kind: type) -> str | None:
 
 
 def forget_queries(state: Any) -> None:
-    """Mark all properties of a parsed scene as unread: looking at one counts as use, and hides misspelt ones."""
+    """Mark all properties of a parsed scene as unread: looking at one counts as use, and hides misspelt ones.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     for node in state.nodes:
         for key in list(node.props.keys()):
             node.props.mark_queried(key, False)
@@ -336,13 +352,22 @@ def _traced(state: Any, index: int) -> int:
 
 
 def described_depth(state: Any, index: int) -> Any:
-    """Return ``max_depth`` of the integrator at node ``index``, or the plugin's default; -1 for no limit."""
+    """Return ``max_depth`` of the integrator at node ``index``, or the plugin's default; -1 for no limit.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        index: index of the node of an integrator.
+    """
     props = state.nodes[_traced(state, index)].props
     return props.get("max_depth", _DEPTHS.get(props.plugin_name(), _DEPTH_IN_PYTHON))
 
 
 def built_depth(integrator: Any) -> int | None:
-    """Return ``max_depth`` of a built integrator, -1 for no limit; None for one without."""
+    """Return ``max_depth`` of a built integrator, -1 for no limit; None for one without.
+
+    Args:
+        integrator: a built integrator.
+    """
     depth = getattr(integrator, "max_depth", None)
     return None if depth is None else NO_LIMIT if int(depth) % 2**32 == 2**32 - 1 else int(depth)
 
@@ -543,12 +568,20 @@ def _check_silhouettes(props: Any) -> None:
 
 
 def printed_properties(plugin: Any) -> dict[str, str]:
-    """Return the properties that a plugin of Mitsuba prints, by name."""
+    """Return the properties that a plugin of Mitsuba prints, by name.
+
+    Args:
+        plugin: a built plugin.
+    """
     return dict(re.findall(r"^ *(\w+) = ([^\n,\[]+),?$", str(plugin), flags=re.MULTILINE))
 
 
 def pixel_format(film: Any) -> str:
-    """Return ``pixel_format`` of a built ``hdrfilm``; file format and variant may have replaced the described one."""
+    """Return ``pixel_format`` of a built ``hdrfilm``; file format and variant may have replaced the described one.
+
+    Args:
+        film: a built ``hdrfilm``.
+    """
     printed = printed_properties(film)["pixel_format"].strip()
     return _PRINTED.get(printed, printed)
 
@@ -556,7 +589,15 @@ def pixel_format(film: Any) -> str:
 
 
 def checked_pulse(name: str, value: Any) -> Pulse | None:
-    """Return a pulse of a call, or None. Raises ``ArgumentError`` for other objects."""
+    """Return a pulse of a call, or None.
+
+    Args:
+        name: name of the argument, for the message.
+        value: value of the argument.
+
+    Raises:
+        ArgumentError: for other objects.
+    """
     if value is None or isinstance(value, Pulse):
         return value
     raise ArgumentError(

@@ -53,7 +53,12 @@ _FLAT_SHAPES = ("rectangle", "disk")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a scene contains, and the label of its node: plugin, name and place in the file."""
+    """Something that a scene contains, and the label of its node: plugin, name and place in the file.
+
+    Args:
+        what: description of the finding.
+        where: label of its node.
+    """
 
     what: str
     where: str
@@ -119,7 +124,7 @@ def scene_inventory(scene: Scene, sensor: int = 0) -> SceneInventory:
     Raises:
         SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
     """
-    return _parsed(scene, "tt.plan", lambda state: take_inventory(state, _resolved, sensor))
+    return _parsed(scene, "tt.plan", lambda state: _take_inventory(state, sensor))
 
 
 def _parsed(scene: Scene, what: str, read: Callable[[Any], _Found]) -> _Found:
@@ -146,26 +151,23 @@ def _parsed(scene: Scene, what: str, read: Callable[[Any], _Found]) -> _Found:
 def described_samplers(scene: Scene) -> list[str | None]:
     """Return what names the sampler of each sensor of a scene, None for a sensor without one.
 
+    Args:
+        scene: the scene.
+
     Raises:
         SceneError: for a scene that Mitsuba cannot parse, and for one with loaded objects.
     """
-    return _parsed(scene, "recipe", samplers_of)
+    return _parsed(scene, "recipe", _samplers_of)
 
 
 def _resolved(name: str) -> Path:
+    """Return the path of a file as Mitsuba finds it."""
     import mitsuba as mi
 
     return Path(str(mi.file_resolver().resolve(name)))
 
 
-def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -> SceneInventory:
-    """Return the contents of a parsed scene.
-
-    Args:
-        state: ``mitsuba.parser.ParserState``.
-        lookup: function of a file's name that finds its path as Mitsuba does.
-        sensor: index of the sensor whose film is described.
-    """
+def _take_inventory(state: Any, sensor: int) -> SceneInventory:
     inventory = SceneInventory(moves=has_velocities(state))
     order = reachable(state, rendered_children(state))
     _note_unused(inventory, state, set(order))
@@ -176,10 +178,10 @@ def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -
         inventory.plugins.add(plugin)
         _note_physics(inventory, state, index, surfaces_of_interfaces)
         if index != 0 and not is_film(node):
-            _note_colours(inventory, state, index, lookup)
+            _note_colours(inventory, state, index)
         _note_bands(inventory, state, node)
     _note_film(inventory, state, order, sensor)
-    samplers = samplers_of(state)
+    samplers = _samplers_of(state)
     inventory.sampler = samplers[sensor] if sensor < len(samplers) else None
     _note_integrator(inventory, state)
     _note_albedo(inventory, state, order)
@@ -188,7 +190,11 @@ def take_inventory(state: Any, lookup: Callable[[str], Path], sensor: int = 0) -
 
 
 def like_mitsuba(plugin: str) -> str:
-    """Return the plugin of Mitsuba that one of this library stands in for: ``dielectric`` for ``diff_dielectric``."""
+    """Return the plugin of Mitsuba that one of this library stands in for: ``dielectric`` for ``diff_dielectric``.
+
+    Args:
+        plugin: plugin name.
+    """
     name = plugin.removeprefix(_TWIN)
     return name.replace("rough_", "rough")
 
@@ -217,10 +223,10 @@ def _note_physics(inventory: SceneInventory, state: Any, index: int, interfaces:
         interfaces.append(index)
 
 
-def _note_colours(inventory: SceneInventory, state: Any, index: int, lookup: Callable[[str], Path]) -> None:
+def _note_colours(inventory: SceneInventory, state: Any, index: int) -> None:
     node = state.nodes[index]
     where = node_label(state, index)
-    found = [_node_colour(node, lookup)]
+    found = [_node_colour(node)]
     found += [_value_colour(node, key, value) for key, value in node.props.items()]
     for verdict in found:
         if verdict is not None and verdict.kind == COLOUR:
@@ -261,7 +267,7 @@ def _sensors(state: Any) -> list[Any]:
     return [state.nodes[index] for index in rendered_children(state) if node_kind(state.nodes[index]) == "Sensor"]
 
 
-def samplers_of(state: Any) -> list[str | None]:
+def _samplers_of(state: Any) -> list[str | None]:
     """Return what names the sampler of each sensor of a parsed scene: the integrator, or the sensor; None for neither.
     """
     of_integrator = _sampler_of_integrator(state)
@@ -409,14 +415,14 @@ _COLOURED_PLUGINS = {
 
 
 @dataclass(frozen=True)
-class Verdict:
+class _Verdict:
     """Colour of a value or plugin: ``kind`` COLOUR or MEASURED, and the property or plugin that has it."""
 
     kind: str
     why: str
 
 
-def _value_colour(node: Any, key: str, value: Any) -> Verdict | None:
+def _value_colour(node: Any, key: str, value: Any) -> _Verdict | None:
     """Return the colour of one property; None for grey and for values that are no spectrum."""
     import mitsuba as mi
 
@@ -425,9 +431,9 @@ def _value_colour(node: Any, key: str, value: Any) -> Verdict | None:
         return None
     if kind == mi.Properties.Type.Color:
         three = [float(value[c]) for c in range(3)]
-        return None if three[0] == three[1] == three[2] else Verdict(COLOUR, f"coloured {key}")
+        return None if three[0] == three[1] == three[2] else _Verdict(COLOUR, f"coloured {key}")
     if kind == mi.Properties.Type.Spectrum and not _constant(value):
-        return Verdict(MEASURED, f"{key} given over wavelength")
+        return _Verdict(MEASURED, f"{key} given over wavelength")
     return None
 
 
@@ -440,62 +446,62 @@ def _constant(spectrum: Any) -> bool:
     return covers and min(values) == max(values)
 
 
-def _node_colour(node: Any, lookup: Callable[[str], Path]) -> Verdict | None:
+def _node_colour(node: Any) -> _Verdict | None:
     """Return the colour of a plugin itself: tables of materials, pictures, grids, plugins with colours of their own."""
     import mitsuba as mi
 
     props, plugin = node.props, node.props.plugin_name()
     if plugin in _MEASURED_PLUGINS:
-        return Verdict(MEASURED, _MEASURED_PLUGINS[plugin])
+        return _Verdict(MEASURED, _MEASURED_PLUGINS[plugin])
     if plugin in _COLOURED_PLUGINS:
-        return Verdict(COLOUR, _COLOURED_PLUGINS[plugin])
+        return _Verdict(COLOUR, _COLOURED_PLUGINS[plugin])
     if plugin in ("conductor", "roughconductor", "diff_conductor", "diff_rough_conductor"):
         material = str(props.get("material", "none"))
-        return None if material.lower() == "none" else Verdict(MEASURED, f"indices of {material!r} over wavelength")
+        return None if material.lower() == "none" else _Verdict(MEASURED, f"indices of {material!r} over wavelength")
     if plugin == "delayed" and any(key in props for key in ("emission", "excitation")):
-        return Verdict(MEASURED, "re-emission at other wavelengths")
+        return _Verdict(MEASURED, "re-emission at other wavelengths")
     if plugin in ("bitmap", "envmap"):
-        return _picture(props, lookup)
+        return _picture(props)
     if plugin == "gridvolume":
-        return _grid(props, lookup)
+        return _grid(props)
     if plugin in (*_TRANSPARENT, *OWN_BSDFS) or node.type in (mi.ObjectType.Integrator, mi.ObjectType.Sampler):
         return None
-    return None if is_integrator(node) else Verdict(COLOUR, f"{plugin!r}, whose colours are not known here")
+    return None if is_integrator(node) else _Verdict(COLOUR, f"{plugin!r}, whose colours are not known here")
 
 
-def _picture(props: Any, lookup: Callable[[str], Path]) -> Verdict | None:
+def _picture(props: Any) -> _Verdict | None:
     import mitsuba as mi
 
     for key in ("bitmap", "data"):
         if key in props:
-            return None if _grey(np.array(props[key])) else Verdict(COLOUR, "coloured picture")
+            return None if _grey(np.array(props[key])) else _Verdict(COLOUR, "coloured picture")
     name = str(props.get("filename", ""))
-    path = lookup(name)
+    path = _resolved(name)
     if not path.is_file():
-        return Verdict(COLOUR, f"picture {name!r}, which was not found")
+        return _Verdict(COLOUR, f"picture {name!r}, which was not found")
     if path.stat().st_size > _PIXELS_WORTH_READING:
-        return Verdict(COLOUR, f"picture {name!r}, taken as coloured without a look at its pixels")
+        return _Verdict(COLOUR, f"picture {name!r}, taken as coloured without a look at its pixels")
     try:
         with threads_for_files():
             pixels = np.array(mi.Bitmap(str(path)))
     except (RuntimeError, ValueError):
-        return Verdict(COLOUR, f"picture {name!r}, which cannot be read")
-    return None if _grey(pixels) else Verdict(COLOUR, f"coloured picture {name!r}")
+        return _Verdict(COLOUR, f"picture {name!r}, which cannot be read")
+    return None if _grey(pixels) else _Verdict(COLOUR, f"coloured picture {name!r}")
 
 
-def _grid(props: Any, lookup: Callable[[str], Path]) -> Verdict | None:
+def _grid(props: Any) -> _Verdict | None:
     for key in ("grid", "data"):
         if key in props:
             values = np.array(props[key])
-            return None if values.ndim < 4 or _grey(values) else Verdict(COLOUR, "coloured grid")
+            return None if values.ndim < 4 or _grey(values) else _Verdict(COLOUR, "coloured grid")
     name = str(props.get("filename", ""))
-    path = lookup(name)
+    path = _resolved(name)
     channels = 3
     if path.is_file():
         # "VOL", version, encoding, three sizes, channels: little-endian 32-bit integers after the first four bytes.
         head = path.open("rb").read(24)
         channels = struct.unpack("<i", head[20:24])[0] if head[:3] == b"VOL" and len(head) == 24 else 3
-    return None if channels == 1 else Verdict(COLOUR, f"grid {name!r} with {channels} channels")
+    return None if channels == 1 else _Verdict(COLOUR, f"grid {name!r} with {channels} channels")
 
 
 def _grey(pixels: np.ndarray) -> bool:

@@ -39,6 +39,10 @@ class Scene:
 
     Pickles hold the description alone; copies share everything, since instances are immutable. A scene with loaded
     objects of Mitsuba (:func:`load`) stays in their variant and process.
+
+    Args:
+        description: source of the scene.
+        variant: name of a variant, None to settle it at the first use.
     """
 
     def __init__(self, description: SceneDescription, variant: str | None):
@@ -507,6 +511,10 @@ def cropped(scene: Scene, pixels: int) -> Scene:
     """Return a scene with films cropped to at most ``pixels`` along each side, about their middle.
 
     Films of sensors that place each pixel themselves, and loaded ones, keep their size.
+
+    Args:
+        scene: the scene.
+        pixels: largest number of pixels along a side.
     """
     return Scene(_Cropped(scene._description, pixels), scene.variant)  # type: ignore[arg-type]
 

@@ -20,7 +20,14 @@ _BODIES = ("shape", "emitter", "sensor", "medium")
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """Velocity of a body, as numbers: metres, seconds and radians, in the world."""
+    """Velocity of a body, as numbers: metres, seconds and radians, in the world.
+
+    Args:
+        of: name of the body.
+        linear: velocity of ``center``, m/s.
+        angular: axis of rotation times angular speed, rad/s.
+        center: point on the axis, metres.
+    """
 
     of: str
     linear: tuple[float, float, float]
@@ -29,7 +36,15 @@ class BodyMotion:
 
 
 def body_motions(motions: Mapping[str, Any]) -> list[BodyMotion]:
-    """Return motions as numbers. Raises ArgumentError for anything but motions."""
+    """Return motions as numbers.
+
+    Args:
+        motions: a :class:`torchtransient.Motion` by the name of each body.
+
+    Raises:
+        ArgumentError: for anything but motions.
+        GradientError: for motions with gradients.
+    """
     found = []
     for name, motion in motions.items():
         if not all(hasattr(motion, part) for part in ("linear", "angular", "center")):
@@ -132,12 +147,20 @@ def _motions_of(state: Any, node: Any) -> list[tuple[str, int]]:
 
 
 def moved_names(state: Any) -> set[str]:
-    """Return the names of the bodies of a parsed scene that motions and volumes of velocities refer to."""
+    """Return the names of the bodies of a parsed scene that motions and volumes of velocities refer to.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     rigid = {node.props.get("of", "") for node in state.nodes if node.props.plugin_name() == PLUGIN}
     named = [node.props.id() for node in state.nodes if _is_volume(node)]
     return rigid | {name.removesuffix(f".{CHILD}") for name in named if name.endswith(f".{CHILD}")}
 
 
 def has_velocities(state: Any) -> bool:
-    """Return True if some body of a parsed scene has a velocity."""
+    """Return True if some body of a parsed scene has a velocity.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     return bool(moved_names(state)) or any(VELOCITY in node.props for node in state.nodes)

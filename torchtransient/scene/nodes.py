@@ -46,12 +46,23 @@ def children(state: Any, node: Any, by_id: Mapping[str, int] | None = None) -> l
 
 
 def find_child(state: Any, node: Any, matches: Callable[[Any], bool]) -> int | None:
-    """Return the index of the first child for which ``matches(node)`` is true, None without one."""
+    """Return the index of the first child for which ``matches(node)`` is true, None without one.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        node: one of its nodes.
+        matches: function of a node.
+    """
     return next((index for _, index in children(state, node) if matches(state.nodes[index])), None)
 
 
 def reachable(state: Any, starts: list[int]) -> list[int]:
-    """Return the indices of ``starts`` and of all nodes below them, through children and references, each once."""
+    """Return the indices of ``starts`` and of all nodes below them, through children and references, each once.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        starts: indices of nodes.
+    """
     seen: dict[int, None] = {}
     waiting, by_id = list(reversed(starts)), state.id_to_index
     while waiting:
@@ -63,17 +74,30 @@ def reachable(state: Any, starts: list[int]) -> list[int]:
 
 
 def descendants(state: Any, node: Any) -> list[Any]:
-    """Return the nodes below a node, each once."""
+    """Return the nodes below a node, each once.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        node: one of its nodes.
+    """
     return [state.nodes[index] for index in reachable(state, [index for _, index in children(state, node)])]
 
 
 def rendered_children(state: Any) -> list[int]:
-    """Return the children of the scene that matter even when nothing refers to them."""
+    """Return the children of the scene that matter even when nothing refers to them.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     return [index for _, index in children(state, state.root) if node_kind(state.nodes[index]) not in _DECLARATIONS]
 
 
 def has_media(state: Any) -> bool:
-    """Return whether a shape, sensor or emitter that is rendered has a participating medium."""
+    """Return whether a shape, sensor or emitter that is rendered has a participating medium.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     return any(node_kind(state.nodes[index]) == "Medium" for index in reachable(state, rendered_children(state)))
 
 
@@ -81,6 +105,9 @@ def described_transforms(state: Any) -> tuple[dict[str, np.ndarray], dict[str, n
     """Return ``to_world`` (4, 4) of the named shapes by name, and every ``to_world`` by its key.
 
     Meshes apply their transform while they are loaded, and forget it.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
     """
     import mitsuba as mi
 
@@ -103,6 +130,9 @@ def is_film(node: Any) -> bool:
     """Return whether a node is a film.
 
     In dictionaries Mitsuba does not know the kind of plugins written in Python: the registry or the name tells.
+
+    Args:
+        node: node of a parsed scene.
     """
     import mitsuba as mi
 
@@ -112,7 +142,11 @@ def is_film(node: Any) -> bool:
 
 
 def is_integrator(node: Any) -> bool:
-    """Return whether a node is an integrator, one written in Python included."""
+    """Return whether a node is an integrator, one written in Python included.
+
+    Args:
+        node: node of a parsed scene.
+    """
     import mitsuba as mi
 
     plugin = node.props.plugin_name()
@@ -121,12 +155,20 @@ def is_integrator(node: Any) -> bool:
 
 
 def is_transient_integrator(plugin: str) -> bool:
-    """Return whether an integrator is one of this library, or registered with it."""
+    """Return whether an integrator is one of this library, or registered with it.
+
+    Args:
+        plugin: plugin name.
+    """
     return plugin.startswith("transient_") or kind_of(plugin) == "integrator"
 
 
 def node_kind(node: Any) -> str:
-    """Return Mitsuba's kind of a node; of plugins written in Python that of the registry."""
+    """Return Mitsuba's kind of a node; of plugins written in Python that of the registry.
+
+    Args:
+        node: node of a parsed scene.
+    """
     kind = str(node.type).rsplit(".", 1)[-1]
     if kind != "Unknown":
         return kind
@@ -138,7 +180,12 @@ def node_kind(node: Any) -> str:
 
 
 def node_label(state: Any, index: int) -> str:
-    """Return a node's plugin, name and place in the file or dictionary, for messages."""
+    """Return a node's plugin, name and place in the file or dictionary, for messages.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        index: index of the node.
+    """
     import mitsuba as mi
 
     node = state.nodes[index]
@@ -151,7 +198,11 @@ def node_label(state: Any, index: int) -> str:
 
 
 def name_children(state: Any) -> None:
-    """Name the nameless children of the scene ``sensor``, ``shape_0``, ``shape_1``: the same in every process."""
+    """Name the nameless children of the scene ``sensor``, ``shape_0``, ``shape_1``: the same in every process.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     direct = [state.nodes[index] for _, index in children(state, state.root)]
     used = {node.props.id() for node in direct}
     nameless = [node for node in direct if not node.props.id()]
@@ -172,6 +223,9 @@ def name_nested(state: Any) -> None:
     """Give materials inside shapes and other materials unique names, so that one of them can be substituted.
 
     Nameless shapes inside groups get one too, so that the transform of each is known.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
     """
     import mitsuba as mi
 
@@ -194,6 +248,9 @@ def split_merged_shapes(state: Any) -> None:
 
     Mitsuba joins them to meshes without a name, whose keys are addresses in memory and whose order is chance. A shape
     keeps its name where no other has it; otherwise its name follows that of the merge.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
     """
     for parent in list(state.nodes):
         while (found := _first_merge(state, parent)) is not None:
@@ -227,7 +284,11 @@ def _free_name(name: str, used: list[str]) -> str:
 
 
 def texture_names(state: Any) -> list[str]:
-    """Return the names of the textures and volumes that the scene itself holds, in order."""
+    """Return the names of the textures and volumes that the scene itself holds, in order.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+    """
     import mitsuba as mi
 
     direct = [state.nodes[index] for _, index in children(state, state.root)]

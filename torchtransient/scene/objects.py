@@ -49,7 +49,11 @@ class Description(abc.ABC):
         return ()
 
     def check_described(self, caller: str) -> None:
-        """Raise ``SceneError`` for loaded objects in the scene: ``caller`` needs a description."""
+        """Raise ``SceneError`` for loaded objects in the scene: ``caller`` needs a description.
+
+        Args:
+            caller: name of the caller, for the message.
+        """
         if self.objects:
             raise SceneError(
                 f"{caller} needs a scene that is described; {self.objects[0]} is a Mitsuba object that was taken as it "
@@ -57,7 +61,11 @@ class Description(abc.ABC):
             )
 
     def check_variant(self, variant: str | None) -> None:
-        """Raise ``SceneError`` for loaded objects of another variant than the scene's."""
+        """Raise ``SceneError`` for loaded objects of another variant than the scene's.
+
+        Args:
+            variant: variant of the scene, None for that of the objects.
+        """
         for entry in self.objects:
             wanted = variant or self.objects[0].variant
             if entry.variant != wanted:
@@ -69,7 +77,12 @@ class Description(abc.ABC):
 
 @dataclass(frozen=True, eq=False)
 class LoadedObject:
-    """Object of Mitsuba inside a scene dictionary, and the path of its keys there."""
+    """Object of Mitsuba inside a scene dictionary, and the path of its keys there.
+
+    Args:
+        value: the object.
+        where: its path.
+    """
 
     value: Any
     where: str
@@ -92,7 +105,11 @@ class LoadedObject:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene(Description):
-    """``mitsuba.Scene`` that is rendered as it is, in place of a description."""
+    """``mitsuba.Scene`` that is rendered as it is, in place of a description.
+
+    Args:
+        scene: the scene.
+    """
 
     scene: Any
 
@@ -126,14 +143,22 @@ def _refuse_pickling(loaded: Any) -> NoReturn:
 
 
 def objects_inside(tree: Any) -> tuple[LoadedObject, ...]:
-    """Return the loaded objects in a scene dictionary."""
+    """Return the loaded objects in a scene dictionary.
+
+    Args:
+        tree: dictionary, or an entry of one.
+    """
     if isinstance(tree, LoadedObject):
         return (tree,)
     return tuple(found for entry in tree.values() for found in objects_inside(entry)) if isinstance(tree, dict) else ()
 
 
 def pointers(objects: tuple[Any, ...]) -> frozenset[int]:
-    """Return the addresses of loaded objects and of all plugins inside them."""
+    """Return the addresses of loaded objects and of all plugins inside them.
+
+    Args:
+        objects: loaded objects and scenes.
+    """
     import mitsuba as mi
 
     starts = [entry.scene if isinstance(entry, LoadedScene) else entry.value for entry in objects]
@@ -252,6 +277,9 @@ def transient_dictionary(scene: Any) -> dict[str, Any] | None:
     A film belongs to its sensor and an integrator to its scene; neither can be exchanged in a loaded scene. Cameras
     with a steady film and steady path tracers are described by the parameters that they show, without the seeds of
     their samplers; all else is used as it is.
+
+    Args:
+        scene: a loaded ``mitsuba.Scene``.
     """
     import mitsuba as mi
 
@@ -333,7 +361,11 @@ def _rfilter(rfilter: Any) -> dict[str, Any] | None:
 
 
 def sampler_plugin(sampler: Any) -> str:
-    """Return the plugin name of a sampler, or its class for one of others."""
+    """Return the plugin name of a sampler, or its class for one of others.
+
+    Args:
+        sampler: a built sampler.
+    """
     name = sampler.class_name() if type(sampler).__module__ == "mitsuba" else type(sampler).__name__
     return _SAMPLERS.get(name, name)
 

@@ -30,6 +30,9 @@ def opaque(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     That one imports the compiler, which takes longer than all other imports of this library; here it is called only if
     the compiler is loaded.
+
+    Args:
+        function: any function.
     """
 
     # Kept by the function, not in a table: it is freed with the function and the scenes that it holds.

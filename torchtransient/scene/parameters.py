@@ -79,7 +79,11 @@ class ParameterInfo:
 
 
 class ParameterTable(Mapping[str, ParameterInfo]):
-    """Parameters of a scene by key. ``str(table)`` is a readable table."""
+    """Parameters of a scene by key. ``str(table)`` is a readable table.
+
+    Args:
+        entries: the parameters, in order.
+    """
 
     def __init__(self, entries: list[ParameterInfo]):
         self._entries = {entry.key: entry for entry in entries}
@@ -157,20 +161,26 @@ def _short(value: Any) -> str:
 
 
 def parameter_table(built: BuiltScene) -> ParameterTable:
-    """Return the table of a built scene (unmerged, real bitmaps, no substitutions). Called inside its variant."""
+    """Return the table of a built scene (unmerged, real bitmaps, no substitutions). Called inside its variant.
+
+    Args:
+        built: the built scene.
+    """
     tracker = ParameterTracker(built.scene)
-    edges = moving_edges_of(built.scene, built.scene.sensors())
+    edges = _moving_edges_of(built.scene, built.scene.sensors())
     entries = []
     for key in built.params.properties:
         node = built.params.properties[key][2]
         found = [_describe(built, tracker, key, node)]
         if key.endswith(f".{POSITIONS}"):
-            found.append(_mesh_to_world(built, tracker, key, node))
+            matrix = built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
+            effect = tracker.effect_of(node, "to_world")
+            found.append(_info(f"{key.rsplit('.', 1)[0]}.to_world", "mesh_transform", (4, 4), matrix, effect))
         entries += [_placed(_with_gaps(info, edges, tracker, node), tracker, node) for info in found]
     return ParameterTable(entries)
 
 
-def moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
+def _moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
     """Return what derivatives lack at moving edges that some sensors see, by the scene's integrator.
 
     Args:
@@ -196,7 +206,7 @@ def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]
         Keys by gap.
     """
     every = built.scene.sensors()
-    edges = moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
+    edges = _moving_edges_of(built.scene, [every[sensor] for sensor in sensors])
     tracker = built.scene.integrator().parameters(built.scene)
     found: dict[Gap, list[str]] = {}
     for key in keys:
@@ -244,11 +254,6 @@ def _info(key: str, kind: str, shape: tuple[int, ...] | None, value: Any, effect
     )
 
 
-def _mesh_to_world(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
-    name, value = f"{key.rsplit('.', 1)[0]}.to_world", built.mesh_to_world.get(node.id(), np.eye(4)).astype(np.float32)
-    return _info(name, "mesh_transform", (4, 4), value, tracker.effect_of(node, "to_world"))
-
-
 def _describe(built: BuiltScene, tracker: ParameterTracker, key: str, node: Any) -> ParameterInfo:
     import mitsuba as mi
 
@@ -294,6 +299,9 @@ def is_transform(value: Any) -> bool:
     """Return whether a value is a transform of Mitsuba.
 
     By name of its class: Dr.Jit arrays answer to any attribute made of component letters.
+
+    Args:
+        value: any value.
     """
     return "Transform" in type(value).__name__
 

@@ -172,7 +172,7 @@ def scene_findings(
         transforms: matrices (4, 4) by key.
         dark: names of lights that no path meets.
     """
-    found = {name: dark_message(name) for name in dark}
+    found = {name: _dark_message(name) for name in dark}
     for key, limits, low, high in ranges:
         if limits.below(low) or limits.above(high):
             found[key] = outside_message(key, limits, low, high)
@@ -182,7 +182,7 @@ def scene_findings(
     return found
 
 
-def dark_message(name: str) -> str:
+def _dark_message(name: str) -> str:
     """Return the message for a light that paths from a sensor never meet."""
     return (
         f"{name!r} is black here: a directionalarea shines in one direction alone, which no path from a sensor ever "
@@ -216,7 +216,11 @@ def outside_message(key: str, limits: PhysicalRange, low: float, high: float) ->
 
 
 def singular_message(key: str) -> str:
-    """Return the message for a transform without an inverse."""
+    """Return the message for a transform without an inverse.
+
+    Args:
+        key: key of the transform.
+    """
     return (
         f"{key!r} has no inverse: it flattens space, and what it is applied to has no normals and is not hit. Scale by "
         "numbers other than 0, flat shapes too."
@@ -227,6 +231,9 @@ def is_singular(matrix: np.ndarray) -> bool:
     """Return whether a transform (4, 4) or (3, 3) flattens space, up to single precision.
 
     False for numbers that are not finite, which other checks refuse.
+
+    Args:
+        matrix: matrix (4, 4) or (3, 3).
     """
     linear = np.asarray(matrix, dtype=np.float64)
     linear = linear[:-1, :-1]
@@ -237,7 +244,11 @@ def is_singular(matrix: np.ndarray) -> bool:
 
 
 def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
-    """Return both numbers of a real tensor, NaN if it holds one, 0 for an empty one. Waits once for the device."""
+    """Return both numbers of a real tensor, NaN if it holds one, 0 for an empty one. Waits once for the device.
+
+    Args:
+        value: tensor of any shape.
+    """
     if value.numel() == 0:
         return 0.0, 0.0
     for dim, stride in enumerate(value.stride()):  # entries that `expand` has repeated are read once
@@ -248,10 +259,18 @@ def smallest_and_largest(value: torch.Tensor) -> tuple[float, float]:
 
 
 def are_finite(low: float, high: float) -> bool:
-    """Return whether all numbers of a tensor with this smallest and largest one are finite."""
+    """Return whether all numbers of a tensor with this smallest and largest one are finite.
+
+    Args:
+        low, high: result of :func:`smallest_and_largest`.
+    """
     return math.isfinite(low) and math.isfinite(high)
 
 
 def all_finite(value: torch.Tensor) -> bool:
-    """Return whether all numbers of a real tensor are finite."""
+    """Return whether all numbers of a real tensor are finite.
+
+    Args:
+        value: tensor of any shape.
+    """
     return are_finite(*smallest_and_largest(value))

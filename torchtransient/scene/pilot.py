@@ -87,7 +87,11 @@ class Arrivals:
         self.block_total = np.bincount(self.block, self.energy, self.blocks)
 
     def through(self, gates: Sequence[Gate]) -> Arrivals:
-        """Return the arrivals as some gates see them: energy times the sum of their sensitivities."""
+        """Return the arrivals as some gates see them: energy times the sum of their sensitivities.
+
+        Args:
+            gates: the gates.
+        """
         seen = copy.copy(self)
         seen.energy = self.energy * sum(gate.value(self.opl) for gate in gates)
         seen.total = float(seen.energy.sum())
@@ -98,6 +102,9 @@ class Arrivals:
         """Return the arrivals as spectra of beats have them: each one later by its rate times each of some times.
 
         The spectra share the energy.
+
+        Args:
+            seconds: delay per rate of each spectrum: metres of path over m/s.
         """
         seen, count = copy.copy(self), len(seconds)
         seen.opl = np.concatenate([self.opl + s * self.rate for s in seconds])
@@ -117,7 +124,11 @@ class Arrivals:
         return int(np.count_nonzero(self.energy))
 
     def share(self, chosen: np.ndarray) -> tuple[float, float]:
-        """Return the share of the energy in the chosen arrivals, a mask (N,), and its standard error over paths."""
+        """Return the share of the energy in the chosen arrivals, a mask (N,), and its standard error over paths.
+
+        Args:
+            chosen: mask (N,) of arrivals.
+        """
         return self._share(chosen, slice(None), self.paths, self.total)
 
     def _share(self, chosen: np.ndarray, part: Any, paths: int, total: float) -> tuple[float, float]:
@@ -160,7 +171,11 @@ class Arrivals:
     # ------------------------------------------------------------------------------------------------------ depth
 
     def enough_depth(self, tail: float) -> int:
-        """Return the smallest depth beyond which light is negligible, or else the largest depth of all arrivals."""
+        """Return the smallest depth beyond which light is negligible, or else the largest depth of all arrivals.
+
+        Args:
+            tail: largest share of the light beyond the depth.
+        """
         low, high = 1, int(self.depth.max())
         while low < high:
             middle = (low + high) // 2
@@ -175,6 +190,9 @@ class Arrivals:
 
         Of the light after which ``tail`` of it comes. Late parts have few arrivals: what they show counts as it is, so
         that the last eighth may lose some times as much.
+
+        Args:
+            tail: a tenth of the largest share, and the share of the light that is left out at the end.
         """
         first, last = self.window(-1, tail)
         depth = 1
@@ -191,6 +209,9 @@ class Arrivals:
         """Return the share of the light in paths deeper than the run's ``deepest``, and its standard error.
 
         Light that has fallen to a share by the middle falls by that once more.
+
+        Args:
+            deepest: largest depth that the run has followed.
         """
         part, error = self.share(self.depth > deepest // 2)
         return part * part, 2 * part * error
@@ -223,6 +244,9 @@ def rate_axis_over(low: float, high: float) -> RateAxis:
     """Return 64 bins that hold rest and all rates (m/s) from ``low`` to ``high``; a rate of zero is in a bin's middle.
 
     Of rest alone one bin, 1 m/s wide.
+
+    Args:
+        low, high: smallest and largest rate, m/s.
     """
     low, high = min(low, 0.0), max(high, 0.0)
     if low == high:

@@ -77,7 +77,11 @@ class Effects(abc.ABC):
         """Return the reasons of the decisions, a line each."""
 
     def planned_scene(self, scene: Any) -> Scene:
-        """Return a scene in the variant of the plan. Raises ``SceneError`` for another scene."""
+        """Return a scene in the variant of the plan. Raises ``SceneError`` for another scene.
+
+        Args:
+            scene: anything that :func:`load` takes.
+        """
         given = load(scene)
         if not given.same_description(self.scene):
             raise SceneError(
@@ -102,7 +106,11 @@ class Effects(abc.ABC):
         return film, temporal_filter
 
     def check_sensors(self, sensors: Sequence[int]) -> None:
-        """Raise ``SceneError`` for sensors without a plan."""
+        """Raise ``SceneError`` for sensors without a plan.
+
+        Args:
+            sensors: indices of sensors.
+        """
         others = sorted(set(sensors) - {self.sensor})
         if others:
             raise SceneError(
@@ -116,14 +124,24 @@ class Effects(abc.ABC):
 
 @dataclass(frozen=True)
 class Choice:
-    """Decision, and the line that explains it."""
+    """Decision, and the line that explains it.
+
+    Args:
+        value: the decision.
+        reason: the line.
+    """
 
     value: str
     reason: str
 
 
 def text_of(findings: Sequence[Finding], most: int = 3) -> str:
-    """Return the first ``most`` findings as text, with the number of the others."""
+    """Return the first ``most`` findings as text, with the number of the others.
+
+    Args:
+        findings: the findings.
+        most: number of findings that are written out.
+    """
     named = "; ".join(str(finding) for finding in findings[:most])
     return named if len(findings) <= most else f"{named}; and {len(findings) - most} more"
 
@@ -188,7 +206,11 @@ def _polarization(inventory: SceneInventory, outputs: Sequence[str], strict: boo
 
 
 def choose_integrator(inventory: SceneInventory) -> tuple[Choice, list[str]]:
-    """Return the integrator for surfaces or for volumes, or another transient one of the scene, and notes."""
+    """Return the integrator for surfaces or for volumes, or another transient one of the scene, and notes.
+
+    Args:
+        inventory: contents of the scene.
+    """
     notes = [
         f"not used: {text_of(inventory.declared_only)}, declared and referred to by nothing"
     ] if inventory.declared_only else []  # fmt: skip
@@ -210,7 +232,7 @@ def _depth_text(depth: int) -> str:
     return "no limit" if depth == NO_LIMIT else str(depth)
 
 
-def depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
+def _depth_by_albedo(inventory: SceneInventory, tail: float) -> tuple[int | None, str]:
     """Return the depth at which little of the emitted power is left, if the albedos bound it, and the reason.
 
     Args:
@@ -268,7 +290,15 @@ class Draft:
 
 @dataclass(frozen=True)
 class Findings:
-    """Decisions by a pilot run, or without one; attributes as in the plan."""
+    """Decisions by a pilot run, or without one.
+
+    Args:
+        max_depth: bound on the depth, None for the scene's.
+        film_choice: film of the plan, None to keep the scene's.
+        temporal_filter: name of the filter, empty for films without one.
+        reasons: one line per decision.
+        pilot: results of the pilot run, None without one.
+    """
 
     max_depth: int | None
     film_choice: Any
@@ -278,7 +308,17 @@ class Findings:
 
 
 class Finder:
-    """Search for depth, window and temporal filter, by a pilot run where it is needed."""
+    """Search for depth, window and temporal filter, by a pilot run where it is needed.
+
+    Args:
+        draft: decisions that are made already.
+        reasons: their lines.
+        inventory: contents of the scene.
+        tail: largest share of the light in deeper paths.
+        missed: largest share of the light outside of the window.
+        seed: seed of the pilot run.
+        relative: late light counts as much as early light.
+    """
 
     def __init__(
         self,
@@ -400,11 +440,11 @@ class Finder:
             )
             return None
         if self.arrivals is None:
-            bound, reason = depth_by_albedo(self.inventory, self.tail)
+            bound, reason = _depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(reason)
             return bound
         if self.arrivals.dark:
-            bound, reason = depth_by_albedo(self.inventory, self.tail)
+            bound, reason = _depth_by_albedo(self.inventory, self.tail)
             self.reasons.append(f"{reason}; the pilot run saw no light")
             return bound
         from torchtransient.plugins.integrators.pilot import PILOT_DEPTH

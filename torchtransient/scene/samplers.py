@@ -26,13 +26,21 @@ def sampler_for(named: str | None, asked: str | None = None) -> str:
 
 
 def sampler_for_all(named: Iterable[str | None]) -> str:
-    """Return the plugin name of the sampler of several sensors, "auto" where they have different ones."""
+    """Return the plugin name of the sampler of several sensors, "auto" where they have different ones.
+
+    Args:
+        named: plugin name of each sensor in the scene, None where there is none.
+    """
     found = {sampler_for(name) for name in named}
     return found.pop() if len(found) == 1 else AUTO
 
 
 def reason_for(named: str | None) -> str:
-    """Return the line of a plan that says which sampler a scene gets, and why."""
+    """Return the line of a plan that says which sampler a scene gets, and why.
+
+    Args:
+        named: plugin name in the scene, None if there is none.
+    """
     plugin = sampler_for(named)
     if plugin == named:
         why = "as the scene names it"
@@ -43,7 +51,11 @@ def reason_for(named: str | None) -> str:
 
 
 def correlation_warning(plugin: str) -> str:
-    """Return a warning of a sampler whose numbers depend on each other, empty for others."""
+    """Return a warning of a sampler whose numbers depend on each other, empty for others.
+
+    Args:
+        plugin: plugin name.
+    """
     if plugin not in CORRELATED_SAMPLERS:
         return ""
     return (

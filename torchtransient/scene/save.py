@@ -208,8 +208,8 @@ _TEXTS = ("values", "wavelengths")
 _DERIVED = {("spot", "cutoff_angle"): ("beam_width",)}
 
 
-class Place(NamedTuple):
-    """Place of a built object in the description.
+class _Place(NamedTuple):
+    """_Place of a built object in the description.
 
     Attributes:
         node: index of the node that the object was made of, or of one above it.
@@ -223,10 +223,10 @@ class Place(NamedTuple):
     made: Any = None
 
 
-def _places(scene: Any, state: Any) -> dict[int, Place]:
+def _places(scene: Any, state: Any) -> dict[int, _Place]:
     """Return the places of the objects of a built scene in the list of nodes, by address."""
-    found: dict[int, Place] = {}
-    waiting = [(scene, Place(0))]
+    found: dict[int, _Place] = {}
+    waiting = [(scene, _Place(0))]
     while waiting:
         value, place = waiting.pop()
         for inner, its in _places_in(value, place, state):
@@ -236,7 +236,7 @@ def _places(scene: Any, state: Any) -> dict[int, Place]:
     return found
 
 
-def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
+def _places_in(value: Any, place: _Place, state: Any) -> list[tuple[Any, _Place]]:
     """Return the objects inside an object with their places."""
     index = place.node
     if place.names:
@@ -251,14 +251,14 @@ def _places_in(value: Any, place: Place, state: Any) -> list[tuple[Any, Place]]:
             unmatched.append((name, inner))
         else:
             free.pop(match, None)
-            found.append((inner, Place(match)))
+            found.append((inner, _Place(match)))
     for name, inner in unmatched:
         match = next((c for c in free if _may_be(inner, state.nodes[c])), None)
         if name in state.nodes[index].props or match is None:
-            found.append((inner, Place(index, (name,), inner)))
+            found.append((inner, _Place(index, (name,), inner)))
         else:
             free.pop(match)
-            found.append((inner, Place(match)))
+            found.append((inner, _Place(match)))
     return found
 
 
@@ -270,7 +270,7 @@ def _may_be(value: Any, node: Any) -> bool:
     return kind is not None and isinstance(value, kind)
 
 
-def _write_value(writer: XmlWriter, built: Any, places: dict[int, Place], slot: Slot, value: np.ndarray) -> None:
+def _write_value(writer: XmlWriter, built: Any, places: dict[int, _Place], slot: Slot, value: np.ndarray) -> None:
     """Write an installed value into its node. Raises ``SceneError`` for a node without a property for it."""
     import mitsuba as mi
 
@@ -337,25 +337,22 @@ def _number_property(props: Any, name: str, value: np.ndarray) -> tuple[str, np.
     return ("scale", value) if plugin == "d65" and name == "value" else (name, value)
 
 
-def _write_made(state: Any, place: Place, owner: Any, value: np.ndarray, key: str) -> None:
+def _write_made(state: Any, place: _Place, owner: Any, value: np.ndarray, key: str) -> None:
     """Write a value of an object that Mitsuba has made of a number or of a default."""
     import mitsuba as mi
 
     node, (first, *rest) = state.nodes[place.node], place.names
+    is_emitter = node_kind(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
     surface = isinstance(place.made, mi.BSDF) and place.made.class_name() == "SmoothDiffuse" and len(rest) == 1
     if surface:
         _write_numbers(_child(state, place.node, first, "diffuse", mi.ObjectType.BSDF), rest[0], value, key)
-    elif not rest and first not in node.props and isinstance(owner, mi.Texture) and _is_emitter(node):
+    elif not rest and first not in node.props and isinstance(owner, mi.Texture) and is_emitter:
         # Light that is not described is that of daylight.
         _write_numbers(_child(state, place.node, first, "d65", mi.ObjectType.Texture), "scale", value, key)
     elif not rest or (isinstance(place.made, mi.Volume) and len(rest) == 1):
         _write_numbers(node.props, first, value, key)
     else:
         raise SceneError(f"scene.save: {key!r} has no place in the description, and cannot be said in XML.")
-
-
-def _is_emitter(node: Any) -> bool:
-    return node_kind(node) == "Emitter" or kind_of(node.props.plugin_name()) == "emitter"
 
 
 def _child(state: Any, index: int, name: str, plugin: str, kind: Any) -> Any:
@@ -441,6 +438,10 @@ class XmlWriter:
 
     Mitsuba's own writer (``mi.parser.write_file``) drops the names of most nodes, and with them the keys of parameters,
     and decomposes transforms with errors of 1e-6.
+
+    Args:
+        state: parsed scene (``mitsuba.parser.ParserState``).
+        folder: folder of the files.
     """
 
     def __init__(self, state: Any, folder: Path) -> None:
@@ -453,7 +454,12 @@ class XmlWriter:
         self._count = 0
 
     def note_kind(self, index: int, built: Any) -> None:
-        """Note the kind of a node by its built object: the parser does not know that of plugins in Python."""
+        """Note the kind of a node by its built object: the parser does not know that of plugins in Python.
+
+        Args:
+            index: index of the node.
+            built: the object that was built of it.
+        """
         import mitsuba as mi
 
         kinds = (kind for kind in _KINDS if isinstance(built, getattr(mi, kind)))
@@ -469,7 +475,12 @@ class XmlWriter:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
     def file(self, name: str, ending: str) -> Path:
-        """Return the path of a new file in the folder."""
+        """Return the path of a new file in the folder.
+
+        Args:
+            name: name of the file; other characters than letters, digits, "-" and "_" are replaced.
+            ending: ending with its dot.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         safe = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "data"
         path = self.folder / f"{safe}{ending}"
@@ -479,7 +490,11 @@ class XmlWriter:
         return path
 
     def name_of(self, path: Path) -> str:
-        """Return the name of a file in the folder, as the scene refers to it."""
+        """Return the name of a file in the folder, as the scene refers to it.
+
+        Args:
+            path: path of the file.
+        """
         return f"{self.folder.name}/{path.name}"
 
     # ------------------------------------------------------------------------------------------------------- nodes

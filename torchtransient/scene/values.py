@@ -136,6 +136,9 @@ def flat_drjit_copy(tensor: torch.Tensor) -> Any:
 
     The scene must not alias memory of the caller, and a recorded kernel would go on reading other memory where the
     first call had it.
+
+    Args:
+        tensor: float32 tensor of any shape.
     """
     import drjit as dr
     import mitsuba as mi
@@ -156,13 +159,22 @@ def flat_drjit_copy(tensor: torch.Tensor) -> Any:
 
 
 def wait_for_torch(tensor: torch.Tensor) -> None:
-    """Wait for torch's stream of a CUDA tensor: Dr.Jit reads and reuses memory on a stream of its own."""
+    """Wait for torch's stream of a CUDA tensor: Dr.Jit reads and reuses memory on a stream of its own.
+
+    Args:
+        tensor: tensor on any device.
+    """
     if tensor.is_cuda:
         torch.cuda.current_stream(tensor.device).synchronize()
 
 
 class Slot:
-    """Place of one torch value in a built scene: its shape, and the parameters of Mitsuba that it sets."""
+    """Place of one torch value in a built scene: its shape, and the parameters of Mitsuba that it sets.
+
+    Args:
+        built: the built scene.
+        key: key of the parameter.
+    """
 
     def __init__(self, built: BuiltScene, key: str):
         self.key = key
@@ -194,7 +206,11 @@ class Slot:
         return is_number_of_kernels(*self._class_and_name())
 
     def check(self, value: Any) -> None:
-        """Raise ``SceneError`` for a pose that Mitsuba would store wrongly."""
+        """Raise ``SceneError`` for a pose that Mitsuba would store wrongly.
+
+        Args:
+            value: value in the shape of the slot.
+        """
         if is_turned_by_reflections(*self._class_and_name()):
             check_pose(self.key, self.initial, value)
 
@@ -263,6 +279,10 @@ def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
 
     A light with a texture is sampled by a map from texture coordinates to points, which Mitsuba keeps until positions
     change; where those do and normals do not, it makes up new normals.
+
+    Args:
+        keys: keys that are written.
+        params: ``mitsuba.SceneParameters`` of the scene.
     """
     moved = [key for key in keys if names_array(key, TEXCOORDS)]
     others = [key_beside(key, name) for key in moved for name in (POSITIONS, NORMALS)]
@@ -270,13 +290,23 @@ def dependent_keys(keys: Iterable[str], params: Any) -> list[str]:
 
 
 def add_normals(keys: Iterable[str], params: Mapping[str, Any]) -> list[str]:
-    """Return the keys, and those of ``params`` for the normals that Mitsuba recomputes when positions change."""
+    """Return the keys, and those of ``params`` for the normals that Mitsuba recomputes when positions change.
+
+    Args:
+        keys: keys that are written.
+        params: values, or parameters of the scene, by key.
+    """
     normals = [key_beside(key, NORMALS) for key in keys if names_array(key, POSITIONS)]
     return list(dict.fromkeys((*keys, *(key for key in normals if key in params))))
 
 
 class SlotTable:
-    """Slots of some keys in a built scene, and the described values, which can be put back."""
+    """Slots of some keys in a built scene, and the described values, which can be put back.
+
+    Args:
+        built: the built scene.
+        keys: keys of the values.
+    """
 
     def __init__(self, built: BuiltScene, keys: tuple[str, ...]):
         self.built = built
@@ -299,7 +329,11 @@ class SlotTable:
                 owner[target] = slot.key
 
     def install(self, leaves: list[Any]) -> None:
-        """Write the leaves, one flat array for each slot, and update the scene."""
+        """Write the leaves, one flat array for each slot, and update the scene.
+
+        Args:
+            leaves: flat arrays, one for each slot.
+        """
         for slot, leaf in zip(self.slots, leaves, strict=True):
             slot.write(leaf, self.originals)
         self._update()

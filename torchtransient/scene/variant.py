@@ -48,12 +48,12 @@ def at_work() -> Iterator[bool]:
     check_process()  # before the lock: a thread that did not come along in a fork may hold it
     # Private, but what threading.Condition asks: there is no other way to ask whether this thread holds it.
     outermost = not engine_lock._is_owned()  # type: ignore[attr-defined]
-    with engine_lock, interrupts_pass():
+    with engine_lock, _interrupts_pass():
         yield outermost
 
 
 @contextmanager
-def interrupts_pass() -> Iterator[None]:
+def _interrupts_pass() -> Iterator[None]:
     """Raise the interrupt that ended the block, in place of the RuntimeError that C++ makes of it."""
     # Read before the block: a call in an except block has not failed because of the exception that is handled there.
     interrupt, handled = None, sys.exc_info()[1]
@@ -96,14 +96,22 @@ def quiet() -> Iterator[None]:
 
 
 def is_differentiable(variant: str | None) -> bool:
-    """Return whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``)."""
+    """Return whether a variant compiles kernels and differentiates (``llvm_ad_*``, ``cuda_ad_*``).
+
+    Args:
+        variant: name of a variant, None for none.
+    """
     return variant is not None and variant.startswith(("llvm_ad_", "cuda_ad_"))
 
 
 def resolve_variant(requested: str | None) -> str:
     """Return the variant of a scene: the requested one, else the active one if differentiable, else ``llvm_ad_rgb``.
 
-    Raises ``VariantError`` for a variant that is unknown or not differentiable.
+    Args:
+        requested: name of a variant, None for no request.
+
+    Raises:
+        VariantError: for a variant that is unknown or not differentiable.
     """
     import mitsuba as mi
 
@@ -124,12 +132,20 @@ def resolve_variant(requested: str | None) -> str:
 
 
 def device_type(variant: str) -> str:
-    """Return the torch device type whose memory a variant works on, ``cuda`` or ``cpu``."""
+    """Return the torch device type whose memory a variant works on, ``cuda`` or ``cpu``.
+
+    Args:
+        variant: name of a variant.
+    """
     return "cuda" if variant.startswith("cuda") else "cpu"
 
 
 def stokes_components(variant: str) -> int:
-    """Return the number of Stokes components that a variant renders: 4 in polarized ones, otherwise 1."""
+    """Return the number of Stokes components that a variant renders: 4 in polarized ones, otherwise 1.
+
+    Args:
+        variant: name of a variant.
+    """
     return 4 if variant.endswith("_polarized") else 1
 
 
@@ -140,6 +156,9 @@ def take_over(device: str) -> None:
     never evaluated, and torch calls backwards of CUDA tensors in threads of its own. A result that was freed may still
     be read by torch, and Dr.Jit would write to its memory: of torch's streams Dr.Jit's own waits for the default one
     alone.
+
+    Args:
+        device: "cuda" or "cpu".
     """
     import drjit as dr
 
@@ -154,6 +173,9 @@ def active_variant(variant: str) -> Iterator[None]:
 
     Another active variant is put back at the end (a switch costs some 6 ms); when none was active, ``variant``
     stays. Nested calls are free. An interrupt inside of the block is raised as such.
+
+    Args:
+        variant: name of a variant.
     """
     import mitsuba as mi
 

@@ -24,10 +24,14 @@ _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
 @dataclass(frozen=True)
 class Ranks:
-    """The rank of this process in a run.
+    """Rank of this process in a run. Made by :func:`ranks`.
 
-    ``rank``: its number of ``size``; ``local``: its number on this machine of ``local_size``. ``device``: of its
-    tensors. ``variant_prefix``: beginning of the names of Mitsuba variants that compute there.
+    Attributes:
+        rank: number of the process, below ``size``.
+        size: number of processes.
+        local: number of the process on its machine, below ``local_size``.
+        local_size: number of processes on the machine.
+        device: device of the process's tensors.
     """
 
     rank: int = 0

@@ -261,10 +261,13 @@ _ENTRIES = ("format", "version", "step", "parts", "values", "random", "libraries
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Contents of a checkpoint beside the states of its parts.
+    """Contents of a checkpoint beside the states of its parts. Returned by :func:`load_checkpoint`.
 
-    ``step``: the number of steps that are done, which is the step to go on with. ``values``: as they were given.
-    ``libraries``: versions that wrote it, by name. ``ranks``: number of processes.
+    Attributes:
+        step: number of steps that are done, which is the step to go on with.
+        values: plain data, as they were given.
+        libraries: versions that wrote it, by name.
+        ranks: number of processes.
     """
 
     step: int

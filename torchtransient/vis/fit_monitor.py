@@ -188,6 +188,7 @@ class FitMonitor:
         self._lights: list[_Light] = []
         self._now: _Light | None = None
         self._looks, self._between = 0, 1
+        self._seen_output = False
         self._live = _in_notebook() if live is None else live
         self._writer = None if log_dir is None else _writer(path_of(log_dir, "FitMonitor: log_dir"))
         if self._live or self._writer is not None:
@@ -210,7 +211,8 @@ class FitMonitor:
 
         Raises:
             ArgumentError: for a loss that is no number.
-            ShapeError: for a loss of several, an output that is no light, or not of the target's size.
+            ShapeError: for a loss of several, an output that is no light, or not over the target's channels, bins and
+                pixels; of outputs at the first one already.
         """
         number = self._next if step is None else count("FitMonitor.step: step", step, 0, ArgumentError)
         self._next = number + 1
@@ -221,13 +223,28 @@ class FitMonitor:
         for key, leaf in self._differentiated if taken else ():
             if leaf.grad is not None:
                 self._gradients[key].add(number, leaf.grad)
+        if output is not None and (look or not self._seen_output):
+            light = self._light_of_step(number, output)
+            self._seen_output = True
+        else:
+            light = None
         if look:
-            self._look(number, output)
+            self._look(number, light)
         self._turns.end(begin, look)
         if look and (self._live or self._writer is not None) and time.perf_counter() >= self._draw_again:
             self._show()
 
-    def _look(self, number: int, output: Source | None) -> None:
+    def _light_of_step(self, number: int, output: Source) -> _Light:
+        """Return the light of a step, checked against the target: the first output is, whichever steps are looked at.
+        """
+        try:
+            light = self._light(number, output)
+            self._check_like_target(light)
+        except ShapeError as error:
+            raise ShapeError(f"{error} monitor.step(loss), without the output, watches a fit without light.") from None
+        return light
+
+    def _look(self, number: int, light: _Light | None) -> None:
         self._take_losses()
         for name, gradient in self._gradients.items():
             share = gradient.share()
@@ -235,8 +252,8 @@ class FitMonitor:
                 self._noise.setdefault(name, _Track()).add(number, [share])
         for name, value in self._shown_values():
             self._values.setdefault(name, _Track()).add(number, _row(value))
-        if output is not None:
-            self._take_light(self._light(number, output))
+        if light is not None:
+            self._take_light(light)
         if self._writer is not None:
             for name, track in self._losses.items():
                 if track.steps[-1] == number:
@@ -304,12 +321,25 @@ class FitMonitor:
         # Images of a film's memory are written again by the next step.
         return _Light(number, image.clone(), np.stack(curves) if curves else np.empty((0, 0)), places, label)
 
-    def _take_light(self, light: _Light) -> None:
-        if self._target is not None and light.image.shape != self._target.image.shape:
+    def _check_like_target(self, light: _Light) -> None:
+        target = self._target
+        if target is None:
+            return
+        if light.image.shape != target.image.shape:
             raise ShapeError(
                 "FitMonitor.step: expected light of the target's channels and pixels, "
-                f"{tuple(self._target.image.shape)}, got {tuple(light.image.shape)}."
+                f"{tuple(target.image.shape)}, got {tuple(light.image.shape)}."
             )
+        bins, got = len(target.places), len(light.places)
+        # Images have no bins; without an axis places are numbers.
+        same = got == bins and (light.x_label != target.x_label or np.allclose(light.places, target.places))
+        if not same and 1 not in (bins, got):
+            raise ShapeError(
+                f"FitMonitor.step: expected light over the target's {bins} bins, around {target.places[0]:g} to "
+                f"{target.places[-1]:g}, got {got}, around {light.places[0]:g} to {light.places[-1]:g}."
+            )
+
+    def _take_light(self, light: _Light) -> None:
         self._now = light
         self._looks += 1
         if (self._looks - 1) % self._between:

@@ -91,6 +91,12 @@ def _rates_of(
     if held is not None:
         axis = getattr(source, "axis", None) if axis is None else axis
         rate_axis = getattr(source, "rate_axis", None) if rate_axis is None else rate_axis
+    elif hasattr(source, "rates"):
+        has_beats = getattr(source, "beats", None) is not None
+        other = ", whose beats tt.sensing.range_and_speed reads" if has_beats else ""
+        raise ShapeError(
+            f"{who}: expected light by rates, got a result without{other}. Render with rates=tt.RateAxis(...)."
+        )
     light = as_tensor(source if held is None else held, who)
     if light.ndim != 5 or light.is_complex() or not light.numel():
         raise ShapeError(

@@ -113,9 +113,8 @@ def test_plan():
         tt.plan(make_room(), "transient", film=Moments(2))
 
 
-@pytest.mark.parametrize("ending", ["h5", "npz"])
-def test_result_files(tmp_path, ending):
+def test_result_files(tmp_path):
     out = tt.render(make_room(), film=Moments(2), spp=2, seed=0)
-    back = read_result(write_result(tmp_path / f"a.{ending}", out))
+    back = read_result(write_result(tmp_path / "a.h5", out))
     assert torch.equal(back.others["moments"], out.others["moments"]) and back.others["number_of_moments"] == 2
     assert back.transient is None and back.channels == out.channels

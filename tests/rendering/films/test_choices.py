@@ -97,17 +97,16 @@ def test_values_that_compare_travel_and_print(argument):
 
 
 @each
-@pytest.mark.parametrize("ending", ["h5", "npz"])
-@pytest.mark.parametrize("leading, components", [((), 1), ((2,), 1), ((), 4)])
-def test_output_and_file(tmp_path, argument, ending, leading, components):
+def test_output_and_file(tmp_path, argument):
     choice = choice_for(argument)
-    out = output_of(choice, leading, components)
-    assert films.layout_of_output(out) == choice and not out.others
-    for name in ("transient", "phasor", "gated", "rates", "beats", "slow_phasor"):
-        assert (getattr(out, name) is None) == (name != choice.measures)
-    back = read_result(write_result(tmp_path / f"a.{ending}", out))
-    assert films.layout_of_output(back) == choice
-    assert torch.equal(choice.tensor(back), choice.tensor(out)) and torch.equal(back.steady, out.steady)
+    for leading, components, ending in (((), 1, "h5"), ((2,), 1, "npz"), ((), 4, "h5"), ((), 1, "npz")):
+        out = output_of(choice, leading, components)
+        assert films.layout_of_output(out) == choice and not out.others
+        for name in ("transient", "phasor", "gated", "rates", "beats", "slow_phasor"):
+            assert (getattr(out, name) is None) == (name != choice.measures)
+        back = read_result(write_result(tmp_path / f"{components}{len(leading)}.{ending}", out))
+        assert films.layout_of_output(back) == choice
+        assert torch.equal(choice.tensor(back), choice.tensor(out)) and torch.equal(back.steady, out.steady)
 
 
 def test_settings_in_a_scene():

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import copy
-import itertools
 
 import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long_rows
 from tools.small_room import WALL_POSE, make_room
 from torchtransient.errors import GradientError, SceneError
 
@@ -22,7 +20,6 @@ FILMS = {
     "gated": {"type": "gated_hdr_film", **SIZE, "gates": "gaussian 8 0.5; gaussian 9 0.5"},
     "phasor": {"type": "phasor_hdr_film", **SIZE, "frequencies": "0.0, 0.5"},
 }
-PAIRS = [pair for pair in itertools.permutations(FILMS, 2) if "histogram" in pair[0] + pair[1]]
 
 
 def room_of(*films, **integrator):
@@ -47,11 +44,10 @@ def grad_and_values(renderer):
     return tensor.detach(), renderer.values[WALL_POSE].grad, out.stats.temporal_filter
 
 
-QUICK = [(("gated", "histogram"), "")]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("pair", "of_integrator"), long_rows(itertools.product(PAIRS, ["", "gaussian"]), QUICK))
+@pytest.mark.parametrize(
+    ("pair", "of_integrator"), [(("gated", "histogram"), ""), (("smooth histogram", "phasor"), "gaussian")]
+)
 def test_each_sensor_renders_as_if_it_were_alone(pair, of_integrator):
     settings = {"temporal_filter": of_integrator, "gaussian_stddev": 0.8} if of_integrator else {}
     scene = tt.load(room_of(*(FILMS[name] for name in pair), **settings), variant=VARIANT)
@@ -87,9 +83,7 @@ def test_a_filter_that_one_film_refuses_changes_no_other():
     [
         ({**HISTOGRAM, "temporal_bins": 2}, FILMS["gated"], "Histogram.*Gates"),
         (HISTOGRAM, {**HISTOGRAM, "start_opl": 5.0}, "start_opl=5.0"),
-        (HISTOGRAM, {**HISTOGRAM, "bin_width_opl": 0.125}, "bin_width_opl=0.125"),
         (FILMS["gated"], {**FILMS["gated"], "gates": "gaussian 8 0.5; gaussian 9 0.6"}, "Gates"),
-        (FILMS["phasor"], {**FILMS["phasor"], "frequencies": "0.0, 0.75"}, "Phasors"),
         (FILMS["phasor"], {**FILMS["phasor"], "start_opl": 1.0}, "start_opl=1"),
         (HISTOGRAM, {**HISTOGRAM, "width": 3}, r"\(3, 3, 24, 3\)"),
     ],

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from torchtransient import Chirps, TimeAxis
+from torchtransient.errors import ShapeError
 from torchtransient.sensing import BeatNoise, Compose, Speckle, fold_beats, range_and_speed
 
 WINDOWS = ["rectangular", "hann", "hamming", "blackman", "blackmanharris", "nuttall"]
@@ -131,3 +133,9 @@ def test_folded_bins(start, bins, wanted, sums):
     folded, axis = fold_beats(torch.arange(1.0, bins + 1).reshape(1, -1, 1, 1), TimeAxis(start, 1.0, bins))
     assert axis == TimeAxis(wanted[0], 1.0, wanted[1])
     assert folded.flatten().tolist() == sums
+
+
+def test_results_without_beats_say_how_to_get_them():
+    beats = torch.ones(2, 8, 1, 1)
+    with pytest.raises(ShapeError, match="chirps="):
+        range_and_speed(SimpleNamespace(beats=None, transient=beats, chirps=None, axis=TimeAxis(0.0, 1.0, 8)))

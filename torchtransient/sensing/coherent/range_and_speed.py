@@ -76,6 +76,8 @@ def range_and_speed(
     if not isinstance(beats, Tensor) and isinstance(held := getattr(beats, "beats", None), Tensor):
         chirps, axis = beats.chirps if chirps is None else chirps, beats.axis if axis is None else axis
         beats = held
+    elif not isinstance(beats, Tensor) and hasattr(beats, "beats"):
+        raise ShapeError(f"{me}: expected a result with beats, got one without. Render with chirps=tt.Chirps(...).")
     beats = check_bins(beats, me)  # type: ignore[arg-type]
     chirps, axis = of_class(f"{me}: chirps", chirps, Chirps), check_time_axis(axis, me)
     if not is_one_of(bins, KINDS_OF_BINS):
@@ -83,8 +85,8 @@ def range_and_speed(
     level = check_number(threshold, "threshold", me, low=-math.inf)
     if beats.ndim < 4 or beats.shape[-4] != 2 or beats.shape[TIME] != axis.num_bins:
         raise ShapeError(
-            f"{me}: expected spectra (..., 2, {axis.num_bins}, H, W), up and down over the bins of the axis, got "
-            f"{tuple(beats.shape)}."
+            f"{me}: expected spectra (..., 2, {axis.num_bins}, H, W), up and down over the bins of the axis, as "
+            f"out.beats of a render with chirps= has them, got {tuple(beats.shape)}."
         )
     index = beats.argmax(TIME, keepdim=True)
     here = beats.gather(TIME, index)
