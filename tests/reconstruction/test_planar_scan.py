@@ -38,7 +38,7 @@ def test_grids_have_their_sides_and_points():
     assert repr(of(points_of(2, 2))) == "PlanarScan(2 x 2 points, 0.25 x 0.5 m apart)"
 
 
-@pytest.mark.parametrize("shape", [(3,), (4, 3), (2, 3, 2), (1, 3, 3), (3, 1, 3), (2, 2, 2, 3), (2, 2, 4)])
+@pytest.mark.parametrize("shape", [(4, 3), (1, 3, 3), (2, 2, 2, 3), (2, 2, 4)])
 def test_what_is_no_grid_of_points(shape):
     points = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     with pytest.raises(ShapeError, match=r"Method: expected sensor points as a grid \(Y, X, 3\) of 2 x 2"):

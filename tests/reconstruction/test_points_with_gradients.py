@@ -13,8 +13,6 @@ from torchtransient.reconstruction import (
     FK,
     LCT,
     Backprojection,
-    DiffusionDeconvolution,
-    DirectionalLCT,
     FilteredBackprojection,
     MidpointFK,
     PhasorField,
@@ -50,14 +48,9 @@ def of_scan(kind, name, **options):
 MADE = {
     "fk": of_grid(FK, CONFOCAL),
     "lct": of_grid(LCT, CONFOCAL),
-    "directional lct": of_grid(DirectionalLCT, CONFOCAL),
-    "slab": of_grid(DiffusionDeconvolution, CONFOCAL),
     "midpoint fk": of_grid(MidpointFK, SINGLE),
-    "backprojection": of_scan(Backprojection, "confocal", falloff=1.0),
     "backprojection, legs": of_scan(Backprojection, "exhaustive, legs"),
     "filtered backprojection": of_scan(FilteredBackprojection, "single", filter=PULSE),
-    "phasor field": of_scan(PhasorField, "single", pulse=PULSE, falloff=1.0),
-    "phasor field, legs": of_scan(PhasorField, "exhaustive, legs", pulse=PULSE),
     "phasor field, confocal legs": of_scan(PhasorField, "confocal, legs", pulse=PULSE),
 }
 
