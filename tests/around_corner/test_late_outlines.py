@@ -38,9 +38,7 @@ def test_late_light_that_a_plate_hides():
 
 CASES = {
     "single": lambda: capture_of(plates(), "front.to_world", move(1, 0, 0)),
-    "confocal": lambda: capture_of(plates(), "front.to_world", move(0, 1, 0), "confocal"),
     "exhaustive": lambda: capture_of(plates(), "front.to_world", move(1, 0, 0), "exhaustive", points=2),
-    "seen by each other": lambda: capture_of(plates(), "side.to_world", move(0, 0, 1)),
     "five bounces": lambda: capture_of(plates(), "front.to_world", move(1, 0, 0), bounces=5),
     "a ball": lambda: capture_of(plates(BALL), "front.to_world", move(1, 0, 0)),
 }

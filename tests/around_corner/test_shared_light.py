@@ -12,7 +12,7 @@ VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.usefixtures("no_leftovers")
 
 
-@pytest.mark.parametrize("kind", long(["confocal", "single", "exhaustive"], ["single"]))
+@pytest.mark.parametrize("kind", long(["single", "exhaustive"], ["single"]))
 def test_rays_that_are_left_out_change_nothing(monkeypatch, kind):
     """A plate before another one, and a wall beside them: some elements are clear and some are not."""
     hidden = {"a": plane(), "b": side(), "c": plane(0.8, 0.2, 0.3, 0.2, 0.3)}

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from support.hidden_shapes import ball, mesh, scene_of, wall_grid
-from support.marks import long
 from support.third_bounce_runs import captured, film_of, wall_of
 from torchtransient.plugins.around_corner.shafts import spare_rays
 from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
@@ -24,8 +23,7 @@ def arm():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("single", long([False, True], [False]))
-def test_less_noise_and_no_bias(arm, single):
+def test_less_noise_and_no_bias(arm):
     shapes, scene, points, normals = arm
     film = film_of(GRID, GRID, bins=40, bin_width=0.05)
     tiles = ScanTiles(points, normals, 0.1)
@@ -34,24 +32,22 @@ def test_less_noise_and_no_bias(arm, single):
     for tiled, table in tables.items():
         spare_rays(scene, table, points, normals)
         runs[tiled] = np.array(
-            [run(scene, film, table, arm, seed, single, tiles if tiled else None) for seed in range(64)]
+            [run(scene, film, table, arm, seed, tiles if tiled else None) for seed in range(64)]
         )
     total = {tiled: r.sum(-1) for tiled, r in runs.items()}
     errors = [r.std(0, ddof=1) / 8 for r in total.values()]
     apart = (total[True].mean(0) - total[False].mean(0)) / np.hypot(*errors)
     # All points share samples, or those of a tile: 64 numbers that are not independent.
     assert np.abs(apart).max() < 4.5 and np.mean(apart**2) < 4
-    if not single:
-        assert total[True].var(0).sum() < total[False].var(0).sum() / 8
+    assert total[True].var(0).sum() < total[False].var(0).sum() / 8
 
 
-def run(scene, film, table, arm, seed, single, tiles):
+def run(scene, film, table, arm, seed, tiles):
     _, _, points, normals = arm
     tile = None if tiles is None else tiles.tile_per_point()
     samples = draw_samples(table, 256, seed)
 
     def add():
-        job = ThirdBounce(scene, film, samples, wall_of(points, normals), tile=tile)
-        job.add_single(wall_of(points[:1], normals[:1])) if single else job.add_confocal()
+        ThirdBounce(scene, film, samples, wall_of(points, normals), tile=tile).add_confocal()
 
     return captured(film, add)[1].reshape(GRID**2, 40)

@@ -197,16 +197,6 @@ def test_captures_without_light_are_said_once(kind, settings, tiles):
 
 
 @pytest.mark.slow
-def test_dark_parts_of_a_capture_are_none():
-    """A square upright on the wall's middle, which looks to one side."""
-    upright = [[0.0, -0.05, 0.1], [0.0, 0.05, 0.1], [0.0, 0.05, 0.4], [0.0, -0.05, 0.4]]
-    made = []
-    found = physics_of(lambda: made.append(simulated((upright, [[0, 2, 1], [0, 3, 2]]), tiles=16, time_axis=None)))
-    assert found == []
-    assert bool((made[0].steady[..., :2] > 0).all()) and not bool(made[0].steady[..., 2:].any())
-
-
-@pytest.mark.slow
 def test_layers_without_light_say_it_once():
     layer = renderer(hidden=AWAY)
     found = physics_of(lambda: [layer(seed=seed) for seed in range(3)])

@@ -1,6 +1,5 @@
 """Captures as YAML files: what the entries mean, and what is refused."""
 
-import contextlib
 import json
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 import torchtransient as tt
 from support.sweeps import together
 from torchtransient import scenes
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, TorchTransientError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, ShapeError, StorageError, UnitError
 from torchtransient.nlos import Scan, Wall, read_setup
 from torchtransient.scenes import rotate, scale, translate
 from torchtransient.sensing import Device
@@ -197,44 +196,3 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
 def test_what_is_refused(read, entries, error, message):
     with pytest.raises(error, match=message):
         read(**entries)
-
-
-# What somebody may write where a number, a text, a list or a mapping belongs.
-VALUES = (
-    None, True, -1, 10**400, "x", [30], [None], ["x", "y", "z"], [[0, 1, 0], 30], [[["x", 1, 0], 30]], {}, {"type": 3},
-)  # fmt: skip
-THINGS = (
-    {"shape": "cube"}, {"scene": "nlos_letter"}, {"scene": "nlos_plates"}, {"scene": "nlos_room"}, {"file": "a.obj"},
-    MESH,
-)  # fmt: skip
-SCAN_ENTRIES = (
-    "kind", "size", "laser", "sensor_origin", "laser_origin", "laser_grid", "cell_centers", "extent",
-    "first_and_last_leg",
-)  # fmt: skip
-PLACES = ("scale", "rotate", "translate", "to_world", "albedo", "bsdf", "flip_normals")
-OF_SCENES = ("letter", "size", "depth", "thickness", "subdivide", "person", "level", "width", "gap", "second_size")
-AXES = ({"start_opl": 1, "bin_width_opl": 0.1, "num_bins": 4}, {"start_s": 0, "bin_width_s": 1e-11, "num_bins": 4})
-FREQUENCIES = {"first": 1.0, "step": 0.5, "count": 4, "start_opl": 0.0}
-
-
-def _wrong_entries(value):
-    for thing in THINGS:
-        yield from ({"hidden": {"a": thing | {key: value}}} for key in (*thing, *PLACES, *OF_SCENES))
-    yield {"hidden": {"a": value}}
-    yield from ({key: value} for key in (*ENTRIES, "name", "wall"))
-    yield from ({"wall": {key: value}} for key in ("width", "height", "center", "normal", "up", "albedo", "file"))
-    for kind in ("single", "confocal", "exhaustive"):
-        yield from ({"scan": {"kind": kind, "size": 2, key: value}} for key in SCAN_ENTRIES)
-    for axis in AXES:
-        yield from ({"time_axis": axis | {key: value}} for key in axis)
-    yield from ({"frequencies": FREQUENCIES | {key: value}} for key in FREQUENCIES)
-    yield from ({"sensor": DEVICE | {key: value}} for key in DEVICE)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("value", VALUES, ids=lambda value: repr(value)[:20])
-def test_entries_of_any_kind_are_read_or_refused(read, value):
-    """Nothing but errors of this library, whatever stands where."""
-    for entries in _wrong_entries(value):
-        with contextlib.suppress(TorchTransientError):
-            read(**entries)

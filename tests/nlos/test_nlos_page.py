@@ -72,19 +72,6 @@ def test_every_block_runs(folder):
 
 
 @pytest.mark.slow
-def test_the_file_holds_all_light_of_its_things(folder):
-    setup = tt.nlos.read_setup("capture.yaml")
-    bare = tt.nlos.simulate(**setup | {"sensor": None, "progress": False})
-    torch.testing.assert_close(bare.total(), bare.steady, rtol=1e-5, atol=0)
-    large = tt.nlos.Scan.grid(setup["scan"].wall, 32, kind="confocal")
-    for name, begins in (("ball", 1.2), ("letter", 2.0)):
-        needed = large.default_axis(tt.scenes.bounds({name: setup["hidden"][name]}), 0.01)
-        assert needed.start_opl == pytest.approx(begins, abs=0.011)
-        assert bare.axis.start_opl <= needed.start_opl and needed.end_opl <= bare.axis.end_opl
-    assert setup["sensor"].name == "mpd_spad_like"
-
-
-@pytest.mark.slow
 def test_the_commands_are_what_python_does(folder):
     """Sixteen parts and the seed's noise."""
     for line in PAGE.blocks("sh")[0].splitlines():

@@ -122,20 +122,6 @@ def test_scans_of_one_line_are_asked_how_large_the_volume_is(size):
     assert volume.values.shape[-2:] == (6, 6) and float(volume.values.max()) > 0
 
 
-def test_a_cut_capture_goes_into_an_operator_of_its_bins():
-    """Three times .1 is not .3, and the bins are the same."""
-    capture = point_capture(scanned("confocal", 4), [PLATE], time_axis=tt.TimeAxis(0.0, 0.1, 30))
-    for start in (0.1, 0.3, 0.6, 0.7):
-        axis = tt.TimeAxis(start, 0.1, 20)
-        operator = tt.nlos.Backprojection(capture.scan, tt.nlos.VoxelGrid.before(capture.scan, [0.5]), time_axis=axis)
-        cut = capture.crop(start, start + 2.0)
-        assert cut.axis.start_opl == start
-        inside = capture.crop(start + 0.03, start + 1.96)
-        assert torch.equal(operator.reconstruct(cut), operator.reconstruct(inside))
-    with pytest.raises(ShapeError, match="as the operator has"):
-        operator.reconstruct(capture.crop(0.6, 2.6))
-
-
 @pytest.mark.slow
 def test_the_page(tmp_path, monkeypatch):
     """Its blocks run, its command reads what they wrote, its links lead somewhere."""

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long
 from support.scalars import no_gradient_is_lost
 from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning, SceneError, TorchTransientError
 
@@ -173,9 +172,8 @@ def test_values_that_hide_the_scan_are_said_once(z, batch):
     assert re.search(SAID[z], str(found[0].message))
 
 
-@pytest.mark.parametrize("z", long(SAID, [*SAID][:1]))
-def test_values_that_hide_the_scan_as_errors(z):
-    layer = renderer(parameters=[VERTICES], physics="error")
+def test_values_that_hide_the_scan_as_errors():
+    z, layer = BEHIND, renderer(parameters=[VERTICES], physics="error")
     with pytest.raises(PhysicsError, match=SAID[z]):
         layer({VERTICES: moved(layer, z)}, seed=0)
     quiet = renderer(parameters=[VERTICES], physics="ignore")

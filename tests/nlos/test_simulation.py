@@ -333,6 +333,7 @@ def test_a_camera_sees_points_of_the_wall():
 
 
 OLDER = """<scene version="3.3.0">
+  <default name="place" value="deep"/>
   <integrator type="transient_nlos_path">
     <integer name="block_size" value="1"/><integer name="max_depth" value="-1"/>
     <integer name="filter_depth" value="-1"/><boolean name="discard_direct_paths" value="false"/>
@@ -341,8 +342,7 @@ OLDER = """<scene version="3.3.0">
     <string name="temporal_filter" value="box"/>
   </integrator>
   <emitter type="projector"><rgb name="irradiance" value="1.0, 1.0, 1.0"/><float name="fov" value="0.2"/></emitter>
-  <shape type="rectangle"><transform name="to_world">
-    <scale value="0.4"/><rotate y="1" angle="180"/><translate z="1"/></transform></shape>
+  {hidden}
   <shape type="rectangle" id="relay_wall">
     <sensor type="nlos_capture_meter">
       <sampler type="independent"><integer name="sample_count" value="32"/><integer name="seed" value="0"/></sampler>
@@ -356,12 +356,16 @@ OLDER = """<scene version="3.3.0">
     </sensor>
   </shape>
 </scene>"""
+PLATE = """<shape type="rectangle"><transform name="to_world">
+  <scale value="0.4"/><rotate y="1" angle="180"/><translate z="1"/></transform></shape>"""
+MESH = """<shape type="obj"><string name="filename" value="{}"/>
+  <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""
 
 
 @pytest.mark.slow
 def test_an_older_scene_of_mitransient(tmp_path):
     """As its examples are written: the spot at a place of the film, a projector, properties that say nothing."""
-    (tmp_path / "older.xml").write_text(OLDER)
+    (tmp_path / "older.xml").write_text(OLDER.format(hidden=PLATE))
     capture = tt.nlos.simulate(tmp_path / "older.xml", progress=False)
     assert capture.transient.shape == (1, 200, 4, 8) and float(capture.transient.sum()) > 0
     assert capture.metadata["spp"] == 32 and capture.metadata["variant"] == "llvm_ad_mono"
@@ -369,6 +373,27 @@ def test_an_older_scene_of_mitransient(tmp_path):
     torch.testing.assert_close(found.laser_points, torch.tensor([0.5, -0.5, 0.0]).double(), rtol=0, atol=1e-6)
     torch.testing.assert_close(found.sensor_points[0, 0], torch.tensor([-0.875, -0.75, 0]).double(), rtol=0, atol=1e-6)
     assert found.laser_origin.tolist() == found.sensor_origin.tolist() == [-0.5, 0.0, 0.25]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("route", ["in a folder by a parameter", "in an included file"])
+def test_a_mesh_that_changed_is_another_simulation(tmp_path, route):
+    """Wherever a complete scene names its file."""
+    (tmp_path / "deep").mkdir()
+    mesh = tmp_path / ("deep/a.obj" if "folder" in route else "a.obj")
+    (tmp_path / "more.xml").write_text(f'<scene version="3.0.0">{MESH.format("a.obj")}</scene>')
+    named = MESH.format("$place/a.obj") if "folder" in route else '<include filename="more.xml"/>'
+    (tmp_path / "scene.xml").write_text(OLDER.format(hidden=named))
+
+    def capture(z):
+        mesh.write_text(f"v -0.4 -0.4 {z}\nv -0.4 0.4 {z}\nv 0.4 0.4 {z}\nf 1 2 3\n")
+        settings = {"part": tmp_path / "a.part", "tiles": 2, "keep_part": True, "progress": False}
+        return tt.nlos.simulate(tt.load(tmp_path / "scene.xml"), **settings).transient
+
+    first = capture(1)
+    assert float(first.sum()) > 0 and bool((capture(1) == first).all())
+    with pytest.raises(StorageError, match="belongs to another simulation"):
+        capture(1.05)
 
 
 # ---------------------------------------------------------------------------------------------- variants, forecasts
@@ -388,15 +413,6 @@ def test_the_cheapest_variant():
         assert capture.channels == ("R", "G", "B") and "colour" in capture.metadata["variant_reason"]
     assert simulated(variant="llvm_ad_rgb").channels == ("R", "G", "B")
     assert mi.variant() == VARIANT
-
-
-@pytest.mark.slow
-def test_colours_agree_with_one_channel():
-    a = torch.stack([simulated(spp=256, seed=s).steady[0] for s in range(4)])
-    with mi.variant_context("llvm_ad_rgb"):
-        b = torch.stack([simulated(spp=256, seed=s, variant="llvm_ad_rgb").steady for s in range(4)])
-    assert torch.equal(b[:, 0], b[:, 1])
-    torch.testing.assert_close(a.sum(), b[:, 0].sum(), rtol=1e-5, atol=0)
 
 
 @pytest.mark.slow
@@ -442,16 +458,6 @@ def test_polarized_captures_have_their_shapes():
     assert forecast.shape == tuple(whole.transient.shape) == tuple(parts.transient.shape) == (4, 1, 100, 2, 3)
     assert whole.metadata["variant_reason"].startswith("the active one")
     assert whole.polarized and parts.polarized and parts.steady.shape == (4, 1, 2, 3)
-
-
-@pytest.mark.slow
-def test_tiles_of_exhaustive_captures_are_few(tmp_path):
-    """Each looks at all spots anew."""
-    for kind, count in (("confocal", 16), ("exhaustive", 4)):
-        forecast = tt.nlos.forecast(
-            tt.scenes.nlos_z(), scan(kind, (8, 4)), time_axis=AXIS, spp=1, part=tmp_path / "a.part"
-        )
-        assert forecast.parts == count and os.listdir(tmp_path) == []
 
 
 def test_a_capture_that_does_not_fit():

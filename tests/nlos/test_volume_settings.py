@@ -178,21 +178,6 @@ def test_planes_within_the_depths_are_kept():
         N.reconstruct(capture, "lct", depths=(0.4, 0.6), progress=False)
 
 
-@pytest.mark.parametrize("name", ["bp", "fbp", "phasor"])
-def test_volumes_of_many_planes_are_those_of_the_operator(name):
-    """Of more planes than backprojection takes at a time."""
-    kind = {"bp": N.Backprojection, "fbp": N.FilteredBackprojection, "phasor": N.PhasorField}[name]
-    scan = N.Scan.grid(WALL, (3, 2), kind="confocal")
-    light = torch.rand(1, 64, 2, 3, generator=torch.Generator().manual_seed(0))
-    voxels = N.VoxelGrid.before(scan, torch.linspace(0.1, 0.5, 20))
-    found = N.reconstruct(N.Capture(light, AXIS, scan), name, grid=voxels, wavelength=None if name == "bp" else 0.3,
-                          progress=False)  # fmt: skip
-    settings = {"bp": {}, "fbp": {"filter": N.PhasorFilter(0.3)}, "phasor": {"pulse": N.PhasorFilter(0.3)}}[name]
-    expected = kind(scan, voxels, time_axis=AXIS, **settings).reconstruct(light)
-    assert found.grid == voxels
-    torch.testing.assert_close(found.values, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
-
-
 # ---------------------------------------------------------------------------------------------------------------- slabs
 
 

@@ -7,10 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import torchtransient  # noqa: F401  # isort: skip  (finds LLVM before Dr.Jit is imported, for child processes too)
+
+import mitsuba as mi
 import numpy as np
 import pytest
-
-import torchtransient  # noqa: F401  (finds LLVM before Dr.Jit is imported; child processes inherit what it found)
 
 
 @pytest.fixture(name="peer_python")
@@ -52,5 +53,25 @@ def peer(tmp_path):
             assert str(data["version"]).startswith("1.3"), f"compared with 1.3.1, found {data['version']}"
             render.frequencies = data["frequencies"]
             return data["steady"].astype(np.float64), data["transient"].astype(np.float64)
+
+    return render
+
+
+def build(node):
+    """Arrays become Mitsuba transforms."""
+    if isinstance(node, np.ndarray):
+        return mi.ScalarTransform4f(node)
+    return {key: build(value) for key, value in node.items()} if isinstance(node, dict) else node
+
+
+@pytest.fixture
+def ours():
+    """`ours(scene, seeds, spp)` -> steady (K, H, W, C), transient (K, H, W, T, C), float64; `ours.film` is the last."""
+
+    def render(description, seeds, spp):
+        scene = mi.load_dict(build(description))
+        images = [scene.integrator().render(scene, seed=seed, spp=spp) for seed in seeds]
+        render.film = scene.sensors()[0].film()
+        return tuple(np.stack([np.array(pair[i], dtype=np.float64) for pair in images]) for i in range(2))
 
     return render

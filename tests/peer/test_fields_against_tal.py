@@ -100,13 +100,7 @@ def test_videos_are_those_of_the_peer(benchmark, tal, name):
     video, _ = tal.solve("fbp", DEPTHS, camera=name, wl_mean=PULSE.wavelength, wl_sigma=PULSE.sigma)
     moments = [20, 24, 28] if name == "TRANSIENT" else [0, 2, 5]
     camera = {"TRANSIENT": TransientCamera, "CONFOCAL_TIME_GATED": ConfocalCamera}[name]
-    operator = PhasorField(
-        capture.scan,
-        planes(capture.scan),
-        time_axis=AXIS,
-        pulse=PULSE,
-        camera=camera([AXIS.bin_width_opl * k for k in moments]),
-        dtype=torch.float64,
-    )
+    of = {"time_axis": AXIS, "pulse": PULSE, "camera": camera([AXIS.bin_width_opl * k for k in moments])}
+    operator = PhasorField(capture.scan, planes(capture.scan), dtype=torch.float64, **of)
     for frame, moment in zip(operator.adjoint(capture.transient[0]), moments, strict=True):
         assert benchmark.correlation(frame, video[moment]) > 0.99

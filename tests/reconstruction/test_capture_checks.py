@@ -9,13 +9,10 @@ import torch
 
 from support.grid_operators import SCAN
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Capture
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction import (
     FK,
-    Backprojection,
-    PlanarScan,
-    VoxelGrid,
     lct,
 )
 
@@ -50,14 +47,3 @@ def test_what_is_no_capture_is_told_what_to_do():
                       frequencies=FrequencyAxis((1.0,)))  # fmt: skip
     with pytest.raises(ShapeError, match="lct: expected a capture with a transient, got phasors alone"):
         lct(phasors)
-
-
-def test_grids_of_a_wall_take_captures_of_scans_on_it():
-    operator = FK(PlanarScan.of_scan(SCAN, "test"), time_axis=FINE)
-    light = torch.ones(1, *operator.data_shape)
-    assert operator.reconstruct(Capture(light, FINE, SCAN)).shape == (1, *operator.volume_shape)
-    with pytest.raises(ShapeError, match="expected a confocal scan, got a single one"):
-        operator.reconstruct(Capture(light, FINE, Scan.grid(SCAN.wall, (5, 6), kind="single")))
-    anywhere = Backprojection(SCAN, VoxelGrid.before(SCAN, [0.5]), time_axis=FINE)
-    with pytest.raises(ShapeError, match="own scan"):
-        anywhere.reconstruct(Capture(light, FINE, replace(SCAN, first_and_last_leg=True)))

@@ -39,19 +39,6 @@ def direct(wavefield, axis, pitch):
     return torch.fft.ifft2(out)[:, :rows, :columns]
 
 
-def peak(volume, operator):
-    """Place (3,) of the highest voxel, between samples by a parabola through the logarithms."""
-    index = [int(i) for i in torch.unravel_index(volume.argmax(), volume.shape)]
-    place = []
-    for axis, k in enumerate(index):
-        before, at, after = (float(volume[(*index[:axis], k + i, *index[axis + 1 :])].log()) for i in (-1, 0, 1))
-        place.append(k + 0.5 * (before - after) / (before - 2 * at + after))
-    z = float(operator.depths[0]) + place[0] * operator.axis.bin_width_opl / 2
-    corner = operator.grid.at_depths([z]).points[0, 0, 0]
-    dy, dx = operator.grid.pitch
-    return corner + place[1] * dy * operator.grid.along_y + place[2] * dx * operator.grid.along_x
-
-
 @pytest.mark.parametrize("z", long([0.46, 2.2], [2.2]))
 def test_field_is_that_of_the_direct_transform(z):
     # In parts of the record: 18 and 86 %.
@@ -71,17 +58,6 @@ def test_start_and_unequal_sides_are_those_of_the_direct_transform():
     psi = operator.wavefield(confocal_points([(0.1, -0.1, 0.9)], scan, axis, power=2))
     exact = direct(psi, axis, operator.grid.pitch)
     assert float((operator.adjoint(psi) - exact).abs().max()) < 1e-3 * float(exact.abs().max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("z", [0.45, 2.1])
-def test_points_come_out_where_they_are(z):
-    axis = TimeAxis(0.0, 0.0096, 512)
-    scan = Scan.grid(Wall.plane(1.0, 1.0), 32, kind="confocal")
-    operator = FK(scan, time_axis=axis)
-    point = torch.tensor([0.109375, -0.140625, z], dtype=F64)  # behind a point of the grid
-    found = peak(operator.reconstruct(confocal_points([point.tolist()], scan, axis)).to(F64), operator)
-    assert float((found - point).abs().max()) < 1e-3
 
 
 def test_pictures_are_linear_in_the_light():

@@ -88,18 +88,6 @@ def test_points_come_out_where_they_are():
     assert float((found - torch.tensor(place)).abs().max()) < 0.045
 
 
-@pytest.mark.slow
-def test_front_view_of_a_letter():
-    bar = [(0.02 * k + 0.05, 0.2, 0.8) for k in range(-12, 13)]
-    stem = [(0.05, 0.02 * k - 0.05, 0.8) for k in range(-12, 13)]
-    operator = MidpointFK(SCANS["exhaustive"], time_axis=AXIS, dtype=F64)
-    front = operator.reconstruct(capture_of(bar + stem, SCANS["exhaustive"])).amax(0)
-    places = operator.points[0, ..., :2]
-    across = places[:, :, None] - torch.tensor(bar + stem, dtype=F64)[:, :2]
-    truth = torch.exp(-across.square().sum(-1) / (2 * 0.03**2)).sum(-1)
-    assert float((front * truth).sum() / (front.norm() * truth.norm())) > 0.8
-
-
 def test_what_it_cannot_take_is_refused():
     with pytest.raises(ShapeError, match="Use FK"):
         MidpointFK(Scan.grid(WALL, 8, kind="confocal"), time_axis=AXIS)

@@ -99,19 +99,6 @@ def test_pieces_do_not_show(name, monkeypatch):
         torch.testing.assert_close(operator(whole), forward, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-def test_without_falloff_it_is_filtered_backprojection(kind):
-    # Lines between 16 samples of a wave lose (pi / 16)^2 / 3 of it in the mean; planes know its phase.
-    scan = Scan.grid(WALL, (6, 5), kind=kind, **({"laser_grid": 2} if kind == "exhaustive" else {}))
-    grid = VoxelGrid.before(scan, DEPTHS)
-    pulse, axis = PhasorFilter(0.12, 4.0), TimeAxis(-0.4, 0.03, 50)
-    capture = point_capture(scan, [(0.02, 0.01, 0.15), (-0.05, 0.04, 0.2)], time_axis=axis, pulse_sigma_opl=0.03)
-    light = capture.transient[0]
-    field = PhasorField(scan, grid, time_axis=axis, pulse=pulse, falloff=0.0, dtype=F64).adjoint(light)
-    summed = FilteredBackprojection(scan, grid, time_axis=axis, filter=pulse, dtype=F64).adjoint(light)
-    assert float((field - summed).norm() / summed.norm()) < (math.pi / 16) ** 2 / 3
-
-
 @pytest.mark.parametrize("cycles", [1.0, 2.0, 3.9])
 def test_short_pulses_have_all_their_frequencies(cycles):
     # The definition: the pulse at the exact length of every pair, from the middle of every bin.
@@ -147,21 +134,6 @@ def test_a_point_is_brightest_where_it_is():
     picture = phasor_image(capture, grid, pulse=PhasorFilter(0.04, 3.0))
     assert picture.shape == (1, 11, 12, 12)
     assert int(picture.argmax()) == (6 * 12 + 4) * 12 + 7
-
-
-def test_transient_camera_sees_the_pulse_arrive():
-    # A hidden point lights up when the light of the spot reaches it: at its distance, to a tenth of a wavelength.
-    scan = Scan.grid(WALL, 12, kind="single", laser=(0.25, 0.5))
-    point = torch.tensor([0.03, -0.02, 0.16], dtype=F64)
-    capture = point_capture(scan, point[None], time_axis=TimeAxis(0.1, 0.005, 120), pulse_sigma_opl=0.005)
-    times = torch.arange(0.1, 0.25, 0.004, dtype=F64)
-    grid = VoxelGrid.before(scan, [0.16])
-    camera = TransientCamera(times)
-    video = phasor_image(capture, grid, pulse=PhasorFilter(0.06, 3.0), camera=camera)[0]
-    assert video.shape == (len(times), 1, 12, 12)
-    j, i = divmod(int((grid.points[0] - point).norm(dim=-1).argmin()), 12)
-    seen = float(times[video[:, 0, j, i].argmax()])
-    assert seen == pytest.approx(float((scan.laser_points - point).norm()), abs=0.006)
 
 
 def test_confocal_camera_begins_with_direct_light():

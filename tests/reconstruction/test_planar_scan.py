@@ -57,12 +57,6 @@ def test_rows_and_columns_may_lean_by_a_thousandth(sign):
         of(points_of(lean=sign * math.tan(math.radians(60))))
 
 
-def test_points_in_one_place_are_no_grid():
-    for points in (points_of()[:, :1].expand(3, 4, 3), points_of()[:1].expand(3, 4, 3), torch.zeros(2, 3, 3)):
-        with pytest.raises(ShapeError, match="rectangular grid"):
-            of(points)
-
-
 def test_the_normal_is_that_of_the_wall():
     up = TURN[:, 2].expand(3, 4, 3)
     for normals, sign in ((up, 1.0), (-up, -1.0), (None, 1.0)):

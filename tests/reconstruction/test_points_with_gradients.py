@@ -97,13 +97,6 @@ def test_grids_know_nothing_of_them(normals):
     assert made[0] == VoxelGrid.before(SCANS["confocal"], DEPTHS)
 
 
-def test_points_of_voxels_are_detached():
-    points = scan_operators.points_anywhere().requires_grad_()
-    operator = Backprojection(SCANS["single"], points, time_axis=scan_operators.AXIS, dtype=F64)
-    assert not operator.points.requires_grad and torch.equal(operator.points, points)
-    assert operator.adjoint(torch.ones(operator.data_shape)).isfinite().all()
-
-
 def test_captures_without_legs_depend_on_their_light_alone():
     scan = carrying(SCANS["confocal, legs"])
     capture = Capture(torch.ones(1, 40, *scan.shape), TimeAxis(0.5, 0.02, 40), scan)

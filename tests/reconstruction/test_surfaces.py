@@ -50,11 +50,6 @@ def test_confidence_and_mask():
     assert not depth_map(-volume - 1, [0.1, 0.2, 0.3]).mask.any()
 
 
-def test_one_plane_and_two():
-    assert depth_map(torch.ones(1, 2, 2), [0.4]).depth.tolist() == [[pytest.approx(0.4)] * 2] * 2
-    assert depth_map(torch.tensor([[[1.0]], [[2.0]]]), [0.4, 0.5]).depth.item() == pytest.approx(0.5)
-
-
 def test_derivatives_of_depth():
     generator = torch.Generator().manual_seed(3)
     bumps = 1 - 20 * (UNEVEN[:, None, None] - (0.56 + 0.1 * torch.rand(2, 3, dtype=F64, generator=generator))) ** 2
@@ -99,21 +94,6 @@ def test_normals_of_planes(slopes):
     inside = normals_from_volume(volume, grid)[:, 1:-1, 1:-1]
     error = max(abs(s) * (s * p / 0.06) ** 2 / 6 for s, p in zip(slopes, reversed(grid.pitch), strict=True))
     assert (inside - exact[:, 1:-1, 1:-1]).norm(dim=0).max() < 1.5 * error + 2e-2 * max(map(abs, slopes)) + 1e-9
-
-
-def test_batches_are_items_on_their_own():
-    grid = grid_of(UNEVEN)
-    volume = torch.rand(2, 3, *grid.shape, generator=torch.Generator().manual_seed(0))
-    for function in (
-        lambda v: depth_map(v, grid).depth,
-        lambda v: depth_map(v, grid).confidence,
-        lambda v: soft_depth(v, grid),
-        lambda v: normals_from_volume(v, grid),
-        lambda v: normals_from_depth(v[..., 0, :, :], grid),
-    ):
-        torch.testing.assert_close(function(volume)[1, 2], function(volume[1, 2]))
-        torch.testing.assert_close(torch.vmap(function)(volume), function(volume))
-        assert function(volume[:0]).shape == (0, *function(volume).shape[1:])
 
 
 def test_what_cannot_be_taken():
