@@ -134,19 +134,3 @@ def test_the_choice_says_why_not():
 
 
 # ------------------------------------------------------------------------------------------------ colours
-
-
-@pytest.mark.slow
-def test_colours():
-    """Of red, green and blue albedos, each channel is that of paths."""
-    with mi.variant_context("llvm_ad_rgb"):
-        v, f = folded_plates()
-        shape = mesh("a", (v, f), {"type": "rgb", "value": [0.9, 0.5, 0.2]})
-        given = {"min_bounces": 4, "max_depth": 5}
-        some, other = (scan_scene([shape], **given, late_light=choice) for choice in ("chains", "paths"))
-        a, b = rendered(some, CHAINS // 2, 24), rendered(other, PATHS // 2, 16, first=50)
-        assert a.shape[-1] == 3
-        for channel in range(3):
-            equal, z = agree(a[..., channel : channel + 1], b[..., channel : channel + 1])
-            assert equal, z
-        assert a[..., 0].sum() > 3 * a[..., 2].sum()

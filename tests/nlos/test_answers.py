@@ -8,7 +8,6 @@ import copy
 import json
 import warnings
 
-import mitsuba as mi
 import pytest
 import torch
 
@@ -208,22 +207,6 @@ def test_layers_without_light_say_it_once():
         with pytest.raises(PhysicsError, match="no light comes back"):
             strict(seed=0)
     assert len(physics_of(lambda: simulated(TOWARDS, energy=0.0))) == 1
-
-
-# ------------------------------------------------------------------------------------------------------------ variants
-
-
-@pytest.mark.slow
-def test_a_layer_after_another_variant():
-    """What was made for one variant renders and differentiates when classes were made for another in between."""
-    layer = renderer(["letter.bsdf.reflectance.value"], bounces=(3, 4, 5))
-    before = layer(seed=0).transient.detach()
-    with mi.variant_context("llvm_ad_rgb"):
-        tt.nlos.CaptureRenderer(HIDDEN, scan(), time_axis=AXIS, spp=4, bounces=(3, 4, 5))(seed=0)
-    after = layer(seed=0).transient
-    torch.testing.assert_close(after.detach(), before, rtol=0, atol=1e-6 * float(before.max()))
-    after.sum().backward()
-    assert float(layer.values["letter.bsdf.reflectance.value"].grad) > 0
 
 
 def test_a_detached_capture_has_points_without_gradients():

@@ -82,10 +82,9 @@ def test_the_commands_are_what_python_does(folder):
         assert result.exit_code == 0, result.output
     written = tt.nlos.read_capture("capture.h5")
     setup = tt.nlos.read_setup("capture.yaml")
-    for tiles, agree in ((16, True), (1, False)):
-        generator = torch.Generator().manual_seed(setup["seed"])
-        capture = tt.nlos.simulate(**setup, tiles=tiles, generator=generator, progress=False)
-        assert torch.equal(capture.transient, written.transient) == agree
+    generator = torch.Generator().manual_seed(setup["seed"])
+    capture = tt.nlos.simulate(**setup, tiles=16, generator=generator, progress=False)
+    assert torch.equal(capture.transient, written.transient)
     assert tt.nlos.read_capture("capture.npz").metadata["spp"] == 1000
 
 

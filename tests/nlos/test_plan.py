@@ -60,11 +60,3 @@ def test_without_a_pilot_run_the_depth_is_kept():
     """The plate's albedo leaves little of the emitted power behind two bounces, and all that is seen."""
     plan = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=1e-4)), pilot=False)
     assert plan.max_depth is None and "max_depth: 3, kept" in str(plan) and light(plan).startswith(SHARED)
-
-
-@pytest.mark.slow
-def test_colours_and_phasors():
-    coloured = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=(0.2, 0.5, 0.9))))
-    assert coloured.variant == "llvm_ad_rgb"
-    phasors = tt.plan(scene(), "phasor", frequencies=[0.0, 0.5])
-    assert phasors.integrator == "transient_nlos_path" and light(phasors).startswith(SHARED)

@@ -132,16 +132,6 @@ def test_shapes_and_materials(read, tmp_path):
     assert hidden["ball"]["bsdf"]["material"] == "Cu" and hidden["ball"]["bsdf"]["alpha"] == 0.2
 
 
-def test_what_it_says_is_a_scene(read):
-    found = read()
-    sensor = {"type": "perspective", "film": {"type": "hdrfilm"}}
-    scene = {"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, **found["hidden"]}
-    table = tt.load(scene | {"wall": found["scan"].wall}, variant=found["variant"]).parameters()
-    corner = table["letter.vertex_positions"].value.reshape(-1, 3)
-    expected = (found["hidden"]["letter"]["to_world"] @ [0, 0, 0, 1])[:3]
-    assert np.abs(corner - expected).sum(1).min() < 1e-6
-
-
 def test_kinds_of_scans(read):
     scan = scan_of(read, "scan_type: confocal\nlaser_width: 8\nlaser_height: 6\naccount_first_and_last_bounces: true")
     assert scan.kind == "confocal" and scan.first_and_last_leg and scan.shape == (6, 8)

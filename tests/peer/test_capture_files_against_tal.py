@@ -8,7 +8,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
 
 from support.capture_files import holdable
 from torchtransient.axes import FrequencyAxis
@@ -169,15 +168,3 @@ def test_what_tal_reads(tal, tmp_path, name):
 
 def rounded(points):
     return np.round(np.asarray(points, np.float64).reshape(-1, 3), 9) + 0.0
-
-
-def test_what_tal_copies(tal, tmp_path):
-    """Written here, read and written by y-tal, read here: nothing is lost."""
-    for number, (name, capture) in enumerate(HOLDABLE.values()):
-        if name != "tal" or capture.phasor is not None:
-            continue
-        path = capture.write(tmp_path / f"{number}.h5", "tal")
-        tal("copy", path, tmp_path / "copy.h5")
-        back = read_capture(tmp_path / "copy.h5")
-        assert back == capture and torch.equal(back.transient, capture.transient)
-        assert back.metadata == capture.metadata

@@ -1,8 +1,6 @@
 """Backprojection and phasor fields beside y-tal, in the environment that TORCHTRANSIENT_TAL_PYTHON names."""
 
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -31,20 +29,6 @@ DEPTHS = [0.8, 0.85, 0.9, 1.0]
 PULSE = PhasorFilter(0.3, 4.0)
 
 
-def tal_python():
-    """The interpreter that has y-tal: the one that is named, or this one."""
-    named = os.environ.get("TORCHTRANSIENT_TAL_PYTHON")
-    if named:
-        return named
-    if subprocess.run([sys.executable, "-c", "import tal"], capture_output=True, check=False).returncode:
-        pytest.fail(
-            "these tests need y-tal 0.20: install the extra 'peer' here, or set TORCHTRANSIENT_TAL_PYTHON to the "
-            "python of an environment that has it",
-            pytrace=False,
-        )
-    return sys.executable
-
-
 @pytest.fixture(scope="module")
 def benchmark():
     """The program that hands captures to the peer."""
@@ -59,8 +43,8 @@ def benchmark():
 
 
 @pytest.fixture(scope="module")
-def tal(benchmark):
-    worker = benchmark.Tal(tal_python(), 1)
+def tal(benchmark, tal_python):
+    worker = benchmark.Tal(tal_python, 1)
     yield worker
     worker.close()
 

@@ -118,11 +118,3 @@ def test_parts_that_do_not_belong_together(change, error, words):
     N.HiddenVolume(**parts)
     with pytest.raises(error, match=words):
         N.HiddenVolume(**{**parts, **change})
-
-
-def test_films_have_one_direction_for_all_of_their_times():
-    grid = replace(GRID.at_depths([0.3, 0.4]), size=(3, 4))
-    film, vectors = torch.ones(2, 5, 2, 3, 4), torch.ones(2, 3, 2, 3, 4)
-    N.HiddenVolume(film, grid, "fk", times=torch.arange(5), directions=vectors)
-    with pytest.raises(ShapeError, match=r"expected directions \(2, 3, 2, 3, 4\)"):
-        N.HiddenVolume(film, grid, "fk", times=torch.arange(5), directions=vectors[:1])

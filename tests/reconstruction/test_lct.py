@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from support.grid_operators import confocal_points
 from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan, Wall
@@ -171,24 +170,6 @@ def test_directional_model_of_a_point():
     r = way.norm(dim=-1)
     expected = (way @ normal) / r * r**-4
     torch.testing.assert_close(operator(volume).sum(0), expected, rtol=0.015, atol=0.002 * float(expected.max()))
-
-
-def test_walls_that_stand_elsewhere_have_the_same_vectors_turned():
-    # World coordinates: the same scene in front of a wall that is turned and moved.
-    turn = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=F64)
-    points = SCAN.sensor_points @ turn.T + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
-    origin = turn @ SCAN.sensor_origin + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
-    turned = Scan.points(
-        points, kind="confocal", sensor_origin=origin, laser_origin=origin,
-        normals=(SCAN.sensor_normals @ turn.T),
-    )  # fmt: skip
-    light = confocal_points([(0.1, 0.1, 0.9)], SCAN, AXIS)
-    here = DirectionalLCT(SCAN, time_axis=AXIS, dtype=F64)
-    there = DirectionalLCT(turned, time_axis=AXIS, dtype=F64)
-    expected = torch.einsum("ij,jzyx->izyx", turn, here.reconstruct(light))
-    torch.testing.assert_close(there.reconstruct(light), expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
-    moved = here.points @ turn.T + torch.tensor([1.0, 2.0, 3.0], dtype=F64)
-    torch.testing.assert_close(there.points, moved)
 
 
 def test_what_it_cannot_take_is_refused():

@@ -39,12 +39,9 @@ def test_is_the_capture_that_counts_no_legs(name):
     torch.testing.assert_close(found.transient.sum(1), expected.transient.sum(1), rtol=1e-3, atol=0)
 
 
-def test_late_axes_keep_their_start_and_gradients_go_through():
+def test_gradients_go_through():
     scan = Scan.grid(WALL, (6, 5), kind="confocal", first_and_last_leg=True, **ORIGINS)
     capture = capture_of(scan, TimeAxis(3.0, 0.02, 80))
-    found = subtract_legs(capture)
-    assert found.axis.num_bins == 80
-    assert found.axis.start_opl == pytest.approx(3.0 - float(scan.legs.min()))
     light = capture.transient.clone().requires_grad_()
     volume = fk(subtract_legs(Capture(light, capture.axis, scan)), floor=0.25)
     (gradient,) = torch.autograd.grad(volume.sum(), light)

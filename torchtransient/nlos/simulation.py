@@ -80,19 +80,11 @@ class VariantChoice:
     why: str
 
 
-def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
+def _choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     """Choose the cheapest variant in which a capture loses nothing.
 
     ``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is grey,
     on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
-
-    Args:
-        scene: of the capture.
-        requested: name of a variant, or None.
-
-    Raises:
-        VariantError: for a variant that cannot be used.
-        SceneError: for a scene that cannot be read.
     """
     import mitsuba as mi
 
@@ -111,16 +103,10 @@ def choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
     return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {text_of(coloured)}")
 
 
-def files_of(scene: Scene) -> dict[str, str]:
+def _files_of(scene: Scene) -> dict[str, str]:
     """Return the contents of the files that a scene names anywhere, by the name that it has there.
 
-    Included files, defaults and values of ``$parameters`` count.
-
-    Args:
-        scene: a complete one.
-
-    Raises:
-        SceneError: for a description that Mitsuba cannot read.
+    Included files, defaults and values of ``$parameters`` count. Raises SceneError where Mitsuba cannot read it.
     """
     import mitsuba as mi
 
@@ -237,7 +223,7 @@ class SceneWork:
     def key(self, seed: int) -> str:
         """Return the key of a part file of this work."""
         scene = self._renderer.scene
-        return content_key(scene._description, files_of(scene), self.film, self.variant.name, seed, self.count)
+        return content_key(scene._description, _files_of(scene), self.film, self.variant.name, seed, self.count)
 
     def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
         """Return time axis and frequencies of the film, one of which is None."""
@@ -256,13 +242,8 @@ class SceneWork:
 Work: TypeAlias = "HiddenWork | SceneWork"
 
 
-def seed_of(seed: int, number: int) -> int:
-    """Return the seed of a part, independent of the seeds of other parts.
-
-    Args:
-        seed: of the simulation.
-        number: of the part.
-    """
+def _seed_of(seed: int, number: int) -> int:
+    """Return the seed of a part, independent of the seeds of other parts."""
     return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:4], "little")
 
 
@@ -305,7 +286,7 @@ class Forecast:
     def __str__(self) -> str:
         shape = " x ".join(map(str, self.shape))
         parts = f", in {self.parts} parts" if self.parts > 1 else ""
-        taken = "" if self.seconds is None else f", about {duration_in_words(self.seconds)}"
+        taken = "" if self.seconds is None else f", about {_duration_in_words(self.seconds)}"
         lines = [
             self.scan,
             f"{shape}: {size_in_words(self.bytes)}{taken}, {self.spp} samples a point{parts}",
@@ -315,16 +296,8 @@ class Forecast:
         return "\n".join(lines)
 
 
-def forecast_of(work: Work, *, timed: bool) -> Forecast:
-    """Forecast a simulation that is about to start.
-
-    Args:
-        work: to be rendered.
-        timed: with the time, from a small share of the samples.
-
-    Raises:
-        StorageError: for a capture that does not fit into memory.
-    """
+def _forecast_of(work: Work, *, timed: bool) -> Forecast:
+    """Forecast a simulation, ``timed`` from a small share of its samples. Raises StorageError beyond the memory."""
     shape = _measured_shape(work)
     taken = math.prod(shape) * _NUMBER_BYTES * (1 if work.film.frequencies is None else 2)
     _check_fits(taken, shape, work)
@@ -401,12 +374,8 @@ def size_in_words(count: int) -> str:
     return f"{count / 2**10:.4g} KiB"
 
 
-def duration_in_words(seconds: float) -> str:
-    """Return seconds in words.
-
-    Args:
-        seconds: a duration.
-    """
+def _duration_in_words(seconds: float) -> str:
+    """Return seconds in words."""
     if seconds < 100:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -472,7 +441,7 @@ def simulate(
     part_file = nullcontext() if path is None else PartFile(path, work.key(seed))
     with part_file as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
-        forecast = forecast_of(work, timed=progress and not finished)
+        forecast = _forecast_of(work, timed=progress and not finished)
         if progress:
             print(forecast, file=sys.stderr)
         if kept is None and work.count == 1:
@@ -524,7 +493,7 @@ def forecast(
         hidden, scan, time_axis, frequencies, spp, (of_light[0], of_light[1]), variant, _parts(scan, path, tiles)
     )
     with active_variant(work.variant.name):
-        return forecast_of(work, timed=True)
+        return _forecast_of(work, timed=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------- work
@@ -550,7 +519,7 @@ def _work(
         "bounces": DEFAULT_BOUNCES if bounces is None else bounces,
         "energy": DEFAULT_ENERGY if energy is None else energy,
     }
-    chosen = choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
+    chosen = _choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
@@ -583,7 +552,7 @@ def _scene_work(
     given = variant
     if given is None and isinstance(scene, Scene):
         given = scene._requested_variant
-    chosen = choose_variant(loaded, given)
+    chosen = _choose_variant(loaded, given)
     return SceneWork(load(loaded, variant=chosen.name), time_axis, frequencies, spp, chosen, parts)
 
 
@@ -616,7 +585,7 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 bar.update(1)
                 continue
             began = time.perf_counter()
-            capture = work.render(number, seed_of(seed, number))
+            capture = work.render(number, _seed_of(seed, number))
             layout = RowLayout.of(capture)
             part = layout.rows(capture)
             seconds = time.perf_counter() - began
