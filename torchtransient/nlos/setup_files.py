@@ -202,12 +202,12 @@ _SCAN_ENTRIES = (
 
 
 def _of_description(data: Mapping[str, Any], folder: Path, name: str) -> dict[str, Any]:
-    section = Section(data, "capture description", _ENTRIES)
-    if "hidden" not in section:
+    if "hidden" not in data:
         raise SceneError(
             f"{name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of y-tal), got "
             f"{', '.join(map(str, data))}."
         )
+    section = Section(data, "capture description", _ENTRIES)
     section.text("name", "")
     hidden = described_shapes(section.get("hidden"), folder)
     scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
