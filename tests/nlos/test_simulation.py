@@ -311,25 +311,33 @@ def test_spots_around_the_axis_of_a_laser(kind):
                                rtol=0, atol=1e-6)  # fmt: skip
 
 
-def test_a_camera_sees_points_of_the_wall():
-    """Pixel centres of a perspective sensor; those that look past the wall are put on the wall's plane."""
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+def test_a_camera_sees_points_of_the_wall(slope):
+    """Pixel centres of a perspective sensor; those that look past the wall are put on the plane of the nearest one, of
+    a wall whose right half, x > 0, leans towards the camera.
+    """
     description = complete("single")
     meter = description["wall"].pop("sensor")
+    corners = [[x, y, slope * max(x, 0)] for x in (-1, 0, 1) for y in (-0.8, 0.8)]
+    description["wall"] = tt.nlos.Wall.mesh(corners, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]).shape
     look = mi.ScalarTransform4f().look_at([0, 0, 0.8], [0, 0, 0], [0, 1, 0])
-    film = meter["film"] | {"width": 8, "height": 4}
-    fov = math.degrees(2 * math.atan(2 / 0.8))
+    film, fov = meter["film"] | {"width": 8, "height": 4}, math.degrees(2 * math.atan(2 / 0.8))
     description["camera"] = {"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": look, "film": film}
-    description["laser"] |= {"to_world": mi.ScalarTransform4f().look_at([0, 0, 0.8], [0.3, 0.1, 0], [0, 1, 0])}
+    description["laser"] |= {"to_world": mi.ScalarTransform4f().look_at([0, 0, 0.8], [-0.3, 0.1, 0], [0, 1, 0])}
     with pytest.warns(tt.errors.TorchTransientWarning, match="16 of the sensor's 32 rays look past the wall"):
         capture = tt.nlos.simulate(description, spp=4, progress=False)
     points = capture.scan.sensor_points
     x, y = 2 * ((torch.arange(8) + 0.5) / 4 - 1), 2 * (0.5 - (torch.arange(4) + 0.5) / 4)
-    # Cameras of Mitsuba look along +z with x to the left.
-    expected = torch.stack([-x[None, :].expand(4, 8), y[:, None].expand(4, 8), torch.zeros(4, 8)], -1).double()
-    torch.testing.assert_close(points.abs(), expected.abs(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(capture.scan.laser_points, torch.tensor([0.3, 0.1, 0.0]).double(), rtol=0, atol=1e-5)
+    flat = torch.stack([x[None, :].expand(4, 8), y[:, None].expand(4, 8), torch.zeros(4, 8)], -1).double()
+    camera = torch.tensor([0.0, 0.0, 0.8]).double()
+    way = 0.8 / (0.8 + slope * flat[..., :1].clamp_min(0))
+    expected = camera + way * (flat - camera)
+    torch.testing.assert_close(points, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(capture.scan.laser_points, torch.tensor([-0.3, 0.1, 0.0]).double(), rtol=0, atol=1e-5)
     past = (points[..., 0].abs() > 1) | (points[..., 1].abs() > 0.8)
-    assert bool((capture.transient.sum((0, 1))[past] == 0).all()) and int(past.sum()) == 16
+    assert int(past.sum()) == 16
+    if not slope:  # of pixels without any part on the wall
+        assert bool((capture.transient.sum((0, 1))[past] == 0).all())
 
 
 OLDER = """<scene version="3.3.0">

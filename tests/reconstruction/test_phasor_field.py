@@ -66,7 +66,10 @@ def test_is_the_sum_that_is_written_out(name, falloff):
     operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, falloff=falloff, dtype=F64)
     light = noise(*operator.data_shape)
     expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, falloff).reshape(grid.shape)
-    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
+    most = float(expected.abs().max())
+    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * most)
+    # The picture is the intensity.
+    torch.testing.assert_close(operator.reconstruct(light), expected.abs().square(), rtol=0, atol=1e-10 * most**2)
 
 
 def test_transient_camera_is_the_sum_that_is_written_out():
