@@ -237,7 +237,7 @@ BODIES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "kind"), zip(BODIES, ("confocal", "single", "confocal"), strict=True))
+@pytest.mark.parametrize(("case", "kind"), [*zip(BODIES, ("confocal", "single", "confocal"), strict=True)])
 def test_bodies_of_many_parts(case, kind):
     hidden, change = BODIES[case]
     capture = capture_of(hidden(), "body.vertex_positions", change, kind)
