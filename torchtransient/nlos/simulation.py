@@ -26,7 +26,7 @@ from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers, count, of_class
-from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError, StorageError
+from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
 from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
 from torchtransient.nlos.renderer import (
@@ -106,7 +106,7 @@ def _choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
 def _files_of(scene: Scene) -> dict[str, str]:
     """Return the contents of the files that a scene names anywhere, by the name that it has there.
 
-    Included files, defaults and values of ``$parameters`` count. Raises SceneError where Mitsuba cannot read it.
+    Included files, defaults and values of ``$parameters`` count. The scene has been built before.
     """
     import mitsuba as mi
 
@@ -114,10 +114,7 @@ def _files_of(scene: Scene) -> dict[str, str]:
     description.check_described("tt.nlos: a simulation that is kept in files")
     assert not isinstance(description, LoadedScene)  # refused above
     with active_variant(scene.variant), description.resolved_files():
-        try:
-            nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes
-        except RuntimeError as error:
-            raise SceneError(f"{description.name}: {error}") from error
+        nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes
         for props in (node.props for node in nodes):
             for name in list(props):
                 if props.type(name) == mi.Properties.Type.String:
