@@ -69,8 +69,8 @@ class Case:
 
     def __init__(self, arrays: Mesh, scan: int, pairs: int, samples: int, rays_too: bool = True) -> None:
         # Plugins know their variant: their modules are imported when one is active.
-        from torchtransient.plugins.around_corner import exhaustive, shafts, third_bounce
         from torchtransient.plugins.around_corner import geometry as wall_points
+        from torchtransient.plugins.around_corner import shafts, third_bounce
         from torchtransient.plugins.sampling import hidden_elements, shared_samples
 
         v, f = plate(2, 2, (0, 0, 0))
@@ -105,8 +105,8 @@ class Case:
             "any-hit rays": (lambda: self.rays(flat), flat),
             "confocal": (free.add_confocal, flat),
             "single": (lambda: free.add_single(laser), flat),
-            "exhaustive": (lambda: exhaustive.add_exhaustive(paired, lasers, False), square),
-            "exhaustive, reciprocal": (lambda: exhaustive.add_exhaustive(paired, lasers, True), square),
+            "exhaustive": (lambda: third_bounce.add_exhaustive(paired, lasers, False), square),
+            "exhaustive, reciprocal": (lambda: third_bounce.add_exhaustive(paired, lasers, True), square),
         }
         if every is not None:
             self.jobs["confocal, a ray each"] = (job(self.scene, one, every, sensors).add_confocal, flat)

@@ -5,14 +5,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import torchtransient.plugins.around_corner.exhaustive as exhaustive
 from support.hidden_shapes import ball, folded_plates, mannequin, mesh, plate, scene_of, wall_grid
 from support.third_bounce_runs import captured, film_of, table_of, wall_of
 from torchtransient.errors import SceneError
 from torchtransient.interfaces import CaptureType
+from torchtransient.plugins.around_corner import third_bounce
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce, add_exhaustive
 from torchtransient.plugins.sampling.shared_samples import draw_samples
 
 VARIANT = "llvm_ad_mono"
@@ -43,7 +43,7 @@ class Runs:
 
     def exhaustive(self, spots=None, **arguments):
         spots = self.sensors if spots is None else spots
-        run = lambda: exhaustive.add_exhaustive(self.job(self.pairs), spots, **arguments)  # noqa: E731
+        run = lambda: add_exhaustive(self.job(self.pairs), spots, **arguments)  # noqa: E731
         steady, cube = captured(self.pairs, run)
         return steady, cube.reshape(GRID**2, GRID**2, *cube.shape[4:])
 
@@ -55,7 +55,7 @@ def test_reciprocity_is_exact(monkeypatch, name, bins, samples):
     runs.pairs = films(bins)[1]
     start = type(runs.pairs).start_render
     monkeypatch.setattr(type(runs.pairs), "start_render", lambda film, count: start(film, samples))
-    monkeypatch.setattr(exhaustive, "MOST_MIRRORED", 2 * GRID**2 * bins)
+    monkeypatch.setattr(third_bounce, "MOST_MIRRORED", 2 * GRID**2 * bins)
     steady, cube = runs.exhaustive()
     assert np.array_equal(cube, cube.transpose(1, 0, 2, 3))
     whole_steady, whole = runs.exhaustive(reciprocal=False)
@@ -77,7 +77,7 @@ def test_bands_of_a_film_hold_what_it_holds(monkeypatch, rows):
         for film, kind, lasers in ((pairs, "EXHAUSTIVE", spots), (one, "CONFOCAL", sensors)):
             film.start_render(1)
             third = ThirdBounce(scene, film, samples, sensors)
-            third.add_confocal() if film is one else exhaustive.add_exhaustive(third, spots)
+            third.add_confocal() if film is one else add_exhaustive(third, spots)
             yield held_by(film)
             film.start_render(1)
             with dr.suspend_grad():
@@ -115,7 +115,7 @@ def test_colours_of_the_other_side():
         for faces in (f, f[:, ::-1]):
             runs = Runs([mesh("a", (v, faces), front, two_sided=True, back=back)])
             job = lambda film, runs=runs: ThirdBounce(runs.scene, film, runs.samples, runs.sensors, 1.0)  # noqa: E731
-            add = lambda runs=runs, job=job: exhaustive.add_exhaustive(job(runs.pairs), runs.sensors)  # noqa: E731
+            add = lambda runs=runs, job=job: add_exhaustive(job(runs.pairs), runs.sensors)  # noqa: E731
             found.append(captured(runs.pairs, add)[1].reshape(-1, 3).sum(0))
     away = np.cross(*(v[f[0][1:]] - v[f[0][0]]))[2] > 0
     expected = colours[::-1] if away else colours

@@ -74,10 +74,9 @@ def test_phasors_are_the_transform_of_fine_bins(which, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_colours(kind):
+def test_colours():
     """Every channel is a capture of its own albedo and energy."""
-    albedos, energies = [0.2, 0.5, 0.8], [1.0, 2.0, 3.0]
+    kind, albedos, energies = "exhaustive", [0.2, 0.5, 0.8], [1.0, 2.0, 3.0]
     with mi.variant_context("llvm_ad_rgb"):
         laser = {"type": "laser_beam", "energy": {"type": "rgb", "value": energies}}
         _, cube, _ = render("third", kind, HISTOGRAM, {"type": "rgb", "value": albedos}, laser=laser)

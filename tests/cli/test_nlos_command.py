@@ -264,7 +264,7 @@ def test_a_killed_simulation_goes_on(folder, signal_name):
 
 @pytest.mark.slow
 def test_a_part_file_of_other_settings(folder, monkeypatch):
-    from torchtransient.nlos.work import HiddenWork
+    from torchtransient.nlos.simulation import HiddenWork
 
     real = HiddenWork.render
     with monkeypatch.context() as patch:

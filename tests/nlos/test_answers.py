@@ -5,26 +5,16 @@ fit, and captures without light.
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import warnings
 
-import mitsuba as mi
 import pytest
 import torch
 
 import torchtransient as tt
 from support.marks import long, long_rows
 from torchtransient import sensing
-from torchtransient.errors import (
-    ArgumentError,
-    PhysicsError,
-    PhysicsWarning,
-    SceneError,
-    TorchTransientError,
-    UnitError,
-)
-from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.errors import PhysicsError, PhysicsWarning, SceneError, UnitError
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
@@ -63,20 +53,14 @@ def physics_of(act):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parameters", long([(), [VERTICES]], [()]))
-def test_bins_that_nobody_gave(parameters):
+def test_bins_that_nobody_gave():
     """Those of `simulate`: they hold all light of three bounces, but what a wider filter spreads over their rim."""
-    made = renderer(parameters, time_axis=None)(seed=0)
+    made = renderer([VERTICES], time_axis=None)(seed=0)
     assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), tt.units.seconds_to_opl(16e-12))
     assert made.axis == simulated(time_axis=None).axis
-    torch.testing.assert_close(made.total().detach(), made.steady.detach(), rtol=1e-2 if parameters else 1e-5, atol=0)
+    torch.testing.assert_close(made.total().detach(), made.steady.detach(), rtol=1e-2, atol=0)
     phasors = renderer(frequencies=[1.0], time_axis=None)(seed=0)
     assert phasors.axis is None and phasors.phasor.shape == (1, 1, 4, 4)
-
-
-def test_depths_are_said_by_bounces():
-    with pytest.raises(ArgumentError, match="max_depth: bounces= says"):
-        renderer(max_depth=5)
 
 
 @pytest.mark.slow
@@ -98,7 +82,7 @@ def test_what_metadata_say():
 # --------------------------------------------------------------------------------------------------- points of a call
 
 
-@pytest.mark.parametrize("key", long(POINT_TENSORS, [POINTS]))
+@pytest.mark.parametrize("key", long([POINTS, LASER_ORIGIN], [POINTS]))
 def test_captures_know_the_points_of_their_call(key):
     of = scan("single")
     layer, old = renderer([key], of=of), getattr(of, POINT_TENSORS[key])
@@ -171,16 +155,13 @@ def correlation(axis):
 @pytest.mark.parametrize(
     ("sensor", "error", "message"),
     [
-        (response(tt.TimeAxis(1.5, 0.06, 40)), UnitError, r"the axis of stage '0' \(ImpulseResponse"),
         (sensing.Compose([response(tt.TimeAxis(1.5, 0.06, 40))]), UnitError, r"the axis of stage 'stages\.0'"),
-        (correlation(tt.TimeAxis(0.0, 0.05, 40)), UnitError, r"the axis of stage '0' \(ItofCorrelation"),
         (correlation(tt.TimeAxis(1.5, 0.05, 41)), UnitError, r"the axis of stage '0' \(ItofCorrelation"),
-        (correlation(AXIS), SceneError, "expected an answer with the transient's 40 bins, got 8"),
         (sensing.Compose([correlation(AXIS)]), SceneError, "expected an answer with the transient's 40 bins, got 8"),
     ],
 )  # fmt: skip
 def test_sensors_that_do_not_fit_are_said_before_the_render(monkeypatch, sensor, error, message):
-    monkeypatch.setattr(TransientRenderer, "forward", None)
+    monkeypatch.setattr(tt.TransientRenderer, "forward", None)
     with pytest.raises(error, match=message):
         simulated(sensor=sensor)
     with pytest.raises(error, match=message):
@@ -200,31 +181,18 @@ def test_checks_of_sensors_draw_nothing():
 # ------------------------------------------------------------------------------------------------------- without light
 
 
-DARK = {
-    "confocal": ("confocal", {}), "exhaustive": ("exhaustive", {}),
-    "phasors": ("exhaustive", {"frequencies": [1.0], "time_axis": None}),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize(
-    ("dark", "tiles"), long_rows(itertools.product(DARK, [1, 3]), [("confocal", 3)])
+    ("kind", "settings", "tiles"),
+    long_rows(
+        [("confocal", {}, 3), ("exhaustive", {}, 1), ("exhaustive", {"frequencies": [1.0], "time_axis": None}, 3)],
+        [("confocal", {}, 3)],
+    ),
 )
-def test_captures_without_light_are_said_once(dark, tiles):
-    kind, settings = DARK[dark]
+def test_captures_without_light_are_said_once(kind, settings, tiles):
     found = physics_of(lambda: simulated(AWAY, of=scan(kind), tiles=tiles, **settings))
     assert len(found) == 1 and found[0].startswith("simulate: no light comes back from the hidden things")
     assert ("within the bins" in found[0]) == (kind == "exhaustive" and not settings)
     assert physics_of(lambda: simulated(TOWARDS, of=scan(kind), tiles=tiles, **settings)) == []
-
-
-@pytest.mark.slow
-def test_dark_parts_of_a_capture_are_none():
-    """A square upright on the wall's middle, which looks to one side."""
-    upright = [[0.0, -0.05, 0.1], [0.0, 0.05, 0.1], [0.0, 0.05, 0.4], [0.0, -0.05, 0.4]]
-    made = []
-    found = physics_of(lambda: made.append(simulated((upright, [[0, 2, 1], [0, 3, 2]]), tiles=16, time_axis=None)))
-    assert found == []
-    assert bool((made[0].steady[..., :2] > 0).all()) and not bool(made[0].steady[..., 2:].any())
 
 
 @pytest.mark.slow
@@ -233,41 +201,16 @@ def test_layers_without_light_say_it_once():
     found = physics_of(lambda: [layer(seed=seed) for seed in range(3)])
     assert len(found) == 1 and found[0].startswith("CaptureRenderer: no light comes back from the hidden things.")
     assert physics_of(lambda: renderer(hidden=TOWARDS)(seed=0)) == []
-    # What was said of something else does not explain it.
-    other = renderer(hidden=AWAY)
-    other.renderer.scene.warned.add("window of a film")
-    assert len(physics_of(lambda: other(seed=0))) == 1
     assert physics_of(lambda: renderer(hidden=AWAY, physics="ignore")(seed=0)) == []
     strict = renderer(hidden=AWAY, physics="error")
     for _ in range(2):
         with pytest.raises(PhysicsError, match="no light comes back"):
             strict(seed=0)
-    with pytest.raises(TorchTransientError):
-        simulated(AWAY, energy=-1.0)
     assert len(physics_of(lambda: simulated(TOWARDS, energy=0.0))) == 1
 
 
-# ------------------------------------------------------------------------------------------------------------ variants
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("bounces", long([(3, 4, 5), (3, 4, 5, 6, 7, 8), "all"], [(3, 4, 5)]))
-def test_a_layer_after_another_variant(bounces):
-    """What was made for one variant renders and differentiates when classes were made for another in between."""
-    layer = renderer(["letter.bsdf.reflectance.value"], bounces=bounces)
-    before = layer(seed=0).transient.detach()
-    with mi.variant_context("llvm_ad_rgb"):
-        tt.nlos.CaptureRenderer(HIDDEN, scan(), time_axis=AXIS, spp=4, bounces=bounces)(seed=0)
-    after = layer(seed=0).transient
-    torch.testing.assert_close(after.detach(), before, rtol=0, atol=1e-6 * float(before.max()))
-    if bounces != "all":  # which has no derivatives
-        after.sum().backward()
-        assert float(layer.values["letter.bsdf.reflectance.value"].grad) > 0
-
-
 def test_a_detached_capture_has_points_without_gradients():
-    renderer = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan(), ["wall.sensor.points"], time_axis=AXIS, spp=4)
-    capture = renderer(seed=0)
+    capture = renderer([POINTS])(seed=0)
     assert capture.scan.sensor_points.requires_grad
     assert not capture.detach().scan.sensor_points.requires_grad
     assert copy.deepcopy(capture.detach()) == capture.detach()

@@ -1,4 +1,4 @@
-"""The dictionary of a capture as the scan says it, entry by entry; and what files of one say beside it."""
+"""The dictionary of a capture as the scan says it, entry by entry; one mesh is one capture, whichever file it is in."""
 
 from __future__ import annotations
 
@@ -12,19 +12,24 @@ import torch
 import torchtransient as tt
 from support.scalars import no_gradient_is_lost
 from torchtransient.errors import ArgumentError, SceneError, StorageError, UnitError
-from torchtransient.nlos.scene import mesh_file, shapes_of
-from torchtransient.nlos.tal_yaml import material, read_tal_yaml, spectrum
 
 N = tt.nlos
+VARIANT = "llvm_ad_mono"
 WALL = N.Wall.plane(2.0, 1.6, albedo=0.7)
 Z = tt.scenes.nlos_z()
+CONFOCAL = N.Scan.grid(WALL, 2, kind="confocal")
 KINDS = {"single": {}, "confocal": {}, "exhaustive": {"laser_grid": (2, 5)}}
+
+
+def shapes_of(hidden):
+    """What is hidden in the scene of a capture."""
+    own = ("type", "integrator", "laser", "wall")
+    return {name: node for name, node in N.capture_scene(hidden, CONFOCAL).items() if name not in own}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("bounces", "first", "last"), [
-    ((3,), 3, 3), (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2), (np.array([4, 3]), 3, 4),
-    (torch.tensor([6, 7]), 6, 7),
+    (range(4, 9), 4, 8), ("all", 0, -1), (2, 2, 2), (torch.tensor([4, 3]), 3, 4),
 ])  # fmt: skip
 def test_scenes_say_what_a_scan_does(kind, bounces, first, last):
     scan = N.Scan.grid(WALL, (4, 3), kind=kind, first_and_last_leg=True, **KINDS[kind])
@@ -61,26 +66,21 @@ def test_points_with_gradients_stand_in_a_scene_as_numbers():
     np.testing.assert_array_equal(found, scan.sensor_points.reshape(-1, 3).numpy())
 
 
-@pytest.mark.parametrize("bounces", [(), (1,), (1, 2), (3, 5), (3, 3), (3.0,), (True,), "some", None, (2, None)])
-def test_bounces_that_are_none(bounces):
-    with pytest.raises(SceneError, match="bounces: expected whole numbers of at least 2 without gaps"):
-        N.capture_scene(Z, N.Scan.grid(WALL, 2, kind="confocal"), bounces=bounces)
-
-
-def test_joules_from_zero_on():
-    scan = N.Scan.grid(WALL, 2, kind="confocal")
-    for energy in (0, 0.0, np.float32(2.0), {"type": "rgb", "value": [1.0, 2.0, 3.0]}):
-        assert N.capture_scene(Z, scan, energy=energy)["laser"]["energy"] is energy
+def test_bounces_and_joules_that_are_none():
+    for bounces in ((), (1, 2), (3, 5), (3, 3), (3.5,), (True,), "some", (2, None)):
+        with pytest.raises(SceneError, match="bounces: expected whole numbers of at least 2 without gaps"):
+            N.capture_scene(Z, CONFOCAL, bounces=bounces)
+    for energy in (0, np.float32(2.0), {"type": "rgb", "value": [1.0, 2.0, 3.0]}):
+        assert N.capture_scene(Z, CONFOCAL, energy=energy)["laser"]["energy"] is energy
     for energy, error in ((-1e-9, UnitError), (math.inf, UnitError), (math.nan, UnitError), (True, SceneError),
-                          ("1", SceneError), (None, SceneError)):  # fmt: skip
+                          ("1", SceneError)):  # fmt: skip
         with pytest.raises(error, match="energy: expected joules"):
-            N.capture_scene(Z, scan, energy=energy)
+            N.capture_scene(Z, CONFOCAL, energy=energy)
 
 
 @pytest.mark.parametrize(("hidden", "names"), [
     ({"type": "sphere"}, ["hidden"]), ({"a": {"type": "sphere"}, "b": {"type": "cube"}}, ["a", "b"]),
-    ({"type": "scene", "a": {"type": "sphere"}}, ["a"]), ((np.eye(3), [[0, 1, 2]]), ["hidden"]),
-    ([np.eye(3), [[0, 1, 2]]], ["hidden"]),
+    ({"type": "scene", "a": {"type": "sphere"}}, ["a"]), ([np.eye(3), [[0, 1, 2]]], ["hidden"]),
 ])  # fmt: skip
 def test_things_have_names(hidden, names):
     assert sorted(shapes_of(hidden)) == names
@@ -93,33 +93,37 @@ def test_objects_with_vertices_and_faces_are_meshes():
     np.testing.assert_array_equal(found["faces"], [[0, 1, 2]])
 
 
-@pytest.mark.parametrize("kind", ["area", "point", "spot", "projector", "constant", "envmap", "directional"])
+@pytest.mark.parametrize("kind", ["area", "point", "projector", "constant", "directional"])
 def test_light_among_hidden_things_is_found_wherever_it_is(kind):
     deep = {"thing": {"type": "shapegroup", "inner": {"type": "cube", "lamp": {"type": kind}}}}
     with pytest.raises(SceneError, match=rf"'thing\.inner\.lamp' \({kind}\) emits light"):
         shapes_of(deep)
-    for other in ("sensor", "integrator"):
-        with pytest.raises(SceneError, match="is no hidden thing"):
-            shapes_of({other: {"type": "perspective"}})
-    for other in ("transient_path", "nlos_capture_meter"):
-        with pytest.raises(SceneError, match="is no hidden thing"):
-            shapes_of({"a": {"type": other}})
 
 
-# ------------------------------------------------------------------------------------------------------------ arguments
+def test_what_belongs_to_the_capture_is_no_hidden_thing():
+    for given in ({"sensor": {"type": "perspective"}}, {"a": {"type": "transient_path"}}):
+        with pytest.raises(SceneError, match="is no hidden thing"):
+            shapes_of(given)
+
+
+def test_albedos_are_those_of_walls_and_meshes():
+    """One number of any library, or three in a list, a tuple or an array."""
+    for given in (0.5, torch.tensor(0.5), 1):
+        wall, mesh = N.Wall.plane(albedo=given).shape, tt.scenes.triangle_mesh(CORNERS, FACES, reflectance=given)
+        assert wall["bsdf"] == mesh["bsdf"] == {"type": "diffuse", "reflectance": float(given)}
+    for three in ([0.25, 0.5, 1], np.array([0.25, 0.5, 1.0]), torch.tensor([0.25, 0.5, 1.0])):
+        wall, mesh = N.Wall.plane(albedo=three).shape, tt.scenes.triangle_mesh(CORNERS, FACES, reflectance=three)
+        assert wall["bsdf"] == mesh["bsdf"]
+        assert mesh["bsdf"]["reflectance"] == {"type": "rgb", "value": [0.25, 0.5, 1.0]}
 
 
 def test_forecasts_take_the_arguments_of_simulate():
-    scan = N.Scan.grid(WALL, 2, kind="confocal")
     with pytest.raises(ArgumentError, match="forecast: expected the arguments of simulate, got more, other"):
-        N.forecast(Z, scan, other=1, seed=0, more=2)
+        N.forecast(Z, CONFOCAL, other=1, seed=0, more=2)
     # Those that change nothing about what it takes are taken too.
     others = {"seed": 1, "sensor": None, "keep_part": True, "progress": False, "generator": None}
-    found = N.forecast(Z, scan, time_axis=tt.TimeAxis(1.9, 0.05, 20), spp=16, variant="llvm_ad_mono", **others)
+    found = N.forecast(Z, CONFOCAL, time_axis=tt.TimeAxis(1.9, 0.05, 20), spp=16, variant="llvm_ad_mono", **others)
     assert found.shape == (1, 20, 2, 2) and found.spp == 16 and found.parts == 1 and found.bytes == 320
-
-
-# ---------------------------------------------------------------------------------------------------------------- files
 
 
 def test_setups_are_files_of_three_kinds(tmp_path):
@@ -132,74 +136,82 @@ def test_setups_are_files_of_three_kinds(tmp_path):
             N.read_setup(tmp_path / path, **given)
 
 
-@pytest.mark.parametrize(("entries", "wanted"), [
-    ("", {"time_axis": tt.TimeAxis(0.0, 0.003, 16), "frequencies": None, "energy": 1.0, "variant": None,
-          "bounces": "all", "spp": 1_000_000}),
-    ("mitsuba_variant: llvm_ad_mono\nlaser_emission: 1, 2, 3",
-     {"variant": "llvm_ad_mono", "energy": {"type": "rgb", "value": [1.0, 2.0, 3.0]}}),
-    ("laser_emission: 2.5, 2.5, 2.5\nintegrator_filter_bounces: 2\nsample_count: 7",
-     {"energy": 2.5, "bounces": (3,), "spp": 7}),
-    ("laser_emission_mode: mono\nlaser_emission: 4\nintegrator_max_depth: 5\nintegrator_discard_direct_paths: true",
-     {"energy": 4.0, "bounces": (3, 4, 5)}),
-    ("histogram_mode: frequency\nwl_mean: 0.02\nwl_sigma: 0.03", {"time_axis": None}),
-])  # fmt: skip
-def test_arguments_of_tals_scenes(tmp_path, entries, wanted):
-    (tmp_path / "a").mkdir()
-    path = tmp_path / "a" / "a.yaml"
-    path.write_text(TAL + entries + "\n")
-    said = read_tal_yaml(path)
-    for source in (path, tmp_path / "a"):
-        found = N.read_setup(source)
-        assert set(found) == {"hidden", "scan", "time_axis", "frequencies", "spp", "bounces", "energy", "variant"}
-        assert found["scan"] == said.scan and found["hidden"].keys() == {"ball"}
-        assert {name: found[name] for name in wanted} == wanted
-        assert (found["frequencies"] is None) == (found["time_axis"] is not None)
+
+# -------------------------------------------------------------------------------------------------------------- meshes
 
 
-@pytest.mark.parametrize("entry", ["geometry: []", "relay_wall: wall"])
-def test_scenes_of_tal_are_told_by_their_entries(tmp_path, entry):
-    (tmp_path / "a.yaml").write_text(entry + "\n")
-    with pytest.raises(SceneError, match=r"y-tal scene: .*geometry"):
-        N.read_setup(tmp_path / "a.yaml")
-
-
-def test_meshes_of_one_array(tmp_path):
-    np.savez(tmp_path / "a.npz", vertices=np.eye(3))
-    with pytest.raises(StorageError, match=r"hidden: expected 'vertices' and 'faces' in .*, got vertices alone"):
-        mesh_file(tmp_path / "a.npz", "hidden")
-    np.savez(tmp_path / "a.npz", points=np.eye(3))
-    with pytest.raises(StorageError, match="got neither"):
-        mesh_file(tmp_path / "a.npz", "hidden")
-    np.savez(tmp_path / "a.npz", vertices=np.eye(3), faces=[[0, 2, 1]])
-    found = mesh_file(tmp_path / "a.npz", "hidden")
-    assert found["type"] == "mesh_arrays" and "bsdf" not in found
-    (tmp_path / "a.PLY").write_text("ply")
-    path = tmp_path / "a.PLY"
-    assert mesh_file(path, "x") == {"type": "ply", "filename": str(path), "face_normals": True}
-
-
-def test_materials_and_spectra_of_tal():
-    assert material({"id": "copper", "alpha": 0.25}, "here")["alpha"] == 0.25
-    numbers = "<bsdf type='a'><integer name='b' value='3'/><float name='c' value='3'/></bsdf>"
-    found = material({"id": "custom", "text": numbers}, "here")
-    assert found["b"] == found["c"] == 3 and type(found["b"]) is int and type(found["c"]) is float
-    text = "<!-- a --><bsdf type='a'><rgb name='b' value='0.5'/><boolean name='c' value='false'/></bsdf>"
-    assert material({"id": "custom", "text": text}, "here") == {
-        "type": "a", "b": {"type": "rgb", "value": [0.5, 0.5, 0.5]}, "c": False
-    }  # fmt: skip
-    assert spectrum("0.5", "here") == 0.5
-    assert spectrum("400:1, 700:2.5", "here") == {"type": "spectrum", "value": [(400.0, 1.0), (700.0, 2.5)]}
-    for text in ("400:1", "400:1, 700", "400:1:2, 700:1", "1 2", "", "400:x, 700:1"):
-        with pytest.raises(SceneError, match="here: expected"):
-            spectrum(text, "here")
-
-
-TAL = """
-geometry:
-- {name: wall, mesh: {type: rectangle}, material: {id: white}, scale_x: 2.0}
-- {name: ball, mesh: {type: sphere}, material: {id: white}, displacement_z: 3.0}
-relay_wall: wall
-sensor_width: 8
-sensor_height: 4
-num_bins: 16
+AXIS = tt.TimeAxis(1.0, 0.05, 60)
+# Two triangles that meet at an angle: interpolated normals would be others than theirs.
+CORNERS = np.array([[-0.5, -0.4, 0.9], [0.0, -0.4, 1.1], [0.0, 0.4, 1.1], [0.5, -0.4, 0.9]])
+FACES = np.array([[0, 2, 1], [1, 2, 3]])
+HEADER = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+{normals}element face 2
+property list uchar int vertex_indices
+end_header
 """
+
+
+def written(folder, ending):
+    path = folder / f"mesh{ending}"
+    vertices, faces = [" ".join(map(str, v)) for v in CORNERS], [" ".join(map(str, f)) for f in FACES]
+    if ending == ".npz":
+        np.savez(path, vertices=CORNERS, faces=FACES)
+    elif ending == ".ply":  # with normals that are none of its triangles
+        header = HEADER.format(normals="property float nx\nproperty float ny\nproperty float nz\n")
+        rows = [f"{v} 0.6 0 -0.8" for v in vertices] + [f"3 {f}" for f in faces]
+        path.write_text(header + "\n".join(rows) + "\n")
+    else:
+        lines = [f"v {v}" for v in vertices] + ["f " + " ".join(map(str, f + 1)) for f in FACES]
+        path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def capture(hidden, **settings):
+    scan = N.Scan.grid(N.Wall.plane(), 2, kind="confocal")
+    settings = {"time_axis": AXIS, "spp": 64, "progress": False} | settings
+    return N.simulate(hidden, settings.pop("scan", scan), **settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [".obj", ".ply", ".npz"])
+def test_files_arrays_and_descriptions_agree(tmp_path, ending):
+    path = written(tmp_path, ending)
+    expected = capture((CORNERS, FACES)).transient
+    text = f"""
+hidden: {{mesh: {{file: {path}}}}}
+scan: {{kind: confocal, size: 2}}
+time_axis: {{start_opl: 1.0, bin_width_opl: 0.05, num_bins: 60}}
+spp: 64
+"""
+    (tmp_path / "a.yaml").write_text(text)
+    described = N.read_setup(tmp_path / "a.yaml")
+    for found in (capture(path), N.simulate(**described, progress=False)):
+        torch.testing.assert_close(found.transient, expected, rtol=0, atol=1e-5 * float(expected.max()))
+
+
+def test_files_of_meshes(tmp_path):
+    for name, error, message in (
+        ("a.stl", SceneError, r"expected a mesh file \(\.obj, \.ply, \.serialized, \.npz\)"),
+        ("a.xml", SceneError, "leave scan out"), ("a.obj", SceneError, "no file"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=message):
+            shapes_of(tmp_path / name)
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"nothing")
+    with pytest.raises(StorageError, match="'vertices' and 'faces' in"):
+        shapes_of(path)
+    for arrays, got in (({"vertices": CORNERS}, "vertices alone"), ({"points": CORNERS}, "neither")):
+        np.savez(path, **arrays)
+        with pytest.raises(StorageError, match=rf"hidden: expected 'vertices' and 'faces' in .*, got {got}"):
+            shapes_of(str(path))
+    np.savez(path, vertices=CORNERS, faces=FACES)
+    found = shapes_of(path)["hidden"]
+    assert found["type"] == "mesh_arrays" and "bsdf" not in found
+    path = tmp_path / "a.PLY"
+    path.write_text("ply")
+    assert shapes_of(path)["hidden"] == {"type": "ply", "filename": str(path), "face_normals": True}

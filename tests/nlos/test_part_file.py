@@ -1,18 +1,20 @@
-"""Part files: what is finished survives kills, full disks and other processes; what is damaged is said."""
+"""Part files: what is finished survives kills, full disks and other processes; what is damaged is said. Captures as
+rows of numbers come back without a change.
+"""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import torch
 
+import torchtransient as tt
 from torchtransient.errors import StorageError
-from torchtransient.nlos import part_file
-from torchtransient.nlos.part_file import PartFile, delete_part_file
+from torchtransient.nlos.part_file import FORMAT, PartFile, RowLayout, delete_part_file
 
 ABOUT = {"a": [1, 2]}
 
@@ -36,6 +38,7 @@ def test_parts_come_back(path):
         assert kept.last is None and not kept.has(0)
         keep(kept, 2)
         keep(kept, 0)
+    np.testing.assert_array_equal(np.load(path.with_name(path.name + ".npy"))[4:6], rows(2))
     with PartFile(path, "key") as kept:
         assert [kept.has(n) for n in range(3)] == [True, False, True] and kept.last == 2
         assert kept.about == ABOUT and kept.seconds == 1.0
@@ -44,14 +47,6 @@ def test_parts_come_back(path):
         np.testing.assert_array_equal(kept.everything(), np.concatenate([rows(n) for n in range(3)]))
         kept.remove()
     assert os.listdir(path.parent) == []
-
-
-def test_others_can_read_the_rows(path):
-    with PartFile(path, "key") as kept:
-        keep(kept, 1)
-    found = np.load(path.with_name(path.name + ".npy"))
-    np.testing.assert_array_equal(found[2:4], rows(1))
-    assert found.shape == (6, 5)
 
 
 def test_a_part_in_the_place_of_another(path):
@@ -65,16 +60,7 @@ def test_a_part_in_the_place_of_another(path):
         np.testing.assert_array_equal(kept.rows(0, 2), rows(2))
 
 
-def test_another_simulation(path):
-    with PartFile(path, "key") as kept:
-        keep(kept, 0)
-    with pytest.raises(StorageError, match=r"belongs to another simulation.*delete it"), PartFile(path, "other"):
-        pass
-    with PartFile(path, "key") as kept:
-        assert kept.has(0)
-
-
-@pytest.mark.parametrize("text", ["", "something else", "{}", '{"format": "torchtransient part 1"}', "[1]"])
+@pytest.mark.parametrize("text", ["", "something else", '{"format": "torchtransient part 1"}', "[1]"])
 def test_files_that_are_no_part_files(path, text):
     path.write_text(text)
     for opened in (lambda: PartFile(path, "key").__enter__(), lambda: delete_part_file(path)):
@@ -162,22 +148,57 @@ def test_one_process_at_a_time(path):
         child.wait()
     with PartFile(path, "key") as kept:  # a killed process holds nothing
         keep(kept, 0)
-    assert json.loads(path.read_text())["format"] == part_file.FORMAT
     delete_part_file(path)
     assert os.listdir(path.parent) == []
 
 
-def test_a_folder_that_is_missing(tmp_path):
-    with pytest.raises(StorageError, match="does not exist"), PartFile(tmp_path / "no" / "a.part", "key"):
-        pass
-
-
-def test_files_of_another_form(path):
-    """Whatever their simulation: they are neither read nor deleted."""
+def test_files_of_others(path):
+    """Of another simulation or another form: they are neither read nor deleted."""
     with PartFile(path, "key") as kept:
         keep(kept, 0)
-    path.write_text(path.read_text().replace(part_file.FORMAT, "torchtransient part 1"))
+    with pytest.raises(StorageError, match=r"belongs to another simulation.*delete it"), PartFile(path, "other"):
+        pass
+    with PartFile(path, "key") as kept:
+        assert kept.has(0)
+    path.write_text(path.read_text().replace(FORMAT, "torchtransient part 1"))
     for opened in (lambda: PartFile(path, "key").__enter__(), lambda: delete_part_file(path)):
         with pytest.raises(StorageError, match="belongs to another simulation"):
             opened()
     assert path.exists()
+
+
+# ----------------------------------------------------------------------------------------------------- captures as rows
+
+WALL = tt.nlos.Wall.plane(2.0, 1.6)
+SCANS = {
+    "exhaustive": tt.nlos.Scan.grid(WALL, (4, 3), kind="exhaustive", laser_grid=(2, 1)),
+    "list": tt.nlos.Scan.points([[0.0, 0, 0], [0.1, 0.2, 0]], kind="confocal", sensor_origin=[0, 0, 1],
+                                laser_origin=[0, 0, 1]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", SCANS)
+@pytest.mark.parametrize("front", [(3,), (4, 1)])
+@pytest.mark.parametrize("phasor", [False, True])
+@pytest.mark.parametrize("steady", [False, True])
+def test_there_and_back(kind, front, phasor, steady):
+    """Without a copy where none is needed."""
+    scan, generator = SCANS[kind], torch.Generator().manual_seed(0)
+    polarized = len(front) == 2
+    cube = torch.randn(*front, 3, *scan.shape, generator=generator, dtype=torch.complex64 if phasor else torch.float32)
+    image = torch.randn(*front, *scan.shape, generator=generator) if steady else None
+    axes = (None, tt.FrequencyAxis((0.1, 0.2, 0.3))) if phasor else (tt.TimeAxis(0.5, 0.1, 3), None)
+    made = tt.nlos.Capture(
+        None if phasor else cube, axes[0], scan, phasor=cube if phasor else None, frequencies=axes[1], steady=image,
+        channels=tuple("abc"[: front[-1]]), polarized=polarized,
+    )  # fmt: skip
+    layout = RowLayout.of(made)
+    found = layout.rows(made)
+    assert found.shape == (len(scan.sensor_points.reshape(-1, 3)), layout.columns) and found.dtype == np.float32
+    back = tt.nlos.Capture(**RowLayout.from_plain(layout.plain()).capture(found, scan, *axes))
+    assert back.tensors().keys() == made.tensors().keys()
+    for name, tensor in made.tensors().items():
+        assert torch.equal(back.tensors()[name], tensor)
+    assert (back.channels, back.polarized) == (made.channels, made.polarized)
+    if not phasor:
+        assert back.transient.data_ptr() == torch.from_numpy(found).data_ptr()

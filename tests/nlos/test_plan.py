@@ -26,7 +26,7 @@ def light(plan):
     return next(line for line in plan.reasons if line.startswith("light: "))
 
 
-@pytest.mark.parametrize("kind", long(["single", "confocal", "exhaustive"], ["confocal"]))
+@pytest.mark.parametrize("kind", long(["confocal", "exhaustive"], ["confocal"]))
 def test_a_capture_is_planned_and_rendered(kind):
     plan = tt.plan(scene(kind, filter_bounces=3, min_bounces=0))
     assert (plan.variant, plan.integrator, plan.max_depth) == ("llvm_ad_mono", "transient_nlos_path", 3)
@@ -38,18 +38,17 @@ def test_a_capture_is_planned_and_rendered(kind):
     assert sum(out.stats.energy_before) + sum(out.stats.energy_after) < 0.01 * float(out.transient.sum())
 
 
-def test_one_number_of_bounces_stays_one():
-    """A pilot run goes deeper than the scene; what its integrator filters is not asked for."""
+def test_bounces_of_a_plan():
+    """A pilot run goes deeper than the scene; what its integrator filters is not asked for, later light is told."""
     plan = tt.plan(scene(filter_bounces=3, min_bounces=0, max_depth=8))
     assert plan.max_depth == 3 and plan.time_axis.end_opl < 4.2 and light(plan) == SHARED + "no later light"
-
-
-def test_later_light_is_told():
     plan = tt.plan(scene(hidden=tt.scenes.nlos_corner(), min_bounces=0, max_depth=-1))
     assert plan.max_depth >= 4 and light(plan).startswith(f"{SHARED}light of 4 ") and "chains" in light(plan)
 
 
 def test_why_paths():
+    plan = tt.plan(scene(), ("transient", "stokes"))
+    assert plan.variant == "llvm_ad_mono_polarized" and "from paths, since the variant" in light(plan)
     metal = tt.scenes.nlos_z()
     metal["letter"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3, "id": "metal"}
     plan = tt.plan(scene(hidden=metal), pilot=False)
@@ -61,16 +60,3 @@ def test_without_a_pilot_run_the_depth_is_kept():
     """The plate's albedo leaves little of the emitted power behind two bounces, and all that is seen."""
     plan = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=1e-4)), pilot=False)
     assert plan.max_depth is None and "max_depth: 3, kept" in str(plan) and light(plan).startswith(SHARED)
-
-
-@pytest.mark.slow
-def test_colours_and_phasors():
-    coloured = tt.plan(scene(hidden=tt.scenes.nlos_z(albedo=(0.2, 0.5, 0.9))))
-    assert coloured.variant == "llvm_ad_rgb"
-    phasors = tt.plan(scene(), "phasor", frequencies=[0.0, 0.5])
-    assert phasors.integrator == "transient_nlos_path" and light(phasors).startswith(SHARED)
-
-
-def test_polarization_is_from_paths():
-    plan = tt.plan(scene(), ("transient", "stokes"))
-    assert plan.variant == "llvm_ad_mono_polarized" and "from paths, since the variant" in light(plan)

@@ -8,14 +8,15 @@ import copy
 import pickle
 import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 import torchtransient as tt
-from support.marks import long
-from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning, SceneError
+from support.scalars import no_gradient_is_lost
+from torchtransient.errors import ArgumentError, PhysicsError, PhysicsWarning, SceneError, TorchTransientError
 
 VARIANT = "llvm_ad_mono"
 AXIS = tt.TimeAxis(1.5, 0.05, 40)
@@ -39,7 +40,7 @@ def renderer(of=None, parameters=(), **settings):
 # --------------------------------------------------------------------------------------------------- points of a scan
 
 
-@pytest.mark.parametrize("key", [POINTS, SPOTS, ORIGIN, LASER_ORIGIN])
+@pytest.mark.parametrize("key", [POINTS, LASER_ORIGIN])
 def test_a_key_that_the_scan_brings_too(key):
     leaf = torch.nn.Parameter(GRID.clone())
     origin, spot = torch.nn.Parameter(ASIDE.clone()), torch.nn.Parameter(GRID[0, 1].clone())
@@ -56,16 +57,10 @@ def test_a_key_that_the_scan_brings_too(key):
 @pytest.mark.parametrize("as_leaf", ["as it is", "transposed", "of a larger one"])
 def test_points_that_an_optimizer_changes(as_leaf):
     """However their numbers lie in memory, a call renders those of now and gives their gradient to the leaf."""
-    if as_leaf == "transposed":
-        leaf = torch.nn.Parameter(GRID.transpose(0, 1).contiguous().transpose(0, 1))
-        assert not leaf.is_contiguous()
-        given = leaf
-    elif as_leaf == "as it is":
-        leaf = given = torch.nn.Parameter(GRID.clone())
-    else:
-        leaf = torch.nn.Parameter(torch.cat([GRID, GRID]))
-        given = leaf[:2]
-    layer = renderer(scan(given))
+    made = {"transposed": GRID.transpose(0, 1).contiguous().transpose(0, 1), "of a larger one": torch.cat([GRID, GRID])}
+    leaf = torch.nn.Parameter(made.get(as_leaf, GRID).clone(memory_format=torch.preserve_format))
+    assert leaf.is_contiguous() == (as_leaf != "transposed")
+    layer = renderer(scan(leaf[:2] if as_leaf == "of a larger one" else leaf))
     before = layer(seed=0).transient
     before.sum().backward()
     before = before.detach()
@@ -79,20 +74,17 @@ def test_points_that_an_optimizer_changes(as_leaf):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("computed", long(["in single precision", "of an offset"], ["of an offset"]))
-def test_points_that_were_computed_do_not_follow(computed):
-    if computed == "of an offset":
-        leaf = torch.nn.Parameter(torch.zeros(3, dtype=torch.float64))
-        layer = renderer(scan(GRID + leaf))
-    else:
-        leaf = torch.nn.Parameter(GRID.float())
-        layer = renderer(scan(leaf))
-    layer(seed=0).transient.sum().backward()
-    assert float(leaf.grad.abs().sum()) > 0
-    with torch.no_grad():
-        leaf += 0.0
-    with pytest.raises(SceneError, match=r"computed of have changed.*make scan and renderer anew"):
-        layer(seed=0)
+def test_points_that_were_computed_do_not_follow():
+    """Of an offset, and in single precision."""
+    for leaf, points in ((torch.zeros(3).double(), lambda leaf: GRID + leaf), (GRID.float(), lambda leaf: leaf)):
+        leaf = torch.nn.Parameter(leaf)
+        layer = renderer(scan(points(leaf)))
+        layer(seed=0).transient.sum().backward()
+        assert float(leaf.grad.abs().sum()) > 0
+        with torch.no_grad():
+            leaf += 0.0
+        with pytest.raises(SceneError, match=r"computed of have changed.*make scan and renderer anew"):
+            layer(seed=0)
 
 
 def test_copies_follow_their_own_points():
@@ -106,24 +98,28 @@ def test_copies_follow_their_own_points():
 # -------------------------------------------------------------------------------------------------------------- seeds
 
 
-@pytest.mark.parametrize("seed", [np.uint32(5), torch.tensor(5), [5]])
-def test_seeds_of_any_library(seed):
+def test_seeds_of_any_library():
     layer = renderer()
-    torch.testing.assert_close(layer(seed=seed).transient.squeeze(0), layer(seed=5).transient.squeeze(0))
-
-
-@pytest.mark.parametrize("seed", [-1, 2**32, True, 1.5, "5", [0, -1], np.array([2**33])])
-def test_seeds_that_are_those_of_others(seed):
-    with pytest.raises(ArgumentError, match="seed: expected a whole number from 0 to 4294967295"):
-        renderer()(seed=seed)
-    if not isinstance(seed, (list, np.ndarray)):
-        with pytest.raises(ArgumentError, match="seed: expected a whole number from 0 to 4294967295"):
-            tt.nlos.simulate(tt.scenes.nlos_z(), scan(), time_axis=AXIS, spp=4, seed=seed, progress=False)
-
-
-def test_metadata_hold_the_seed_as_a_plain_number():
+    expected = layer(seed=5).transient.squeeze(0)
+    for seed in (np.uint32(5), torch.tensor(5), [5]):
+        torch.testing.assert_close(layer(seed=seed).transient.squeeze(0), expected)
     capture = tt.nlos.simulate(tt.scenes.nlos_z(), scan(), time_axis=AXIS, spp=4, seed=np.int64(3), progress=False)
     assert capture.metadata["seed"] == 3 and type(capture.metadata["seed"]) is int
+
+
+def test_seeds_that_are_those_of_others():
+    layer = renderer()
+    for seed in (-1, 2**32, True, 1.5, [0, -1], np.array([2**33])):
+        with pytest.raises(ArgumentError, match="seed: expected a whole number from 0 to 4294967295"):
+            layer(seed=seed)
+
+
+def test_values_that_are_none():
+    layer = renderer(parameters=["letter.bsdf.reflectance.value"])
+    assert layer(None, seed=0).transient.shape == (1, 40, 2, 3)
+    for values in ([1], "x", 3, torch.tensor([1.0]), {1: 2}):
+        with pytest.raises(TorchTransientError, match=r"expected keys of scene\.parameters"):
+            layer(values, seed=0)
 
 
 def test_a_vmap_of_seeds():
@@ -158,8 +154,7 @@ def moved(layer, z):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("z", SAID)
-@pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.parametrize(("z", "batch"), [(BEHIND, True), (BETWEEN, False)])
 def test_values_that_hide_the_scan_are_said_once(z, batch):
     layer = renderer(parameters=[VERTICES])
     value = moved(layer, z)
@@ -177,9 +172,8 @@ def test_values_that_hide_the_scan_are_said_once(z, batch):
     assert re.search(SAID[z], str(found[0].message))
 
 
-@pytest.mark.parametrize("z", long(SAID, [*SAID][:1]))
-def test_values_that_hide_the_scan_as_errors(z):
-    layer = renderer(parameters=[VERTICES], physics="error")
+def test_values_that_hide_the_scan_as_errors():
+    z, layer = BEHIND, renderer(parameters=[VERTICES], physics="error")
     with pytest.raises(PhysicsError, match=SAID[z]):
         layer({VERTICES: moved(layer, z)}, seed=0)
     quiet = renderer(parameters=[VERTICES], physics="ignore")
@@ -218,3 +212,11 @@ def test_captures_have_no_gates():
     layer = tt.nlos.CaptureRenderer(tt.scenes.nlos_z(), scan(), gates=[tt.Gate.gaussian(2.0, 0.5)], spp=4)
     with pytest.raises(ArgumentError, match="capture: expected a time axis or frequencies; a capture has no place for"):
         layer(seed=0)
+
+
+@pytest.mark.parametrize("moved", ["sensor_points", "laser_points"])
+def test_points_that_carry_gradients_are_looked_at(moved):
+    of = tt.nlos.Scan.grid(WALL, (3, 2), kind="single")
+    of = replace(of, **{moved: getattr(of, moved).clone().requires_grad_()})
+    with no_gradient_is_lost():
+        renderer(of)

@@ -1,7 +1,7 @@
-"""What y-tal makes of files, in its own environment. `python peer_tal.py make|copy|dump SOURCE TARGET`.
+"""What y-tal makes of files, in its own environment. `python peer_tal.py make|dump SOURCE TARGET`.
 
-`make`: an .npz of the fields of a capture becomes a file that y-tal writes. `copy`: y-tal reads a file and writes it.
-`dump`: y-tal reads a file, and its fields become an .npz.
+`make`: an .npz of the fields of a capture becomes a file that y-tal writes. `dump`: y-tal reads a file, and its
+fields become an .npz.
 """
 
 import sys
@@ -72,8 +72,6 @@ def main(mode, source, target):
     if mode == "make":
         with np.load(source) as fields:
             write_capture(target, made(dict(fields)))
-    elif mode == "copy":
-        write_capture(target, read_capture(source))
     else:
         np.savez(target, **dump(read(source)))
 

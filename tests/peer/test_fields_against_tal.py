@@ -1,8 +1,6 @@
 """Backprojection and phasor fields beside y-tal, in the environment that TORCHTRANSIENT_TAL_PYTHON names."""
 
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -31,20 +29,6 @@ DEPTHS = [0.8, 0.85, 0.9, 1.0]
 PULSE = PhasorFilter(0.3, 4.0)
 
 
-def tal_python():
-    """The interpreter that has y-tal: the one that is named, or this one."""
-    named = os.environ.get("TORCHTRANSIENT_TAL_PYTHON")
-    if named:
-        return named
-    if subprocess.run([sys.executable, "-c", "import tal"], capture_output=True, check=False).returncode:
-        pytest.fail(
-            "these tests need y-tal 0.20: install the extra 'peer' here, or set TORCHTRANSIENT_TAL_PYTHON to the "
-            "python of an environment that has it",
-            pytrace=False,
-        )
-    return sys.executable
-
-
 @pytest.fixture(scope="module")
 def benchmark():
     """The program that hands captures to the peer."""
@@ -59,8 +43,8 @@ def benchmark():
 
 
 @pytest.fixture(scope="module")
-def tal(benchmark):
-    worker = benchmark.Tal(tal_python(), 1)
+def tal(benchmark, tal_python):
+    worker = benchmark.Tal(tal_python, 1)
     yield worker
     worker.close()
 
@@ -100,13 +84,7 @@ def test_videos_are_those_of_the_peer(benchmark, tal, name):
     video, _ = tal.solve("fbp", DEPTHS, camera=name, wl_mean=PULSE.wavelength, wl_sigma=PULSE.sigma)
     moments = [20, 24, 28] if name == "TRANSIENT" else [0, 2, 5]
     camera = {"TRANSIENT": TransientCamera, "CONFOCAL_TIME_GATED": ConfocalCamera}[name]
-    operator = PhasorField(
-        capture.scan,
-        planes(capture.scan),
-        time_axis=AXIS,
-        pulse=PULSE,
-        camera=camera([AXIS.bin_width_opl * k for k in moments]),
-        dtype=torch.float64,
-    )
+    of = {"time_axis": AXIS, "pulse": PULSE, "camera": camera([AXIS.bin_width_opl * k for k in moments])}
+    operator = PhasorField(capture.scan, planes(capture.scan), dtype=torch.float64, **of)
     for frame, moment in zip(operator.adjoint(capture.transient[0]), moments, strict=True):
         assert benchmark.correlation(frame, video[moment]) > 0.99

@@ -6,9 +6,10 @@ import copy
 
 import pytest
 import torch
+from torch import nn
 
 import torchtransient as tt
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.reconstruction.transient_operator import ScanOperator, TransientOperator, reconstructed
 
 AXIS = tt.TimeAxis(0.0, 0.05, 16)
@@ -55,18 +56,50 @@ def test_it_is_whole():
         EveryBin(SCAN, GRID.at_depths([100.0]), time_axis=AXIS)
 
 
-def test_what_is_missing_is_said():
-    class Bare(TransientOperator):
-        def map_(self, x):
-            return x
+class Doubled(TransientOperator):
+    """Twice a transient, without tables and voxels."""
 
-        adjoint_ = map_
+    def __init__(self, scan, *, time_axis, dtype=torch.float32):
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        self.weight = 2.0
+        self.volume_shape = self.data_shape = (time_axis.num_bins, *scan.shape)
 
+    def map_(self, x):
+        return self.weight * x
+
+    adjoint_ = map_
+
+
+def test_operators_without_tables_and_voxels():
     with pytest.raises(TypeError, match="abstract"):
         TransientOperator(SCAN, time_axis=AXIS, dtype=torch.float32)
-    bare = Bare(SCAN, time_axis=AXIS, dtype=torch.float32)
-    assert bare.grid is None and bare.depths is None
-    with pytest.raises(ShapeError, match="expected a grid, or points"):
-        _ = bare.points
+    single = Doubled(SCAN, time_axis=AXIS)
+    assert single.grid is None and single.depths is None
+    x = torch.rand(single.volume_shape, dtype=torch.float64)
+    assert single(x).dtype == torch.float32
+    double = single.double()
+    assert double.dtype == torch.float64 and torch.equal(double(x), 2 * x)
+    assert double.to("meta").float().dtype == torch.float32
+    with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
+        double.half()
+    with pytest.raises(ShapeError, match=r"expected a grid, or points.*Set its grid"):
+        double.points  # noqa: B018
     with pytest.raises(NotImplementedError):
-        bare.reconstruct(torch.zeros(1))
+        single.reconstruct(x)
+
+
+@pytest.mark.parametrize("kind", [nn.Parameter, lambda t: t.requires_grad_()])
+def test_parameters_of_a_class_would_get_no_gradient(kind):
+    operator = Doubled(SCAN, time_axis=AXIS)
+    x = torch.rand(operator.volume_shape)
+    table = kind(torch.ones(()))
+    del operator.weight
+    if isinstance(table, nn.Parameter):
+        operator.weight = table
+    else:
+        operator.register_buffer("weight", table)
+    for function in (operator, operator.adjoint):
+        with pytest.raises(GradientError, match="weight"):
+            function(x)
+    operator.weight.requires_grad_(False)
+    assert torch.equal(operator(x), x)

@@ -22,7 +22,6 @@ from torchtransient.reconstruction import (
     backprojection,
     filtered_backproject,
 )
-from torchtransient.reconstruction.filters import sample_places
 
 F64 = torch.float64
 POINTS = points_anywhere()
@@ -81,17 +80,6 @@ def test_pieces_do_not_show(name, monkeypatch):
     torch.testing.assert_close(operator(whole), forward, rtol=1e-12, atol=1e-12)
 
 
-def test_a_voxel_gives_its_value_to_every_pair():
-    # Two shares of one value: all of it arrives, at its length.
-    scan = SCANS["single"]
-    axis = TimeAxis(0.0, 0.01, 100)
-    light = Backprojection(scan, POINTS, time_axis=axis, dtype=F64)(torch.full((len(POINTS),), 2.0, dtype=F64))
-    torch.testing.assert_close(light.sum(0), torch.full(scan.shape, 2.0 * len(POINTS), dtype=F64))
-    lengths = (scan.laser_points - POINTS).norm(dim=-1) + (scan.sensor_points[:, :, None] - POINTS).norm(dim=-1)
-    mean = (light * axis.centers_opl[:, None, None]).sum(0) / light.sum(0)
-    torch.testing.assert_close(mean, lengths.mean(-1))
-
-
 def test_far_from_the_origin_and_late_single_precision_keeps_its_digits():
     # The same hidden point 300 m away from the origin, with legs of 500 m: 1e9 float32 ulp of a bin otherwise.
     shift = torch.tensor([300.0, -200.0, 100.0], dtype=F64)
@@ -117,10 +105,8 @@ def test_distances_below_half_a_bin_do_not_grow_without_bound():
     assert light.max() <= 4 * (0.01**2) ** -2.0
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-def test_a_point_is_brightest_where_it_is(kind):
-    settings = {"exhaustive": {"laser_grid": 3}}.get(kind, {})
-    scan = Scan.grid(WALL, 8, kind=kind, **settings)
+def test_a_point_is_brightest_where_it_is():
+    scan = Scan.grid(WALL, 8, kind="exhaustive", laser_grid=3)
     axis = TimeAxis(0.1, 0.01, 50)
     grid = VoxelGrid.before(scan, torch.linspace(0.1, 0.2, 11), size=9, extent=0.2)
     place = grid.points[6, 2, 5]
@@ -129,20 +115,9 @@ def test_a_point_is_brightest_where_it_is(kind):
     assert volume.shape == (1, 11, 9, 9)
     assert volume.dtype == F64
     assert int(volume.argmax()) == (6 * 9 + 2) * 9 + 5
-    picture = filtered_backproject(capture, grid, filter=PhasorFilter(0.04, 3.0))
-    assert int(picture.argmax()) == (6 * 9 + 2) * 9 + 5
-
-
-def test_phasor_filter_is_the_convolution_with_its_pulse():
-    # Closed form: a bin holds a delta, the filtered row is the pulse itself, of a spectrum of height one.
-    pulse, width, bins = PhasorFilter(0.2, 4.0), 0.01, 128
-    row = torch.zeros(bins, dtype=F64)
-    row[50] = 1.0
-    found = pulse.rows(row, width)
-    t = width * (torch.arange(bins, dtype=F64) - 50)
-    envelope = torch.exp(-(t**2) / (2 * pulse.sigma**2)) * width / (pulse.sigma * math.sqrt(2 * math.pi))
-    expected = torch.polar(envelope, 2 * math.pi * t / pulse.wavelength)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10 * float(envelope.max()))
+    for sharpened in (PhasorFilter(0.04, 3.0), LaplacianFilter()):
+        picture = filtered_backproject(capture, grid, filter=sharpened)
+        assert int(picture.argmax()) == (6 * 9 + 2) * 9 + 5
 
 
 def pulse_at(pulse, lengths, width):
@@ -151,16 +126,13 @@ def pulse_at(pulse, lengths, width):
     return torch.polar(height, 2 * math.pi * lengths / pulse.wavelength)
 
 
-@together("wavelength, cycles", [(0.02, 4.0), (0.16, 40.0), (1.0, 4.0), (0.08, 20.0), (30.0, 0.5)])
-@together("samples", [1, 2, 3, 8])
+@together("wavelength, cycles", [(0.02, 4.0), (0.16, 40.0), (30.0, 0.5)])
+@together("samples", [1, 2, 3])
 def test_rows_are_convolved_with_the_whole_pulse_and_do_not_wrap(wavelength, cycles, samples):
     pulse, width, bins = PhasorFilter(wavelength, cycles), 0.01, 45
     rows = torch.randn(2, bins, dtype=F64, generator=torch.Generator().manual_seed(0))
-    first, last = sample_places(bins, samples)
-    at = width * torch.arange(first, last, dtype=F64) / samples
     # From end to end of the record.
-    assert (float(at[0]), float(at[-1])) == pytest.approx((-width * (samples // 2) / samples,
-                                                           width * (bins - 1 + samples // 2 / samples)))  # fmt: skip
+    at = width * torch.arange(-(samples // 2), (bins - 1) * samples + samples // 2 + 1, dtype=F64) / samples
     matrix = pulse_at(pulse, at[:, None] - width * torch.arange(bins, dtype=F64), width)
     found, expected = pulse.rows(rows, width, samples), rows.to(matrix) @ matrix.T
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
@@ -170,10 +142,7 @@ def test_rows_are_convolved_with_the_whole_pulse_and_do_not_wrap(wavelength, cyc
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize(
-    "bins, cycles",
-    [(2.0, 4.0), (2.5, 4.0), (3.0, 3.0), (4.0, 4.0), (6.0, 0.5), (9.0, 1.0), (16.0, 0.25), (16.0, 4.0), (40.0, 4.0)],
-)
+@pytest.mark.parametrize("bins, cycles", [(2.0, 4.0), (3.0, 3.0), (6.0, 0.5), (16.0, 0.25), (40.0, 4.0)])
 @pytest.mark.parametrize("scan", ["confocal", "exhaustive, legs"])
 def test_filtered_light_is_the_pulse_at_every_length(scan, bins, cycles):
     # Lines between samples of a wave lose (pi / n)^2 / 2 of it at most, n of them: 16 and more.
@@ -184,17 +153,17 @@ def test_filtered_light_is_the_pulse_at_every_length(scan, bins, cycles):
     assert float(lengths.min()) > 0.03 and float(lengths.max()) < 0.9
     matrix = pulse_at(pulse, lengths[..., None] - axis.centers_opl, 0.01)
     expected = torch.einsum("vpt,tp->v", matrix, light.flatten(1).to(matrix))
-    assert (operator.adjoint(light) - expected).norm() < (math.pi / 16) ** 2 / 2 * expected.norm()
+    lost, picture = (math.pi / 16) ** 2 / 2, expected.abs().square()
+    assert (operator.adjoint(light) - expected).norm() < lost * expected.norm()
+    assert (operator.reconstruct(light) - picture).norm() < 2 * lost * picture.norm()
 
 
-@pytest.mark.parametrize("name", ["backprojection", "filtered backprojection"])
-def test_light_at_the_ends_of_a_record_does_not_reach_beyond_them(name):
+@pytest.mark.parametrize("kind", [Backprojection, FilteredBackprojection])
+def test_light_at_the_ends_of_a_record_does_not_reach_beyond_them(kind):
     # Before and behind the record there is nothing, not even nothing times NaN.
-    for axis in (TimeAxis(4.0, 0.05, 20), TimeAxis(-3.0, 0.05, 20)):
-        of = {"time_axis": axis, "dtype": F64}
-        scan = SCANS["confocal"]
-        operator = (Backprojection(scan, POINTS, **of) if name == "backprojection" else
-                    FilteredBackprojection(scan, POINTS, filter=PhasorFilter(0.2), **of))  # fmt: skip
+    pulse = {} if kind is Backprojection else {"filter": PhasorFilter(0.2)}
+    for start in (4.0, -3.0):
+        operator = kind(SCANS["confocal"], POINTS, time_axis=TimeAxis(start, 0.05, 20), dtype=F64, **pulse)
         light = torch.full(operator.data_shape, math.nan, dtype=F64)
         assert not operator.adjoint(light).abs().any()
         assert not operator(torch.full_like(operator.adjoint(light), math.nan)).any()
@@ -224,16 +193,6 @@ def test_laplacian_of_quadratic_brightness():
     quadratic = laplacian.volume(1.0 * z**2 - 0.5 * y**2 + 2.0 * x**2)[inside]
     torch.testing.assert_close(quadratic, torch.full_like(quadratic, -2 * 2.5), rtol=1e-9, atol=1e-9)
     assert laplacian.volume(1 + z - 2 * y + 3 * x)[inside].abs().max() < 1e-9
-
-
-def test_laplacian_sharpens():
-    scan, axis = Scan.grid(WALL, 8, kind="confocal"), TimeAxis(0.1, 0.01, 50)
-    grid = VoxelGrid.before(scan, torch.linspace(0.1, 0.2, 11), size=9, extent=0.2)
-    capture = point_capture(scan, grid.points[6, 4, 4][None], time_axis=axis)
-    plain, sharp = backproject(capture, grid)[0], filtered_backproject(capture, grid, filter=LaplacianFilter())[0]
-    assert int(sharp.argmax()) == (6 * 9 + 4) * 9 + 4
-    widths = [int((volume > volume.max() / 2).sum()) for volume in (plain, sharp)]
-    assert widths[1] < widths[0]
 
 
 def test_filters_that_cannot_be_taken():

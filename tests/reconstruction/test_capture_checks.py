@@ -7,15 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from support.grid_operators import SCAN, SINGLE
+from support.grid_operators import SCAN
 from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.capture import Capture, Scan
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.capture import Capture
+from torchtransient.errors import ShapeError
 from torchtransient.reconstruction import (
     FK,
-    Backprojection,
-    PlanarScan,
-    VoxelGrid,
     lct,
 )
 
@@ -23,17 +20,6 @@ FINE = TimeAxis(0.5, 0.125, 8)
 RIGHT = TimeAxis(0.1, 0.04, 16)
 LEGS = replace(SCAN, first_and_last_leg=True)
 POINTS = torch.tensor([[0.0, 0.0, 0.2]])
-
-
-def test_walls_records_and_points_of_one_size_are_taken():
-    # A scan of one point has no width, and a spot in the wall counts as a sensor point does.
-    one = Scan.points([[0, 0, 0]], kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
-    for scan in (one, SCAN, SINGLE, LEGS):
-        Backprojection(scan, POINTS, time_axis=TimeAxis(0.0, 0.1, 40))
-    apart = Scan.points([[0, 0, 0]], kind="single", laser_points=[30, 0, 0], sensor_origin=(0, 0, 1),
-                        laser_origin=(0, 0, 1))  # fmt: skip
-    with pytest.raises(UnitError, match="up to 30 m apart"):
-        Backprojection(apart, POINTS, time_axis=RIGHT)
 
 
 def test_axes_are_those_of_the_operator_to_rounding():
@@ -50,15 +36,6 @@ def test_axes_are_those_of_the_operator_to_rounding():
     FK(SCAN, time_axis=replace(FINE, start_opl=-1e-9))
 
 
-@pytest.mark.parametrize("falloff", [12.0, -12.0])
-def test_falloffs_beyond_single_precision(falloff):
-    # (r_laser r_sensor)^12 of some 0.04 m^2 is 1e-17, of a micrometre squared 1e-144.
-    Backprojection(SCAN, POINTS, time_axis=RIGHT, falloff=falloff)
-    near = SCAN.sensor_points[:1, :1].reshape(-1, 3)
-    with pytest.raises(UnitError, match="falloff"):
-        Backprojection(SCAN, near, time_axis=TimeAxis(0.0, 1e-6, 200_000), falloff=falloff)
-
-
 def test_what_is_no_capture_is_told_what_to_do():
     for given, words in (
         ("a.hdf5", r"reads files\.$"), (torch.ones(3), "operators such as tt.nlos.FK take tensors"),
@@ -70,14 +47,3 @@ def test_what_is_no_capture_is_told_what_to_do():
                       frequencies=FrequencyAxis((1.0,)))  # fmt: skip
     with pytest.raises(ShapeError, match="lct: expected a capture with a transient, got phasors alone"):
         lct(phasors)
-
-
-def test_grids_of_a_wall_take_captures_of_scans_on_it():
-    operator = FK(PlanarScan.of_scan(SCAN, "test"), time_axis=FINE)
-    light = torch.ones(1, *operator.data_shape)
-    assert operator.reconstruct(Capture(light, FINE, SCAN)).shape == (1, *operator.volume_shape)
-    with pytest.raises(ShapeError, match="expected a confocal scan, got a single one"):
-        operator.reconstruct(Capture(light, FINE, Scan.grid(SCAN.wall, (5, 6), kind="single")))
-    anywhere = Backprojection(SCAN, VoxelGrid.before(SCAN, [0.5]), time_axis=FINE)
-    with pytest.raises(ShapeError, match="own scan"):
-        anywhere.reconstruct(Capture(light, FINE, replace(SCAN, first_and_last_leg=True)))

@@ -39,25 +39,9 @@ def direct(wavefield, axis, pitch):
     return torch.fft.ifft2(out)[:, :rows, :columns]
 
 
-def peak(volume, operator):
-    """Place (3,) of the highest voxel, between samples by a parabola through the logarithms."""
-    index = [int(i) for i in torch.unravel_index(volume.argmax(), volume.shape)]
-    place = []
-    for axis, k in enumerate(index):
-        before, at, after = (float(volume[(*index[:axis], k + i, *index[axis + 1 :])].log()) for i in (-1, 0, 1))
-        place.append(k + 0.5 * (before - after) / (before - 2 * at + after))
-    z = float(operator.depths[0]) + place[0] * operator.axis.bin_width_opl / 2
-    corner = operator.grid.at_depths([z]).points[0, 0, 0]
-    dy, dx = operator.grid.pitch
-    return corner + place[1] * dy * operator.grid.along_y + place[2] * dx * operator.grid.along_x
-
-
-DEPTHS = {"18 %": 0.46, "39 %": 1.0, "63 %": 1.6, "86 %": 2.2}
-
-
-@pytest.mark.parametrize("share", long(DEPTHS, ["86 %"]))
-def test_field_is_that_of_the_direct_transform(share):
-    z = DEPTHS[share]
+@pytest.mark.parametrize("z", long([0.46, 2.2], [2.2]))
+def test_field_is_that_of_the_direct_transform(z):
+    # In parts of the record: 18 and 86 %.
     operator = FK(SCAN, time_axis=AXIS, dtype=F64)
     psi = operator.wavefield(confocal_points([(0.1, -0.15, z)], SCAN, AXIS))
     exact, found = direct(psi, AXIS, operator.grid.pitch), operator.adjoint(psi)
@@ -76,37 +60,21 @@ def test_start_and_unequal_sides_are_those_of_the_direct_transform():
     assert float((operator.adjoint(psi) - exact).abs().max()) < 1e-3 * float(exact.abs().max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("z", [0.45, 1.0, 1.55, 2.1])
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_points_come_out_where_they_are(z, dtype):
-    axis = TimeAxis(0.0, 0.0096, 512)
-    scan = Scan.grid(Wall.plane(1.0, 1.0), 32, kind="confocal")
-    operator = FK(scan, time_axis=axis, dtype=dtype)
-    point = torch.tensor([0.109375, -0.140625, z], dtype=F64)  # behind a point of the grid
-    found = peak(operator.reconstruct(confocal_points([point.tolist()], scan, axis)).to(F64), operator)
-    assert float((found - point).abs().max()) < 1e-3
-
-
-@pytest.mark.slow
 def test_pictures_are_linear_in_the_light():
     # |psi|^2 is linear in the light: one quarter of the albedo shows one quarter. y-tal 0.20 shows a sixteenth.
-    axis = TimeAxis(0.0, 0.0192, 256)
-    scan = Scan.grid(Wall.plane(1.0, 1.0), 32, kind="confocal")
-    operator = FK(scan, time_axis=axis, dtype=F64)
-    one, quarter = (confocal_points([(0.1, -0.15, 1.0)], scan, axis, strengths=[a]) for a in (1.0, 0.25))
-    ratio = float(operator.reconstruct(quarter).max() / operator.reconstruct(one).max())
+    operator = FK(SCAN, time_axis=AXIS, dtype=F64)
+    light = confocal_points([(0.1, -0.15, 1.0)], SCAN, AXIS)
+    ratio = float(operator.reconstruct(light / 4).max() / operator.reconstruct(light).max())
     assert ratio == pytest.approx(0.25, rel=1e-12)
 
 
-@pytest.mark.parametrize("tilt", long([0.0, 0.5], [0.5]))
-def test_migration_of_the_model_is_the_cosine_of_the_wave(tilt):
+def test_migration_of_the_model_is_the_cosine_of_the_wave():
     # A wave packet whose direction has the cosine J: model, then migration, give J / 2 of it, the half since of the
     # real wavefield each of the two signs of frequency has one half.
     axis = TimeAxis(0.0, 0.04, 128)
     scan = Scan.grid(Wall.plane(2.0, 2.0), 48, kind="confocal")
     operator = FK(scan, time_axis=axis, dtype=F64)
-    off = operator.points - torch.tensor([0.2 if tilt else 0.0, 0.0, 1.0], dtype=F64)
+    tilt, off = 0.5, operator.points - torch.tensor([0.2, 0.0, 1.0], dtype=F64)
     turns = 5.0 * off[..., 2] + 5.0 * tilt * off[..., 0]
     packet = torch.polar(torch.exp(-off.square().sum(-1) / (2 * 0.2**2)), 2 * math.pi * turns)
     again = operator.adjoint(operator(packet))
@@ -154,34 +122,13 @@ def test_what_it_cannot_take_is_refused():
     with pytest.raises(ShapeError, match="grid"):
         FK(Scan.points(SCAN.sensor_points.reshape(-1, 3), kind="confocal", sensor_origin=(0, 0, 1),
                        laser_origin=(0, 0, 1)), time_axis=AXIS)  # fmt: skip
-    with pytest.raises(ArgumentError, match="expected a TimeAxis"):
-        FK(SCAN, time_axis=0.04)
-    with pytest.raises(ShapeError, match="4 bins"):
-        FK(SCAN, time_axis=TimeAxis(0, 0.1, 3))
     with pytest.raises(ShapeError, match=r"tt\.nlos\.Scan or a PlanarScan"):
         FK("scan", time_axis=AXIS)
-    with pytest.raises(ArgumentError, match="target"):
-        FK(SCAN, time_axis=AXIS, target="mirror")
-    with pytest.raises(ArgumentError, match="taps"):
-        FK(SCAN, time_axis=AXIS, taps=3)
-    with pytest.raises(UnitError, match="floor"):
-        FK(SCAN, time_axis=AXIS, floor=-1.0)
-    with pytest.raises(UnitError, match="dtype"):
-        FK(SCAN, time_axis=AXIS, dtype=torch.float16)
-    operator = FK(SCAN, time_axis=TimeAxis(0.0, 0.1, 8))
-    other = Capture(torch.zeros(1, 9, SIDE, SIDE), TimeAxis(0.0, 0.1, 9), SCAN)
-    with pytest.raises(ShapeError, match="expected a capture with TimeAxis"):
-        operator.reconstruct(other)
-    stokes = Capture(torch.zeros(4, 1, 8, SIDE, SIDE), TimeAxis(0.0, 0.1, 8), SCAN, polarized=True)
-    with pytest.raises(ShapeError, match="Stokes"):
-        operator.reconstruct(stokes)
-    with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
-        fk(torch.zeros(8, SIDE, SIDE))
-
-
-def test_voxels_stand_at_half_the_middle_of_each_bin():
-    operator = FK(SCAN, time_axis=TimeAxis(0.5, 0.25, 4))
-    assert operator.depths.tolist() == [0.3125, 0.4375, 0.5625, 0.6875]
-    assert operator.data_shape == operator.volume_shape == (4, SIDE, SIDE)
-    with pytest.raises(ShapeError, match="4 bins at least, got 3"):
-        FK(SCAN, time_axis=TimeAxis(0.5, 0.25, 3))
+    for settings, error, words in (
+        ({"time_axis": 0.04}, ArgumentError, "expected a TimeAxis"),
+        ({"time_axis": TimeAxis(0, 0.1, 3)}, ShapeError, "4 bins at least, got 3"),
+        ({"target": "mirror"}, ArgumentError, "target"), ({"taps": 3}, ArgumentError, "taps"),
+        ({"floor": -1.0}, UnitError, "floor"), ({"dtype": torch.float16}, UnitError, "dtype"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=words):
+            FK(SCAN, **{"time_axis": AXIS, **settings})

@@ -22,7 +22,7 @@ def made(kind, **options):
     return kind(SCAN, time_axis=AXIS, v_bins=16, dtype=F64, **options)
 
 
-@pytest.mark.parametrize("place", [(3, 0, 0), (2, 1, 3), (5, 2, 1), (0, 1, 2)])
+@pytest.mark.parametrize("place", [(2, 1, 3), (5, 2, 0)])
 @pytest.mark.parametrize("kind", [LCT, DirectionalLCT])
 def test_a_point_of_v_lights_the_wall_at_its_squared_distance(kind, place):
     operator = made(kind)

@@ -1,11 +1,11 @@
 """Phasor fields against sums that are written out, against filtered backprojection, and in time."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from support.marks import long
 from support.scan_operators import AXIS, DEPTHS, PULSE, SCANS, WALL, bent_scan
 from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
@@ -55,26 +55,21 @@ def written_out(scan, points, light, operator, falloff, moments=None):
     return found
 
 
-@pytest.mark.parametrize("name", SCANS)
+@pytest.mark.parametrize("name", [*SCANS, "single, elsewhere"])
 @pytest.mark.parametrize("falloff", [0.0, 1.0])
 def test_is_the_sum_that_is_written_out(name, falloff):
-    scan = SCANS[name]
+    scan = SCANS[name.removesuffix(", elsewhere")]
     grid = VoxelGrid.before(scan, DEPTHS)
+    if "elsewhere" in name:  # more rows and columns of the scan's pitch, behind each other as they like
+        dy, dx = 0.2 / 3, 0.06
+        grid = VoxelGrid.before(scan, [0.12, 0.13, 0.31], size=(7, 2), extent=(7 * dx, 2 * dy))
     operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, falloff=falloff, dtype=F64)
     light = noise(*operator.data_shape)
     expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, falloff).reshape(grid.shape)
-    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
-
-
-def test_planes_of_other_sizes_elsewhere():
-    # Rows and columns of the scan's pitch, more of them, beside it and behind each other as they like.
-    scan = SCANS["single"]
-    pitch = (0.06, 0.2 / 3)
-    grid = VoxelGrid.before(scan, [0.12, 0.13, 0.31], size=(7, 2), extent=(7 * pitch[0], 2 * pitch[1]))
-    operator = PhasorField(scan, grid, time_axis=AXIS, pulse=PULSE, dtype=F64)
-    light = noise(*operator.data_shape)
-    expected = written_out(scan, grid.points.reshape(-1, 3), light, operator, 0.0).reshape(grid.shape)
-    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
+    most = float(expected.abs().max())
+    torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * most)
+    # The picture is the intensity.
+    torch.testing.assert_close(operator.reconstruct(light), expected.abs().square(), rtol=0, atol=1e-10 * most**2)
 
 
 def test_transient_camera_is_the_sum_that_is_written_out():
@@ -86,7 +81,7 @@ def test_transient_camera_is_the_sum_that_is_written_out():
     torch.testing.assert_close(operator.adjoint(light), expected, rtol=0, atol=1e-11 * float(expected.abs().max()))
 
 
-@pytest.mark.parametrize("name", long(SCANS, [*SCANS][::3]))
+@pytest.mark.parametrize("name", [*SCANS][::3])
 def test_pieces_do_not_show(name, monkeypatch):
     scan = SCANS[name]
     operator = PhasorField(scan, VoxelGrid.before(scan, DEPTHS), time_axis=AXIS, pulse=PULSE, dtype=F64)
@@ -99,20 +94,7 @@ def test_pieces_do_not_show(name, monkeypatch):
         torch.testing.assert_close(operator(whole), forward, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-def test_without_falloff_it_is_filtered_backprojection(kind):
-    # Lines between 16 samples of a wave lose (pi / 16)^2 / 3 of it in the mean; planes know its phase.
-    scan = Scan.grid(WALL, (6, 5), kind=kind, **({"laser_grid": 2} if kind == "exhaustive" else {}))
-    grid = VoxelGrid.before(scan, DEPTHS)
-    pulse, axis = PhasorFilter(0.12, 4.0), TimeAxis(-0.4, 0.03, 50)
-    capture = point_capture(scan, [(0.02, 0.01, 0.15), (-0.05, 0.04, 0.2)], time_axis=axis, pulse_sigma_opl=0.03)
-    light = capture.transient[0]
-    field = PhasorField(scan, grid, time_axis=axis, pulse=pulse, falloff=0.0, dtype=F64).adjoint(light)
-    summed = FilteredBackprojection(scan, grid, time_axis=axis, filter=pulse, dtype=F64).adjoint(light)
-    assert float((field - summed).norm() / summed.norm()) < (math.pi / 16) ** 2 / 3
-
-
-@pytest.mark.parametrize("cycles", [1.0, 1.5, 2.0, 3.0, 3.9, 6.0])
+@pytest.mark.parametrize("cycles", [1.0, 2.0, 3.9])
 def test_short_pulses_have_all_their_frequencies(cycles):
     # The definition: the pulse at the exact length of every pair, from the middle of every bin.
     scan, axis, pulse = SCANS["confocal"], TimeAxis(0.1, 0.02, 60), PhasorFilter(0.2, cycles)
@@ -125,17 +107,6 @@ def test_short_pulses_have_all_their_frequencies(cycles):
     expected = torch.einsum("vpt,tp->v", matrix, light.flatten(1).to(matrix)).reshape(grid.shape)
     found = PhasorField(scan, grid, time_axis=axis, pulse=pulse, dtype=F64).adjoint(light)
     assert (found - expected).norm() < 2e-3 * expected.norm()
-
-
-def test_voxels_on_a_spot_fall_off_as_half_a_bin_does():
-    scan = Scan.grid(WALL, (4, 3), kind="single", laser=(0.25 / 2, 0.5))
-    assert float((scan.sensor_points - scan.laser_points).norm(dim=-1).min()) < 1e-12
-    grid = VoxelGrid.before(scan, [1e-9, 0.1])
-    of = {"time_axis": TimeAxis(-0.05, 0.02, 40), "falloff": 2.0, "dtype": F64}
-    light = noise(40, *scan.shape)
-    found = PhasorField(scan, grid, pulse=PULSE, **of).adjoint(light)
-    summed = FilteredBackprojection(scan, grid, filter=PULSE, **of).adjoint(light)
-    assert (found - summed).norm() < 2e-2 * summed.norm()
 
 
 def test_records_do_not_wrap():
@@ -151,29 +122,13 @@ def test_records_do_not_wrap():
     assert operator.adjoint(light).abs().max() < 3e-4 * late.adjoint(light).abs().max()
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
-def test_a_point_is_brightest_where_it_is(kind):
-    wall_scan = Scan.grid(WALL, 12, kind=kind, **({"laser_grid": 3} if kind == "exhaustive" else {}))
+def test_a_point_is_brightest_where_it_is():
+    wall_scan = Scan.grid(WALL, 12, kind="exhaustive", laser_grid=3)
     grid = VoxelGrid.before(wall_scan, torch.linspace(0.1, 0.2, 11))
     capture = point_capture(wall_scan, grid.points[6, 4, 7][None], time_axis=TimeAxis(0.1, 0.01, 50))
     picture = phasor_image(capture, grid, pulse=PhasorFilter(0.04, 3.0))
     assert picture.shape == (1, 11, 12, 12)
     assert int(picture.argmax()) == (6 * 12 + 4) * 12 + 7
-
-
-def test_transient_camera_sees_the_pulse_arrive():
-    # A hidden point lights up when the light of the spot reaches it: at its distance, to a tenth of a wavelength.
-    scan = Scan.grid(WALL, 12, kind="single", laser=(0.25, 0.5))
-    point = torch.tensor([0.03, -0.02, 0.16], dtype=F64)
-    capture = point_capture(scan, point[None], time_axis=TimeAxis(0.1, 0.005, 120), pulse_sigma_opl=0.005)
-    times = torch.arange(0.1, 0.25, 0.004, dtype=F64)
-    grid = VoxelGrid.before(scan, [0.16])
-    camera = TransientCamera(times)
-    video = phasor_image(capture, grid, pulse=PhasorFilter(0.06, 3.0), camera=camera)[0]
-    assert video.shape == (len(times), 1, 12, 12)
-    j, i = divmod(int((grid.points[0] - point).norm(dim=-1).argmin()), 12)
-    seen = float(times[video[:, 0, j, i].argmax()])
-    assert seen == pytest.approx(float((scan.laser_points - point).norm()), abs=0.006)
 
 
 def test_confocal_camera_begins_with_direct_light():
@@ -208,13 +163,6 @@ def test_what_cannot_be_taken():
     for depths in ([0.0, 0.1], [-0.2, -0.1, 0.1], [-0.2, -0.1]):
         with pytest.raises(ShapeError, match="planes before the wall"):
             PhasorField(scan, grid.at_depths(depths), **of)
-    with pytest.raises(UnitError, match="two bins"):
-        PhasorField(scan, grid, time_axis=AXIS, pulse=PhasorFilter(0.03))
-    for camera in (ConfocalCamera, TransientCamera):
-        with pytest.raises(ShapeError, match="times"):
-            camera([])
-        with pytest.raises(UnitError, match="finite times"):
-            camera([math.inf])
 
 
 def test_planes_that_touch_the_wall_fall_off_as_half_a_bin_does():
@@ -227,3 +175,42 @@ def test_planes_that_touch_the_wall_fall_off_as_half_a_bin_does():
     other = FilteredBackprojection(scan, grid, filter=PULSE, **of).reconstruct(light)
     assert field.isfinite().all()
     assert (field - other).norm() < 0.02 * other.norm()
+
+
+@pytest.mark.parametrize("name", ["along_x", "along_y"])
+def test_planes_are_parallel_to_the_wall(name):
+    scan = SCANS["confocal"]
+    grid = VoxelGrid.before(scan, DEPTHS)
+    for angle, taken in ((1e-3, True), (2e-3, False)):
+        turned = math.cos(angle) * getattr(grid, name) + math.sin(angle) * grid.normal
+        normal = math.cos(angle) * grid.normal - math.sin(angle) * getattr(grid, name)
+        other = replace(grid, **{name: turned, "normal": normal})
+        if taken:
+            PhasorField(scan, other, time_axis=AXIS, pulse=PULSE)
+            continue
+        with pytest.raises(ShapeError, match="planes along the wall's rows and columns"):
+            PhasorField(scan, other, time_axis=AXIS, pulse=PULSE)
+
+
+def test_without_normals_planes_are_on_either_side():
+    scan = replace(SCANS["confocal"], wall=None, sensor_normals=None, laser_normals=None)
+    grid = VoxelGrid.before(scan, DEPTHS)
+    light = noise(AXIS.num_bins, *scan.shape)
+    fields = [
+        PhasorField(scan, at, time_axis=AXIS, pulse=PULSE, falloff=1.0, dtype=F64).adjoint(light)
+        for at in (grid, grid.at_depths([-d for d in reversed(DEPTHS)]))
+    ]
+    torch.testing.assert_close(fields[1], fields[0].flip(0), rtol=0, atol=1e-12 * float(fields[0].abs().max()))
+    for depths in ([-0.1, 0.1], [0.0, 0.1], [-0.1, 0.0]):
+        with pytest.raises(ShapeError, match="planes before the wall"):
+            PhasorField(scan, grid.at_depths(depths), time_axis=AXIS, pulse=PULSE)
+
+
+@pytest.mark.parametrize("camera", [ConfocalCamera, TransientCamera])
+def test_times_of_cameras_are_a_list_of_finite_numbers(camera):
+    assert camera([0.1, 0.2]).times.tolist() == [0.1, 0.2] and camera(torch.tensor([1, 2])).times.dtype == F64
+    for times in ([], [[0.1]], 0.1, None, "now"):
+        with pytest.raises(ShapeError, match=rf"{camera.__name__}: expected times \(N,\)"):
+            camera(times)
+    with pytest.raises(UnitError, match=rf"{camera.__name__}: expected finite times"):
+        camera([0.1, math.nan])

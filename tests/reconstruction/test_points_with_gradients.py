@@ -13,8 +13,6 @@ from torchtransient.reconstruction import (
     FK,
     LCT,
     Backprojection,
-    DiffusionDeconvolution,
-    DirectionalLCT,
     FilteredBackprojection,
     MidpointFK,
     PhasorField,
@@ -50,14 +48,9 @@ def of_scan(kind, name, **options):
 MADE = {
     "fk": of_grid(FK, CONFOCAL),
     "lct": of_grid(LCT, CONFOCAL),
-    "directional lct": of_grid(DirectionalLCT, CONFOCAL),
-    "slab": of_grid(DiffusionDeconvolution, CONFOCAL),
     "midpoint fk": of_grid(MidpointFK, SINGLE),
-    "backprojection": of_scan(Backprojection, "confocal", falloff=1.0),
     "backprojection, legs": of_scan(Backprojection, "exhaustive, legs"),
     "filtered backprojection": of_scan(FilteredBackprojection, "single", filter=PULSE),
-    "phasor field": of_scan(PhasorField, "single", pulse=PULSE, falloff=1.0),
-    "phasor field, legs": of_scan(PhasorField, "exhaustive, legs", pulse=PULSE),
     "phasor field, confocal legs": of_scan(PhasorField, "confocal, legs", pulse=PULSE),
 }
 
@@ -102,13 +95,6 @@ def test_grids_know_nothing_of_them(normals):
     assert not any(tensor.requires_grad for grid in (wall, bare, *made) for tensor in tensors_of(grid))
     assert not place.requires_grad
     assert made[0] == VoxelGrid.before(SCANS["confocal"], DEPTHS)
-
-
-def test_points_of_voxels_are_detached():
-    points = scan_operators.points_anywhere().requires_grad_()
-    operator = Backprojection(SCANS["single"], points, time_axis=scan_operators.AXIS, dtype=F64)
-    assert not operator.points.requires_grad and torch.equal(operator.points, points)
-    assert operator.adjoint(torch.ones(operator.data_shape)).isfinite().all()
 
 
 def test_captures_without_legs_depend_on_their_light_alone():

@@ -33,14 +33,6 @@ def slanted(grid, slope_x, slope_y, width):
     return torch.exp(-((grid.depths[:, None, None] - depth) ** 2) / (2 * width**2)), depth
 
 
-def test_depth_of_a_parabola_is_exact_on_uneven_planes():
-    truth = torch.linspace(0.511, 0.72, 40, dtype=F64).reshape(5, 8)
-    volume = 1 - (UNEVEN[:, None, None] - truth) ** 2
-    found = depth_map(volume, UNEVEN)
-    # The highest plane is the nearest one to the top of a parabola: the top is within half a step.
-    torch.testing.assert_close(found.depth, truth, rtol=0, atol=1e-12)
-
-
 def test_tops_beyond_the_planes_stay_on_them():
     volume = 2 - (UNEVEN[:, None, None] - torch.tensor([[0.3, 0.9]], dtype=F64)) ** 2
     torch.testing.assert_close(depth_map(volume, UNEVEN).depth, torch.tensor([[0.5, 0.75]], dtype=F64))
@@ -56,11 +48,6 @@ def test_confidence_and_mask():
     assert torch.isfinite(found.depth).all()
     assert depth_map(volume, [0.1, 0.2, 0.3], threshold=0.01).mask[0, 0].tolist() == [True, True, True, False]
     assert not depth_map(-volume - 1, [0.1, 0.2, 0.3]).mask.any()
-
-
-def test_one_plane_and_two():
-    assert depth_map(torch.ones(1, 2, 2), [0.4]).depth.tolist() == [[pytest.approx(0.4)] * 2] * 2
-    assert depth_map(torch.tensor([[[1.0]], [[2.0]]]), [0.4, 0.5]).depth.item() == pytest.approx(0.5)
 
 
 def test_derivatives_of_depth():
@@ -91,7 +78,7 @@ def test_gradients_of_empty_volumes_are_finite():
         assert torch.isfinite(gradient).all()
 
 
-@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (0.25, 0.2)])
+@pytest.mark.parametrize("slopes", [(0.3, 0.0), (0.25, -0.2)])
 def test_normals_of_planes(slopes):
     grid = grid_of(torch.linspace(0.3, 0.9, 61, dtype=F64))
     volume, depth = slanted(grid, *slopes, 0.06)
@@ -109,21 +96,6 @@ def test_normals_of_planes(slopes):
     assert (inside - exact[:, 1:-1, 1:-1]).norm(dim=0).max() < 1.5 * error + 2e-2 * max(map(abs, slopes)) + 1e-9
 
 
-def test_batches_are_items_on_their_own():
-    grid = grid_of(UNEVEN)
-    volume = torch.rand(2, 3, *grid.shape, generator=torch.Generator().manual_seed(0))
-    for function in (
-        lambda v: depth_map(v, grid).depth,
-        lambda v: depth_map(v, grid).confidence,
-        lambda v: soft_depth(v, grid),
-        lambda v: normals_from_volume(v, grid),
-        lambda v: normals_from_depth(v[..., 0, :, :], grid),
-    ):
-        torch.testing.assert_close(function(volume)[1, 2], function(volume[1, 2]))
-        torch.testing.assert_close(torch.vmap(function)(volume), function(volume))
-        assert function(volume[:0]).shape == (0, *function(volume).shape[1:])
-
-
 def test_what_cannot_be_taken():
     grid = grid_of(UNEVEN)
     for function in (depth_map, soft_depth, normals_from_volume):
@@ -137,8 +109,6 @@ def test_what_cannot_be_taken():
         depth_map(torch.zeros(2, 2, 2), [0.2, 0.1])
     with pytest.raises(UnitError, match="threshold"):
         depth_map(torch.zeros(grid.shape), grid, threshold=2.0)
-    with pytest.raises(UnitError, match="sharpness"):
-        soft_depth(torch.zeros(grid.shape), grid, sharpness=0.0)
     with pytest.raises(UnitError, match="sharpness"):
         soft_depth(torch.zeros(grid.shape), grid, sharpness=1e50)
     with pytest.raises(ShapeError, match="knows its axes"):
@@ -169,7 +139,7 @@ def test_planes_that_single_precision_does_not_tell_apart():
     )
 
 
-@pytest.mark.parametrize("strange", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("strange", [math.nan, -math.inf])
 def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
     volume = torch.rand(2, 8, 3, 3, generator=torch.Generator().manual_seed(1)).requires_grad_()
     broken = volume.clone()
@@ -184,21 +154,13 @@ def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
     assert slope.isfinite().all()
 
 
-@pytest.mark.parametrize("scale", [1e-38, 1e-25, 1e-12, 1.0, 1e12, 1e25])
+@pytest.mark.parametrize("scale", [1e-38, 1e-12, 1e25])
 def test_nothing_depends_on_the_unit_of_the_volume(scale):
     grid = grid_of(UNEVEN)
     volume = slanted(grid, 0.2, 0.1, 0.1)[0].float()
     for name in ("depth_map", "soft_depth", "normals_from_volume"):
         found, expected = SURFACES[name](volume * scale, grid), SURFACES[name](volume, grid)
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("level", [-2.0, 0.0])
-def test_normals_where_nothing_is_above_zero_are_the_walls(level):
-    grid = grid_of(UNEVEN)
-    volume = level + torch.rand(*grid.shape, dtype=F64, generator=torch.Generator().manual_seed(0)) * (level < 0)
-    found = normals_from_volume(volume, grid)
-    torch.testing.assert_close(found, -grid.normal[:, None, None].expand_as(found))
 
 
 def lumpy(seed=0, size=(6, 5, 7)):

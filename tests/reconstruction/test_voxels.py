@@ -79,18 +79,6 @@ def test_what_is_no_grid():
         replace(grid, along_y=grid.along_x)
 
 
-def test_walls_that_are_at_right_angles_to_a_share_of_their_pitch_have_voxels():
-    # Rows that lean by 5e-4, as points in single precision do: within what a grid may be off.
-    points = Scan.grid(Wall.plane(1.0, 1.0), 8, kind="confocal").sensor_points.clone()
-    points[..., 0] += 5e-4 * points[..., 1]
-    scan = Scan.points(points, kind="confocal", sensor_origin=(0, 0, 1), laser_origin=(0, 0, 1))
-    grid = VoxelGrid.before(scan, [0.5, 1.0])
-    off = (grid.points[..., :2] - points[..., :2]).norm(dim=-1)
-    # The lean itself over seven rows; lengths along it are longer by its square.
-    assert float(off.max()) == pytest.approx(5e-4 * 7 / 8, rel=5e-4)
-    assert float(grid.along_x @ grid.along_y) == pytest.approx(0.0, abs=1e-15)
-
-
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_without_normals_voxels_stand_where_sensor_and_laser_do(turned, side):
@@ -123,19 +111,6 @@ def test_voxels_stand_where_their_axes_say():
         depth = (0.25, 1.0, 4.0)[k]
         assert grid.points[k, j, i].tolist() == [10.0 + depth, 20.0 + 2.0 * i, 30.0 + 0.5 * j]
     assert repr(grid) == "VoxelGrid((3, 2, 3), 0.5 x 2 m apart, depths 0.25 to 4 m)"
-
-
-def test_lists_of_points_have_no_number_of_voxels_and_no_cells():
-    points = SCAN.sensor_points.reshape(-1, 3)
-    origins = {"sensor_origin": (1.6, 2.0, 3.8), "laser_origin": (1.6, 2.0, 3.8)}
-    listed = Scan.points(points, kind="confocal", wall=WALL, **origins)
-    with pytest.raises(ShapeError, match=r"expected size= for a list of points, got None"):
-        VoxelGrid.before(listed, [0.5], extent=0.4)
-    # From the first to the last point, six and four of them 0.2 m apart.
-    grid = VoxelGrid.before(listed, [0.5], size=(5, 2))
-    assert grid.extent == pytest.approx((1.0, 0.6)) and grid.pitch == pytest.approx((0.3, 0.2))
-    # With a cell around each where they are a grid.
-    assert VoxelGrid.before(SCAN, [0.5], size=(5, 2)).extent == pytest.approx((1.2, 0.8))
 
 
 def test_one_row_of_points_takes_the_axes_of_its_wall():

@@ -38,12 +38,12 @@ def operators(dtype=torch.float64):
     }
 
 
-def confocal_points(points, scan, axis, *, power=4, sigma_bins=2.0, strengths=None):
+def confocal_points(points, scan, axis, *, power=4, sigma_bins=2.0):
     """(T, Y, X) float64: light r^-power of isotropic points, Gaussian pulses integrated over the bins."""
     wall = scan.sensor_points
     light = torch.zeros(axis.num_bins, *scan.sensor_shape, dtype=torch.float64)
-    for point, strength in zip(points, strengths or [1.0] * len(points), strict=True):
+    for point in points:
         r = (wall - torch.tensor(point, dtype=torch.float64)).norm(dim=-1)
         steps = (axis.edges_opl[:, None, None] - 2 * r) / (sigma_bins * axis.bin_width_opl)
-        light += strength * r**-power * torch.special.ndtr(steps).diff(dim=0)
+        light += r**-power * torch.special.ndtr(steps).diff(dim=0)
     return light

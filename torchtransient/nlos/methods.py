@@ -100,15 +100,8 @@ def is_planar(scan: Scan) -> bool:
     return True
 
 
-def pitch_of(scan: Scan) -> float:
-    """Return the distance of sensor points from their neighbours, metres.
-
-    Args:
-        scan: of any kind.
-
-    Returns:
-        Pitch of a grid, mean over the points of a list, zero for one point.
-    """
+def _pitch_of(scan: Scan) -> float:
+    """Return the distance of sensor points from their neighbours, metres: the mean over a list, zero for one point."""
     if is_planar(scan):
         return max(PlanarScan.of_scan(scan, "pitch_of").pitch)
     points = scan.sensor_points.detach().cpu().reshape(-1, 3)
@@ -138,7 +131,7 @@ def default_wavelength(capture: Capture) -> float:
     if capture.axis is None:
         raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
     turns = 4.0 if capture.scan.kind in ("confocal", "pairs") else 2.0
-    return max(turns * pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)
+    return max(turns * _pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)
 
 
 # Planes whose points backprojection holds at once: filters run over all rows once for each such pass. Bytes of a

@@ -52,17 +52,8 @@ from torchtransient.reconstruction.capture_checks import (
 from torchtransient.volume_methods import FILTERS, Method
 
 
-def checked_light(capture: Capture, who: str) -> Capture:
-    """Return a capture whose light is finite.
-
-    Args:
-        capture: with a transient.
-        who: begins the message.
-
-    Raises:
-        UnitError: for NaN and infinities, which transforms spread over the whole volume; it names their number and the
-            first point.
-    """
+def _checked_light(capture: Capture, who: str) -> Capture:
+    """Return a capture whose light is finite. Raises UnitError for NaN, which transforms spread over the volume."""
     light = capture.transient
     assert light is not None  # a capture without one has been refused
     finite = torch.isfinite(light)
@@ -127,7 +118,7 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     checked_capture(capture, "without_slab")
     capture = subtract_legs(capture)
     transient, axis = checked_capture(capture, "without_slab")
-    checked_light(capture, "without_slab")
+    _checked_light(capture, "without_slab")
     # The Wiener filter works at the brightness of the data; float64 keeps what the slab lost.
     slab = DiffusionDeconvolution(capture.scan, time_axis=axis, thickness=thickness, snr=snr, dtype=torch.float64)
     clear = slab.to(transient.device).reconstruct(transient.double())
@@ -212,10 +203,10 @@ def reconstruct(
         raise ArgumentError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
     assert capture.axis is not None
     check_proportions(capture.scan, capture.axis, "reconstruct")
-    capture = checked_light(_intensities(capture), "reconstruct")
+    capture = _checked_light(_intensities(capture), "reconstruct")
     if not entry.takes_legs:
         capture = _from_zero(subtract_legs(capture))
-    near_far = None if depths is None else checked_depths(depths)
+    near_far = None if depths is None else _checked_depths(depths)
     assert capture.axis is not None
     with torch.no_grad():
         if entry.free_grid:
@@ -265,7 +256,7 @@ def default_grid(
             )
         near = max((axis.start_opl - legs) / 2, NEAREST * far)
     else:
-        near, far = checked_depths(depths)
+        near, far = _checked_depths(depths)
     if planes is None:
         # Depths that are whole bins to rounding are as many planes.
         planes = max(2, min(MOST_PLANES, math.ceil((far - near) / (axis.bin_width_opl / 2) - 1e-6)))
@@ -278,15 +269,8 @@ def default_grid(
     return VoxelGrid.before(capture.scan, middles, size=size, extent=extent)
 
 
-def checked_depths(depths: Any) -> tuple[float, float]:
-    """Return (near, far).
-
-    Args:
-        depths: two numbers in metres, 0 <= near < far.
-
-    Raises:
-        UnitError: for other values.
-    """
+def _checked_depths(depths: Any) -> tuple[float, float]:
+    """Return (near, far), metres, 0 <= near < far. Raises UnitError for other values."""
     plain = real_array(depths)
     if plain is None or plain.shape != (2,):
         raise UnitError(f"reconstruct: expected depths as (near, far) in metres, got {shown(depths)}.")

@@ -69,12 +69,8 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
     return module
 
 
-def is_readable(tensor: torch.Tensor) -> bool:
-    """Return False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that).
-
-    Args:
-        tensor: of any kind.
-    """
+def _is_readable(tensor: torch.Tensor) -> bool:
+    """Return False under ``torch.vmap``, where Python cannot look at values (torch has no public question for that)."""
     try:
         bool(tensor.any())
     except RuntimeError:
@@ -82,13 +78,8 @@ def is_readable(tensor: torch.Tensor) -> bool:
     return True
 
 
-def black_message(who: str, within: str = "") -> str:
-    """Return the warning of a capture without light.
-
-    Args:
-        who: begins the message.
-        within: part of the record without light, "" for all of it.
-    """
+def _black_message(who: str, within: str = "") -> str:
+    """Return the warning of a capture without light; ``within``: a part of the record, "" for all of it."""
     return (
         f"{who}: no light comes back from the hidden things{within}. Meshes scatter on the side that their normals "
         "point to (corners run counterclockwise as seen from there), which has to face the wall; others need a "
@@ -108,7 +99,7 @@ def say_black(who: str, capture: Capture) -> None:
     light = next(tensor for tensor in found if tensor is not None)
     if not bool(light.any()):
         within = " within the bins" if light is capture.transient else ""
-        warnings.warn(black_message(who, within), PhysicsWarning, stacklevel=3)
+        warnings.warn(_black_message(who, within), PhysicsWarning, stacklevel=3)
 
 
 def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: torch.Generator | None) -> torch.Tensor:
@@ -161,22 +152,13 @@ def checked_seed(who: str, value: Any) -> int:
     return number
 
 
-def check_seeds(who: str, value: Any) -> None:
-    """Check the seeds of a layer.
-
-    Args:
-        who: begins the message.
-        value: None, one seed, one for each entry of a batch, or the tensor that ``vmap`` has given to its entries,
-            which cannot be looked at.
-
-    Raises:
-        ArgumentError: for other values.
-    """
+def _check_seeds(who: str, value: Any) -> None:
+    """Check one seed, one for each entry of a batch, or the tensor of ``vmap``, which cannot be looked at."""
     if value is None:
         return
     if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 1:
         for one in value:
-            check_seeds(who, one)
+            _check_seeds(who, one)
         return
     _, of_each_entry = draw_seed(value)
     if of_each_entry is None:
@@ -200,16 +182,8 @@ def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
         raise ArgumentError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
 
 
-def keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
-    """Return parameters by key.
-
-    Args:
-        who, name: begin the message.
-        given: mapping, or a list of keys.
-
-    Raises:
-        SceneError: for other objects.
-    """
+def _keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
+    """Return parameters by key, of a mapping or a list of keys. Raises SceneError for other objects."""
     listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
     keys = list(given) if listed else [given]
     if not listed or not all(isinstance(key, str) for key in keys):
@@ -358,7 +332,7 @@ class CaptureRenderer(nn.Module):
         super().__init__()
         of_class("CaptureRenderer: scan", scan, Scan)
         check_sensor("CaptureRenderer", sensor)
-        wanted = keys_and_values("CaptureRenderer", "parameters", parameters)
+        wanted = _keys_and_values("CaptureRenderer", "parameters", parameters)
         settings["spp"] = checked_samples("CaptureRenderer: spp", settings.get("spp"))
         if settings.get("max_depth") is not None:
             raise ArgumentError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
@@ -412,13 +386,13 @@ class CaptureRenderer(nn.Module):
         Raises:
             SceneError, ArgumentError: as there, and for other seeds, which modulo 2^32 are those of others.
         """
-        check_seeds("CaptureRenderer", seed)
+        _check_seeds("CaptureRenderer", seed)
         check_sensor("CaptureRenderer", self.sensor, generator)
         checked_samples("CaptureRenderer: spp", spp)
         self._sources.check()
         given = _attached(self.scan)
         if values is not None:
-            given |= keys_and_values("CaptureRenderer", "values", values)
+            given |= _keys_and_values("CaptureRenderer", "values", values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
         self._say_black(out)
         capture = as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
@@ -435,8 +409,8 @@ class CaptureRenderer(nn.Module):
         watch, told = self.renderer._watch, self.renderer.scene.warned
         if not self.says_black or not watch.enabled or told & {SENSOR_RAYS, LASER_RAYS, HIDDEN}:
             return
-        if (watch.mode == "error" or _BLACK not in told) and is_readable(out.steady) and not bool(out.steady.any()):
-            watch.warn(_BLACK, black_message("CaptureRenderer"))
+        if (watch.mode == "error" or _BLACK not in told) and _is_readable(out.steady) and not bool(out.steady.any()):
+            watch.warn(_BLACK, _black_message("CaptureRenderer"))
 
     def _scan_of(self, given: Mapping[str, Any]) -> Scan:
         """The scan with the points of this call, which later steps do not change. Points that differ in a batch, or
@@ -448,7 +422,7 @@ class CaptureRenderer(nn.Module):
         changed: dict[str, Any] = {}
         for key, old in _points_of(self.scan).items():
             value = now[key]
-            if value is not None and (value.numel() != old.numel() or not is_readable(value)):
+            if value is not None and (value.numel() != old.numel() or not _is_readable(value)):
                 return self.scan
             changed[_FIELDS[key]] = old if value is None else value.to(old.dtype).reshape(old.shape).clone()
         if self.scan.kind == "confocal":

@@ -32,7 +32,7 @@ DEFAULT_SEED = 0
 
 # Plugins of Mitsuba by what names of files end with; .npz is read here.
 _PLUGINS = {".obj": "obj", ".ply": "ply", ".serialized": "serialized"}
-MESH_FILES = (*_PLUGINS, ".npz")
+_MESH_FILES = (*_PLUGINS, ".npz")
 
 
 def mesh_file(path: Path, where: str) -> dict[str, Any]:
@@ -55,8 +55,8 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
             f"{where}: {str(path)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it as "
             "it is: tt.nlos.simulate(path)."
         )
-    if suffix not in MESH_FILES:
-        raise SceneError(f"{where}: expected a mesh file ({', '.join(MESH_FILES)}), got {str(path)!r}.")
+    if suffix not in _MESH_FILES:
+        raise SceneError(f"{where}: expected a mesh file ({', '.join(_MESH_FILES)}), got {str(path)!r}.")
     if not path.is_file():
         raise SceneError(f"{where}: no file {str(path)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
     if suffix == ".npz":
@@ -103,7 +103,7 @@ WALL, SENSOR, LASER = "wall", "sensor", "laser"
 _INTEGRATOR = "integrator"
 ALL_BOUNCES = "all"
 # What single precision holds.
-MOST_ENERGY = 1e30
+_MOST_ENERGY = 1e30
 # Plugins of emitters, Mitsuba's and ours.
 _LIGHTS = (
     "area", "angulararea", "directionalarea", "point", "spot", "projector", "laser_beam", "directional", "constant",
@@ -262,8 +262,8 @@ def _check_energy(energy: Any) -> None:
     joules = as_number(energy)
     if joules is None:
         raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
-    if not 0 <= joules < MOST_ENERGY:
-        raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {MOST_ENERGY:g} at most).")
+    if not 0 <= joules < _MOST_ENERGY:
+        raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {_MOST_ENERGY:g} at most).")
 
 
 def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:

@@ -18,8 +18,7 @@ Only `hidden` and `scan` must be there.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +42,7 @@ from torchtransient.nlos.scene import (
     mesh_file,
     mesh_of_npz,
 )
-from torchtransient.nlos.tal_yaml import TalSettings, read_tal_yaml
+from torchtransient.nlos.tal_yaml import tal_arguments
 from torchtransient.scene.load import load
 from torchtransient.scenes import bounds
 from torchtransient.scenes.parts import diffuse
@@ -132,7 +131,7 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
         shape["flip_normals"] = True
     if "bsdf" in section and "albedo" in section:
         raise SceneError(f"{where}: albedo and bsdf exclude each other; give one.")
-    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(albedo_of(section))
+    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(_albedo(section))
     return shape
 
 
@@ -146,13 +145,8 @@ def _bsdf(section: Section) -> dict[str, Any]:
     return dict(given)
 
 
-def albedo_of(section: Section, default: float = 0.5) -> Any:
-    """Return the entry `albedo`: a number, or three as a tuple.
-
-    Args:
-        section: that holds it.
-        default: where it is missing.
-    """
+def _albedo(section: Section, default: float = 0.5) -> Any:
+    """Return the entry `albedo`: a number, or three as a tuple."""
     if isinstance(section.get("albedo", default), list):
         return tuple(section.numbers("albedo", (3,)))
     return section.number("albedo", default)
@@ -197,7 +191,7 @@ def _is_pair(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 2 and isinstance(value[0], list) and not isinstance(value[1], list)
 
 
-ENTRIES = (
+_ENTRIES = (
     "name", "hidden", "wall", "scan", "time_axis", "frequencies", "spp", "bounces", "sensor", "seed", "variant",
 )  # fmt: skip
 _PLANE_ENTRIES = ("width", "height", "center", "normal", "up", "albedo")
@@ -207,63 +201,30 @@ _SCAN_ENTRIES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class CaptureDescription:
-    """Contents of a description file.
-
-    ``hidden``: shapes by name, Mitsuba dictionaries. ``scan``: with the wall. ``axis``: the bins, for phasors None.
-    ``frequencies``: of a phasor capture, else None. ``bounces``: the numbers of bounces that count, the laser's spot
-    being the first; None for all. ``sensor``: that measures the light, or None. ``entries``: the file.
-    """
-
-    name: str
-    hidden: Mapping[str, Any]
-    scan: Scan
-    axis: TimeAxis | None
-    frequencies: FrequencyAxis | None = None
-    spp: int = DEFAULT_SPP
-    bounces: tuple[int, ...] | None = DEFAULT_BOUNCES
-    sensor: Device | None = None
-    seed: int = DEFAULT_SEED
-    variant: str | None = None
-    entries: Mapping[str, Any] = field(default_factory=dict)
-
-
-def read_description(source: str | Path) -> CaptureDescription:
-    """Read and check a description. Nothing is executed.
-
-    Args:
-        source: path of a YAML file, from whose folder names of files are looked up, or YAML text.
-
-    Raises:
-        SceneError: for unknown, missing and wrong entries.
-        StorageError: for files that cannot be read.
-    """
-    with short_errors("capture description"):
-        return _description(source)
-
-
-def _description(source: str | Path) -> CaptureDescription:
-    data, folder = read_yaml(source, "capture description")
-    section = Section(data, "capture description", ENTRIES)
+def _of_description(data: Mapping[str, Any], folder: Path, name: str) -> dict[str, Any]:
+    if "hidden" not in data:
+        raise SceneError(
+            f"{name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of y-tal), got "
+            f"{', '.join(map(str, data))}."
+        )
+    section = Section(data, "capture description", _ENTRIES)
+    section.text("name", "")
     hidden = described_shapes(section.get("hidden"), folder)
     scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
     frequencies = _frequencies(section)
     if frequencies is not None and "time_axis" in section:
         raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
-    return CaptureDescription(
-        name=section.text("name", "capture" if isinstance(source, str) and "\n" in source else Path(source).stem),
-        hidden=hidden,
-        scan=scan,
-        axis=None if frequencies is not None else _axis(section.get("time_axis", {}), scan, hidden),
-        frequencies=frequencies,
-        spp=section.whole("spp", DEFAULT_SPP),
-        bounces=_bounces(section),
-        sensor=_sensor(section.get("sensor", None), folder),
-        seed=section.whole("seed", DEFAULT_SEED, least=0),
-        variant=section.text("variant", None),
-        entries=data,
-    )
+    return {
+        "hidden": hidden,
+        "scan": scan,
+        "time_axis": None if frequencies is not None else _axis(section.get("time_axis", {}), scan, hidden),
+        "frequencies": frequencies,
+        "spp": section.whole("spp", DEFAULT_SPP),
+        "bounces": _bounces(section),
+        "sensor": _sensor(section.get("sensor", None), folder),
+        "seed": section.whole("seed", DEFAULT_SEED, least=0),
+        "variant": section.text("variant", None),
+    }
 
 
 def wall_of(data: Any, folder: Path) -> Wall:
@@ -282,11 +243,11 @@ def wall_of(data: Any, folder: Path) -> Wall:
         if path.suffix.lower() != ".npz":
             raise SceneError(f"wall: expected an .npz file with vertices and faces, got '{path.name}'.")
         vertices, faces = mesh_of_npz(path, "wall")
-        return Wall.mesh(vertices, faces, **_given(section, {"up": (3,)}), albedo=albedo_of(section))
+        return Wall.mesh(vertices, faces, **_given(section, {"up": (3,)}), albedo=_albedo(section))
     section = Section(data, "wall", _PLANE_ENTRIES)
     sizes = {name: section.number(name) for name in ("width", "height") if name in section}
     places = _given(section, {"center": (3,), "normal": (3,), "up": (3,)})
-    return Wall.plane(**sizes, **places, albedo=albedo_of(section))
+    return Wall.plane(**sizes, **places, albedo=_albedo(section))
 
 
 def scan_of(data: Any, wall: Wall) -> Scan:
@@ -356,10 +317,10 @@ def _frequencies(section: Section) -> FrequencyAxis | None:
     )
 
 
-def _bounces(section: Section) -> tuple[int, ...] | None:
+def _bounces(section: Section) -> tuple[int, ...] | str:
     given = section.get("bounces", list(DEFAULT_BOUNCES))
-    if given == "all":
-        return None
+    if given == ALL_BOUNCES:
+        return ALL_BOUNCES
     wanted = given if isinstance(given, list) else [given]
     numbers = [as_number(value, "bounces") for value in wanted]
     if not numbers or any(number != round(number) or number < 1 for number in numbers):
@@ -384,10 +345,6 @@ def _sensor(given: Any, folder: Path) -> Device | None:
         raise type(error)(f"sensor: {error}") from error
 
 
-# Bounces of light that goes from spot to scan point, and around one corner.
-_WALL_TO_WALL, _AROUND_A_CORNER = 2, 3
-
-
 def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
     """Read a file as the arguments of ``simulate``: ``simulate(**read_setup("capture.yaml"))``.
 
@@ -397,7 +354,7 @@ def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
     by one factor for all points.
 
     Args:
-        path: a YAML file of this library (:func:`read_description`), a scene file of y-tal's renderer or its folder
+        path: a YAML file of this library (above), a scene file of y-tal's renderer or its folder
             (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
             integrator ``transient_nlos_path``.
         xml_parameters: fill the ``$parameters`` of an XML file.
@@ -421,72 +378,7 @@ def _setup(path: str | Path, xml_parameters: Mapping[str, Any]) -> dict[str, Any
         raise SceneError(
             f"expected a capture as YAML (.yaml, .yml), the folder of a y-tal scene, or Mitsuba's XML, got '{source}'."
         )
-    entries, _ = read_yaml(source, "capture")
+    entries, folder = read_yaml(source, "capture")
     if "geometry" in entries or "relay_wall" in entries:
-        return _of_tal(read_tal_yaml(source))
-    if "hidden" not in entries:
-        raise SceneError(
-            f"{source.name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of "
-            f"y-tal), got {', '.join(map(str, entries))}."
-        )
-    found = read_description(source)
-    return {
-        "hidden": dict(found.hidden),
-        "scan": found.scan,
-        "time_axis": found.axis,
-        "frequencies": found.frequencies,
-        "spp": found.spp,
-        "bounces": ALL_BOUNCES if found.bounces is None else found.bounces,
-        "sensor": found.sensor,
-        "seed": found.seed,
-        "variant": found.variant,
-    }
-
-
-def _of_tal(settings: TalSettings) -> dict[str, Any]:
-    return {
-        "hidden": dict(settings.hidden),
-        "scan": settings.scan,
-        "time_axis": None if settings.frequencies is not None else settings.axis,
-        "frequencies": settings.frequencies,
-        "spp": settings.spp,
-        "bounces": tal_bounces(settings.max_depth, settings.filter_bounces, settings.discard_direct_paths),
-        "energy": _energy(settings.laser_emission),
-        "variant": settings.variant if "mitsuba_variant" in settings.entries else None,
-    }
-
-
-def tal_bounces(max_depth: int, filter_bounces: int, discard_direct_paths: bool) -> Sequence[int] | str:
-    """Return the bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
-
-    A flat wall does not light itself, so that light of two bounces is none without a limit.
-
-    Args:
-        max_depth, filter_bounces, discard_direct_paths: as the parameters of that name of `transient_nlos_path`.
-
-    Raises:
-        SceneError: for settings that leave nothing.
-    """
-    first = _AROUND_A_CORNER if discard_direct_paths else _WALL_TO_WALL
-    last = max_depth
-    if filter_bounces != -1:
-        wanted = filter_bounces + 1
-        first, last = max(first, wanted), wanted if max_depth == -1 else min(max_depth, wanted)
-    if last == -1:
-        return ALL_BOUNCES
-    if last < first:
-        raise SceneError(
-            f"y-tal scene: integrator_max_depth: {max_depth}, integrator_filter_bounces: {filter_bounces} and "
-            f"integrator_discard_direct_paths: {str(discard_direct_paths).lower()} leave no light. filter_bounces: 2 "
-            "with max_depth: -1 is light around one corner, of three bounces."
-        )
-    return tuple(range(first, last + 1))
-
-
-def _energy(emission: Any) -> Any:
-    """A number, or a spectrum of Mitsuba."""
-    if not isinstance(emission, tuple):
-        return emission
-    if len(set(emission)) == 1:
-        return emission[0]
-    return {"type": "rgb", "value": list(emission)}
+        return tal_arguments(entries, folder)
+    return _of_description(entries, folder, source.name)

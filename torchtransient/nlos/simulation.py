@@ -7,16 +7,17 @@ that were done keep their bits.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -26,8 +27,14 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import Numbers, count, of_class
 from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
+from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
 from torchtransient.nlos.renderer import (
+    POINTS,
+    SPOTS,
+    CaptureRenderer,
+    as_capture,
+    check_scan,
     check_sensor,
     checked_module,
     checked_seed,
@@ -46,11 +53,15 @@ from torchtransient.nlos.scene import (
     capture_scene,
     hidden_bounds,
 )
-from torchtransient.nlos.work import Film, HiddenWork, SceneWork, Work, choose_variant, seed_of
+from torchtransient.nlos.scene_scan import scan_of_scene
 from torchtransient.rendering.arguments import checked_samples
 from torchtransient.rendering.memory import available_bytes
+from torchtransient.rendering.renderer import TransientRenderer
+from torchtransient.scene.inventory import scene_inventory
 from torchtransient.scene.load import Scene, load
-from torchtransient.scene.variant import active_variant
+from torchtransient.scene.objects import LoadedScene
+from torchtransient.scene.plan import text_of
+from torchtransient.scene.variant import active_variant, is_differentiable, resolve_variant
 from torchtransient.sensing import Device
 
 # Parts of a simulation with a part file, of which a kill loses one at most. Tiles of exhaustive captures each look at
@@ -59,6 +70,197 @@ PARTS, EXHAUSTIVE_PARTS = 16, 4
 # Shares of the samples that the time is estimated by, and the fewest that tell something.
 FEW, SOME, LEAST = 512, 128, 16
 _NUMBER_BYTES = 4
+
+
+@dataclass(frozen=True)
+class VariantChoice:
+    """``name``: of the variant; ``why`` it was chosen."""
+
+    name: str
+    why: str
+
+
+def _choose_variant(scene: Scene, requested: str | None) -> VariantChoice:
+    """Choose the cheapest variant in which a capture loses nothing.
+
+    ``requested``; else the active one where it is polarized; else one channel where every spectrum of a scene is grey,
+    on the device of the variant that :func:`tt.load` would take; else that variant, but none of one channel.
+    """
+    import mitsuba as mi
+
+    if requested is not None:
+        return VariantChoice(resolve_variant(requested), "as asked for")
+    active, name = mi.variant(), resolve_variant(None)
+    if name.endswith("_polarized"):
+        return VariantChoice(name, "the active one, which is polarized")
+    # In the variant that is active, or becomes so: a switch takes time.
+    found = scene_inventory(load(scene, variant=name if is_differentiable(active) else f"{name.split('_')[0]}_ad_mono"))
+    coloured = [*found.colours, *found.measured, *found.bands]
+    if not coloured:
+        device = name.split("_")[0]
+        return VariantChoice(f"{device}_ad_mono", "every spectrum is grey, so that one channel carries all of it")
+    # One channel may have been chosen for the scene before.
+    return VariantChoice(name.replace("_mono", "_rgb"), f"colour: {text_of(coloured)}")
+
+
+def _files_of(scene: Scene) -> dict[str, str]:
+    """Return the contents of the files that a scene names anywhere, by the name that it has there.
+
+    Included files, defaults and values of ``$parameters`` count. The scene has been built before.
+    """
+    import mitsuba as mi
+
+    description, found = scene._description, {}
+    description.check_described("tt.nlos: a simulation that is kept in files")
+    assert not isinstance(description, LoadedScene)  # refused above
+    with active_variant(scene.variant), description.resolved_files():
+        nodes = description.parse(mi.parser.ParserConfig(scene.variant)).nodes
+        for props in (node.props for node in nodes):
+            for name in list(props):
+                if props.type(name) == mi.Properties.Type.String:
+                    value = str(props[name])
+                    found[value] = contents_of(Path(str(mi.file_resolver().resolve(value))))
+    return {name: contents for name, contents in found.items() if contents}
+
+
+@dataclass(frozen=True)
+class Film:
+    """Film and effort of a simulation: ``time_axis`` or ``frequencies``, and ``spp``."""
+
+    time_axis: TimeAxis | None
+    frequencies: FrequencyAxis | Numbers | None
+    spp: int
+
+
+class HiddenWork:
+    """A scan of hidden things, rendered in runs of sensor points: ``tiles`` of them, or less where points are few."""
+
+    def __init__(
+        self, hidden: Any, scan: Scan, settings: dict[str, Any], film: Film, variant: VariantChoice, tiles: int
+    ) -> None:
+        self.hidden, self.scan, self.film, self.variant = hidden, scan.detach(), film, variant
+        self._settings = settings | vars(film) | {"variant": variant.name}
+        self._points = self.scan.sensor_points.reshape(-1, 3)
+        size = -(-len(self._points) // min(tiles, len(self._points)))
+        # Of equal sizes but for the last: a size is a scene to be built.
+        self._runs = [(k, min(k + size, len(self._points))) for k in range(0, len(self._points), size)]
+        self._renderers: dict[int, CaptureRenderer] = {}
+        if self.count > 1:
+            # Of all points before the first part, not of some when their turn comes.
+            check_scan(load(capture_scene(hidden, self.scan, **settings), variant=variant.name), self.scan)
+
+    @property
+    def count(self) -> int:
+        """The number of parts."""
+        return len(self._runs)
+
+    def run(self, number: int) -> tuple[int, int]:
+        """Return the first sensor point of a part, and the one behind its last."""
+        return self._runs[number]
+
+    def key(self, seed: int) -> str:
+        """Return the key of a part file of this work."""
+        return content_key(self.hidden, self.scan, self._settings, seed, self._runs)
+
+    def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
+        """Return time axis and frequencies of the film, one of which is None."""
+        return self.renderer(0).axis, self.renderer(0).frequencies
+
+    def renderer(self, number: int) -> TransientRenderer:
+        """Return the renderer of a part."""
+        return self._of(number).renderer
+
+    def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
+        """Render a part as a capture: of a list of points where there are several parts."""
+        first, last = self._runs[number]
+        values = {} if self.count == 1 else {POINTS: self._points[first:last]}
+        if values and self.scan.kind == "pairs":
+            values[SPOTS] = self.scan.laser_points.reshape(-1, 3)[first:last]
+        capture: Capture = self._of(number)(values, seed=seed, spp=spp, progress=progress)
+        return capture
+
+    def _of(self, number: int) -> CaptureRenderer:
+        first, last = self._runs[number]
+        if last - first not in self._renderers:
+            scan, parameters = self.scan, ()  # type: Scan, tuple[str, ...]
+            if self.count > 1:
+                scan = _listed(self.scan, first, last)
+                parameters = (POINTS, SPOTS) if scan.kind == "pairs" else (POINTS,)
+            made = CaptureRenderer(self.hidden, scan, parameters, **self._settings)
+            # Parts may be dark; of the whole capture it is said.
+            made.says_black = False
+            self._renderers[last - first] = made
+        return self._renderers[last - first]
+
+
+class SceneWork:
+    """A complete scene, rendered in ``passes`` over all sensor points, with a share of the samples each."""
+
+    def __init__(
+        self, scene: Scene, time_axis: TimeAxis | None, frequencies: Any, spp: int | None, variant: VariantChoice,
+        passes: int,
+    ) -> None:  # fmt: skip
+        self._renderer = TransientRenderer(scene, time_axis=time_axis, frequencies=frequencies, spp=spp)
+        used = spp or self._renderer._scene_spp
+        self.film = Film(self._renderer.axis, self._renderer.frequencies, used)
+        self.variant = variant
+        self.count = min(passes, used)
+        with active_variant(scene.variant):
+            self.scan = scan_of_scene(scene.built(self._renderer._options).scene)
+
+    def run(self, number: int) -> tuple[int, int]:
+        """Return the range of all sensor points."""
+        return 0, math.prod(self.scan.sensor_shape)
+
+    def share(self, number: int) -> int:
+        """Return the samples of a pass."""
+        whole, more = divmod(self.film.spp, self.count)
+        return whole + (number < more)
+
+    def key(self, seed: int) -> str:
+        """Return the key of a part file of this work."""
+        scene = self._renderer.scene
+        return content_key(scene._description, _files_of(scene), self.film, self.variant.name, seed, self.count)
+
+    def axes(self) -> tuple[TimeAxis | None, FrequencyAxis | None]:
+        """Return time axis and frequencies of the film, one of which is None."""
+        return self._renderer.axis, self._renderer.frequencies
+
+    def renderer(self, number: int) -> TransientRenderer:
+        """Return the renderer of all parts."""
+        return self._renderer
+
+    def render(self, number: int, seed: int, *, spp: int | None = None, progress: bool = False) -> Capture:
+        """Render a pass as a capture."""
+        out = self._renderer(seed=seed, spp=spp or self.share(number), progress=progress)
+        return as_capture(out, self.scan)
+
+
+Work: TypeAlias = "HiddenWork | SceneWork"
+
+
+def _seed_of(seed: int, number: int) -> int:
+    """Return the seed of a part, independent of the seeds of other parts."""
+    return int.from_bytes(hashlib.sha256(f"{seed}:{number}".encode()).digest()[:4], "little")
+
+
+def _listed(scan: Scan, first: int, last: int) -> Scan:
+    """The scan of a run of its sensor points."""
+
+    def part(values: torch.Tensor | None) -> torch.Tensor | None:
+        return None if values is None else values.reshape(-1, 3)[first:last]
+
+    points, normals = part(scan.sensor_points), part(scan.sensor_normals)
+    assert points is not None
+    changed: dict[str, Any] = {"sensor_points": points, "sensor_normals": normals}
+    if scan.kind == "confocal":
+        changed |= {"laser_points": points, "laser_normals": normals}
+    elif scan.kind == "pairs":
+        changed |= {"laser_points": part(scan.laser_points), "laser_normals": part(scan.laser_normals)}
+    return replace(scan, **changed)
+
+
+# --------------------------------------------------------------------------------------------------------- forecasts
 
 
 @dataclass(frozen=True)
@@ -81,7 +283,7 @@ class Forecast:
     def __str__(self) -> str:
         shape = " x ".join(map(str, self.shape))
         parts = f", in {self.parts} parts" if self.parts > 1 else ""
-        taken = "" if self.seconds is None else f", about {duration_in_words(self.seconds)}"
+        taken = "" if self.seconds is None else f", about {_duration_in_words(self.seconds)}"
         lines = [
             self.scan,
             f"{shape}: {size_in_words(self.bytes)}{taken}, {self.spp} samples a point{parts}",
@@ -91,16 +293,8 @@ class Forecast:
         return "\n".join(lines)
 
 
-def forecast_of(work: Work, *, timed: bool) -> Forecast:
-    """Forecast a simulation that is about to start.
-
-    Args:
-        work: to be rendered.
-        timed: with the time, from a small share of the samples.
-
-    Raises:
-        StorageError: for a capture that does not fit into memory.
-    """
+def _forecast_of(work: Work, *, timed: bool) -> Forecast:
+    """Forecast a simulation, ``timed`` from a small share of its samples. Raises StorageError beyond the memory."""
     shape = _measured_shape(work)
     taken = math.prod(shape) * _NUMBER_BYTES * (1 if work.film.frequencies is None else 2)
     _check_fits(taken, shape, work)
@@ -128,7 +322,7 @@ def _measured_shape(work: Work) -> tuple[int, ...]:
 def _seconds(work: Work) -> float:
     """Estimate the seconds of all parts from runs of the first with few samples: a start, and a cost of each sample."""
     # Of few samples in all, those of a part: a render that has next to nothing to do says nothing of others.
-    of_part = max(1, work.film.spp // work.count) if work.sums else work.film.spp
+    of_part = max(1, work.film.spp // work.count) if isinstance(work, SceneWork) else work.film.spp
     few, some = max(LEAST, of_part // FEW), max(LEAST, of_part // SOME)
     few, some = (few, some) if some > few else (of_part, of_part)
     times = {}
@@ -144,9 +338,7 @@ def _seconds(work: Work) -> float:
     told &= before
     slope = max(0.0, (times[some] - times[few]) / (some - few)) if some > few else 0.0
     of_one = times[some] + slope * (of_part - some)
-    if work.sums:
-        return work.count * of_one
-    return of_one / _share(work)
+    return work.count * of_one if isinstance(work, SceneWork) else of_one / _share(work)
 
 
 def _share(work: Work) -> float:
@@ -179,12 +371,8 @@ def size_in_words(count: int) -> str:
     return f"{count / 2**10:.4g} KiB"
 
 
-def duration_in_words(seconds: float) -> str:
-    """Return seconds in words.
-
-    Args:
-        seconds: a duration.
-    """
+def _duration_in_words(seconds: float) -> str:
+    """Return seconds in words."""
     if seconds < 100:
         return f"{seconds:.2g} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
@@ -243,24 +431,33 @@ def simulate(
         StorageError: where the capture does not fit into memory or the disk is full, and for a part file that belongs
             to another simulation, is damaged, or is worked on by another process.
     """
-    seed, path = checked_seed("simulate", seed), _part_path(part)
+    seed, path = checked_seed("simulate", seed), None if part is None else path_of(part, "simulate: part")
     check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     chain = None if sensor is None else _chain(sensor, work.axes()[0])
-    with _part_file(path, work, seed) as kept, active_variant(work.variant.name), torch.no_grad():
+    part_file = nullcontext() if path is None else PartFile(path, work.key(seed))
+    with part_file as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
-        forecast = forecast_of(work, timed=progress and not finished)
+        forecast = _forecast_of(work, timed=progress and not finished)
         if progress:
             print(forecast, file=sys.stderr)
-        whole = kept is None and work.count == 1
-        capture, seconds = _whole(work, seed, progress) if whole else _in_parts(work, seed, kept, progress)
+        if kept is None and work.count == 1:
+            began = time.perf_counter()
+            capture = work.render(0, seed, progress=progress)
+            seconds = time.perf_counter() - began
+        else:
+            capture, seconds = _in_parts(work, seed, kept, progress)
         say_black("simulate", capture)
         if chain is not None and capture.transient is not None:
             light = measured(in_film_shape(capture.transient, capture.scan), capture.scan, chain, generator)
             capture = replace(capture, transient=in_scan_shape(light, capture.scan))
         if kept is not None and not keep_part:
             kept.remove()
-    return replace(capture, metadata=_metadata(work, forecast, seed, seconds))
+    metadata = {
+        "spp": work.film.spp, "seed": seed, "seconds": seconds, "parts": work.count, "variant": work.variant.name,
+        "variant_reason": work.variant.why, "light": forecast.light,
+    }  # fmt: skip
+    return replace(capture, metadata=metadata)
 
 
 def forecast(
@@ -288,12 +485,12 @@ def forecast(
     unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
     if unknown:
         raise ArgumentError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
-    path = _part_path(part)
+    path = None if part is None else path_of(part, "simulate: part")
     work = _work(
         hidden, scan, time_axis, frequencies, spp, (of_light[0], of_light[1]), variant, _parts(scan, path, tiles)
     )
     with active_variant(work.variant.name):
-        return forecast_of(work, timed=True)
+        return _forecast_of(work, timed=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------- work
@@ -319,7 +516,7 @@ def _work(
         "bounces": DEFAULT_BOUNCES if bounces is None else bounces,
         "energy": DEFAULT_ENERGY if energy is None else energy,
     }
-    chosen = choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
+    chosen = _choose_variant(load(capture_scene(hidden, scan, **settings)), variant)
     if time_axis is None and frequencies is None:
         with active_variant(chosen.name):
             bounds = hidden_bounds(hidden, chosen.name)
@@ -352,7 +549,7 @@ def _scene_work(
     given = variant
     if given is None and isinstance(scene, Scene):
         given = scene._requested_variant
-    chosen = choose_variant(loaded, given)
+    chosen = _choose_variant(loaded, given)
     return SceneWork(load(loaded, variant=chosen.name), time_axis, frequencies, spp, chosen, parts)
 
 
@@ -360,10 +557,6 @@ def _is_complete(scene: Mapping[str, Any]) -> bool:
     """Return True for a dictionary with an integrator: hidden things have none."""
     kinds = [str(node.get("type", "")) for node in scene.values() if isinstance(node, Mapping)]
     return any("path" in kind for kind in kinds) or "integrator" in scene
-
-
-def _part_path(part: Any) -> Path | None:
-    return None if part is None else path_of(part, "simulate: part")
 
 
 def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
@@ -374,20 +567,6 @@ def _parts(scan: Any, part: Path | None, tiles: int | None) -> int:
 
 
 # ------------------------------------------------------------------------------------------------------------- renders
-
-
-def _whole(work: Work, seed: int, progress: bool) -> tuple[Capture, float]:
-    began = time.perf_counter()
-    return work.render(0, seed, progress=progress), time.perf_counter() - began
-
-
-@contextmanager
-def _part_file(path: Path | None, work: Work, seed: int) -> Iterator[PartFile | None]:
-    if path is None:
-        yield None
-        return
-    with PartFile(path, work.key(seed)) as kept:
-        yield kept
 
 
 def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> tuple[Capture, float]:
@@ -403,24 +582,30 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 bar.update(1)
                 continue
             began = time.perf_counter()
-            capture = work.render(number, seed_of(seed, number))
+            capture = work.render(number, _seed_of(seed, number))
             layout = RowLayout.of(capture)
-            found = layout.rows(capture)
+            part = layout.rows(capture)
             seconds = time.perf_counter() - began
             done += seconds
-            if work.sums:
-                rows = _sum_so_far(kept, number, points) if rows is None else rows
-                weighed = work.weight(number) * found
-                rows = weighed if rows is None else np.add(rows, weighed, out=rows)
+            first, total, before = work.run(number)[0], points, None
+            if isinstance(work, SceneWork):
+                first, total, before = _slot(number, points), 2 * points, number - 1
+                if rows is None and kept is not None and number > 0:
+                    rows = kept.rows(_slot(number - 1, points), points)
+                weighed = work.share(number) / work.film.spp * part
+                part = rows = weighed if rows is None else np.add(rows, weighed, out=rows)
             elif kept is None:
                 rows = np.empty((points, layout.columns), np.float32) if rows is None else rows
-                rows[slice(*work.run(number))] = found
+                rows[slice(*work.run(number))] = part
             if kept is not None:
-                _keep(kept, work, number, rows if work.sums else found, seconds, layout)
+                about = layout.plain()
+                kept.keep(number, first, part, total=total, seconds=seconds, about=about, instead_of=before)
             bar.update(1)
     assert layout is not None
     if kept is not None:
-        rows, done = _everything(kept, work, points), kept.seconds
+        whole = isinstance(work, HiddenWork)
+        rows = kept.everything() if whole else kept.rows(_slot(work.count - 1, points), points)
+        done = kept.seconds
     assert rows is not None
     return Capture(**layout.capture(rows, work.scan, *work.axes()), metadata={}), done
 
@@ -431,23 +616,7 @@ def _slot(number: int, points: int) -> int:
 
 
 def _has(kept: PartFile, work: Work, number: int) -> bool:
-    return kept.last is not None and number <= kept.last if work.sums else kept.has(number)
-
-
-def _sum_so_far(kept: PartFile | None, number: int, points: int) -> Rows | None:
-    return None if kept is None or number == 0 else kept.rows(_slot(number - 1, points), points)
-
-
-def _keep(kept: PartFile, work: Work, number: int, rows: Any, seconds: float, layout: RowLayout) -> None:
-    points = math.prod(work.scan.sensor_shape)
-    first, total, before = work.run(number)[0], points, None
-    if work.sums:
-        first, total, before = _slot(number, points), 2 * points, number - 1
-    kept.keep(number, first, rows, total=total, seconds=seconds, about=layout.plain(), instead_of=before)
-
-
-def _everything(kept: PartFile, work: Work, points: int) -> Rows:
-    return kept.rows(_slot(work.count - 1, points), points) if work.sums else kept.everything()
+    return kept.last is not None and number <= kept.last if isinstance(work, SceneWork) else kept.has(number)
 
 
 # -------------------------------------------------------------------------------------------------------------- results
@@ -459,10 +628,3 @@ def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.
     # Counts as they are drawn: nothing of a simulation has gradients.
     return checked_module(sensor, axis, "straight_through")
 
-
-
-def _metadata(work: Work, forecast: Forecast, seed: int, seconds: float) -> dict[str, Any]:
-    return {
-        "spp": work.film.spp, "seed": seed, "seconds": seconds, "parts": work.count, "variant": work.variant.name,
-        "variant_reason": work.variant.why, "light": forecast.light,
-    }  # fmt: skip

@@ -1,10 +1,9 @@
-"""Scene files of y-tal's renderer (`tal render`, versions 0.20 and 0.21) as plain settings."""
+"""Scene files of y-tal's renderer (`tal render`, versions 0.20 and 0.21), read as arguments of ``simulate``."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,10 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.scan import GRID_KINDS
-from torchtransient.checks import short_errors, shown, some_of
+from torchtransient.checks import shown, some_of
 from torchtransient.errors import SceneError
-from torchtransient.files.yaml_files import Section, as_number, file_beside, read_yaml
+from torchtransient.files.yaml_files import Section, as_number, file_beside
+from torchtransient.nlos.scene import ALL_BOUNCES
 from torchtransient.plugins.films.transform_bins import transform_bins
 from torchtransient.scenes.transforms import rotate, scale, translate
 
@@ -23,16 +23,9 @@ _VALUES = ("float", "integer", "boolean", "string", "rgb", "spectrum")
 _PLUGINS = ("bsdf", "texture")
 
 
-def material(data: Any, where: str) -> dict[str, Any]:
+def _material(data: Any, where: str) -> dict[str, Any]:
     """Return the BSDF of an entry `material`: `id: white`, `id: copper` with `alpha`, or `id: custom` with XML as
     `text`.
-
-    Args:
-        data: the entry.
-        where: begins the message.
-
-    Raises:
-        SceneError: for other ids, and for XML that is more than nested BSDFs, textures and values.
     """
     identity = data.get("id") if isinstance(data, Mapping) else None
     if identity == "white":
@@ -90,24 +83,13 @@ def _value(kind: str, text: str, where: str) -> Any:
             raise SceneError(f"{where}: expected one or three numbers, got {text!r}.")
         return {"type": "rgb", "value": numbers * (3 // len(numbers))}
     if kind == "spectrum":
-        return spectrum(text, where)
+        return _spectrum(text, where)
     number = as_number(text, where)
     return int(number) if kind == "integer" else number
 
 
-def spectrum(text: str, where: str) -> Any:
-    """Return a spectrum that is given as text.
-
-    Args:
-        text: one number, or wavelengths in nm with values, "400:1, 700:2".
-        where: begins the message.
-
-    Returns:
-        Number, or a Mitsuba dictionary of pairs.
-
-    Raises:
-        SceneError: for other texts.
-    """
+def _spectrum(text: str, where: str) -> Any:
+    """Return one number, or pairs of wavelengths in nm and values ("400:1, 700:2") as a Mitsuba dictionary."""
     words = text.replace(",", " ").split()
     if len(words) == 1 and ":" not in words[0]:
         return as_number(words[0], where)
@@ -117,7 +99,8 @@ def spectrum(text: str, where: str) -> Any:
     return {"type": "spectrum", "value": [(as_number(a, where), as_number(b, where)) for a, b in pairs]}
 
 
-DEFAULT_VARIANT = "llvm_ad_rgb"
+# Bounces of light that goes from spot to scan point, and around one corner.
+_WALL_TO_WALL, _AROUND_A_CORNER = 2, 3
 _KNOWN = (
     "name", "mitsuba_variant", "integrator_max_depth", "integrator_filter_bounces", "integrator_discard_direct_paths",
     "integrator_nlos_laser_sampling", "integrator_nlos_hidden_geometry_sampling",
@@ -137,91 +120,79 @@ _GEOMETRY = (
 _ANALYTIC = ("rectangle", "sphere")
 
 
-@dataclass(frozen=True)
-class TalSettings:
-    """Contents of a scene file of y-tal. Lengths in metres.
-
-    ``hidden``: shapes by name, Mitsuba dictionaries with absolute names of mesh files. ``scan``: with the wall, in the
-    order of this library, rows along y (y-tal's arrays have x first). ``axis``: the bins. ``frequencies``: bins that a
-    phasor film keeps of a transform of these, None for histograms. ``spp``: samples a sensor point.
-
-    ``max_depth``, ``filter_bounces``, ``discard_direct_paths``: as the parameters of that name of `transient_nlos_path`
-    in mitransient 1.x, -1 for no limit. ``hidden_geometry_sampling``, ``rroulette``, ``includes_relay_wall``: settings
-    of its estimator, which change noise alone. ``laser_emission``: irradiance of the projector, a number, a linear sRGB
-    triple or a spectrum. ``entries``: the file.
-    """
-
-    name: str
-    scan: Scan
-    hidden: Mapping[str, Any]
-    axis: TimeAxis
-    spp: int
-    variant: str
-    frequencies: FrequencyAxis | None = None
-    max_depth: int = -1
-    filter_bounces: int = -1
-    discard_direct_paths: bool = False
-    hidden_geometry_sampling: bool = False
-    rroulette: bool = False
-    includes_relay_wall: bool = True
-    laser_emission: Any = (1.0, 1.0, 1.0)
-    entries: Mapping[str, Any] = field(default_factory=dict)
-
-
-def read_tal_yaml(source: str | Path) -> TalSettings:
-    """Read a scene file of y-tal. Nothing is executed.
+def tal_arguments(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the contents of a scene file of y-tal as arguments of ``simulate``. Nothing is executed.
 
     Entries that are missing or null have y-tal's defaults. Mesh files are looked up from the file's folder, the folder
     above it (where `tal render FOLDER` is called) and the current one. The relay wall may be turned, which y-tal does
-    not support.
+    not support. Rows of the scan are along y (y-tal's arrays have x first).
 
     Args:
-        source: path, folder of an experiment, or YAML text.
+        data: entries of the file.
+        folder: of the file.
 
     Raises:
-        StorageError: for files that cannot be read.
         SceneError: for unknown entries, wrong values, and settings that are not supported: a laser that is not sampled
             as a spot, bins that are found automatically, spots laid out by a field of view, walls that are no
             rectangle.
     """
-    with short_errors("y-tal scene"):
-        return _settings(source)
-
-
-def _settings(source: str | Path) -> TalSettings:
-    data, folder = read_yaml(source, "y-tal scene")
     section = Section(data, "y-tal scene", _KNOWN)
-    _refuse_unsupported(section)
+    _check_supported(section)
     wall, hidden = _geometry(section, (folder, folder.parent, Path.cwd()))
     axis = TimeAxis(
         section.number("start_opl", 0.0), section.number("bin_width_opl", 0.003), section.whole("num_bins", 4096)
     )
-    return TalSettings(
-        name=section.text("name", ""),
-        scan=_scan(section, wall),
-        hidden=hidden,
-        axis=axis,
-        spp=section.whole("sample_count", 1_000_000),
-        variant=section.text("mitsuba_variant", DEFAULT_VARIANT),
-        frequencies=_frequencies(section, axis),
-        max_depth=section.whole("integrator_max_depth", -1, least=-1),
-        filter_bounces=section.whole("integrator_filter_bounces", -1, least=-1),
-        discard_direct_paths=section.flag("integrator_discard_direct_paths", False),
-        hidden_geometry_sampling=section.flag("integrator_nlos_hidden_geometry_sampling", False),
-        rroulette=section.flag("integrator_nlos_hidden_geometry_sampling_do_rroulette", False),
-        includes_relay_wall=section.flag("integrator_nlos_hidden_geometry_sampling_includes_relay_wall", True),
-        laser_emission=_emission(section),
-        entries=data,
-    )
+    frequencies = _frequencies(section, axis)
+    return {
+        "hidden": hidden,
+        "scan": _scan(section, wall),
+        "time_axis": None if frequencies is not None else axis,
+        "frequencies": frequencies,
+        "spp": section.whole("sample_count", 1_000_000),
+        "bounces": _bounces(
+            section.whole("integrator_max_depth", -1, least=-1),
+            section.whole("integrator_filter_bounces", -1, least=-1),
+            section.flag("integrator_discard_direct_paths", False),
+        ),
+        "energy": _emission(section),
+        "variant": section.text("mitsuba_variant", None),
+    }
 
 
-def _refuse_unsupported(section: Section) -> None:
+def _bounces(max_depth: int, filter_bounces: int, discard_direct_paths: bool) -> Sequence[int] | str:
+    """Return the bounces that mitransient 1.x counts with laser sampling; -1 is no limit, no filter.
+
+    A flat wall does not light itself, so that light of two bounces is none without a limit.
+    """
+    first = _AROUND_A_CORNER if discard_direct_paths else _WALL_TO_WALL
+    last = max_depth
+    if filter_bounces != -1:
+        wanted = filter_bounces + 1
+        first, last = max(first, wanted), wanted if max_depth == -1 else min(max_depth, wanted)
+    if last == -1:
+        return ALL_BOUNCES
+    if last < first:
+        raise SceneError(
+            f"y-tal scene: integrator_max_depth: {max_depth}, integrator_filter_bounces: {filter_bounces} and "
+            f"integrator_discard_direct_paths: {str(discard_direct_paths).lower()} leave no light. filter_bounces: 2 "
+            "with max_depth: -1 is light around one corner, of three bounces."
+        )
+    return tuple(range(first, last + 1))
+
+
+def _check_supported(section: Section) -> None:
+    section.text("name", "")
+    # Settings of y-tal's estimator, which change noise alone, and of some scans alone.
+    for name in (
+        "integrator_nlos_hidden_geometry_sampling", "integrator_nlos_hidden_geometry_sampling_do_rroulette",
+        "integrator_nlos_hidden_geometry_sampling_includes_relay_wall", "simultaneous_scan",
+    ):  # fmt: skip
+        section.flag(name, True)
     if not section.flag("integrator_nlos_laser_sampling", True):
         raise SceneError(
             "y-tal scene: integrator_nlos_laser_sampling: false is not supported: the laser lights a point of the "
             "wall, which paths are connected to. Leave the entry out."
         )
-    section.flag("simultaneous_scan", True)  # of some scans alone, and never anything else
     if section.flag("auto_detect_bins", False):
         raise SceneError(
             "y-tal scene: auto_detect_bins: true is not supported (y-tal's renderer leaves it out too). Give start_opl "
@@ -238,10 +209,11 @@ def _frequencies(section: Section, axis: TimeAxis) -> FrequencyAxis | None:
 
 
 def _emission(section: Section) -> Any:
+    """Return the irradiance of the projector, a number or a spectrum of Mitsuba."""
     mode = section.choice("laser_emission_mode", ("mono", "rgb", "spectrum"), "rgb")
     given, where = section.get("laser_emission", "1.0, 1.0, 1.0"), "y-tal scene: laser_emission"
     if mode == "spectrum":
-        return spectrum(str(given), where)
+        return _spectrum(str(given), where)
     words = given if isinstance(given, list) else str(given).replace(",", " ").split()
     numbers = [as_number(word, where) for word in words]
     wanted = 3 if mode == "rgb" else 1
@@ -249,7 +221,7 @@ def _emission(section: Section) -> Any:
         return 1.0
     if len(numbers) != wanted:
         raise SceneError(f"{where}: expected {wanted} numbers for laser_emission_mode: {mode}, got {given!r}.")
-    return tuple(numbers) if mode == "rgb" else numbers[0]
+    return {"type": "rgb", "value": numbers} if len(set(numbers)) > 1 else numbers[0]
 
 
 # ---------------------------------------------------------------------------------------------------------- geometry
@@ -290,7 +262,7 @@ def _shape(part: Section, name: str, folders: Sequence[Path]) -> dict[str, Any]:
     if kind == "obj":
         shape["filename"] = str(file_beside(mesh.text("filename"), folders, f"{where}: mesh"))
     shape["to_world"] = _placed(part)
-    shape["bsdf"] = material(part.get("material"), f"{where}: material")
+    shape["bsdf"] = _material(part.get("material"), f"{where}: material")
     return shape
 
 

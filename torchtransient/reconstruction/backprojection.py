@@ -116,7 +116,7 @@ class EllipsoidOperator(ScanOperator):
                 f"{who}: expected points within 1e9 bins of each other, got some {longest / self.step:.3g} bins away. "
                 "Lengths are in metres."
             )
-        near = max(half, apart(voxels, sensors)) * max(half, apart(voxels, lasers))
+        near = max(half, _apart(voxels, sensors)) * max(half, _apart(voxels, lasers))
         check_falloff(self.falloff, near, longest**2, self.dtype, who)
 
     voxels: Tensor
@@ -251,16 +251,8 @@ class EllipsoidOperator(ScanOperator):
         part.copy_(rows.transpose(1, 2).reshape(part.shape))
 
 
-def apart(a: Tensor, b: Tensor) -> float:
-    """Return a lower bound of the distances between two sets of points: the distance of the boxes around them.
-
-    Args:
-        a: points (N, 3).
-        b: points (M, 3), in the same unit.
-
-    Returns:
-        Distance in that unit, zero where the boxes overlap.
-    """
+def _apart(a: Tensor, b: Tensor) -> float:
+    """Return the distance of the boxes around points (N, 3) and (M, 3), zero where they overlap."""
     gaps = torch.maximum(a.amin(0) - b.amax(0), b.amin(0) - a.amax(0)).clamp_min(0)
     return float(gaps.norm())
 

@@ -35,44 +35,6 @@ FOAM = (262.0, 0.53, 1.12, 0.0036)
 FOAM_THICKNESS = 0.0254
 
 
-def slab_transmittance(
-    opl: Tensor,
-    rho_squared: Tensor,
-    *,
-    thickness: float,
-    reduced_scattering: float,
-    absorption: float,
-    index: float,
-    extrapolation: float,
-) -> Tensor:
-    """Return the light of a pencil beam that leaves a slab's far side, the dipole sum of Contini et al., equation 36.
-
-    ``IMAGES`` pairs of dipoles on each side. Valid where the slab is thick beside 1 / ``reduced_scattering``.
-
-    Args:
-        opl: optical path lengths in vacuum, c t, metres; broadcasts with ``rho_squared``.
-        rho_squared: squared distance from the beam, m^2.
-        thickness: metres.
-        reduced_scattering, absorption: 1/m.
-        index: index of refraction.
-        extrapolation: length behind the sides at which the fluence vanishes, metres.
-
-    Returns:
-        Light per metre of ``opl`` and square metre, zero at times of zero and before.
-    """
-    diffusion = 1 / (3 * (absorption + reduced_scattering))
-    source = 1 / reduced_scattering
-    m = torch.arange(-IMAGES, IMAGES + 1, dtype=torch.float64, device=opl.device)
-    above = thickness * (1 - 2 * m) - 4 * m * extrapolation - source
-    below = thickness * (1 - 2 * m) - (4 * m - 2) * extrapolation + source
-    travelled = torch.where(opl > 0, opl, torch.ones_like(opl)) / index
-    spread = 4 * diffusion * travelled
-    dipoles = above * torch.exp(-(above**2) / spread[..., None]) - below * torch.exp(-(below**2) / spread[..., None])
-    amplitude = torch.exp(-absorption * travelled) / (2 * (4 * math.pi * diffusion) ** 1.5 * travelled**2.5 * index)
-    light = amplitude * dipoles.sum(-1) * torch.exp(-rho_squared / spread)
-    return torch.where(opl > 0, light, torch.zeros_like(light))
-
-
 class DiffusionDeconvolution(ConfocalOperator):
     """Confocal captures through a slab that lies on the scanned wall, as a linear operator, and its Wiener inverse.
 
@@ -151,22 +113,24 @@ class DiffusionDeconvolution(ConfocalOperator):
         return {"kernel": torch.view_as_real(torch.fft.rfftn(whole))}
 
     def _flash(self, delay: Tensor) -> tuple[Tensor, Tensor]:
-        """Light (D,) of a pencil beam straight behind the slab by ``delay`` (D,), metres, and s (D,) of the Gaussian
-        exp(-rho^2 / s) over which it is spread.
+        """Light (D,) of a pencil beam straight behind the slab after optical path lengths ``delay`` (D,), metres, per
+        metre and square metre, and s (D,) of the Gaussian exp(-rho^2 / s) over which it is spread.
+
+        The dipole sum of Contini et al., equation 36, of ``IMAGES`` pairs on each side. Valid where the slab is thick
+        beside the inverse of the reduced scattering.
         """
         reduced_scattering, absorption, index, extrapolation = self.properties
-        light = slab_transmittance(
-            delay,
-            torch.zeros((), dtype=torch.float64, device="cpu"),
-            thickness=self.thickness,
-            reduced_scattering=reduced_scattering,
-            absorption=absorption,
-            index=index,
-            extrapolation=extrapolation,
-        ).clamp_min(0)
+        diffusion, source = 1 / (3 * (absorption + reduced_scattering)), 1 / reduced_scattering
+        m = torch.arange(-IMAGES, IMAGES + 1, dtype=torch.float64, device="cpu")
+        above = self.thickness * (1 - 2 * m) - 4 * m * extrapolation - source
+        below = self.thickness * (1 - 2 * m) - (4 * m - 2) * extrapolation + source
         # Delay zero has no light: any width will do.
         travelled = torch.where(delay > 0, delay, torch.ones_like(delay)) / index
-        return light, 4 / (3 * (absorption + reduced_scattering)) * travelled
+        spread = 4 * diffusion * travelled
+        dipoles = above * torch.exp(-(above**2) / spread[:, None]) - below * torch.exp(-(below**2) / spread[:, None])
+        amplitude = torch.exp(-absorption * travelled) / (2 * (4 * math.pi * diffusion) ** 1.5 * travelled**2.5 * index)
+        light = amplitude * dipoles.sum(-1)
+        return torch.where(delay > 0, light, torch.zeros_like(light)).clamp_min(0), spread
 
     def _total(self) -> float:
         """The sum over all bins and points of light that passes once, however late and far aside."""

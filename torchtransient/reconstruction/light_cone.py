@@ -131,21 +131,15 @@ class ConeGrid:
         """
         w = torch.arange(self.padded // 2 + 1, dtype=torch.float64, device="cpu")
         w = w * (2 * math.pi / (self.padded * self.width))
-        turns = -w[:, None] * offset_powers(count, pitch, 2)
-        size = offset_powers(count, pitch, moment) * (self.window()[:, None] if windowed else torch.ones_like(turns))
+        turns = -w[:, None] * _offset_powers(count, pitch, 2)
+        size = _offset_powers(count, pitch, moment) * (self.window()[:, None] if windowed else torch.ones_like(turns))
         return torch.view_as_real(torch.fft.fft(torch.polar(torch.ones_like(turns), turns) * size))
 
 
-def offset_powers(count: int, pitch: float, moment: int) -> Tensor:
-    """Return powers of the offsets along one side of the wall, in the order of transforms.
+def _offset_powers(count: int, pitch: float, moment: int) -> Tensor:
+    """Return powers (2 count,) of the offsets along one side of the wall, in the order of transforms.
 
-    Args:
-        count: points along the side.
-        pitch: between them, metres.
-        moment: the power.
-
-    Returns:
-        (2 count,) float64. The farthest offset stands for both signs: its odd powers are zero.
+    The farthest offset stands for both signs: its odd powers are zero.
     """
     q = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device="cpu") * pitch
     powers: Tensor = q**moment
@@ -370,7 +364,7 @@ class ConeOperator(ConfocalOperator):
         """Mean of the kernels' power over all frequencies."""
         sums = [
             scale**2 * math.prod(
-                float(offset_powers(n, pitch, power).square().sum())
+                float(_offset_powers(n, pitch, power).square().sum())
                 for n, pitch, power in zip(self.grid.size, self.grid.pitch, powers, strict=True)
             )
             for powers, scale in zip(self.moments, self.scales, strict=True)

@@ -98,21 +98,12 @@ def _times(values: Any, who: str) -> Tensor:
     return times
 
 
-def waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype, nearest: float = 0.0) -> Tensor:
-    """Return ``exp(2 pi i f r) / r^falloff`` of distances r at evenly spaced frequencies f.
+def _waves(distances: Tensor, frequencies: Tensor, falloff: float, dtype: torch.dtype, nearest: float) -> Tensor:
+    """Return ``exp(2 pi i f r) / r^falloff``, (F, ...), of distances r (...) at evenly spaced frequencies f (F,).
 
     Phases have the digits of double precision: single precision has none left for r of many wavelengths. A sine of each
     frequency would be most of the work of a plane, so waves follow from each other by products, which lose F ulp.
-
-    Args:
-        distances: (...) float64, metres.
-        frequencies: (F,) float64, cycles per metre.
-        falloff: the power.
-        dtype: a complex one.
-        nearest: distances below fall off as it does, metres.
-
-    Returns:
-        (F, ...).
+    Distances below ``nearest`` fall off as it does.
     """
     count = len(frequencies)
     wave = _turned(distances * frequencies[0])
@@ -132,15 +123,8 @@ def _turned(turns: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(turns), (turns - turns.round()) * (2 * math.pi))
 
 
-def phase_pairs(turns: Tensor) -> Tensor:
-    """Return real and imaginary part of ``exp(2 pi i turns)``.
-
-    Args:
-        turns: (...) float64.
-
-    Returns:
-        (..., 2) float64.
-    """
+def _phase_pairs(turns: Tensor) -> Tensor:
+    """Real and imaginary part (..., 2) of ``exp(2 pi i turns)``."""
     return torch.view_as_real(_turned(turns))
 
 
@@ -343,8 +327,8 @@ class PhasorField(ScanOperator):
         times = torch.zeros(1, dtype=torch.float64, device="cpu") if self.camera.times is None else self.camera.times
         return {
             "dft": torch.cat([weights * phase.cos(), weights * phase.sin()]),
-            "legs": phase_pairs(self.frequencies[:, None] * torch.cat([spots, points])),
-            "moments": phase_pairs(times[:, None] * self.frequencies),
+            "legs": _phase_pairs(self.frequencies[:, None] * torch.cat([spots, points])),
+            "moments": _phase_pairs(times[:, None] * self.frequencies),
         }
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
@@ -467,7 +451,7 @@ class PhasorField(ScanOperator):
         falloff = self.falloff * (2 if confocal else 1)
         for height in self.heights.tolist():
             distances = (across + height**2).sqrt_()
-            yield torch.fft.fft2(waves(distances, frequencies, falloff, self.dtype.to_complex(), self._nearest))
+            yield torch.fft.fft2(_waves(distances, frequencies, falloff, self.dtype.to_complex(), self._nearest))
 
     def _illumination(self, plane: int, band: slice, some: slice, device: torch.device) -> Tensor | None:
         """(F, L, Y, X): waves from some spots to the voxels of a plane; None where the laser is not focused."""
@@ -481,7 +465,7 @@ class PhasorField(ScanOperator):
         height = (float(self.heights[plane]) - spots[:, 2]).square()
         distances = (sides[0][:, :, None] + sides[1][:, None, :] + height[:, None, None]).sqrt_()
         frequencies = self.frequencies[band].to(device)
-        return waves(distances, frequencies, self.falloff, self.dtype.to_complex(), self._nearest)
+        return _waves(distances, frequencies, self.falloff, self.dtype.to_complex(), self._nearest)
 
     @property
     def _nearest(self) -> float:

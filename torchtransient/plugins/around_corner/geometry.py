@@ -47,6 +47,9 @@ def front_normal(si: Any) -> Any:
     """Return the geometric normal (Normal3f) on the side of the shading normal, where a one-sided surface scatters.
 
     Mitsuba's own points to the other side with mirrored transforms, and with normals against the order of the corners.
+
+    Args:
+        si: interactions (SurfaceInteraction3f).
     """
     return dr.mulsign(mi.Normal3f(si.n), dr.dot(si.sh_frame.n, si.n))
 
@@ -148,5 +151,11 @@ def points_of(si: Any, factor: Any, length: Any) -> WallPoints:
 
 
 def gather_one_or_each(array: Any, index: Any, active: Any = True) -> Any:
-    """Gather entries of an array that has one entry for all, or one each."""
+    """Gather entries of an array that has one entry for all, or one each.
+
+    Args:
+        array: of any type, of width one or of one entry each.
+        index: numbers of the entries (UInt32).
+        active: mask.
+    """
     return dr.gather(type(array), array, index if dr.width(array) > 1 else mi.UInt32(0), active)

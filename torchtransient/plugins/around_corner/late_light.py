@@ -479,7 +479,7 @@ class LateLight:
             base = film.pixel_base(base, lanes.laser)
         target = film.create_event_block(launch, base, self.job.match, EVENTS, exclusive=launch.spp == 1)
         sums = {"L": mi.UnpolarizedSpectrum(0), "before": mi.Float(0), "after": mi.Float(0), "block": target.begin()}
-        sums = sum_over_links(self, part, lanes, target, sums)
+        sums = _sum_over_links(self, part, lanes, target, sums)
         target.end(sums["block"])
         film.add_steady(lanes.pixel, self.job.match.to_channels(sums["L"]))
         film.add_outside(lanes.pixel, sums["before"], sums["after"])
@@ -591,16 +591,16 @@ class LateLanes:
             pixels = pixels[np.argsort(light.tiles.numbers[pixels], kind="stable")]
         lasers = light.lasers.width if light.exhaustive else 1
         lane = dr.arange(mi.UInt32, len(pixels) * launch.spp * lasers)
-        place, laser = divmod_by(lane, lasers)
+        place, laser = _divmod_by(lane, lasers)
         if launch.listed:
-            place, rest = divmod_by(place, launch.spp)
+            place, rest = _divmod_by(place, launch.spp)
         else:
-            rest, place = divmod_by(place, len(pixels))
-        group, piece = divmod_by(rest, launch.pieces)
+            rest, place = _divmod_by(place, len(pixels))
+        group, piece = _divmod_by(rest, launch.pieces)
         return dr.gather(mi.UInt32, mi.UInt32(pixels.astype(np.uint32)), place), group, piece, laser
 
 
-def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
+def _divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
     """Return quotient and rest of whole numbers; the divisor is kept in memory, not in the kernel."""
     by = dr.opaque(mi.UInt32, divisor)
     quotient = number // by
@@ -608,16 +608,16 @@ def divmod_by(number: Any, divisor: int) -> tuple[Any, Any]:
 
 
 @dr.syntax
-def sum_over_links(light, part, lanes, target, sums):
+def _sum_over_links(light, part, lanes, target, sums):
     """Add the light of each lane's links to the film's block ``target`` and to ``sums``."""
     k = mi.UInt32(lanes.first)
     while dr.hint(k < lanes.last, label="links"):
-        deposit(light, part, lanes, target, sums, k)
+        _deposit(light, part, lanes, target, sums, k)
         k += 1
     return sums
 
 
-def deposit(light, part, lanes, target, sums, k):
+def _deposit(light, part, lanes, target, sums, k):
     """Add the events of link ``k``."""
     link = dr.gather(mi.Vector4f, part.links.flat, k)
     head, tail = mi.UInt32(link.z), mi.UInt32(link.w)

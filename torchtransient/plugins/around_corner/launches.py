@@ -81,7 +81,12 @@ class Launch:
 
 
 def launches_of(film: Any, samples: int) -> list[Launch]:
-    """Return the launches of ``samples`` samples for each pixel of a film."""
+    """Return the launches of ``samples`` samples for each pixel of a film.
+
+    Args:
+        film: of the capture.
+        samples: number for each pixel.
+    """
     width = int(film.crop_size()[0])
     most = film.lanes_at_most(EVENTS)
     found = []

@@ -213,6 +213,9 @@ def parts_of(shapes: list[Any]) -> tuple[list[Part], Triangles]:
     """Return the parts of all shapes, and the triangles of the meshes.
 
     With more than ``MOST_PARTS`` pieces each mesh is one part.
+
+    Args:
+        shapes: of the scene.
     """
     numbers = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
     triangles = Triangles.from_meshes([shapes[k] for k in numbers])
@@ -268,6 +271,7 @@ def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, is_requested: Any) -
     """Find pairs of parts of which one may hide the other, or points of its own, from a viewpoint.
 
     Args:
+        parts: of the scene.
         viewpoints: points of the wall, (P, 3), metres.
         is_requested: predicate of (hider, hidden) for the pairs that count.
 

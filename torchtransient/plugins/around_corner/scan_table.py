@@ -307,7 +307,14 @@ class LaserSpots:
 
 
 def capture_type(given: Any) -> CaptureType:
-    """Return a capture type by its number or name. Raises SceneError for others."""
+    """Return a capture type.
+
+    Args:
+        given: number or name.
+
+    Raises:
+        SceneError: for others.
+    """
     if isinstance(given, str) and not given.strip().lstrip("-").isdigit():
         names = {c.name.lower(): c for c in CaptureType}
         if given.lower() in names:
@@ -320,7 +327,14 @@ def capture_type(given: Any) -> CaptureType:
 
 
 def laser_of(scene: Any) -> Any:
-    """Return the one emitter of an NLOS scene. Raises SceneError for another number of emitters."""
+    """Return the one emitter of an NLOS scene.
+
+    Args:
+        scene: built scene.
+
+    Raises:
+        SceneError: for another number of emitters.
+    """
     emitters = scene.emitters()
     if len(emitters) != 1:
         names = ", ".join(repr(e.id()) for e in emitters) or "none"
@@ -332,7 +346,12 @@ def laser_of(scene: Any) -> Any:
 
 
 def origin_of(scene: Any, sensor: Any) -> Any:
-    """Return the position of the laser (Point3f, metres)."""
+    """Return the position of the laser (Point3f, metres).
+
+    Args:
+        scene: built scene.
+        sensor: of the capture, which may say it.
+    """
     given = getattr(sensor, "laser_origin", None)
     return mi.Point3f(laser_of(scene).world_transform().translation()) if given is None else given
 
@@ -342,6 +361,9 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
     pixel, or one for every laser position.
 
     Args:
+        scene: built scene.
+        sensor: of the capture.
+        capture: its type.
         fov: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for the
             laser positions of the sensor.
 
@@ -390,6 +412,9 @@ def scan_rays(sensor: Any) -> Any:
     """Return a ray for each pixel of a sensor's film, to the scanned point or along the pixel's axis (Ray3f).
 
     Attached where the sensor is.
+
+    Args:
+        sensor: of the capture.
     """
     if hasattr(sensor, "scanned"):
         origin = mi.Point3f(sensor.origin)
@@ -403,7 +428,12 @@ def scan_rays(sensor: Any) -> Any:
 
 
 def scanned_points(scene: Any, sensor: Any) -> Any:
-    """Return the scanned points (Point3f): the sensor's targets, or the points that its pixels see."""
+    """Return the scanned points (Point3f): the sensor's targets, or the points that its pixels see.
+
+    Args:
+        scene: built scene.
+        sensor: of the capture.
+    """
     if hasattr(sensor, "scanned"):
         return sensor.scanned()
     ray = scan_rays(sensor)
@@ -415,7 +445,16 @@ def scanned_points(scene: Any, sensor: Any) -> Any:
 
 
 def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
-    """Raise SceneError unless the laser has as many aims as the capture asks for."""
+    """Check that the laser has as many aims as the capture asks for.
+
+    Args:
+        aims: directions of the laser.
+        sensor: of the capture.
+        capture: its type.
+
+    Raises:
+        SceneError: for another number.
+    """
     film, count = sensor.film(), dr.width(aims)
     if capture is CaptureType.SINGLE and count != 1:
         raise SceneError(

@@ -62,6 +62,10 @@ def saves_time(scene: Any, rays: int) -> bool:
     """Return whether finding shafts takes less time than ``rays`` visibility rays, some of which they spare.
 
     It costs some 400 rays a triangle.
+
+    Args:
+        scene: built scene.
+        rays: number of rays.
     """
     triangles = sum(int(shape.face_count()) for shape in scene.shapes() if shape.is_mesh())
     return rays > _RAYS_A_TRIANGLE * triangles
@@ -89,6 +93,7 @@ def clear_elements(shapes: list[Any], elements: AreaElements, region: ScanRegion
 
     Args:
         shapes: all shapes of the scene.
+        elements: the hidden ones.
         region: box of scan points and laser spots.
         smooth: normals are interpolated, so that points may be seen from behind their planes; then only elements with
             the region on one side of their planes are clear.

@@ -11,13 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from torchtransient.interfaces import CaptureType
-from torchtransient.plugins.around_corner.exhaustive import add_exhaustive
 from torchtransient.plugins.around_corner.geometry import WallPoints, points_of
 from torchtransient.plugins.around_corner.late_light import LateLight
 from torchtransient.plugins.around_corner.launches import ScanJob
 from torchtransient.plugins.around_corner.scan_table import ACROSS, ScanTable
 from torchtransient.plugins.around_corner.shafts import saves_time, spare_rays
-from torchtransient.plugins.around_corner.third_bounce import ThirdBounce
+from torchtransient.plugins.around_corner.third_bounce import ThirdBounce, add_exhaustive
 from torchtransient.plugins.around_corner.third_bounce_gradients import (
     ThirdBounceGradients,
     ends_of_points,
@@ -202,17 +201,22 @@ def _same(spots: Any, points: Any) -> bool:
     return bool(dr.all(near & (spots.wi.z * points.wi.z > 0) & spots.is_valid() & points.is_valid()))
 
 
-def moves(context: Any, shapes: list[Any]) -> bool:
+def _moves(context: Any, shapes: list[Any]) -> bool:
     """Return whether derivatives are requested by parameters of ``shapes``, or of plugins inside them."""
     held = {node.ptr for shape in shapes for node in [shape, *objects_below(shape, mi.Object)]}
     return bool(held & context.wanted.nodes)
 
 
 def moves_scan(context: Any, hidden: list[Any]) -> bool:
-    """Return whether derivatives are requested by other parameters than those of ``hidden``: wall, sensor, laser."""
+    """Return whether derivatives are requested by wall, sensor or laser.
+
+    Args:
+        context: of the job.
+        hidden: shapes that do not count, with the plugins inside them.
+    """
     others = [shape for shape in context.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]
     held = {node.ptr for shape in hidden for node in [shape, *objects_below(shape, mi.Object)]}
-    return bool(context.wanted.nodes - held) or moves(context, others)
+    return bool(context.wanted.nodes - held) or _moves(context, others)
 
 
 def _rows(vectors: Any, width: int) -> np.ndarray:
@@ -278,7 +282,7 @@ class SharedThirdBounce:
             if not scan:
                 points = points.detached()
             # What a single spot lights follows the spot.
-            if not (moves(context, elements.shapes) or (scan and laser is not None)):
+            if not (_moves(context, elements.shapes) or (scan and laser is not None)):
                 samples = samples.detached()
             self.gradients = ThirdBounceGradients(context.scene, film, samples, points, self.samples.clear)
 

@@ -222,7 +222,8 @@ class ThirdBounceGradients:
         """Back-propagate ``<adjoint, capture>`` to the scene; ``incoming``: the film's adjoint."""
         read = AdjointReader(self.film, self.match, incoming)
         found = []
-        for own, others, over in ((self.samples, self.points, over_points), (self.points, self.samples, over_samples)):
+        passes = (self.samples, self.points, _over_points), (self.points, self.samples, _over_samples)
+        for own, others, over in passes:
             with dr.resume_grad():  # the question whether a field is attached is answered no while suspended
                 names = own.attached
             if names:
@@ -245,7 +246,7 @@ class ThirdBounceGradients:
             by_sample: adjoints are those of the sample.
         """
         with dr.resume_grad():
-            sample, point = dr_copy(pair.sample), dr_copy(pair.point)
+            sample, point = _dr_copy(pair.sample), _dr_copy(pair.point)
             found = leaves(sample if by_sample else point, list(adjoints), dr.width(pair.k))
             value, length, opl, arrives = self.connection(sample, point, pair.k)
             A, slope = read.block(pair.s).read(opl, arrives)
@@ -268,7 +269,7 @@ class ThirdBounceGradients:
             lane.tangent = tangents[1].load(pixel)
             dr.eval(vars(lane.fields), vars(lane.tangent), pixel, first, last)
             sums = {"dL": mi.UnpolarizedSpectrum(0), "block": block.begin()}
-            sums = tangents_over_samples(self, tangents[0], block, sums, lane)
+            sums = _tangents_over_samples(self, tangents[0], block, sums, lane)
             block.end(sums["block"])
             self.film.add_steady(pixel, self.match.to_channels(sums["dL"]))
             block.finish()
@@ -277,7 +278,7 @@ class ThirdBounceGradients:
     def step_on(self, tangents: Ends, block: Any, sums: dict[str, Any], lane: Local, k: Any) -> None:
         """Add the derivative of the connection with sample ``k`` to the film's block and to ``sums``."""
         with dr.resume_grad():
-            sample, point, width = self.samples.load(k), dr_copy(lane.fields), dr.width(lane.own)
+            sample, point, width = self.samples.load(k), _dr_copy(lane.fields), dr.width(lane.own)
             leaves(sample, list(tangents.fields), width, tangents.load(k))
             leaves(point, list(vars(lane.tangent)), width, lane.tangent)
             value, length, opl, arrives = self.connection(sample, point, k)
@@ -286,7 +287,7 @@ class ThirdBounceGradients:
         block.put_slope(sums["block"], opl, d_value, value * d_opl, arrives)
 
 
-def dr_copy(local: Local) -> Local:
+def _dr_copy(local: Local) -> Local:
     """Return a copy of the containers with the same fields: leaves made in the copy leave the original as it is."""
     return Local(**vars(local))
 
@@ -336,7 +337,7 @@ class AdjointReader:
 
 
 @dr.syntax
-def over_points(job, read, adjoints, split):
+def _over_points(job, read, adjoints, split):
     """Return the adjoints of each lane's sample, by its range of the points."""
     s = mi.UInt32(split.first)
     while dr.hint(s < split.last, label="scanned points, reverse"):
@@ -346,7 +347,7 @@ def over_points(job, read, adjoints, split):
 
 
 @dr.syntax
-def over_samples(job, read, adjoints, split):
+def _over_samples(job, read, adjoints, split):
     """Return the adjoints of each lane's point, by its range of the samples."""
     k = mi.UInt32(split.first)
     while dr.hint(k < split.last, label="hidden samples, reverse"):
@@ -356,7 +357,7 @@ def over_samples(job, read, adjoints, split):
 
 
 @dr.syntax
-def tangents_over_samples(job, tangents, block, sums, lane):
+def _tangents_over_samples(job, tangents, block, sums, lane):
     """Add the derivatives of the light from each lane's range of the samples to its point."""
     k = mi.UInt32(lane.first)
     while dr.hint(k < lane.last, label="hidden samples, forward mode"):

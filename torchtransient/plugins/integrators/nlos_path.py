@@ -14,7 +14,7 @@ from torchtransient.interfaces import CaptureType
 from torchtransient.plugins._registry import register
 from torchtransient.plugins.around_corner.division import BOUNCES, Division
 from torchtransient.plugins.around_corner.late_light import FIRST, MOST
-from torchtransient.plugins.around_corner.outlines import (
+from torchtransient.plugins.around_corner.occlusion import (
     follows_outlines,
     late_outlines,
     mutual_occlusion,

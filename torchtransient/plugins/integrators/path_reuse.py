@@ -15,8 +15,7 @@ from torchtransient.plugins.integrators.base import UNLIMITED
 from torchtransient.plugins.integrators.job import Pass
 from torchtransient.plugins.properties import whole_number
 from torchtransient.plugins.shared_paths.groups import Group, Sharing, pixel_order, seed_of, spread
-from torchtransient.plugins.shared_paths.lists import LastArrival, SuffixList, bring
-from torchtransient.plugins.shared_paths.packed import PackedCube, PackedSink
+from torchtransient.plugins.shared_paths.lists import LastArrival, PackedCube, PackedSink, SuffixList, bring
 from torchtransient.plugins.transport.context import PathSettings, RenderContext
 from torchtransient.plugins.transport.emitter_connections import EmitterSampled
 from torchtransient.plugins.transport.sinks import FilmSink

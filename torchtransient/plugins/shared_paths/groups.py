@@ -235,12 +235,24 @@ def _densities(group, density):
 # Numbers that are spread evenly over groups.
 
 def seed_of(seed: Any, number: int) -> Any:
-    """Return another seed: a hash of a seed (UInt32) and a number."""
+    """Return another seed, a hash.
+
+    Args:
+        seed: UInt32.
+        number: whole number, another one for each seed.
+    """
     return hashed(hashed(seed) + dr.opaque(mi.UInt32, number) * mi.UInt32(0x9E3779B9) + 0x7F4A7C15)
 
 
 def spread(sampler: Any, seed: Any, lanes: int, count: int) -> None:
-    """Seed a sampler ``owen`` such that its samples are evenly spread over every ``count`` lanes, a power of two."""
+    """Seed a sampler such that its samples are evenly spread over every ``count`` lanes.
+
+    Args:
+        sampler: an ``owen``.
+        seed: UInt32.
+        lanes: number of lanes.
+        count: a power of two.
+    """
     lane = dr.arange(mi.UInt32, lanes)
     sampler.seed_sets(seed, lane // count, lane & (count - 1))
 
