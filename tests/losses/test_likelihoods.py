@@ -107,8 +107,10 @@ def test_free_running(dead_bins):
 
 
 def test_read_noise_value():
-    y, m = torch.tensor([3.0, -2.0, 40.0], dtype=torch.float64), torch.tensor([1.0, 0.0, 50.0], dtype=torch.float64)
-    wanted = -torch.distributions.Normal(m, (4 + m).sqrt()).log_prob(y)
+    """Of means below zero, of a record less its background, the read noise alone is left."""
+    y = torch.tensor([3.0, -2.0, 40.0, 1.0], dtype=torch.float64)
+    m = torch.tensor([1.0, 0.0, 50.0, -3.0], dtype=torch.float64)
+    wanted = -torch.distributions.Normal(m, (4 + m.clamp_min(0)).sqrt()).log_prob(y)
     torch.testing.assert_close(read_noise_nll(m, y, 2.0, reduction="none"), wanted)
     plain = -torch.distributions.Normal(m, torch.full_like(m, 2.0)).log_prob(y)
     torch.testing.assert_close(read_noise_nll(m, y, 2.0, shot_noise=False, reduction="none"), plain)

@@ -154,6 +154,17 @@ def test_precision_autocast_and_the_dark(loss):
         assert bool(value.isfinite()) and bool(leaf.grad.isfinite().all())
 
 
+@pytest.mark.parametrize("size", [1e-9, 1e9])
+def test_units_and_places(size):
+    """Squares of the unit, and angles, wherever the mesh is."""
+    v = wavy()
+    moved = size * (v + torch.tensor([0.7, -0.4, 0.9], dtype=torch.float64))
+    for weights in ("uniform", "cotangent"):
+        found = losses.mesh_laplacian_smoothing(moved, RING, weights=weights) / size**2
+        torch.testing.assert_close(found, losses.mesh_laplacian_smoothing(v, RING, weights=weights))
+    torch.testing.assert_close(losses.mesh_normal_consistency(moved, RING), losses.mesh_normal_consistency(v, RING))
+
+
 @every
 def test_faces_that_index_from_the_end(loss):
     for wrong, error in ((RING - 1, ShapeError), (RING + 1, ShapeError), (RING.double(), UnitError)):
