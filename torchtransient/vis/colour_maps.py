@@ -102,14 +102,6 @@ def cyclic_map(kind: str = "even") -> ListedColormap:
     return ListedColormap(colours.tolist(), name=f"cyclic, {kind}")
 
 
-def rainbow_map() -> ListedColormap:
-    """`rainbow` as a matplotlib colour map, for colour bars."""
-    figure_type()
-    from matplotlib.colors import ListedColormap
-
-    return ListedColormap(rainbow(np.linspace(0, 1, 256)).tolist(), name="equal lightness, red to violet")
-
-
 def symmetric_limit(values: Any, percentile: float = 99.0) -> float:
     """Return half the width of a scale centred at zero.
 

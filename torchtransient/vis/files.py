@@ -43,12 +43,9 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
     """
     if path is None:
         return image
-    try:
-        from PIL import Image as Pillow
-    except ImportError as error:
-        raise missing("pillow") from error
+    images = pillow()
     with _place_of(path, who) as (unfinished, ending):
-        Pillow.fromarray(image).save(unfinished, format=Pillow.registered_extensions().get(f".{ending}", ending))
+        images.fromarray(image).save(unfinished, format=images.registered_extensions().get(f".{ending}", ending))
     return image
 
 
@@ -115,12 +112,11 @@ def to_palette(path: str | Path) -> None:
     Args:
         path: the file; of other kinds it is left as it is.
     """
-    from PIL import Image as Pillow
-
     if Path(path).suffix != ".png":
         return
-    picture = Pillow.open(path).convert("RGB")
-    few = picture.quantize(256, Pillow.Quantize.MAXCOVERAGE, kmeans=2, dither=Pillow.Dither.NONE)
+    images = pillow()
+    picture = images.open(path).convert("RGB")
+    few = picture.quantize(256, images.Quantize.MAXCOVERAGE, kmeans=2, dither=images.Dither.NONE)
     few.save(path, optimize=True)
 
 
@@ -129,7 +125,7 @@ def figure_type() -> type[Figure]:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise missing("matplotlib") from error
+        raise _missing("matplotlib") from error
     return Figure
 
 
@@ -168,8 +164,31 @@ def enlarge(image: Image, factor: int) -> Image:
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def missing(package: str) -> MissingPackageError:
-    """Return the error for a package that pictures need."""
+def pillow() -> Any:
+    """Return the module PIL.Image. Raises MissingPackageError without Pillow."""
+    try:
+        import PIL.Image
+    except ImportError as error:
+        raise _missing("pillow") from error
+    return PIL.Image
+
+
+def grey_where_broken(name: str) -> Any:
+    """Return a colour map of matplotlib whose colour for NaN is grey.
+
+    Args:
+        name: name of the map.
+
+    Raises:
+        MissingPackageError: without matplotlib.
+    """
+    figure_type()
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))
+
+
+def _missing(package: str) -> MissingPackageError:
     return MissingPackageError(
         f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
     )

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import as_number, is_one_of, shown
+from torchtransient.checks import as_number, is_one_of, positive, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.vis.sources import real_tensor
 
@@ -89,23 +89,6 @@ def _quantile(given: float, who: str) -> float:
     return number
 
 
-def checked_positive(name: str, given: float, who: str = "tone_map") -> float:
-    """Return a finite number above zero.
-
-    Args:
-        name: name of the argument.
-        given: its value.
-        who: beginning of the message.
-
-    Raises:
-        UnitError: for anything else.
-    """
-    number = as_number(given)
-    if number is None or not (math.isfinite(number) and number > 0):
-        raise UnitError(f"{who}: expected {name} > 0, got {shown(given)}.")
-    return number
-
-
 def _lit(transient: Tensor, start: int) -> Tensor:
     values = transient[:, start : start + _FRAMES_AT_ONCE].detach().amax(0)
     return values[torch.isfinite(values) & (values > 0)]
@@ -134,10 +117,10 @@ def tone_map(
         UnitError: unless exposure, gamma and stops are positive.
     """
     image = _checked(image, "tone_map")
-    factor = checked_positive("exposure", exposure_of(image) if exposure is None else exposure)
+    factor = positive("tone_map: exposure", exposure_of(image) if exposure is None else exposure)
     if not is_one_of(curve, CURVES):
         raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {shown(curve)}.")
-    gamma, stops = checked_positive("gamma", gamma), checked_positive("stops", stops)
+    gamma, stops = positive("tone_map: gamma", gamma), positive("tone_map: stops", stops)
     mapped = image.detach().to(torch.float64) * factor
     broken = ~torch.isfinite(mapped).all(0)
     mapped = torch.nan_to_num(mapped, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)
