@@ -5,10 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,6 +13,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.generation_runs import start_command, wait_until
 from support.marks import long
 from support.sweeps import together
 from torchtransient.__main__ import main
@@ -191,31 +188,8 @@ def test_mistakes_are_said_before_anything_is_rendered(folder, arguments, word):
 MANY = ("nlos", "own.yaml", "-o", "a.h5", "--parts", "6", "--spp", "600000", "--quiet")
 
 
-def start(folder, *arguments):
-    # Children take the package from where this process has it.
-    path = os.pathsep.join([str(Path(tt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path}
-    command = [sys.executable, "-m", "torchtransient", *arguments]
-    # What is started in the background ignores interrupts, and hands that on.
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    try:
-        return subprocess.Popen(
-            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def finished_parts(part):
     return json.loads(part.read_text())["done"] if part.exists() else {}
-
-
-def wait_for_parts(child, part, count):
-    deadline = time.monotonic() + 120
-    while len(finished_parts(part)) < count:
-        assert child.poll() is None, child.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @pytest.mark.slow
@@ -223,9 +197,9 @@ def wait_for_parts(child, part, count):
 def test_a_killed_simulation_goes_on(folder, signal_name):
     """Killed in the middle, with whatever was being written; the second call ends with the same bits."""
     part = folder / "a.h5.part"
-    child = start(folder, *MANY)
+    child = start_command(folder, *MANY)
     try:
-        wait_for_parts(child, part, 2)
+        wait_until(lambda: len(finished_parts(part)) >= 2, 120)
         child.send_signal(signal.SIGSTOP)  # or it may end before the next lines, which compile kernels
         # A second one on the same part file is refused while the first one works.
         other = run(*MANY[1:])

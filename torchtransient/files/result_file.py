@@ -92,7 +92,11 @@ class Result(ErrorBars, TensorRecord):
 
     @classmethod
     def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
-        """Return the metadata of a batch."""
+        """Return the metadata of a batch.
+
+        Args:
+            records: results of the batch.
+        """
         return {"metadata": {"batch": [record.metadata for record in records]}}
 
     def _shown_notes(self) -> dict[str, str]:
