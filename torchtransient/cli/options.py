@@ -235,37 +235,21 @@ def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
     return f"{shape} {film.plural}", ""
 
 
-def pictures_of(film: FilmLayout) -> tuple[str, ...]:
-    """Return the pictures of ``torchtransient render`` that show a film.
-
-    Args:
-        film: of the render.
-    """
+def _pictures_of(film: FilmLayout) -> tuple[str, ...]:
+    """Return the pictures of ``torchtransient render`` that show a film."""
     if isinstance(film, Histogram | Rates):
         return _PICTURES
     return ("video",) if isinstance(film, Phasors | Gates) else ()
 
 
-def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
-    """Write a video of a render and return its contents in words.
-
-    Args:
-        film: of the render.
-        output: the render.
-        path: place of the video.
-        progress: show a progress bar.
-
-    Raises:
-        ArgumentError: for films without a video.
-    """
+def _write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
+    """Write a video of a render and return its contents in words; other films were refused by `check_pictures`."""
     from torchtransient.vis.phasors import phasor_video
     from torchtransient.vis.videos import video
 
     if isinstance(film, Phasors):
         phasor_video(output, path, progress=progress)
         return "the wave of the first frequency"
-    if not isinstance(film, Histogram | Gates | Rates):
-        raise ArgumentError(f"--video shows nothing of {film.plural}; leave it out.")
     video(output, path, progress=progress)
     return f"{film.count} frames" + (", one for each gate" if isinstance(film, Gates) else "")
 
@@ -307,7 +291,7 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
         if not options[name]:
             continue
         flag = f"--{name.replace('_', '-')}"
-        if film is not None and name not in pictures_of(film):
+        if film is not None and name not in _pictures_of(film):
             raise click.UsageError(f"{flag} shows a histogram over time; leave it out for {film.plural}.")
         if name == "video":
             check_video(options[name])
@@ -343,7 +327,7 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
         tt.vis.rainbow(output, options["rainbow"])
         click.echo(f"{options['rainbow']}: hue by arrival")
     if options["video"]:
-        shown = write_film_video(film, output, options["video"], progress=not options["quiet"])
+        shown = _write_film_video(film, output, options["video"], progress=not options["quiet"])
         click.echo(f"{options['video']}: {shown}")
 
 

@@ -19,7 +19,7 @@ from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, figure_type, picture_figure, save_figure, save_image, to_bytes
-from torchtransient.vis.sources import Source, as_tensor, axis_of, images_of, pixel_of, real_tensor, transient_of
+from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of, real_tensor, transient_of
 from torchtransient.vis.tone_mapping import BROKEN, exposure_of, tone_map
 from torchtransient.vis.videos import moment
 
@@ -250,7 +250,11 @@ def peak_time_picture(
         StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "peak_time_picture")
-    axis = axis_of(cube, axis, "peak_time_picture")
+    if axis is None:
+        raise ShapeError(
+            f"peak_time_picture: a transient of {cube.shape[1]} bins without an axis has no times. Give "
+            "axis=TimeAxis(...), or a RenderOutput, which knows its own."
+        )
     peaks = peak_time(torch.nan_to_num(cube, posinf=0.0, neginf=0.0), axis).numpy()
     low, high = _limits(peaks, axis, limits)
     figure, (panel,) = picture_figure(peaks.shape[0], peaks.shape[1], side=5.0)

@@ -117,25 +117,6 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
     return cube, axis
 
 
-def axis_of(cube: Tensor, axis: TimeAxis | None, who: str) -> TimeAxis:
-    """Return the axis of a picture that shows lengths in metres.
-
-    Args:
-        cube: the transient.
-        axis: its axis, if it is known.
-        who: beginning of messages.
-
-    Raises:
-        ShapeError: without an axis.
-    """
-    if axis is None:
-        raise ShapeError(
-            f"{who}: a transient of {cube.shape[1]} bins without an axis has no times. Give axis=TimeAxis(...), or a "
-            "RenderOutput, which knows its own."
-        )
-    return axis
-
-
 def steady_of(source: Source, who: str = "picture") -> Tensor:
     """Return an intensity (C, H, W), C = 1 or 3.
 
