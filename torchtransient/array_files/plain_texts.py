@@ -72,7 +72,7 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
         StorageError: for texts in another format, more than 100 levels and more than ``most_nodes`` nodes.
         TorchTransientError: errors that constructors of ``loader`` raise.
     """
-    own = type("Loader", (loader or safe_loader(yaml),), {})
+    own: Any = type("Loader", (loader or safe_loader(yaml),), {})
     # PyYAML follows YAML 1.1, where a number needs a point. A quoted 1e-10 stays a text.
     own.add_implicit_resolver("tag:yaml.org,2002:float", _WITHOUT_POINT, list("-+0123456789"))
     try:

@@ -125,7 +125,7 @@ def figure_type() -> type[Figure]:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise _missing("matplotlib") from error
+        raise missing("matplotlib") from error
     return Figure
 
 
@@ -165,7 +165,7 @@ def pillow() -> Any:
     try:
         import PIL.Image
     except ImportError as error:
-        raise _missing("pillow") from error
+        raise missing("pillow") from error
     return PIL.Image
 
 
@@ -184,7 +184,12 @@ def grey_where_broken(name: str) -> Any:
     return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))
 
 
-def _missing(package: str) -> MissingPackageError:
+def missing(package: str) -> MissingPackageError:
+    """Return the error of pictures without a package.
+
+    Args:
+        package: to install.
+    """
     return MissingPackageError(
         f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
     )
