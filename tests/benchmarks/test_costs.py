@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from support.sweeps import together
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -51,16 +53,11 @@ def test_recordings_stay_what_they_are(tmp_path):
 
 
 @pytest.mark.slow
-def test_threads_and_processes(tmp_path):
-    report, _ = run("thread_cost.py", tmp_path)
-    assert len(report["cases"]) == 6 and len(report["ratios"]) == 4
-
-
-@pytest.mark.slow
-def test_functions_across(tmp_path):
-    report, _ = run("wrap_cost.py", tmp_path)
-    assert len(report["cases"]) == 20 and all(case["min"] > 0 for case in report["cases"].values())
-    assert len(report["ratios"]) == 12
+@pytest.mark.parametrize(("script", "cases", "ratios"), [("thread_cost.py", 6, 4), ("wrap_cost.py", 20, 12)])
+def test_threads_and_functions_across(tmp_path, script, cases, ratios):
+    report, _ = run(script, tmp_path)
+    assert len(report["cases"]) == cases and len(report["ratios"]) == ratios
+    assert all(case["min"] > 0 for case in report["cases"].values())
 
 
 @pytest.mark.slow
@@ -146,31 +143,17 @@ def test_scenes_of_mitsuba_beside_it(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("command", "names"),
-    [
-        (["cases", "plate", "shadow_area"], ["plate", "shadow_area"]),
-        (["room", "meter", "--depth", "3"], ["meter, depth 3"]),
-        (["spread", "corner"], ["corner, depth 3"]),
-        (["step"], ["wall", "cpu", "memory"]),
-        (["fit"], ["start 0"]),
-    ],
-    ids=lambda value: value[0],
-)
+@together("command, names", [
+    (["cases", "plate"], ["plate"]), (["room", "meter", "--depth", "3"], ["meter, depth 3"]),
+    (["spread", "corner"], ["corner, depth 3"]), (["step"], ["wall", "cpu", "memory"]), (["fit"], ["start 0"]),
+    (["sweep", "disk"], None),
+])  # fmt: skip
 def test_moving_edges(tmp_path, command, names):
-    report, printed = run("boundary_cost.py", tmp_path, *command)
-    assert list(report["results"]) == names and all(name in printed for name in names[:2])
-    for found in report["results"].values():
-        assert "failed" not in found
-
-
-@pytest.mark.slow
-def test_every_shape_that_moves(tmp_path):
     """At toy size most differences are noise: none fails to be measured."""
-    report, printed = run("boundary_cost.py", tmp_path, "sweep", "disk", "mesh")
-    verdicts = {name: found["verdict"] for name, found in report["results"].items()}
-    assert len(verdicts) == 18 and "failed" not in verdicts.values()
-    assert "disk, shadow, turn: " in printed
+    report, _ = run("boundary_cost.py", tmp_path, *command)
+    assert report["results"] and (names is None or list(report["results"]) == names)
+    for found in report["results"].values():
+        assert "failed" not in found and found.get("verdict") != "failed"
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ precision. Files hand on whole numbers of 8 bits and half precision as they are.
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from support.sweeps import together
@@ -19,8 +18,8 @@ AXIS = TimeAxis(2.0, 0.05, 60)
 WALL = Wall.plane(1.0, 1.0)
 KINDS = {"confocal": {}, "single": {}, "exhaustive": {"laser_grid": (2, 1)}}
 NUMBERS = (
-    torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32,
-    torch.uint64, torch.float16, torch.bfloat16, torch.float8_e4m3fn, torch.float8_e5m2, torch.float32, torch.float64,
+    torch.bool, torch.uint8, torch.int8, torch.int32, torch.int64, torch.uint16, torch.uint64, torch.float16,
+    torch.bfloat16, torch.float8_e5m2,
 )  # fmt: skip
 
 
@@ -48,11 +47,10 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.slow
 @together("dtype", NUMBERS)
 @together("name", FUNCTIONS)
 def test_numbers_of_every_kind(name, dtype):
-    for kind in KINDS:
+    for kind in ("confocal", "exhaustive"):
         scan = scanned(kind)
         given = counts(scan, dtype)
         found = FUNCTIONS[name](Capture(given, AXIS, scan))
@@ -83,15 +81,13 @@ def test_legs_are_taken_off_counts_as_linear_interpolation_does():
         np.testing.assert_allclose(found.transient[0, :, y, x].numpy(), expected, atol=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float16, torch.bool], ids=str)
-def test_volumes_and_pictures_of_counts(dtype):
+def test_volumes_and_pictures_of_counts():
     scan = scanned("confocal")
-    given = counts(scan, dtype, channels=1)
+    given = counts(scan, torch.uint8, channels=1)
     capture, precise = (Capture(t, AXIS, scan) for t in (given, given.float()))
     for method in ("fk", "bp", "phasor"):
         torch.testing.assert_close(reconstruct(capture, method).values, reconstruct(precise, method).values)
-    vis.transients_grid(capture)
+    vis.transients_grid(capture, rows=1, columns=1)
     vis.peak_time_picture(capture)
 
 

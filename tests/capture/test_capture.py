@@ -34,20 +34,19 @@ def capture(name, channels=2, **changes):
     return Capture(**{"transient": transient, "axis": AXIS, "scan": scan, **changes})
 
 
-@pytest.mark.parametrize("name", ["exhaustive", "lists"])
-def test_the_diagonal_is_confocal(name):
-    made = capture(name, steady=torch.rand(2, *SCANS[name].shape))
-    diagonal = made.confocal()
-    assert diagonal.scan.kind == "confocal" and diagonal.scan.shape == diagonal.transient.shape[2:]
-    if name == "exhaustive":
-        for row in range(3):
-            for column in range(4):
-                expected = made.transient[:, :, row, column, row, column]
-                assert torch.equal(diagonal.transient[:, :, row, column], expected)
-                assert torch.equal(diagonal.steady[:, row, column], made.steady[:, row, column, row, column])
-    else:
-        expected = torch.stack([made.transient[..., k, k] for k in range(3)], -1)
-        assert torch.equal(diagonal.transient, expected)
+def test_the_diagonal_is_confocal():
+    made = capture("exhaustive", steady=torch.rand(2, *SCANS["exhaustive"].shape))
+    batch = Capture.stack([made, made.map(lambda t: t + 1)])
+    for given in (made, batch):
+        diagonal = given.confocal()
+        assert diagonal.scan.kind == "confocal" and diagonal.scan.shape == diagonal.transient.shape[-2:]
+        for name in ("transient", "steady"):
+            whole = getattr(given, name)
+            expected = torch.stack([whole[..., r, c, r, c] for r in range(3) for c in range(4)], -1)
+            assert torch.equal(getattr(diagonal, name).flatten(-2), expected)
+    lists = capture("lists")
+    expected = torch.stack([lists.transient[..., k, k] for k in range(3)], -1)
+    assert torch.equal(lists.confocal().transient, expected)
 
 
 def test_one_spot_of_an_exhaustive_capture():
@@ -57,6 +56,8 @@ def test_one_spot_of_an_exhaustive_capture():
     assert torch.equal(one.transient, made.transient[:, :, 2, 3])
     assert torch.equal(one.steady, made.steady[:, 2, 3])
     assert torch.equal(capture("lists").single(1).transient, capture("lists").transient[:, :, 1])
+    batch = Capture.stack([made, made.map(lambda t: t + 1)])
+    assert torch.equal(batch.single((1, 2)).transient, batch.transient[:, :, :, 1, 2])
     with pytest.raises(SceneError):
         capture("single").single(0)
     with pytest.raises(SceneError):
@@ -87,14 +88,11 @@ def test_phasors():
         Capture(None, None, SCANS["single"], phasor=phasor.real, frequencies=axis)
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        lambda t: t.numpy(), lambda t: t.double().numpy(), lambda t: t.tolist(), lambda t: tuple(t.tolist()),
-        lambda t: t.numpy().astype(">f4"), lambda t: np.ascontiguousarray(t.flip(3).numpy())[..., ::-1],
-        lambda t: np.frombuffer(t.numpy().tobytes(), np.float32).reshape(t.shape),
-    ],
-)  # fmt: skip
+@together("given", [
+    lambda t: t.numpy(), lambda t: t.double().numpy(), lambda t: t.tolist(), lambda t: t.numpy().astype(">f4"),
+    lambda t: np.ascontiguousarray(t.flip(3).numpy())[..., ::-1],
+    lambda t: np.frombuffer(t.numpy().tobytes(), np.float32).reshape(t.shape),
+])  # fmt: skip
 def test_arrays_and_lists_are_measured_too(given):
     expected = capture("single", steady=torch.rand(2, 3, 4))
     with warnings.catch_warnings():
@@ -184,20 +182,11 @@ def test_leading_dimensions_are_channels_polarization_and_a_batch():
             replace(polarized, steady=steady)
 
 
-def test_one_spot_of_a_batch_of_grids():
-    made = capture("exhaustive")
-    batch = Capture.stack([made, made.map(lambda t: t + 1)])
-    assert torch.equal(batch.single((1, 2)).transient, batch.transient[:, :, :, 1, 2])
-    expected = torch.stack([batch.transient[..., r, c, r, c] for r in range(3) for c in range(4)], -1)
-    assert torch.equal(batch.confocal().transient.flatten(-2), expected)
-
-
 @together("changes, error", [
     *(({"transient": torch.zeros(shape)}, ShapeError) for shape in ((1, 7, 3, 4), (1, 8, 4, 3), (0, 8, 3, 4))),
     ({"transient": torch.zeros(1, 8, 3, 4, dtype=torch.complex64)}, ShapeError), ({"transient": None}, ShapeError),
     ({"transient": np.ma.masked_array(np.zeros((1, 8, 3, 4)), mask=False)}, ShapeError), ({"axis": None}, ShapeError),
-    *(({"transient": wrong}, ShapeError)
-      for wrong in ("x", {}, object(), np.array(["a"]), [[1.0], [2.0, 3.0]], 10**400)),
+    *(({"transient": wrong}, ShapeError) for wrong in ("x", np.array(["a"]), [[1.0], [2.0, 3.0]])),
     ({"steady": torch.zeros(2, 4, 3)}, ShapeError), ({"scan": None}, ArgumentError),
     ({"axis": (0.0, 0.1, 8)}, ArgumentError), ({"frequencies": AXIS}, ArgumentError),
     ({"channels": ["a"]}, ArgumentError), ({"channels": (1,)}, ArgumentError), ({"metadata": [1]}, StorageError),

@@ -9,6 +9,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
+from support.sweeps import together
 from torchtransient import _llvm
 from torchtransient.__main__ import main
 from torchtransient.cli import doctor
@@ -36,32 +37,22 @@ def test_a_users_bad_choice_of_llvm(tmp_path):
     assert "1 problem found" in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("code", "message"),
-    [
-        ("import os; os.abort()", "the process was ended by SIGABRT"),
-        ("raise SystemExit('the image sums to nan')", "failed: the image sums to nan"),
-    ],
-)
-def test_a_probe_that_fails(monkeypatch, code, message):
+@together("code, seconds, message", [
+    ("import os; os.abort()", 60, "the process was ended by SIGABRT"),
+    ("raise SystemExit('the image sums to nan')", 60, "failed: the image sums to nan"),
+    ("import time; time.sleep(60)", 0.5, "no answer"),
+])  # fmt: skip
+def test_a_probe_that_fails(monkeypatch, code, seconds, message):
     monkeypatch.setattr(doctor, "_RENDER", code)
+    monkeypatch.setattr(doctor, "_TIMEOUT_S", seconds)
     finding = doctor.probe("llvm_ad_rgb")
-    assert finding.state == "problem"
-    assert message in finding.text
-
-
-def test_a_probe_that_hangs(monkeypatch):
-    monkeypatch.setattr(doctor, "_RENDER", "import time; time.sleep(60)")
-    monkeypatch.setattr(doctor, "_TIMEOUT_S", 0.5)
-    assert "no answer" in doctor.probe("llvm_ad_rgb").text
+    assert finding.state == "problem" and message in finding.text
 
 
 def test_what_programs_get_that_import_mitsuba_alone(monkeypatch):
     monkeypatch.setattr(doctor, "_PLAIN", "print('15.0.6')")
-    state = [(f.state, f.text) for f in doctor.llvm()]
-    assert state[0][0] == "ok"
-    assert state[1][0] == "note"
-    assert "gets LLVM 15.0.6. Import torchtransient first" in state[1][1]
+    found, note = doctor.llvm()
+    assert (found.state, note.state) == ("ok", "note") and "gets LLVM 15.0.6" in note.text
 
 
 def test_a_missing_package(monkeypatch):
@@ -71,14 +62,11 @@ def test_a_missing_package(monkeypatch):
     assert "torchtransient[data]" in found["h5py"].text
 
 
-@pytest.mark.parametrize(
-    "driver, torch_sees, findings",
-    [
-        (False, False, [("note", "cuda_ad_rgb", "no NVIDIA driver")]),
-        (True, False, [("note", "cuda_ad_rgb", "Dr.Jit sees a GPU and torch")]),
-        (True, True, [("ok", "CUDA", "a card, torch built for CUDA"), ("ok", "cuda_ad_rgb", "as expected")]),
-    ],
-)
+@together("driver, torch_sees, findings", [
+    (False, False, [("note", "cuda_ad_rgb", "no NVIDIA driver")]),
+    (True, False, [("note", "cuda_ad_rgb", "Dr.Jit sees a GPU and torch")]),
+    (True, True, [("ok", "CUDA", "a card, torch built for CUDA"), ("ok", "cuda_ad_rgb", "as expected")]),
+])  # fmt: skip
 def test_what_is_said_of_a_gpu(monkeypatch, driver, torch_sees, findings):
     import drjit as dr
     import torch

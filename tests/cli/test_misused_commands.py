@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import click
-import pytest
 from click.testing import CliRunner
 
+from support.sweeps import together
 from torchtransient.cli import main as cli
+from torchtransient.errors import SceneError
 
 
-@pytest.mark.parametrize(
-    ("error", "status", "words"),
-    [
-        (PermissionError(13, "Permission denied", "a.h5"), 2, "Permission denied"), (TypeError("a\nb"), 70, "a b"),
-        (KeyError("a"), 70, "KeyError"), (RecursionError("deep"), 70, "a fault of torchtransient"),
-        (RuntimeError("x" * 9000), 70, "--debug shows where"),
-    ],
-)  # fmt: skip
+@together("error, status, words", [
+    (PermissionError(13, "Permission denied", "a.h5"), 2, "Permission denied"), (TypeError("a\nb"), 70, "a b"),
+    (KeyError("a"), 70, "KeyError"), (RuntimeError("x" * 9000), 70, "a fault of torchtransient"),
+    (SceneError("no scene"), 2, "no scene"),
+])  # fmt: skip
 def test_errors_of_others(monkeypatch, error, status, words):
     @click.command()
     def broken():
@@ -37,8 +35,3 @@ def test_a_reader_that_has_left_is_no_error_of_ours(monkeypatch):
     monkeypatch.setattr(cli.Commands, "get_command", lambda self, ctx, name: broken)
     found = CliRunner().invoke(cli.main, ["plan"])
     assert found.exit_code == 1 and not found.stderr
-
-
-def test_a_folder_that_is_no_data_set(tmp_path):
-    found = CliRunner().invoke(cli.main, ["dataset", "verify", str(tmp_path)])
-    assert found.exit_code == 2 and "holds no shard" in found.stderr

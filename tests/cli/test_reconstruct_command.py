@@ -19,12 +19,11 @@ from torchtransient.__main__ import main
 POINT = (0.15, -0.1, 0.7)
 AXIS = tt.TimeAxis(0.0, 0.02, 128)
 WALL = tt.nlos.Wall.plane(1.0, 1.0)
+# Each method once.
 EVERY = [
-    ("confocal", ["fk", "lct", "directional-lct", "bp", "fbp", "phasor"]),
-    ("single", ["midpoint-fk", "bp", "fbp", "phasor"]),
-    ("exhaustive", ["midpoint-fk", "bp", "fbp", "phasor"]),
-]
-PAIRS = [(kind, method) for kind, methods in EVERY for method in methods]
+    ("confocal", "fk"), ("confocal", "lct"), ("confocal", "directional-lct"), ("single", "bp"), ("exhaustive", "fbp"),
+    ("exhaustive", "phasor"), ("single", "midpoint-fk"),
+]  # fmt: skip
 
 
 def captured(kind, legs=False, axis=AXIS):
@@ -54,11 +53,7 @@ def brightest(volume):
     return volume.grid.points.reshape(-1, 3)[index]
 
 
-# Each method once.
-ONCE = list({method: (kind, method) for kind, method in PAIRS}.values())
-
-
-@pytest.mark.parametrize(("kind", "method"), long_rows(PAIRS, ONCE[::2]))
+@pytest.mark.parametrize(("kind", "method"), long_rows(EVERY, EVERY[::2]))
 def test_a_point_is_found_by_every_method(folder, kind, method):
     captured(kind).write("a.h5")
     result = run("a.h5", "--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture")
@@ -70,24 +65,17 @@ def test_a_point_is_found_by_every_method(folder, kind, method):
     torch.testing.assert_close(brightest(volume), torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
 
 
-SUITS = [("confocal", "fk"), ("single", "phasor"), ("exhaustive", "phasor")]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "method"), long_rows(SUITS, SUITS[1:2]))
-def test_without_a_method_the_one_that_suits_is_taken(folder, kind, method):
-    article = "an" if kind == "exhaustive" else "a"
-    captured(kind).write("a.npz")
+def test_without_a_method_the_one_that_suits_is_taken(folder):
+    captured("single").write("a.npz")
     result = run("a.npz", "-o", "v.npz", "--depths", 0.4, 1.0)
     assert result.exit_code == 0, result.output
-    assert f"--method {method}: {article} {kind} scan" in result.stderr and "volume: 100%" in result.stderr
+    assert "--method phasor: a single scan" in result.stderr and "volume: 100%" in result.stderr
     volume = tt.nlos.read_volume("v.npz")
-    assert volume.method == method and volume.metadata["reason"].startswith(f"{article} {kind} scan")
+    assert volume.method == "phasor" and volume.metadata["reason"].startswith("a single scan")
     assert volume.metadata["capture"] == "a.npz"
     assert "v.npz: 1 x " in result.stdout and (folder / "v.png").stat().st_size > 5000
 
 
-@pytest.mark.slow
 def test_lists_of_points_go_to_filtered_backprojection(folder):
     scan = captured("confocal").scan
     points = scan.sensor_points.reshape(-1, 3)[::2]
@@ -117,14 +105,12 @@ def test_lists_on_one_line_are_asked_for_an_extent_and_take_it(folder):
     assert grid.extent == pytest.approx((0.6, 0.5)) and grid.shape == (3, 4, 5)
 
 
-@pytest.mark.parametrize("method", ["fk", "fbp"])
-def test_legs_do_not_matter(folder, method):
-    axis = tt.TimeAxis(0.3, 0.02, 160)
-    captured("confocal", legs=True, axis=axis).write("legs.h5")
-    options = ("--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture")
-    assert run("legs.h5", *options).exit_code == 0
-    found = brightest(tt.nlos.read_volume(f"legs_{method}.h5"))
-    torch.testing.assert_close(found, torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
+def test_legs_do_not_matter(folder):
+    captured("confocal", legs=True, axis=tt.TimeAxis(0.3, 0.02, 160)).write("legs.h5")
+    for method in ("fk", "fbp"):
+        assert run("legs.h5", "--method", method, "--depths", 0.4, 1.0, "--quiet", "--no-picture").exit_code == 0
+        found = brightest(tt.nlos.read_volume(f"legs_{method}.h5"))
+        torch.testing.assert_close(found, torch.tensor(POINT, dtype=torch.float64), rtol=0, atol=0.085)
 
 
 def test_options_are_those_of_the_function(folder):
@@ -196,29 +182,21 @@ def test_what_a_file_leaves_open_is_asked_for(folder):
 
 @together("arguments, word", [
     (("missing.h5",), "missing.h5"), (("a.h5", "--method", "midpoint-fk"), "--method"),
-    (("a.h5", "--method", "fk", "--snr", 3), "--snr"),
-    (("a.h5", "--method", "bp", "--wavelength", 0.1), "--wavelength"),
+    (("a.h5", "--method", "fk", "--snr", 3), "--snr"), (("a.h5", "--method", "fk", "--voxels", 8), "--voxels"),
     (("a.h5", "--method", "fbp", "--filter", "laplacian", "--cycles", 3), "--cycles"),
-    (("a.h5", "--method", "fk", "--voxels", 8), "--voxels"),
     (("a.h5", "--method", "bp", "--voxels", "4,x"), "X,Y[,Z]"),
     (("a.h5", "--method", "bp", "--bounds", 0, 0, 0, 1, 1, 1), "--voxels"),
     (("a.h5", "--bounds", 0, 0, 0, 1, 1, 1, "--depths", 0, 1), "--depths"),
     (("a.h5", "--method", "phasor", "--camera", "confocal"), "--times"), (("a.h5", "--times", 0, 1, 3), "--camera"),
     (("a.h5", "--method", "phasor", "--camera", "transient", "--times", 0, 1, 3), "one laser spot"),
-    (("a.h5", "--slab-snr", 3), "--slab"), (("a.h5", "--slab", 0.02, "--slab-snr", 0), "snr"),
-    (("a.h5", "--gamma", 0), "--gamma"), (("a.h5", "--gamma", "nan"), "--gamma"),
-    (("a.h5", "--threshold", 5), "--threshold"), (("a.h5", "--slab", 25.4), "--slab"),
-    (("a.h5", "--record", 0, 2000), "--record"), (("a.h5", "--taps", 3), "taps"),
-    (("a.h5", "--method", "lct", "--v-bins", 2), "v_bins"),
-    (("a.h5", "--method", "bp", "--extent", 600), "within the record"),
+    (("a.h5", "--slab-snr", 3), "--slab"), (("a.h5", "--gamma", 0), "--gamma"),
+    (("a.h5", "--threshold", 5), "--threshold"), (("a.h5", "--record", 0, 2000), "--record"),
     (("a.h5", "--method", "fbp", "--wavelength", 60), "wavelength of"),
     (("a.h5", "--method", "bp", "--voxels", "9000,9000,9000"), "TiB"), ((".",), "is a directory"),
-    (("a.h5", "--depths", 1, 0.5), "near < far"), (("a.h5", "--depths", 5, 6), "within the record"),
-    (("a.h5", "--record", 9, 10), "no bin"), (("a.h5", "--sum-bins", 500), "128 bins"),
-    (("a.h5", "--wall-size", 1), "--wall-size"), (("a.h5", "--format", "xyz"), "format"),
-    (("a.h5", "-o", "v.txt"), ".npz"), (("a.h5", "--picture", "nowhere/a.png"), "nowhere"),
-    (("a.h5", "--picture", "a.png", "--no-picture"), "--no-picture"), (("a.h5", "--device", "abacus"), "abacus"),
-    (("a.h5", "--method", "lct", "--snr", -1), "snr"),
+    (("a.h5", "--depths", 5, 6), "within the record"), (("a.h5", "--sum-bins", 500), "128 bins"),
+    (("a.h5", "--wall-size", 1), "--wall-size"), (("a.h5", "-o", "v.txt"), ".npz"),
+    (("a.h5", "--picture", "nowhere/a.png"), "nowhere"), (("a.h5", "--device", "abacus"), "abacus"),
+    (("a.h5", "--picture", "a.png", "--no-picture"), "--no-picture"),
 ])  # fmt: skip
 def test_mistakes_are_said_in_options(confocal, folder, arguments, word):
     shutil.copyfile(confocal, "a.h5")

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from support import view_cases as cases
+from support.sweeps import together
 from torchtransient.__main__ import main
 from torchtransient.cli import view
 
@@ -45,23 +46,17 @@ def test_a_page(files):
 def test_two_files(files):
     done = run("a.h5", "b.h5", "-o", "both.html")
     assert done.exit_code == 0, done.output
-    assert "A − B" in (files / "both.html").read_text(encoding="utf-8") or "\\u2212" in (files / "both.html").read_text(
-        encoding="utf-8"
-    )
+    text = (files / "both.html").read_text(encoding="utf-8")
+    assert "A − B" in text or "\\u2212" in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("missing.h5",), "missing.h5"),
-        (("a.h5", "b.h5", "a.h5"), "one file or two"),
-        (("a.h5", "-o", "nowhere/a.html"), "nowhere"),
-    ],
-)
+@together("arguments, words", [
+    (("missing.h5",), "missing.h5"), (("a.h5", "b.h5", "a.h5"), "one file or two"),
+    (("a.h5", "-o", "nowhere/a.html"), "nowhere"),
+])  # fmt: skip
 def test_refusals(files, arguments, words):
     done = run(*arguments)
-    assert done.exit_code == 2
-    assert words in done.output
+    assert done.exit_code == 2 and words in done.output
 
 
 def test_a_large_file_is_served_until_it_is_interrupted(files):

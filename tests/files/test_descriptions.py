@@ -48,11 +48,10 @@ def test_files_and_folders(tmp_path, monkeypatch):
 
 @together("old, new", [
     ("spp: 16", "spp: many"), ("spp: 16", "spp: 1.5"), ("spp: 16", "spp: 0"), ("spp: 16", "spp: true"),
-    ("spp: 16", "spp: .inf"), ("spp: 16", "spp: 16\nspp: 17"), ("spp: 16", "sp: 16"), ("width: 2.0", "width: [1]"),
-    ("width: 2.0", "width: 1 m"), ("kind: confocal", "kind: 3"), ("kind: confocal", "kind: biaxial"),
-    ("size: [4, 3]", "size: [4, 3, 2]"), ("size: [4, 3]", "size: [4, x]"), ("num_bins: 60", "num_bins: null"),
-    ("wall: {width: 2.0, height: 1.6}", "wall: 3"), (SETUP, "- 1\n- 2"), (SETUP, "3\n"), (SETUP, "\n"),
-    (SETUP, "words\nand words"),
+    ("spp: 16", "spp: .inf"), ("width: 2.0", "width: [1]"), ("width: 2.0", "width: 1 m"),
+    ("kind: confocal", "kind: biaxial"), ("size: [4, 3]", "size: [4, 3, 2]"), ("size: [4, 3]", "size: [4, x]"),
+    ("num_bins: 60", "num_bins: null"), ("wall: {width: 2.0, height: 1.6}", "wall: 3"), (SETUP, "- 1\n- 2"),
+    (SETUP, "\n"),
 ])  # fmt: skip
 def test_entries_of_other_kinds(tmp_path, old, new):
     with pytest.raises(TorchTransientError) as found:

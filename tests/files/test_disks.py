@@ -24,6 +24,7 @@ from support.capture_files import ENDINGS, grids, holdable, made, volume
 from support.fake_recipe import FakeRecipe
 from support.killed_writers import output
 from support.stored_samples import sample, write
+from support.sweeps import together
 from torchtransient.array_files import part_files
 from torchtransient.errors import SceneError, StorageError, TorchTransientError
 from torchtransient.files import read_result, write_result
@@ -60,42 +61,30 @@ EACH_WRITER = [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()
 NO_NAMES = (None, 5, b"a", ["a"], object(), "a\0b", "x" * 5000)
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_devices_are_not_read(tmp_path, name):
+@together("name", READERS)
+def test_neither_devices_nor_what_is_no_name_are_read(tmp_path, name):
     read, ending = READERS[name]
-    (tmp_path / f"a{ending}").symlink_to("/dev/null")
-    with pytest.raises(TorchTransientError):
-        read(tmp_path / f"a{ending}")
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_readers_of_what_is_no_name(name):
-    for given in NO_NAMES:
+    place = tmp_path / f"{name}{ending}"
+    place.symlink_to("/dev/null")
+    for given in (place, *NO_NAMES):
         with pytest.raises(TorchTransientError):
-            READERS[name][0](given)
+            read(given)
 
 
 @pytest.mark.parametrize("name", EACH_WRITER)
-def test_pipes_are_not_replaced(tmp_path, name):
+def test_neither_pipes_nor_what_is_no_name_are_written(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
     write, ending = WRITERS[name]
     place = tmp_path / f"a{ending}"
     os.mkfifo(place)
     reading = os.open(place, os.O_RDONLY | os.O_NONBLOCK)  # or opening it would wait for a reader
     try:
-        with pytest.raises(StorageError):
-            write(place)
+        for given in (place, *NO_NAMES[1:]):  # without a name nothing is written
+            with pytest.raises(TorchTransientError):
+                write(given)
     finally:
         os.close(reading)
     assert stat.S_ISFIFO(place.stat().st_mode) and list(tmp_path.iterdir()) == [place]
-
-
-@pytest.mark.parametrize("name", EACH_WRITER)
-def test_writers_to_what_is_no_name(tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    for given in NO_NAMES[1:]:  # without a name nothing is written
-        with pytest.raises(TorchTransientError):
-            WRITERS[name][0](given)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", EACH_WRITER)
@@ -119,30 +108,24 @@ def test_full_disks(tmp_path, name):
 XML = '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"/>{}</scene>'
 
 
-@pytest.mark.parametrize("kind", ["ply", "obj", "serialized"])
-def test_meshes_that_are_devices(tmp_path, kind):
-    (tmp_path / "a").symlink_to("/dev/null")
-    (tmp_path / "s.xml").write_text(XML.format(f'<shape type="{kind}"><string name="filename" value="a"/></shape>'))
+MESH = '<shape type="{}"><string name="filename" value="a"/></shape>'
+PICTURE = '<texture type="bitmap" name="reflectance"><string name="filename" value="a.png"/></texture>'
+
+
+@together("content", [
+    *map(MESH.format, ("ply", "obj", "serialized")), '<include filename="a"/>',
+    f'<shape type="rectangle"><bsdf type="diffuse">{PICTURE}</bsdf></shape>',
+    '<default name="here" value="a"/><include filename="inner.xml"/>',
+])  # fmt: skip
+def test_scenes_that_name_devices(tmp_path_factory, content):
+    """Of meshes, textures and includes, those of included files too."""
+    folder = tmp_path_factory.mktemp("scene")
+    for name in ("a", "a.png"):
+        (folder / name).symlink_to("/dev/null")
+    (folder / "inner.xml").write_text('<scene version="3.0.0"><include filename="$here"/></scene>')
+    (folder / "s.xml").write_text(XML.format(content))
     with pytest.raises(SceneError):
-        tt.load(tmp_path / "s.xml", variant="llvm_ad_mono").parameters()
-
-
-def test_textures_that_are_devices(tmp_path):
-    (tmp_path / "a.png").symlink_to("/dev/null")
-    texture = {"type": "bitmap", "filename": str(tmp_path / "a.png")}
-    scene = {"type": "scene", "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}}
-    with pytest.raises(SceneError):
-        tt.load(scene, variant="llvm_ad_mono").parameters()
-
-
-def test_includes_that_are_devices(tmp_path):
-    (tmp_path / "a").symlink_to("/dev/null")
-    (tmp_path / "inner.xml").write_text('<scene version="3.0.0"><include filename="$here"/></scene>')
-    outer = XML.format('<default name="here" value="a"/><include filename="inner.xml"/>')
-    for text in (outer, XML.format('<include filename="a"/>')):
-        (tmp_path / "s.xml").write_text(text)
-        with pytest.raises(SceneError):
-            tt.load(tmp_path / "s.xml")
+        tt.load(folder / "s.xml", variant="llvm_ad_mono").parameters()
 
 
 # ------------------------------------------------------------------------------------------------------ files of arrays
@@ -218,13 +201,11 @@ def refuse(number):
     return refused
 
 
-@pytest.mark.parametrize(("call", "number"), [
-    (fcntl, "flock ENOLCK"), (fcntl, "flock ENOSYS"), (fcntl, "flock EOPNOTSUPP"), (os, "link EPERM"),
-    (os, "link EOPNOTSUPP"), (os, "link EMLINK"),
+@pytest.mark.parametrize(("call", "name", "code"), [
+    (fcntl, "flock", "ENOLCK"), (fcntl, "flock", "EOPNOTSUPP"), (os, "link", "EPERM"), (os, "link", "EMLINK"),
 ])  # fmt: skip
-def test_disks_without_locks_or_links(tmp_path, monkeypatch, call, number):
+def test_disks_without_locks_or_links(tmp_path, monkeypatch, call, name, code):
     """A file that is there stays unless another is to take its place."""
-    name, code = number.split()
     monkeypatch.setattr(call, name, refuse(getattr(errno, code)))
     path = tmp_path / "a.txt"
     for over, text, expected in ((False, "one", "one"), (False, "two", "one"), (True, "two", "two")):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import builtins
 import io
 import json
 import os
 import shutil
+import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ import torch
 
 import torchtransient as tt
 from support.capture_files import FREQUENCIES, grids, listed, made, volume
+from support.hostile_captures import WAYS, lead_elsewhere
 from support.killed_writers import output
 from support.sealed_files import as_first_version
 from support.sweeps import together
@@ -163,10 +164,9 @@ def test_others_can_read_it_without_the_library(tmp_path):
 
 @each_kind
 def test_what_is_none_of_these(tmp_path, kind):
+    write = {"capture": tt.nlos.write_capture, "volume": tt.nlos.write_volume, "result": write_result}[kind]
     with pytest.raises(ArgumentError):
-        ALL[kind][1](tmp_path / "a.h5", torch.zeros(3)) if kind != "capture" else tt.nlos.write_capture(
-            tmp_path / "a.h5", torch.zeros(3)
-        )
+        write(tmp_path / "a.h5", torch.zeros(3))
     (tmp_path / "folder.h5").mkdir()
     for name in ("a.exr", "a", "missing/a.h5", "folder.h5"):
         with pytest.raises(StorageError):
@@ -190,19 +190,12 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
 
 
 def test_hdf5_without_its_package(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name == "h5py":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingPackageError, match=r"torchtransient\[data\]"):
         write_result(tmp_path / "a.h5", output(SEED))
 
 
-@pytest.mark.parametrize("metadata", [{1: "a"}, {"a": {2.0: 1}}, {"a": [{None: 1}]}, {"a": {1, 2}}, {"a": object()}])
+@together("metadata", [{1: "a"}, {"a": {2.0: 1}}, {"a": [{None: 1}]}, {"a": {1, 2}}, {"a": object()}])
 def test_metadata_are_plain_and_their_names_texts(tmp_path, metadata):
     """JSON would make texts of other names, two of the same one."""
     for call in (
@@ -227,7 +220,7 @@ def test_tensors_without_numbers_in_memory(tmp_path):
 
 
 @together("changes, error", [
-    ({"times": 5}, ShapeError), ({"times": [1.0, 2.0]}, ShapeError), ({"times": torch.zeros(3, 2)}, ShapeError),
+    ({"times": 5}, ShapeError), ({"times": torch.zeros(3, 2)}, ShapeError),
     ({"times": torch.tensor([torch.nan])}, UnitError), ({"directions": torch.zeros(7, 3, 4, 5, 6)}, ShapeError),
     ({"values": torch.zeros(0, 1, 4, 5, 6)}, ShapeError), ({"method": 5}, ArgumentError),
     ({"values": torch.ones(1, 4, 5, 6) > 0}, ShapeError),
@@ -384,36 +377,14 @@ def test_the_memory_that_is_left(tmp_path, monkeypatch, ending, kind):
         read(path)
 
 
-def links(file, kind):
-    name = MEASURED[kind]
-    yield lambda: file.create_dataset(name, (4, 4, 4, 4), "u1", external=[("/etc/passwd", 0, 256)])
-    layout = h5py.VirtualLayout(shape=(4, 4, 4, 4), dtype="u1")
-    layout[:] = h5py.VirtualSource("/etc/passwd", "a", shape=(4, 4, 4, 4))
-    yield lambda: file.create_virtual_dataset(name, layout)
-    yield lambda: file.__setitem__(name, h5py.ExternalLink("/etc/passwd", "/a"))
-    yield lambda: file.__setitem__(name, h5py.SoftLink("/steady"))
-    yield lambda: file.create_dataset(name, (2**14, 2**14, 2**14), "f4", chunks=True)  # terabytes
-    yield lambda: file.create_group(name)
-
-    def filtered():
-        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        settings.set_chunk((4, 4, 4, 4))
-        # No library on this machine knows it, and HDF5 would look for it in its folders of plugins.
-        settings.set_filter(31999, h5py.h5z.FLAG_OPTIONAL, (1,))
-        space = h5py.h5s.create_simple((4, 4, 4, 4))
-        h5py.h5d.create(file.id, name.encode(), h5py.h5t.IEEE_F32LE, space, settings)
-
-    yield filtered
-
-
 @each_kind
 def test_bytes_from_elsewhere(tmp_path, kind):
     write, read = KINDS[kind]
     path = as_first_version(write(tmp_path / "a.h5"))
-    for number in range(7):
+    for number in range(WAYS):
         with h5py.File(path, "r+") as file:
             del file[MEASURED[kind]]
-            list(links(file, kind))[number]()
+            lead_elsewhere(file, MEASURED[kind], number)
         with pytest.raises(StorageError):
             read(path)
 

@@ -108,9 +108,6 @@ class Shown:
             found.append((name, *numbers, _number(row.locator(".at").inner_text())))
         return found
 
-    def value(self, row=-1):
-        return self.rows()[row][1]
-
     def picture(self, name="image"):
         """Colours of a picture as the page has them, rows of (r, g, b)."""
         return self.page.evaluate(

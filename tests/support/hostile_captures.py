@@ -9,8 +9,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from support.capture_files import holdable, sound_files
-
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
@@ -24,13 +22,6 @@ TEXTS = (
 )  # fmt: skip
 
 
-def whole_files(folder):
-    """A file for each capture that a layout holds, and for each layout that is only read, as paths."""
-    own = [capture for layout, _, capture in holdable() if layout == "torchtransient"]
-    packed = [capture.write(folder / f"own{number}.npz") for number, capture in enumerate(own)]
-    return [*(path for _, path in sound_files(folder)), *packed, old_mat(folder / "old.mat")]
-
-
 def old_mat(path):
     """A MATLAB file before 7.3 in the layout of phasor fields, compressed."""
     import scipy.io
@@ -41,6 +32,32 @@ def old_mat(path):
     }  # fmt: skip
     scipy.io.savemat(path, {"dataset": dataset, "minimalpos": np.zeros(3)}, do_compression=True)
     return path
+
+
+def lead_elsewhere(file, name, way):
+    """Put a dataset into an HDF5 file whose numbers lie in another file, or nowhere, in one of WAYS ways."""
+    shape = (4, 4, 4, 4)
+    if way == 0:
+        file.create_dataset(name, shape, "u1", external=[("/etc/passwd", 0, 256)])
+    elif way == 1:
+        layout = h5py.VirtualLayout(shape=shape, dtype="u1")
+        layout[:] = h5py.VirtualSource("/etc/passwd", "a", shape=shape)
+        file.create_virtual_dataset(name, layout)
+    elif way in (2, 3):
+        file[name] = h5py.ExternalLink("/etc/passwd", "/a") if way == 2 else h5py.SoftLink("/steady")
+    elif way in (4, 5):  # terabytes
+        file.create_dataset(name, (2**14, 2**14, 2**14), "f4", chunks=True, compression="gzip" if way == 5 else None)
+    elif way == 6:
+        file.create_group(name)
+    else:
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_chunk(shape)
+        # No library on this machine knows it, and HDF5 would look for it in its folders of plugins.
+        settings.set_filter(31999, h5py.h5z.FLAG_OPTIONAL, (1,))
+        h5py.h5d.create(file.id, name.encode(), h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple(shape), settings)
+
+
+WAYS = 8
 
 
 def bytes_changed(source: Path, target: Path, rng: random.Random) -> None:

@@ -75,11 +75,6 @@ def capture(kind="confocal", size=(8, 6), bins=24):
     return tt.nlos.Capture(cube, axis, scan)
 
 
-def rates_result():
-    cube, rate_axis = rates()
-    return result(rates=cube[..., :H], rate_axis=rate_axis)
-
-
 def volume(rows=10):
     depths = torch.linspace(0.4, 1.0, 12)
     grid = VoxelGrid(

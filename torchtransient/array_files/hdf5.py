@@ -82,7 +82,9 @@ def read_dataset(parent: Any, name: str, what: str, part: tuple[Any, ...] = ()) 
     if dataset is None or dataset.shape is None or "MATLAB_empty" in dataset.attrs:
         return None
     _check_filters(dataset, name, what)
-    if is_text(dataset):
+    import h5py
+
+    if h5py.check_string_dtype(dataset.dtype) is not None and math.prod(dataset.shape) == 1:
         return _text(dataset, what)
     if not is_number(dataset.dtype):
         raise StorageError(f"{what}: '{name}' holds {str(dataset.dtype)[:60]}; expected numbers of up to 64 bits.")
@@ -145,17 +147,6 @@ def is_number(dtype: np.dtype[Any]) -> bool:
         dtype: of an array.
     """
     return dtype.kind in "biufc" and dtype.itemsize <= (16 if dtype.kind == "c" else 8)
-
-
-def is_text(dataset: Any) -> bool:
-    """Return True for a dataset of one text.
-
-    Args:
-        dataset: of h5py.
-    """
-    import h5py
-
-    return h5py.check_string_dtype(dataset.dtype) is not None and math.prod(dataset.shape or ()) == 1
 
 
 def check_size(declared: int, stored: int, what: str) -> None:

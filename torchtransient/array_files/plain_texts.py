@@ -72,10 +72,12 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
         StorageError: for texts in another format, more than 100 levels and more than ``most_nodes`` nodes.
         TorchTransientError: errors that constructors of ``loader`` raise.
     """
-    loader = loader or safe_loader(yaml)
+    own: Any = type("Loader", (loader or safe_loader(yaml),), {})
+    # PyYAML follows YAML 1.1, where a number needs a point. A quoted 1e-10 stays a text.
+    own.add_implicit_resolver("tag:yaml.org,2002:float", _WITHOUT_POINT, list("-+0123456789"))
     try:
         _check_events(yaml, text, what, most_nodes or max(_NODES, len(text)))
-        return yaml.load(text, Loader=reads_exponents(type("Loader", (loader,), {})))
+        return yaml.load(text, Loader=own)
     except TorchTransientError:
         raise
     except yaml.YAMLError as error:
@@ -131,9 +133,7 @@ def _lenient_loader(yaml: Any) -> Any:
             return loader.construct_sequence(node, deep=True)
         return loader.construct_scalar(node)
 
-    for tag in ("timestamp", "binary"):  # JSON has neither dates nor bytes
-        Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
-    for tag in ("set", "omap", "pairs"):
+    for tag in ("timestamp", "binary", "set", "omap", "pairs"):  # JSON has none of these
         Loader.add_constructor(f"tag:yaml.org,2002:{tag}", lambda loader, node: plain(loader, "", node))
     Loader.add_multi_constructor("", plain)
     return Loader
@@ -164,18 +164,6 @@ def safe_loader(yaml: Any) -> Any:
         yaml: the package PyYAML.
     """
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-def reads_exponents(loader: Any) -> Any:
-    """Return a loader class of PyYAML after changing it to read plain 1e-10 as a number, as JSON and YAML 1.2 do.
-
-    Args:
-        loader: class of PyYAML.
-
-    Quoted 1e-10 stays a text. PyYAML follows YAML 1.1, where a number needs a point.
-    """
-    loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITHOUT_POINT, list("-+0123456789"))
-    return loader
 
 
 def _place(error: Any) -> str:

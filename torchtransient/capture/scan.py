@@ -21,6 +21,7 @@ from torchtransient.tensor_record import same
 # Kinds of a regular grid; "pairs" are given point by point.
 GRID_KINDS = ("single", "confocal", "exhaustive")
 KINDS = (*GRID_KINDS, "pairs")
+_TENSORS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
 # Where origins stand unless they are given: aside of the wall's middle and close to it, as parts of its width.
 _ASIDE, _BEFORE = 0.25, 0.125
 
@@ -64,9 +65,9 @@ class Scan:
     def __post_init__(self) -> None:
         _check_kind(self.kind)
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
-        for name in ("sensor_points", "laser_points", "sensor_origin", "laser_origin"):
+        for name in _TENSORS[:4]:
             object.__setattr__(self, name, _float64_points(name, getattr(self, name), device))
-        for name in ("sensor_normals", "laser_normals"):
+        for name in _TENSORS[4:]:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _unit_normals(name, _float64_points(name, getattr(self, name), device)))
         if self.wall is not None and not isinstance(self.wall, Mapping):
@@ -322,14 +323,12 @@ class Scan:
         """
         if isinstance(device, torch.dtype):
             raise ShapeError(f"Scan.to: expected a device, got {device}; points are float64 throughout.")
-        names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
-        moved = {name: getattr(self, name).to(device) for name in names if getattr(self, name) is not None}
+        moved = {name: getattr(self, name).to(device) for name in _TENSORS if getattr(self, name) is not None}
         return replace(self, **moved)
 
     def detach(self) -> Self:
         """Return the scan without gradients in its points."""
-        names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
-        return replace(self, **{n: getattr(self, n).detach() for n in names if getattr(self, n) is not None})
+        return replace(self, **{n: getattr(self, n).detach() for n in _TENSORS if getattr(self, n) is not None})
 
     def single(self, laser: int | tuple[int, ...]) -> Scan:
         """Return the single scan of one spot of an exhaustive one.
@@ -364,13 +363,10 @@ class Scan:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Scan):
             return NotImplemented
-        return all(same(a, b) for a, b in zip(self._contents(), other._contents(), strict=True))
+        return all(same(a, b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
 
     def __hash__(self) -> int:
         return hash((self.kind, self.shape, self.first_and_last_leg))
-
-    def _contents(self) -> list[Any]:
-        return list(vars(self).values())
 
     def __repr__(self) -> str:
         points = self.sensor_points.detach().reshape(-1, 3)

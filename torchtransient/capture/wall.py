@@ -309,7 +309,7 @@ class Wall:
         distance, triangle = first_hits(places + above[:, None] * self.normal, -self.normal, corners)
         hit = triangle >= 0
         points = places + (above - np.where(hit, distance, 0.0))[:, None] * self.normal
-        normals = triangle_normals(corners)[triangle]
+        normals = _triangle_normals(corners)[triangle]
         back = hit & ((normals * self.normal).sum(1) <= 0)
         if back.any():
             raise SceneError(
@@ -506,12 +506,8 @@ class _Cells:
         return np.asarray(cells[..., 1] * self._count + cells[..., 0])
 
 
-def triangle_normals(corners: Array) -> Array:
-    """Return unit normals (F, 3) of triangles by the winding of their corners; zero for triangles without an area.
-
-    Args:
-        corners: (F, 3, 3).
-    """
+def _triangle_normals(corners: Array) -> Array:
+    """Return unit normals (F, 3) of triangles (F, 3, 3) by the winding of their corners, zero without an area."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.where(length > 0, length, 1.0))

@@ -8,32 +8,18 @@ from typing import Any
 
 import click
 
+from torchtransient.cli.arguments import NumberList
 from torchtransient.cli.options import film_of_options, load_scene, scene_options
 
 NOT_REACHED = 1
 
 
-class Counts(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
-    """Whole numbers with commas between them."""
-
-    name = "N,N,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        """Return the numbers of a text; anything else is a usage error."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            found = tuple(int(part) for part in value.split(","))
-        except ValueError:
-            found = ()
-        if not found or not all(1 <= number < 2**32 for number in found):
-            self.fail(f"expected whole numbers from 1 to 4294967295 such as 16,64,256, got '{value[:60]}'", param, ctx)
-        return found
-
-
 @click.command()
 @scene_options
-@click.option("--spp", type=Counts(), default="16,64,256", show_default=True, help="Samples per pixel to compare.")
+@click.option(
+    "--spp", type=NumberList(int, "N,N,..."), default="16,64,256", show_default=True,
+    help="Samples per pixel to compare.",
+)
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="Also the derivative by this parameter.")
 @click.option("--sampler", "samplers", multiple=True, default=("owen", "independent"), show_default=True)
 @click.option("--temporal-filter", "filters", multiple=True, type=click.Choice(["box", "tent", "gaussian"]))
@@ -52,14 +38,14 @@ def command(scene: Path, **options: Any) -> None:
     Options that may be given several times say what is compared. The exit status is 1 where --error is reached by no
     setting.
     """
-    from torchtransient.files.result_file import check_folder
+    from torchtransient.checks import check_folder
     from torchtransient.vis.files import check_picture
 
     film = film_of_options(options)
     if options["plot"]:
         check_picture(options["plot"])
     if options["json_path"]:
-        check_folder(options["json_path"])
+        check_folder(options["json_path"], "--json")
     described = load_scene(scene, options["variant"], options["params"])
     report = _measure(described, film, options)
     click.echo(report.table())

@@ -52,12 +52,12 @@ def command(scene: Path, **options: Any) -> None:
     import torch
 
     import torchtransient as tt
-    from torchtransient.files.capture_file import check_capture_target
+    from torchtransient.array_files.array_file import check_target
     from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
     beside = scene / f"{scene.resolve().name}.h5" if scene.is_dir() else scene.with_suffix(".h5")
-    target = check_capture_target(options["output"] or beside)
+    target = check_target(options["output"] or beside, "capture file")
     _check_pictures(options)
     part = _part(options, target)
     setup = tt.nlos.read_setup(scene, **assignments(options["params"], "--param"))

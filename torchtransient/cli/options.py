@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.chirps import Chirps
+from torchtransient.cli.arguments import combined
 from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.gates import gates_from_text
 from torchtransient.rendering.films import Beats, FilmLayout, Gates, Histogram, Phasors, Rates
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
     from torchtransient.scene.load import Scene
 
-Command = TypeVar("Command", bound=Callable[..., Any])
 # Options of each film, the first one its name in messages.
 OPTIONS: dict[type[FilmLayout], tuple[str, ...]] = {
     Histogram: ("--start-opl", "--bin-width-opl", "--num-bins"),
@@ -30,7 +30,7 @@ OPTIONS: dict[type[FilmLayout], tuple[str, ...]] = {
     Rates: ("--rates",),
     Beats: ("--chirps",),
 }
-PICTURES = ("overview", "peak_time", "rainbow", "video")
+_PICTURES = ("overview", "peak_time", "rainbow", "video")
 # Python of messages, and the options in its place.
 _WORDS = {
     "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
@@ -57,25 +57,6 @@ _RECONSTRUCTION = {
     "expected size= for a list of points": "expected --voxels for a list of points",
     "Crop the capture.": "Give --record.",
 }
-
-
-def scene_options(command: Command) -> Command:
-    """Add the scene file, and the options of how it is read and rendered, those of every film included.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.argument("scene", type=click.Path(path_type=Path)),
-        click.option("--variant", help="Mitsuba variant, such as llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb."),
-        click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of the scene file."),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same image."),
-        click.option("--max-depth", type=int, help="Longest path, in segments; -1 for no limit."),
-        film_options,
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
 
 
 def assignments(given: Sequence[str], option: str) -> dict[str, str]:
@@ -135,42 +116,36 @@ def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene
     values: dict[str, Any] = dict(assignments(params, "--param"))
     return tt.load(scene, variant=variant, **values)
 
-
-
 # ---------------------------------------------------------------------------------------------------------------- films
 
 
-def film_options(command: Command) -> Command:
-    """Add the options of all films to a command.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.option("--start-opl", type=float, help="Start of the time axis, metres of optical path."),
-        click.option("--bin-width-opl", type=float, help="Width of a bin, metres of optical path."),
-        click.option("--num-bins", type=int, help="Number of bins."),
-        click.option(
-            "--frequencies", metavar="NU,NU,...", help="Phasors at these cycles per metre instead of a transient."
-        ),
-        click.option(
-            "--gates", metavar="GATE;GATE;...", help="Gates as scene files write them, instead of a transient."
-        ),
-        click.option(
-            "--rates",
-            metavar="START:WIDTH:BINS",
-            help="Bins of the rate of path lengths, m/s, beside those of time, of a scene in which things move.",
-        ),
-        click.option(
-            "--chirps",
-            metavar="BANDWIDTH:DURATION:WAVELENGTH",
-            help="Beats of chirps (Hz, s, m; a window such as :blackman may follow) over the axis, instead of a "
-            "transient.",
-        ),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+film_options = combined(
+    click.option("--start-opl", type=float, help="Start of the time axis, metres of optical path."),
+    click.option("--bin-width-opl", type=float, help="Width of a bin, metres of optical path."),
+    click.option("--num-bins", type=int, help="Number of bins."),
+    click.option(
+        "--frequencies", metavar="NU,NU,...", help="Phasors at these cycles per metre instead of a transient."
+    ),
+    click.option("--gates", metavar="GATE;GATE;...", help="Gates as scene files write them, instead of a transient."),
+    click.option(
+        "--rates",
+        metavar="START:WIDTH:BINS",
+        help="Bins of the rate of path lengths, m/s, beside those of time, of a scene in which things move.",
+    ),
+    click.option(
+        "--chirps",
+        metavar="BANDWIDTH:DURATION:WAVELENGTH",
+        help="Beats of chirps (Hz, s, m; a window such as :blackman may follow) over the axis, instead of a transient.",
+    ),
+)
+scene_options = combined(
+    click.argument("scene", type=click.Path(path_type=Path)),
+    click.option("--variant", help="Mitsuba variant, such as llvm_ad_rgb, llvm_ad_mono, cuda_ad_rgb."),
+    click.option("--param", "params", multiple=True, metavar="NAME=VALUE", help="Fill $NAME of the scene file."),
+    click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same image."),
+    click.option("--max-depth", type=int, help="Longest path, in segments; -1 for no limit."),
+    film_options,
+)
 
 
 def film_of_options(options: Mapping[str, Any]) -> FilmLayout | None:
@@ -260,37 +235,21 @@ def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
     return f"{shape} {film.plural}", ""
 
 
-def pictures_of(film: FilmLayout) -> tuple[str, ...]:
-    """Return the pictures of ``torchtransient render`` that show a film.
-
-    Args:
-        film: of the render.
-    """
+def _pictures_of(film: FilmLayout) -> tuple[str, ...]:
+    """Return the pictures of ``torchtransient render`` that show a film."""
     if isinstance(film, Histogram | Rates):
-        return ("overview", "peak_time", "rainbow", "video")
+        return _PICTURES
     return ("video",) if isinstance(film, Phasors | Gates) else ()
 
 
-def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
-    """Write a video of a render and return its contents in words.
-
-    Args:
-        film: of the render.
-        output: the render.
-        path: place of the video.
-        progress: show a progress bar.
-
-    Raises:
-        ArgumentError: for films without a video.
-    """
+def _write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
+    """Write a video of a render and return its contents in words; other films were refused by `check_pictures`."""
     from torchtransient.vis.phasors import phasor_video
     from torchtransient.vis.videos import video
 
     if isinstance(film, Phasors):
         phasor_video(output, path, progress=progress)
         return "the wave of the first frequency"
-    if not isinstance(film, Histogram | Gates | Rates):
-        raise ArgumentError(f"--video shows nothing of {film.plural}; leave it out.")
     video(output, path, progress=progress)
     return f"{film.count} frames" + (", one for each gate" if isinstance(film, Gates) else "")
 
@@ -298,42 +257,20 @@ def write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -
 # ------------------------------------------------------------------------------------------------------------- pictures
 
 
-def video_options(command: Command) -> Command:
-    """Add the options of a video's frames.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.option("--fps", type=click.FloatRange(min=0, min_open=True), default=25.0, show_default=True),
-        click.option("--exposure", type=click.FloatRange(min=0, min_open=True), help="Factor.  [default: measured]"),
-        click.option(
-            "--curve", type=click.Choice(["srgb", "gamma", "log", "linear"]), default="srgb", show_default=True
-        ),
-        click.option("--accumulate", is_flag=True, help="Show the light that has arrived so far."),
-        click.option("--every", type=click.IntRange(min=1), default=1, show_default=True, help="Bins in a frame."),
-        click.option("--no-stamp", is_flag=True, help="No time under the frames."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def picture_options(command: Command) -> Command:
-    """Add the options of pictures that `render` writes beside the result.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png)."),
-        click.option("--video", type=click.Path(path_type=Path), help="Write the light in flight (.mp4 or .gif)."),
-        click.option("--peak-time", type=click.Path(path_type=Path), help="Write when most light arrives (.png)."),
-        click.option("--rainbow", type=click.Path(path_type=Path), help="Write time as hue (.png)."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+video_options = combined(
+    click.option("--fps", type=click.FloatRange(min=0, min_open=True), default=25.0, show_default=True),
+    click.option("--exposure", type=click.FloatRange(min=0, min_open=True), help="Factor.  [default: measured]"),
+    click.option("--curve", type=click.Choice(["srgb", "gamma", "log", "linear"]), default="srgb", show_default=True),
+    click.option("--accumulate", is_flag=True, help="Show the light that has arrived so far."),
+    click.option("--every", type=click.IntRange(min=1), default=1, show_default=True, help="Bins in a frame."),
+    click.option("--no-stamp", is_flag=True, help="No time under the frames."),
+)
+picture_options = combined(
+    click.option("--overview", type=click.Path(path_type=Path), help="Write a picture of the result too (.png)."),
+    click.option("--video", type=click.Path(path_type=Path), help="Write the light in flight (.mp4 or .gif)."),
+    click.option("--peak-time", type=click.Path(path_type=Path), help="Write when most light arrives (.png)."),
+    click.option("--rainbow", type=click.Path(path_type=Path), help="Write time as hue (.png)."),
+)
 
 
 def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
@@ -350,11 +287,11 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
     from torchtransient.vis.files import check_picture
     from torchtransient.vis.videos import check_video
 
-    for name in PICTURES:
+    for name in _PICTURES:
         if not options[name]:
             continue
         flag = f"--{name.replace('_', '-')}"
-        if film is not None and name not in pictures_of(film):
+        if film is not None and name not in _pictures_of(film):
             raise click.UsageError(f"{flag} shows a histogram over time; leave it out for {film.plural}.")
         if name == "video":
             check_video(options[name])
@@ -390,7 +327,7 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
         tt.vis.rainbow(output, options["rainbow"])
         click.echo(f"{options['rainbow']}: hue by arrival")
     if options["video"]:
-        shown = write_film_video(film, output, options["video"], progress=not options["quiet"])
+        shown = _write_film_video(film, output, options["video"], progress=not options["quiet"])
         click.echo(f"{options['video']}: {shown}")
 
 

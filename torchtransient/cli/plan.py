@@ -9,21 +9,11 @@ from typing import Any
 
 import click
 
+from torchtransient.cli.arguments import NameList
 from torchtransient.cli.options import film_of_options, load_scene, scene_options
 from torchtransient.rendering.films import layout_of_plugin
 from torchtransient.rendering.plan import Plan, known_outputs
 from torchtransient.scene.inventory import scene_inventory
-
-
-class Names(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
-    """Words with commas between them."""
-
-    name = "NAME,NAME,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Return the words of a text."""
-        return value if isinstance(value, tuple) else tuple(part.strip() for part in value.split(",") if part.strip())
-
 
 error_option = click.option(
     "--error",
@@ -36,7 +26,7 @@ error_option = click.option(
 @scene_options
 @click.option(
     "--outputs",
-    type=Names(),
+    type=NameList(),
     help=f"Some of {', '.join(known_outputs())}.  [default: that of the film of the options or the scene]",
 )
 @click.option("--gradient", "gradients", multiple=True, metavar="KEY", help="A parameter that gradients are asked for.")

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
+from torchtransient.cli.arguments import NumberList, combined
 from torchtransient.volume_methods import CAMERAS, FILTERS, METHODS, SETTINGS, SLAB_SNR, TARGETS
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 _XYZ = (float, float, float)
 _SIX = (float,) * 6
@@ -18,60 +16,23 @@ _SIX = (float,) * 6
 _OPEN = ("wall_size", "bin_width_s", "start_s", "sensor_origin", "laser_origin", "frame")
 
 
-class Numbers(click.ParamType):  # type: ignore[type-arg]  # a parameter of newer versions
-    """One to ``most`` numbers with commas between them."""
-
-    def __init__(self, kind: Callable[[str], Any], most: int, metavar: str) -> None:
-        self.kind, self.most, self.name = kind, most, metavar
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the numbers (...,) of a text."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            numbers = tuple(self.kind(part) for part in value.split(","))
-        except ValueError:
-            numbers = ()
-        if not 1 <= len(numbers) <= self.most or not all(number > 0 for number in numbers):
-            self.fail(f"expected {self.name}, greater than zero, got '{value}'", param, ctx)
-        return numbers
-
-
-def file_options(command: Command) -> Command:
-    """Add the options for values that a file of another program leaves open.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.option("--format", "layout", help="Layout of CAPTURE (docs/capture_files.md).  [default: found]"),
-        click.option("--wall-size", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the scanned area, metres."),
-        click.option("--bin-width-s", type=float, help="Seconds."),
-        click.option("--start-s", type=float, help="When the first bin begins, seconds."),
-        click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
-        click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
-        click.option("--frame", type=click.IntRange(min=0), help="Of a file with several."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def capture_options(command: Command) -> Command:
-    """Add the options of how a capture is prepared.
-
-    Args:
-        command: function of a command.
-    """
-    options = (
-        click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
-        click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
-        click.option("--slab", type=float, metavar="METRES", help="Take off a slab of foam so thick (confocal scans)."),
-        click.option("--slab-snr", type=float, help=f"Its light over noise, in power.  [default: {SLAB_SNR:g}]"),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+# Values that a file of another program leaves open.
+file_options = combined(
+    click.option("--format", "layout", help="Layout of CAPTURE (docs/capture_files.md).  [default: found]"),
+    click.option("--wall-size", type=NumberList(float, "WIDTH[,HEIGHT]", 2), help="Of the scanned area, metres."),
+    click.option("--bin-width-s", type=float, help="Seconds."),
+    click.option("--start-s", type=float, help="When the first bin begins, seconds."),
+    click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+    click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
+    click.option("--frame", type=click.IntRange(min=0), help="Of a file with several."),
+)
+# How a capture is prepared.
+capture_options = combined(
+    click.option("--record", type=(float, float), metavar="START END", help="Use these bins alone, metres."),
+    click.option("--sum-bins", type=click.IntRange(min=1), default=1, show_default=True, help="Add up so many."),
+    click.option("--slab", type=float, metavar="METRES", help="Take off a slab of foam so thick (confocal scans)."),
+    click.option("--slab-snr", type=float, help=f"Its light over noise, in power.  [default: {SLAB_SNR:g}]"),
+)
 
 
 @click.command()
@@ -89,9 +50,9 @@ def capture_options(command: Command) -> Command:
 @click.option("--method", type=click.Choice(tuple(METHODS)), help="[default: what suits the capture]")
 @click.option("--depths", type=(float, float), metavar="NEAR FAR", help="Before the wall, metres.  [default: all]")
 @click.option(
-    "--voxels", type=Numbers(int, 3, "N or X,Y[,Z]"), help="bp, fbp; Z of phasor.  [default: as the scan, 64]"
+    "--voxels", type=NumberList(int, "N or X,Y[,Z]", 3), help="bp, fbp; Z of phasor.  [default: as the scan, 64]"
 )
-@click.option("--extent", type=Numbers(float, 2, "WIDTH[,HEIGHT]"), help="Of the planes, metres (bp, fbp).")
+@click.option("--extent", type=NumberList(float, "WIDTH[,HEIGHT]", 2), help="Of the planes, metres (bp, fbp).")
 @click.option("--bounds", type=_SIX, metavar="X Y Z X Y Z", help="Lowest and highest corner of the voxels (bp, fbp).")
 @click.option(
     "--target", type=click.Choice(TARGETS), help="f-k and light-cone.  [default: diffuse]"
@@ -131,7 +92,7 @@ def command(capture: Path, **options: Any) -> None:
 
 def _run(capture: Path, options: dict[str, Any]) -> None:
     import torchtransient as tt
-    from torchtransient.files.volume_file import check_volume_target
+    from torchtransient.array_files.array_file import check_target
     from torchtransient.nlos.methods import Choice, choose_method
 
     told = {name: options[name] for name in _OPEN if options[name] is not None}
@@ -142,7 +103,8 @@ def _run(capture: Path, options: dict[str, Any]) -> None:
     choice = choose_method(measured) if method is None else Choice(method, "asked for")
     if not options["quiet"]:
         _tell(measured, choice)
-    target = check_volume_target(options["output"] or capture.with_name(f"{capture.stem}_{choice.name}.h5"))
+    beside = capture.with_name(f"{capture.stem}_{choice.name}.h5")
+    target = check_target(options["output"] or beside, "volume file")
     picture = _picture(options, target)
     prepared = _prepared(measured, options)
     settings: dict[str, Any] = {name: options[name] for name in SETTINGS}

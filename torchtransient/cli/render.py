@@ -57,7 +57,8 @@ def command(scene: Path, **options: Any) -> None:
     where options do not say otherwise; --bin-width-opl and --num-bins may be given alone then.
     torchtransient.files.result_file.read_result reads it.
     """
-    from torchtransient.files.result_file import check_target, write_result
+    from torchtransient.array_files.array_file import check_target
+    from torchtransient.files.result_file import write_result
 
     assignments(options["params"], "--param")
     _check_tolerance(options)
@@ -66,7 +67,7 @@ def command(scene: Path, **options: Any) -> None:
     film = None if options["planned"] else film_of_options(options)
     values = scene_values(options["values"], "--set")
     # What is wrong with the places to write to is said before the render, not after it.
-    target = check_target(options["output"] or scene.with_suffix(".h5"))
+    target = check_target(options["output"] or scene.with_suffix(".h5"), "result file")
     check_pictures(options, film)
     described = load_scene(scene, options["variant"], options["params"])
     if options["list_parameters"]:
@@ -150,11 +151,6 @@ def _render_to_tolerance(
             seed=options["seed"],
             progress=not options["quiet"],
         )
-
-
-def _power(output: Any) -> tuple[Any, Any]:
-    """Return transient and steady image without the components that describe the polarization."""
-    return (output.transient[0], output.steady[0]) if output.polarized else (output.transient, output.steady)
 
 
 def _report_energy(output: Any) -> None:

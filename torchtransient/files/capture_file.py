@@ -21,8 +21,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.array_files import array_file
-from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.array_files.array_file import (
+    array_of,
+    check_target,
+    damage_said,
+    read_arrays,
+    tensor_in,
+    write_arrays,
+)
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.capture import metadata_text
@@ -41,18 +47,6 @@ _ENTRIES = (
 _POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
 
 
-def check_capture_target(path: str | Path) -> Path:
-    """Return the path of a new capture after checking that it can be written, for before a long simulation.
-
-    Args:
-        path: place of the file.
-
-    Raises:
-        StorageError: as :func:`write_capture`.
-    """
-    return array_file.check_target(path, _WHAT)
-
-
 def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any] | None = None) -> Path:
     """Write a capture in the library's own format; an existing file is replaced once the new one is complete.
 
@@ -68,7 +62,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
         StorageError: for an unknown ending, a folder that is missing, a full disk, metadata or a wall that is not plain
             data.
     """
-    target = check_capture_target(path)
+    target = check_target(path, _WHAT)
     if not isinstance(capture, Capture):
         raise ArgumentError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
     metadata = {} if metadata is None else metadata

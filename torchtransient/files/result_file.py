@@ -24,8 +24,14 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from torchtransient.array_files import array_file
-from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.array_files.array_file import (
+    array_of,
+    check_target,
+    damage_said,
+    read_arrays,
+    tensor_in,
+    write_arrays,
+)
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture.capture import metadata_text
 from torchtransient.chirps import Chirps
@@ -86,35 +92,15 @@ class Result(ErrorBars, TensorRecord):
 
     @classmethod
     def merged_notes(cls, records: Sequence[Result]) -> dict[str, Any]:
-        """Return the metadata of a batch."""
+        """Return the metadata of a batch.
+
+        Args:
+            records: results of the batch.
+        """
         return {"metadata": {"batch": [record.metadata for record in records]}}
 
     def _shown_notes(self) -> dict[str, str]:
         return {"metadata": ", ".join(self.metadata)} if self.metadata else {}
-
-
-def check_target(path: str | Path) -> Path:
-    """Return the path of a new result after checking that it can be written, for before a long render.
-
-    Args:
-        path: place of the file.
-
-    Raises:
-        StorageError: as :func:`write_result`.
-    """
-    return array_file.check_target(path, _WHAT)
-
-
-def check_folder(path: str | Path) -> None:
-    """Check that the folder of a path can be written.
-
-    Args:
-        path: place of a file.
-
-    Raises:
-        StorageError: for a folder that is missing or closed, and for a path that is a folder itself.
-    """
-    array_file.check_folder(path, _WHAT)
 
 
 def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapping[str, Any] | None = None) -> Path:
@@ -131,7 +117,7 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
     Raises:
         StorageError: for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
     """
-    target = check_target(path)
+    target = check_target(path, _WHAT)
     given: Any = output
     if not isinstance(given, RenderOutput | Result):
         raise ArgumentError(

@@ -13,8 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from torchtransient.array_files import array_file
-from torchtransient.array_files.array_file import array_of, damage_said, read_arrays, tensor_in, write_arrays
+from torchtransient.array_files.array_file import (
+    array_of,
+    check_target,
+    damage_said,
+    read_arrays,
+    tensor_in,
+    write_arrays,
+)
 from torchtransient.capture.capture import metadata_text
 from torchtransient.errors import ArgumentError
 from torchtransient.files.plain_data import notes_of, text_of
@@ -25,18 +31,6 @@ FORMAT = "torchtransient volume 2"
 FORMATS = ("torchtransient volume 1", FORMAT)
 _WHAT = "volume file"
 _VECTORS = ("first", "along_x", "along_y", "normal")
-
-
-def check_volume_target(path: str | Path) -> Path:
-    """Return the path of a new volume after checking that it can be written, for before long computations.
-
-    Args:
-        path: place of the file.
-
-    Raises:
-        StorageError: as :func:`write_volume`.
-    """
-    return array_file.check_target(path, _WHAT)
 
 
 def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
@@ -52,7 +46,7 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
     Raises:
         StorageError: for an unknown ending, a folder that is missing, a full disk, and metadata that is not plain data.
     """
-    target = check_volume_target(path)
+    target = check_target(path, _WHAT)
     if not isinstance(volume, HiddenVolume):
         raise ArgumentError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
     note = metadata_text(volume.metadata, _WHAT)

@@ -66,6 +66,9 @@ def _text(source: str | Path, who: str) -> tuple[str, Path]:
 class Section:
     """Mapping whose entries are taken by name. Wrong entries raise a SceneError that names them.
 
+    Every method takes the name of an entry and the default for one that is missing or null, which is returned as it is;
+    without a default a missing entry is a SceneError.
+
     Args:
         data: the mapping.
         where: place in the file, for messages.
@@ -88,7 +91,7 @@ class Section:
         return self.data.get(name) is not None
 
     def get(self, name: str, default: Any = _MISSING) -> Any:
-        """Return an entry as it is, `default` if it is missing or null. Raises SceneError without a default."""
+        """Return an entry as it is."""
         value = self.data.get(name)
         if value is not None:
             return value
@@ -97,12 +100,12 @@ class Section:
         return default
 
     def number(self, name: str, default: Any = _MISSING) -> Any:
-        """Return a finite number; `default` as it is."""
+        """Return a finite number."""
         value = self.get(name, default)
         return value if name not in self else as_number(value, self._at(name))
 
     def whole(self, name: str, default: Any = _MISSING, least: int | None = 1) -> Any:
-        """Return a whole number, at least `least`; `default` as it is."""
+        """Return a whole number, at least ``least`` unless that is None."""
         value = self.get(name, default)
         if name not in self:
             return value
@@ -120,21 +123,21 @@ class Section:
         return value
 
     def text(self, name: str, default: Any = _MISSING) -> Any:
-        """Return a text; `default` as it is."""
+        """Return a text."""
         value = self.get(name, default)
         if name in self and not isinstance(value, str):
             raise SceneError(f"{self._at(name)}: expected a text, got {shown(value)}.")
         return value
 
     def choice(self, name: str, choices: Sequence[str], default: Any = _MISSING) -> Any:
-        """Return one of some texts."""
+        """Return one of the texts ``choices``."""
         value = self.get(name, default)
         if value not in choices:
             raise SceneError(f"{self._at(name)}: expected one of {some_of(choices)}, got {shown(value)}.")
         return value
 
     def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
-        """Return a list of finite numbers, as many as one of `counts`; `default` as it is."""
+        """Return a list of finite numbers, as many as one of ``counts``."""
         value = self.get(name, default)
         if name not in self:
             return value

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import as_number, is_one_of, numbers, shown
-from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.checks import as_number, shown
+from torchtransient.errors import UnitError
 from torchtransient.vis.files import figure_type
 
 if TYPE_CHECKING:
@@ -76,8 +76,8 @@ def cyclic(turns: Any, value: Any = 1.0) -> Array:
         turns: hue, of period 1; 0 is red.
         value: brightness from 0, black, to 1.
     """
-    turn = np.mod(np.nan_to_num(numbers("cyclic: turns", turns)), 1.0)
-    level = np.clip(np.nan_to_num(numbers("cyclic: value", value)), 0, 1)
+    turn = np.mod(np.nan_to_num(np.asarray(turns, dtype=np.float64)), 1.0)
+    level = np.clip(np.nan_to_num(np.asarray(value, dtype=np.float64)), 0, 1)
     return oklch(0.75 * level, 0.125 * level, _FIRST_HUE + 360.0 * turn)
 
 
@@ -87,12 +87,7 @@ def cyclic_map(kind: str = "even") -> ListedColormap:
     Args:
         kind: "even" for :func:`cyclic`, or "hsv" for the hue circle of HSV, which papers on polarization often use: its
             yellow and cyan are lighter than its blue.
-
-    Raises:
-        ArgumentError: for another kind.
     """
-    if not is_one_of(kind, CYCLES):
-        raise ArgumentError(f"cyclic_map: expected a kind out of {', '.join(CYCLES)}, got {shown(kind)}.")
     figure_type()  # says so where matplotlib is missing
     import matplotlib
     from matplotlib.colors import ListedColormap
@@ -100,14 +95,6 @@ def cyclic_map(kind: str = "even") -> ListedColormap:
     turns = np.mod((np.arange(256) + 0.5) / 256 - 0.5, 1.0)
     colours = matplotlib.colormaps["hsv"](turns) if kind == "hsv" else cyclic(turns)
     return ListedColormap(colours.tolist(), name=f"cyclic, {kind}")
-
-
-def rainbow_map() -> ListedColormap:
-    """`rainbow` as a matplotlib colour map, for colour bars."""
-    figure_type()
-    from matplotlib.colors import ListedColormap
-
-    return ListedColormap(rainbow(np.linspace(0, 1, 256)).tolist(), name="equal lightness, red to violet")
 
 
 def symmetric_limit(values: Any, percentile: float = 99.0) -> float:

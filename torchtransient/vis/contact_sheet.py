@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import count, mapping, numbers, of_class, several, shown
 from torchtransient.errors import ShapeError
 from torchtransient.vis.files import figure_type, save_figure
 
@@ -35,30 +34,19 @@ class Cell:
     images: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     curve: NDArray[Any] | None = None
 
-    def __post_init__(self) -> None:
-        of_class("Cell: title", self.title, str)
-        for name, image in mapping("Cell: images", self.images, "{name: image}").items():
-            size = _plain_size(image)
-            if len(size) != 2 and (len(size) != 3 or size[2] != 3):
-                raise ShapeError(f"Cell: expected the image {name!r} as (H, W, 3) or (H, W), got {shown(image)}.")
-        if self.curve is not None and numbers("Cell: curve", self.curve).ndim != 1:
-            raise ShapeError(f"Cell: expected curve as (T,), got {shown(self.curve)}.")
-
 
 def contact_sheet(
     cells: Sequence[Cell],
     path: str | Path | None = None,
     *,
-    columns: int | None = None,
     times: NDArray[Any] | None = None,
     title: str = "",
 ) -> Figure:
-    """Draw samples beside each other.
+    """Draw samples beside each other, in a sheet about as high as wide.
 
     Args:
         cells: the samples, all with the same images.
         path: file to write the figure to.
-        columns: samples in a row; None for a sheet about as high as wide.
         times: (T + 1,) edges of the bins of the curves, metres of optical path.
         title: text above the sheet.
 
@@ -66,25 +54,21 @@ def contact_sheet(
         The matplotlib figure.
 
     Raises:
-        ShapeError: without samples, for different images, and times that do not fit.
+        ShapeError: without samples, and for different images.
         StorageError: when the figure cannot be written.
     """
-    cells = several("contact_sheet", cells, "samples, each a Cell", Cell)
     if not cells:
         raise ShapeError("contact_sheet: expected at least one sample, got none.")
     names = list(cells[0].images)
-    for cell_ in cells:
-        if set(cell_.images) != set(names):
+    for each in cells:
+        if set(each.images) != set(names):
             raise ShapeError(
                 f"contact_sheet: expected the images {', '.join(names) or 'none'} of every sample, as the first has "
-                f"them, got {', '.join(cell_.images) or 'none'}."
+                f"them, got {', '.join(each.images) or 'none'}."
             )
-    times = _checked_times(times, cells)
     curves = any(cell.curve is not None for cell in cells)
     cell = (len(names) * _PICTURE + 0.15, _PICTURE + _TITLE + (_CURVE if curves else 0.0))
-    # About as high as it is wide.
-    given = None if columns is None else count("contact_sheet: columns", columns, 1, ShapeError)
-    across = given or max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))
+    across = max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))
     down = -(-len(cells) // across)
     width, height = across * cell[0], down * cell[1]
     top = 0.2 if title else 0.0
@@ -113,23 +97,6 @@ def contact_sheet(
     if title:
         figure.text(0.01, 1 - 0.05 / (height + top + 0.3), title, fontsize=7, va="top")
     return save_figure(figure, path, "contact_sheet", dpi=160)
-
-
-def _checked_times(times: Any, cells: Sequence[Cell]) -> NDArray[np.float64] | None:
-    if times is None:
-        return None
-    edges = numbers("contact_sheet: times", times)
-    bins = {len(cell.curve) for cell in cells if cell.curve is not None}
-    if edges.ndim != 1 or len(edges) < 2 or any(len(edges) != count + 1 for count in bins):
-        wanted = " and ".join(str(count) for count in sorted(bins)) or "some"
-        raise ShapeError(f"contact_sheet: expected times as the edges of {wanted} bins, got {shown(times)}.")
-    return edges
-
-
-def _plain_size(image: Any) -> tuple[int, ...]:
-    """Return the shape of an image; (0,) for anything but an array of numbers."""
-    plain = np.asarray(image) if hasattr(image, "__array__") else np.asarray(None)
-    return plain.shape if plain.dtype.kind in "biuf" else (0,)
 
 
 def _cut(title: str, pictures: int) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.array_files.part_files import replacing
-from torchtransient.checks import check_folder, count, short_message
-from torchtransient.errors import MissingPackageError, ShapeError, StorageError
+from torchtransient.checks import check_folder, short_message
+from torchtransient.errors import MissingPackageError, StorageError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,12 +43,9 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
     """
     if path is None:
         return image
-    try:
-        from PIL import Image as Pillow
-    except ImportError as error:
-        raise missing("pillow") from error
+    images = pillow()
     with _place_of(path, who) as (unfinished, ending):
-        Pillow.fromarray(image).save(unfinished, format=Pillow.registered_extensions().get(f".{ending}", ending))
+        images.fromarray(image).save(unfinished, format=images.registered_extensions().get(f".{ending}", ending))
     return image
 
 
@@ -115,12 +112,11 @@ def to_palette(path: str | Path) -> None:
     Args:
         path: the file; of other kinds it is left as it is.
     """
-    from PIL import Image as Pillow
-
     if Path(path).suffix != ".png":
         return
-    picture = Pillow.open(path).convert("RGB")
-    few = picture.quantize(256, Pillow.Quantize.MAXCOVERAGE, kmeans=2, dither=Pillow.Dither.NONE)
+    images = pillow()
+    picture = images.open(path).convert("RGB")
+    few = picture.quantize(256, images.Quantize.MAXCOVERAGE, kmeans=2, dither=images.Dither.NONE)
     few.save(path, optimize=True)
 
 
@@ -159,17 +155,41 @@ def enlarge(image: Image, factor: int) -> Image:
 
     Args:
         image: (H, W, 3) uint8.
-        factor: side of the square.
-
-    Raises:
-        ShapeError: unless the factor is a whole number of at least 1.
+        factor: side of the square, at least 1.
     """
-    factor = count("picture: scale", factor, 1, ShapeError)
     return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
+def pillow() -> Any:
+    """Return the module PIL.Image. Raises MissingPackageError without Pillow."""
+    try:
+        import PIL.Image
+    except ImportError as error:
+        raise missing("pillow") from error
+    return PIL.Image
+
+
+def grey_where_broken(name: str) -> Any:
+    """Return a colour map of matplotlib whose colour for NaN is grey.
+
+    Args:
+        name: name of the map.
+
+    Raises:
+        MissingPackageError: without matplotlib.
+    """
+    figure_type()
+    import matplotlib
+
+    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))
+
+
 def missing(package: str) -> MissingPackageError:
-    """Return the error for a package that pictures need."""
+    """Return the error of pictures without a package.
+
+    Args:
+        package: to install.
+    """
     return MissingPackageError(
         f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 from torchtransient.array_files.part_files import replacing
 from torchtransient.checks import check_folder
-from torchtransient.vis.files import Image, missing
+from torchtransient.vis.files import Image, pillow
 
 # Points that are drawn of a curve.
 _MOST_POINTS = 1000
@@ -107,18 +107,9 @@ def _number(value: float) -> float | None:
 
 
 def _picture(picture: Picture) -> dict[str, str]:
-    return {"title": picture.title, "png": base64.b64encode(png_of(picture.image)).decode()}
-
-
-def png_of(image: Image) -> bytes:
-    """Return an RGB image (H, W, 3) uint8 as the bytes of a PNG file."""
-    try:
-        from PIL import Image as Pillow
-    except ImportError as error:
-        raise missing("pillow") from error
     written = io.BytesIO()
-    Pillow.fromarray(image).save(written, format="PNG")
-    return written.getvalue()
+    pillow().fromarray(picture.image).save(written, format="PNG")
+    return {"title": picture.title, "png": base64.b64encode(written.getvalue()).decode()}
 
 
 _PAGE = """<!DOCTYPE html>

@@ -17,7 +17,7 @@ from torchtransient.checks import Numbers, as_whole, count, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
-from torchtransient.vis.files import enlarge, figure_type, picture_figure, save_figure, to_bytes
+from torchtransient.vis.files import enlarge, grey_where_broken, picture_figure, save_figure, to_bytes
 from torchtransient.vis.sources import Source, frequencies_of, phasor_of
 from torchtransient.vis.videos import Frames, check_video, with_strip, write_video
 
@@ -116,7 +116,7 @@ def phasor_video(
     steps = count("phasor_video: steps", steps, 1, ShapeError)
     values = np.nan_to_num(images[chosen].numpy(), posinf=0.0, neginf=0.0)
     limit = colour_maps.symmetric_limit(np.abs(values))
-    colours = _colours("RdBu_r")
+    colours = grey_where_broken("RdBu_r")
     factor = max(1, round(320 / max(values.shape))) if scale is None else scale
     factor = count("phasor_video: scale", factor, 1, ShapeError)
     label = _label(chosen, frequencies, "real")
@@ -129,14 +129,8 @@ def phasor_video(
     return write_video(path, Frames(steps, make), steps, fps=fps, progress=progress)
 
 
-def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.float64]:
-    """Return RGB (..., 3) in [0, 1] of complex values: hue by phase, red at 0, brightness by the root of the amplitude.
-
-    Args:
-        values: complex numbers of any shape; grey where they are not finite.
-        percentile: percentile of the amplitudes that is fully bright.
-    """
-    values = _plain(values)
+def _domain_colours(values: NDArray[Any], percentile: float) -> NDArray[np.float64]:
+    """Return RGB (..., 3) in [0, 1]: hue by phase, red at 0, brightness by the root of the amplitude."""
     finite = np.isfinite(values)
     safe = np.where(finite, values, 0)
     amplitude = np.abs(safe)
@@ -146,17 +140,6 @@ def domain_colors(values: NDArray[Any], percentile: float = 99.0) -> NDArray[np.
     return image
 
 
-def _plain(values: Any) -> NDArray[Any]:
-    """Return real or complex numbers as an array."""
-    try:
-        plain = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
-    except ValueError:  # rows of different lengths
-        plain = np.asarray(None)
-    if plain.dtype.kind not in "biufc":
-        raise ShapeError(f"domain_colors: expected complex numbers, got {shown(values)}.")
-    return plain
-
-
 def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: float) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -164,11 +147,12 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: 
     if name in ("real", "imaginary"):
         part = np.real(values) if name == "real" else np.imag(values)
         limit = colour_maps.symmetric_limit(part, percentile)
-        image = panel.imshow(part, cmap=_colours("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
+        image = panel.imshow(part, cmap=grey_where_broken("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
         figure.colorbar(image, ax=panel, shrink=0.8)
     elif name == "amplitude":
         top = colour_maps.symmetric_limit(np.abs(values), percentile)
-        image = panel.imshow(np.abs(values), cmap=_colours("inferno"), vmin=0, vmax=top, interpolation="nearest")
+        colours = grey_where_broken("inferno")
+        image = panel.imshow(np.abs(values), cmap=colours, vmin=0, vmax=top, interpolation="nearest")
         figure.colorbar(image, ax=panel, shrink=0.8)
     else:
         level: Any = colour_maps.cyclic(np.angle(values) / (2 * math.pi))
@@ -176,7 +160,7 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: 
             # What is as good as dark has no phase.
             amplitude = np.where(np.isfinite(values), np.abs(values), 0)
             level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude, percentile)] = 0.5
-        panel.imshow(level if name == "phase" else domain_colors(values, percentile), interpolation="nearest")
+        panel.imshow(level if name == "phase" else _domain_colours(values, percentile), interpolation="nearest")
         bar = figure.colorbar(
             ScalarMappable(Normalize(-1, 1), colour_maps.cyclic_map()), ax=panel, shrink=0.8, label="phase"
         )
@@ -207,10 +191,3 @@ def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
     hertz = abs(nu) * SPEED_OF_LIGHT
     unit, size = next(pair for pair in _UNITS if hertz >= pair[1] or pair[1] == 1)
     return f"{name}, wavelength {1 / nu:.3g} m ({hertz / size:.3g} {unit})"
-
-
-def _colours(name: str) -> Any:
-    figure_type()
-    import matplotlib
-
-    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))

@@ -14,13 +14,13 @@ from torch import Tensor
 
 from torchtransient import checks
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_number, is_one_of, of_class, several, shown
+from torchtransient.checks import as_number, is_one_of, of_class, positive, several, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, figure_type, picture_figure, save_figure, save_image, to_bytes
-from torchtransient.vis.sources import Source, as_tensor, axis_of, images_of, pixel_of, real_tensor, transient_of
-from torchtransient.vis.tone_mapping import BROKEN, checked_positive, exposure_of, tone_map
+from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of, real_tensor, transient_of
+from torchtransient.vis.tone_mapping import BROKEN, exposure_of, tone_map
 from torchtransient.vis.videos import moment
 
 if TYPE_CHECKING:
@@ -32,19 +32,11 @@ _ROWS_AT_ONCE = 32
 # ------------------------------------------------------------------------------------------- when light arrives
 
 
-def light_curve(transient: Tensor) -> Tensor:
+def _light_curve(transient: Tensor) -> Tensor:
     """Return the share of a pixel's light that arrives in each bin, averaged over the pixels that see light.
 
-    Args:
-        transient: (C, T, H, W), C = 1 or 3.
-
-    Returns:
-        (T,) float64, which sums to 1; 0 without light.
-
-    Raises:
-        ShapeError: for another shape.
+    (T,) float64 of light (C, T, H, W); sums to 1, 0 without light.
     """
-    transient = _checked(transient, "light_curve")
     total = torch.zeros(transient.shape[1], dtype=torch.float64, device=transient.device)
     lit = 0
     for part in _row_bands(transient):
@@ -78,17 +70,12 @@ def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
     return torch.cat(rows)
 
 
-def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5, 0.9)) -> list[int]:
-    """Return the bins by which shares of the :func:`light_curve` have arrived, different ones if they can be.
+def _moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5, 0.9)) -> list[int]:
+    """Return the bins by which rising shares of the light have arrived, different ones if they can be.
 
-    Args:
-        transient: (C, T, H, W), C = 1 or 3.
-        shares: shares of the light, rising; without any light, of the bins.
-
-    Raises:
-        ShapeError: for another shape.
+    Without any light, shares of the bins.
     """
-    arrived = light_curve(transient).cumsum(0)
+    arrived = _light_curve(transient).cumsum(0)
     bins = arrived.numel()
     if not float(arrived[-1]) > 0:
         return [int(share * (bins - 1)) for share in shares]
@@ -100,18 +87,9 @@ def moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5,
     return found
 
 
-def median_pixel(steady: Tensor) -> tuple[int, int]:
+def _median_pixel(steady: Tensor) -> tuple[int, int]:
     """Return (row, column) of the pixel of median brightness among those that see light: neither the lamp nor darkness.
-
-    Args:
-        steady: (C, H, W).
-
-    Raises:
-        ShapeError: for another shape.
     """
-    steady = real_tensor(steady, "median_pixel")
-    if steady.ndim != 3 or steady.numel() == 0:
-        raise ShapeError(f"median_pixel: expected a steady image (C, H, W), got {tuple(steady.shape)}.")
     brightness = steady.sum(0).flatten()
     order = brightness.argsort(stable=True)
     order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
@@ -125,18 +103,13 @@ def _row_bands(transient: Tensor) -> Iterator[Tensor]:
         yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
 
 
-def _checked(given: Any, who: str) -> Tensor:
+def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
     transient = real_tensor(given, who)
     if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.numel() == 0:
         raise ShapeError(
             f"{who}: expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, "
             "choose one."
         )
-    return transient
-
-
-def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
-    transient = _checked(given, who)
     if transient.shape[1] != of_class(f"{who}: axis", axis, TimeAxis).num_bins:
         raise ShapeError(
             f"{who}: expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."
@@ -196,8 +169,8 @@ def plot_overview(
             raise ShapeError(
                 f"plot_overview: expected errors of shape {tuple(transient.shape[1:])}, got {tuple(errors.shape)}."
             )
-    row, column = pixel_of(median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
-    overview = Overview(tuple(moments_of_arrival(transient)), (row, column))
+    row, column = pixel_of(_median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
+    overview = Overview(tuple(_moments_of_arrival(transient)), (row, column))
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False).flat
     panels = upper.subplots(1, 3)
@@ -277,7 +250,11 @@ def peak_time_picture(
         StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "peak_time_picture")
-    axis = axis_of(cube, axis, "peak_time_picture")
+    if axis is None:
+        raise ShapeError(
+            f"peak_time_picture: a transient of {cube.shape[1]} bins without an axis has no times. Give "
+            "axis=TimeAxis(...), or a RenderOutput, which knows its own."
+        )
     peaks = peak_time(torch.nan_to_num(cube, posinf=0.0, neginf=0.0), axis).numpy()
     low, high = _limits(peaks, axis, limits)
     figure, (panel,) = picture_figure(peaks.shape[0], peaks.shape[1], side=5.0)
@@ -287,7 +264,7 @@ def peak_time_picture(
     panel.set_yticks([])
     image = panel.imshow(peaks, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
     panel.set_title(title or "arrival of the peak", fontsize=10)
-    bar_in_metres_and_nanoseconds(figure, image, panel, low, high)
+    _bar_in_metres_and_nanoseconds(figure, image, panel, low, high)
     return save_figure(figure, path, "peak_time_picture")
 
 
@@ -308,7 +285,7 @@ def rainbow(
         path: file to write the image to.
         style: "peak" gives every pixel the hue of its :func:`peak_time`; "fusion" adds up the light of all bins, each
             in its own hue, so that early and late light mix as coloured lamps do.
-        limits: lengths over which hues run once, metres; None for 1 % to 99 % of the :func:`light_curve`.
+        limits: lengths over which hues run once, metres; None for where 1 % to 99 % of the light arrives.
         period_opl: metres after which hues repeat, which draws lines of equal time.
         exposure: factor of the sum over channels before the sRGB curve; None makes 5 % of the pixels white.
 
@@ -339,7 +316,7 @@ def rainbow(
     return save_image(to_bytes(colours), path, "rainbow")
 
 
-def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: float, high: float) -> None:
+def _bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: float, high: float) -> None:
     """Draw a colour bar with metres on its right and nanoseconds on its left."""
     bar = figure.colorbar(image, ax=panel, shrink=0.85, pad=0.2)
     bar.set_label("optical path length (m)")
@@ -356,7 +333,7 @@ def bar_in_metres_and_nanoseconds(figure: Any, image: Any, panel: Any, low: floa
 def _hue(opl: NDArray[np.float64], low: float, high: float, period: float | None) -> NDArray[np.float64]:
     if period is None:
         return np.asarray((opl - low) / (high - low))
-    period = checked_positive("period_opl", period, "rainbow")
+    period = positive("rainbow: period_opl", period)
     return np.asarray(np.mod((opl - low) / period, 1.0))
 
 
@@ -385,7 +362,7 @@ def _limits(peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, flo
 
 
 def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
-    arrived = light_curve(cube).cumsum(0)
+    arrived = _light_curve(cube).cumsum(0)
     if not float(arrived[-1]) > 0:
         return axis.start_opl, axis.end_opl
     edges = torch.searchsorted(arrived / arrived[-1], torch.tensor([0.01, 0.99], dtype=torch.float64))
@@ -509,7 +486,7 @@ def frame_grid(
     )
     if bins is None:
         shares = tuple(float(s) for s in (np.arange(number) + 0.5) / number)
-        bins = moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
+        bins = _moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
     bins = several("frame_grid: bins", bins, "numbers of bins")
     if not bins:
         raise ShapeError("frame_grid: expected some bins, got none.")
@@ -645,7 +622,7 @@ def gradient_picture(
     if limit is None:
         limit = colour_maps.symmetric_limit(images, percentile)
     else:
-        limit = checked_positive("limit", limit, "gradient_picture")
+        limit = positive("gradient_picture: limit", limit)
     figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
     import matplotlib
 

@@ -92,7 +92,7 @@ def polarization_picture(
     for panel, name in zip(panels, quantities, strict=False):
         panel.set_title(_TITLES[name], fontsize=10)
         if name == "intensity":
-            panel.imshow(tone_map(_shown_intensity(vectors[0], broken)).numpy(), interpolation="nearest")
+            panel.imshow(tone_map(torch.where(broken, torch.nan, vectors[0])).numpy(), interpolation="nearest")
         elif name == "aolp":
             _draw_angle(figure, panel, total, dark, angle_map)
         else:
@@ -102,14 +102,8 @@ def polarization_picture(
     return save_figure(figure, path, "polarization_picture")
 
 
-def angle_image(stokes: Tensor, dark: NDArray[np.bool_], angle_map: str = "even") -> NDArray[np.float64]:
-    """Return RGB (H, W, 3) in [0, 1]: hue by the angle of linear polarization, colourful by its degree.
-
-    Args:
-        stokes: (4, H, W).
-        dark: (H, W), pixels that are grey.
-        angle_map: "even" goes from grey to a hue of the same lightness; "hsv" is the hue circle of HSV.
-    """
+def _angle_image(stokes: Tensor, dark: NDArray[np.bool_], angle_map: str) -> NDArray[np.float64]:
+    """Return RGB (H, W, 3) in [0, 1] of Stokes vectors (4, H, W): hue by the angle, colourful by the degree."""
     turns = st.angle_of_linear_polarization(stokes, 0).numpy() / math.pi
     degree = np.clip(st.degree_of_linear_polarization(stokes, 0).numpy(), 0, 1)
     # Half polarized light is already half as colourful; the root lets weak polarization be seen.
@@ -129,7 +123,7 @@ def _draw_angle(figure: Any, panel: Any, total: Tensor, dark: NDArray[np.bool_],
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    panel.imshow(angle_image(total, dark, angle_map), interpolation="nearest")
+    panel.imshow(_angle_image(total, dark, angle_map), interpolation="nearest")
     colours = ScalarMappable(Normalize(-90, 90), colour_maps.cyclic_map(angle_map))
     bar = figure.colorbar(colours, ax=panel, shrink=0.8, label="degrees")
     bar.set_ticks([-90, -45, 0, 45, 90])
@@ -151,7 +145,3 @@ def _draw_scalar(figure: Any, panel: Any, name: str, total: Tensor, dark: NDArra
     seen = np.where(dark, np.nan, values) if name in ("dop", "dolp", "docp") else values
     image = panel.imshow(seen, cmap=colour_map, vmin=low, vmax=high, interpolation="nearest")
     figure.colorbar(image, ax=panel, shrink=0.8)
-
-
-def _shown_intensity(intensity: Tensor, broken: Tensor) -> Tensor:
-    return torch.where(broken, torch.nan, intensity)

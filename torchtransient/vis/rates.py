@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 
 from torchtransient.axes import RateAxis, TimeAxis
-from torchtransient.checks import of_class
+from torchtransient.checks import of_class, positive
 from torchtransient.errors import ShapeError
-from torchtransient.vis.files import figure_type, save_figure
+from torchtransient.vis.files import figure_type, grey_where_broken, save_figure
 from torchtransient.vis.sources import Source, as_tensor, pixel_of, read_rates
-from torchtransient.vis.tone_mapping import checked_positive
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,7 +51,7 @@ def range_doppler(
     """
     me = "range_doppler"
     light, axis, rate_axis = _rates_of(source, axis, rate_axis, me)
-    decades = checked_positive("decades", decades, me)
+    decades = positive(f"{me}: decades", decades)
     if axis is None:
         raise ShapeError(f"{me}: light over {light.shape[1]} bins of length needs axis=TimeAxis(...) to be drawn.")
     if pixel is None:
@@ -68,13 +67,16 @@ def range_doppler(
     top = float(known.max()) if known.size and known.max() > 0 else 1.0
     floor = top * 10.0**-decades
     image = panel.imshow(
-        np.maximum(shared, floor).T, cmap=_colours("magma"), norm=LogNorm(floor, top), aspect="auto", origin="lower",
-        interpolation="nearest", extent=(rate_axis.start, rate_axis.end, axis.start_opl, axis.end_opl),
+        np.maximum(shared, floor).T, cmap=grey_where_broken("magma"), norm=LogNorm(floor, top), aspect="auto",
+        origin="lower", interpolation="nearest",
+        extent=(rate_axis.start, rate_axis.end, axis.start_opl, axis.end_opl),
     )  # fmt: skip
     panel.set_xlabel("rate of the optical path length (m/s)")
     panel.set_ylabel("optical path length (m)")
-    panel.secondary_xaxis("top", functions=(_to_approach, _to_rate)).set_xlabel("speed of approach (m/s)")
-    panel.secondary_yaxis("right", functions=(_to_distance, _to_length)).set_ylabel("distance (m)")
+    approach = (lambda rate: -np.asarray(rate) / 2, lambda speed: -2 * np.asarray(speed))
+    panel.secondary_xaxis("top", functions=approach).set_xlabel("speed of approach (m/s)")
+    distance = (lambda opl: np.asarray(opl) / 2, lambda far: 2 * np.asarray(far))
+    panel.secondary_yaxis("right", functions=distance).set_ylabel("distance (m)")
     figure.colorbar(image, ax=panel, shrink=0.85, pad=0.02, label="light in a bin")
     if title:
         figure.suptitle(title, fontsize=11)
@@ -115,26 +117,3 @@ def _rates_of(
             f"{tuple(light.shape)}."
         )
     return light.double().sum(0), axis, rate_axis
-
-
-def _colours(name: str) -> Any:
-    figure_type()
-    import matplotlib
-
-    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))
-
-
-def _to_approach(rate: Any) -> Any:
-    return -np.asarray(rate) / 2
-
-
-def _to_rate(approach: Any) -> Any:
-    return -2 * np.asarray(approach)
-
-
-def _to_distance(opl: Any) -> Any:
-    return np.asarray(opl) / 2
-
-
-def _to_length(distance: Any) -> Any:
-    return 2 * np.asarray(distance)

@@ -117,25 +117,6 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
     return cube, axis
 
 
-def axis_of(cube: Tensor, axis: TimeAxis | None, who: str) -> TimeAxis:
-    """Return the axis of a picture that shows lengths in metres.
-
-    Args:
-        cube: the transient.
-        axis: its axis, if it is known.
-        who: beginning of messages.
-
-    Raises:
-        ShapeError: without an axis.
-    """
-    if axis is None:
-        raise ShapeError(
-            f"{who}: a transient of {cube.shape[1]} bins without an axis has no times. Give axis=TimeAxis(...), or a "
-            "RenderOutput, which knows its own."
-        )
-    return axis
-
-
 def steady_of(source: Source, who: str = "picture") -> Tensor:
     """Return an intensity (C, H, W), C = 1 or 3.
 
@@ -255,7 +236,16 @@ def given_tensor(value: Any, who: str, expected: str = "a tensor or an array") -
 
 
 def real_tensor(value: Any, who: str) -> Tensor:
-    """Return a tensor as :func:`given_tensor`. Raises ShapeError for complex numbers, too."""
+    """Return a tensor as :func:`given_tensor`.
+
+    Args:
+        value: tensor or array.
+        who: beginning of messages.
+
+    Raises:
+        ArgumentError: for anything else.
+        ShapeError: for arrays of other things than numbers, and for complex numbers.
+    """
     tensor = given_tensor(value, who)
     if tensor.is_complex():
         raise ShapeError(f"{who}: expected real numbers, got {tensor.dtype}.")
@@ -263,7 +253,15 @@ def real_tensor(value: Any, who: str) -> Tensor:
 
 
 def as_tensor(value: Any, who: str) -> Tensor:
-    """Return a tensor or array on the CPU without gradients; 16 bit become float32. Errors as `given_tensor`."""
+    """Return numbers on the CPU without gradients; whole numbers and 16 bits become float32.
+
+    Args:
+        value: tensor or array.
+        who: beginning of messages.
+
+    Raises:
+        ArgumentError, ShapeError: as :func:`given_tensor`.
+    """
     tensor = given_tensor(value, who, "a tensor, an array, a RenderOutput or the path of a result").detach().cpu()
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
         return tensor
@@ -390,7 +388,11 @@ def _light_of(capture: Any, who: str) -> tuple[Tensor, TimeAxis]:
 
 
 def middle_spot(scan: Scan) -> tuple[int, ...]:
-    """Return the index of the laser spot in the middle of an exhaustive scan."""
+    """Return the index of the laser spot in the middle of a scan.
+
+    Args:
+        scan: an exhaustive one.
+    """
     return tuple(n // 2 for n in scan.laser_shape)
 
 
@@ -418,7 +420,14 @@ def _axis_in(values: Mapping[str, Any]) -> TimeAxis | None:
 
 
 def read_rates(path: Path) -> Any:
-    """Return light by rates of a file: an object with `rates`, `axis` and `rate_axis`. Errors as `read_file`."""
+    """Return light by rates of a file: an object with `rates`, `axis` and `rate_axis`.
+
+    Args:
+        path: a result, .h5 or .npz.
+
+    Raises:
+        StorageError: as :func:`read_file`, and for files of other films.
+    """
     if path.suffix.lower() not in (*_HDF5, ".npz"):
         raise StorageError(f"picture: expected a result, .h5 or .npz, got '{path}'.")
     names = ("rates_start", "rates_bin_width", "rates_num_bins")

@@ -8,12 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import as_number, is_one_of, shown
+from torchtransient.checks import as_number, is_one_of, positive, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.vis.sources import real_tensor
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
 CURVES = ("srgb", "gamma", "log", "linear")
+# Share of the lit pixels of a video that are white.
+_WHITE = 0.01
 _FRAMES_AT_ONCE = 16
 _LOG_STEPS = 4096
 
@@ -33,44 +35,35 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
         UnitError: for another quantile.
     """
     image = _checked(image, "exposure_of")
-    quantile = _quantile(quantile, "exposure_of")
+    share = as_number(quantile)
+    if share is None or not 0 < share <= 1:
+        raise UnitError(f"exposure_of: expected 0 < quantile <= 1, got {shown(quantile)}.")
     brightest = image.amax(0).flatten().to(torch.float64)
     brightest = brightest[torch.isfinite(brightest)]
     if not bool((brightest > 0).any()):
         return 1.0
     lit = brightest.sort().values
-    white = lit[min(lit.numel() - 1, int(quantile * lit.numel()))].item()
+    white = lit[min(lit.numel() - 1, int(share * lit.numel()))].item()
     # A picture with a few bright pixels only: show those.
     return 1.0 / (white if white > 0 else lit[-1].item())
 
 
-def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
-    """Return one factor for all frames, which brings a quantile of the *lit* pixels of all frames to white.
+def exposure_of_video(transient: Tensor) -> float:
+    """Return one factor for all frames, which leaves 1 % of the *lit* pixels of all frames white.
 
-    Most pixels of most frames are black. The quantile is found to half a hundredth of its value over nine decades below
-    the maximum, without memory of the size of the cube.
+    Most pixels of most frames are black. White is found to half a hundredth of its value over nine decades below the
+    maximum, without memory of the size of the cube.
 
     Args:
         transient: linear radiance in a bin (C, T, H, W), C = 1 or 3.
-        quantile: share of the lit pixels below white, above 0 and at most 1.
 
     Returns:
         The factor, 1 for a black cube.
-
-    Raises:
-        ShapeError: for another shape.
-        UnitError: for another quantile.
     """
-    transient = real_tensor(transient, "exposure_of_video")
-    if transient.ndim != 4 or transient.shape[0] not in (1, 3):
-        raise ShapeError(f"exposure_of_video: expected (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}.")
-    quantile = _quantile(quantile, "exposure_of_video")
     parts = list(range(0, transient.shape[1], _FRAMES_AT_ONCE))
     highest = max((_lit(transient, start).max().item() for start in parts if _lit(transient, start).numel()), default=0)
     if highest <= 0:
         return 1.0
-    if quantile == 1:
-        return 1.0 / highest
     low, high = math.log(highest) - 9 * math.log(10), math.log(highest)
     counts = torch.zeros(_LOG_STEPS, dtype=torch.float64)
     for start in parts:
@@ -78,32 +71,8 @@ def exposure_of_video(transient: Tensor, quantile: float = 0.99) -> float:
         # Two libraries' logarithms of the highest may differ in their last digit.
         counts += torch.histc(values.clamp(low, high), _LOG_STEPS, low, high)
     reached = counts.cumsum(0) / counts.sum()
-    step = int(torch.searchsorted(reached, torch.tensor(quantile, dtype=torch.float64)))
+    step = int(torch.searchsorted(reached, torch.tensor(1 - _WHITE, dtype=torch.float64)))
     return 1.0 / math.exp(low + (step + 1) * (high - low) / _LOG_STEPS)
-
-
-def _quantile(given: float, who: str) -> float:
-    number = as_number(given)
-    if number is None or not 0 < number <= 1:
-        raise UnitError(f"{who}: expected 0 < quantile <= 1, got {shown(given)}.")
-    return number
-
-
-def checked_positive(name: str, given: float, who: str = "tone_map") -> float:
-    """Return a finite number above zero.
-
-    Args:
-        name: name of the argument.
-        given: its value.
-        who: beginning of the message.
-
-    Raises:
-        UnitError: for anything else.
-    """
-    number = as_number(given)
-    if number is None or not (math.isfinite(number) and number > 0):
-        raise UnitError(f"{who}: expected {name} > 0, got {shown(given)}.")
-    return number
 
 
 def _lit(transient: Tensor, start: int) -> Tensor:
@@ -134,10 +103,10 @@ def tone_map(
         UnitError: unless exposure, gamma and stops are positive.
     """
     image = _checked(image, "tone_map")
-    factor = checked_positive("exposure", exposure_of(image) if exposure is None else exposure)
+    factor = positive("tone_map: exposure", exposure_of(image) if exposure is None else exposure)
     if not is_one_of(curve, CURVES):
         raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {shown(curve)}.")
-    gamma, stops = checked_positive("gamma", gamma), checked_positive("stops", stops)
+    gamma, stops = positive("tone_map: gamma", gamma), positive("tone_map: stops", stops)
     mapped = image.detach().to(torch.float64) * factor
     broken = ~torch.isfinite(mapped).all(0)
     mapped = torch.nan_to_num(mapped, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)

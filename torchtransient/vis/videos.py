@@ -19,9 +19,9 @@ from torchtransient.axes import TimeAxis
 from torchtransient.checks import check_folder, function, one_by_one, path_of, positive, short_message, shown
 from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.units import opl_to_seconds
-from torchtransient.vis.files import Image, enlarge, missing, to_bytes
+from torchtransient.vis.files import Image, enlarge, pillow, to_bytes
 from torchtransient.vis.sources import Source, images_of
-from torchtransient.vis.tone_mapping import checked_positive, exposure_of, exposure_of_video, tone_map
+from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
 
 # Pixels: smaller pictures are enlarged to about this, else a player shows a stamp.
 _VISIBLE = 320
@@ -109,7 +109,7 @@ def frames(
     bins, (height, width) = cube.shape[1], cube.shape[2:]
     count = -(-bins // every)
     if exposure is not None:
-        exposure = checked_positive("exposure", exposure, "frames")
+        exposure = positive("frames: exposure", exposure)
     else:
         exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
     factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
@@ -200,7 +200,7 @@ def check_video(path: str | Path) -> Path:
     if target.suffix.lower() == ".mp4":
         _ffmpeg()
     else:
-        _pillow()
+        pillow()
     return target
 
 
@@ -231,10 +231,7 @@ def write_video(
         MissingPackageError: without imageio-ffmpeg or Pillow (extra ``vis``).
     """
     target = check_video(path)
-    try:
-        fps = positive("fps", fps)
-    except UnitError:
-        raise UnitError(f"video: expected fps > 0, got {shown(fps)}.") from None
+    fps = positive("video: fps", fps)
     one_by_one("video", frames, "frames (H, W, 3) of uint8")
     many = checks.count("video: count", count, 0, ShapeError)
     if not many:
@@ -253,12 +250,9 @@ def write_video(
     return target
 
 
-def checked_frame(frame: Any, who: str) -> Image:
-    """Return an image (H, W, 3) of uint8. Raises ShapeError for anything else."""
-    if not isinstance(frame, np.ndarray):
-        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
-    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-        raise ShapeError(f"{who}: expected frames (H, W, 3) of uint8, got {frame.dtype} {tuple(frame.shape)}.")
+def _checked_frame(frame: Any) -> Image:
+    if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        raise ShapeError(f"video: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
     return frame
 
 
@@ -268,7 +262,7 @@ def _followed(frames: Iterable[Image], count: int, progress: bool) -> Iterator[I
 
     size: tuple[int, ...] | None = None
     for given in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
-        frame = checked_frame(given, "video")
+        frame = _checked_frame(given)
         if size is not None and frame.shape != size:
             raise ShapeError(f"video: expected frames of equal size {size}, got {tuple(frame.shape)}.")
         size = frame.shape
@@ -316,28 +310,27 @@ def _is_whole(mp4: Path) -> bool:
 
 def _palette(frames: Iterable[Image], count: int) -> Any:
     """Return 256 colours that serve up to 24 frames out of all."""
-    pillow = _pillow()
     step = max(1, math.ceil(count / _PALETTE_FRAMES))
     seen = []
     for number, frame in enumerate(frames):
         if number % step == 0:
-            pixels = checked_frame(frame, "video").reshape(-1, 3)
+            pixels = _checked_frame(frame).reshape(-1, 3)
             seen.append(pixels[:: max(1, pixels.shape[0] * _PALETTE_FRAMES // _PALETTE_PIXELS)])
     if not seen:
         raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none.")
     # A colour that fills the picture, such as black, must not use up the palette.
     colours = np.unique(np.concatenate(seen) & 0xFC, axis=0)
-    row = pillow.fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
-    chosen = row.quantize(256 - len(_KEPT), method=pillow.Quantize.MEDIANCUT).getpalette() or []
-    palette = pillow.new("P", (1, 1))
+    row = pillow().fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
+    chosen = row.quantize(256 - len(_KEPT), method=pillow().Quantize.MEDIANCUT).getpalette() or []
+    palette = pillow().new("P", (1, 1))
     kept = [level for colour in _KEPT for level in colour]
     palette.putpalette(kept + chosen[: 768 - len(kept)])
     return palette
 
 
 def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) -> None:
-    pillow = _pillow()
-    images = (pillow.fromarray(frame).quantize(palette=palette, dither=pillow.Dither.NONE) for frame in frames)
+    none = pillow().Dither.NONE
+    images = (pillow().fromarray(frame).quantize(palette=palette, dither=none) for frame in frames)
     first = next(images, None)
     if first is None:
         raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none the second time.")
@@ -356,16 +349,6 @@ def _ffmpeg() -> Any:
     return imageio_ffmpeg
 
 
-def _pillow() -> Any:
-    try:
-        from PIL import Image as Pillow
-    except ImportError as error:
-        raise MissingPackageError(
-            "video: a .gif needs the package pillow. Install it with pip install 'torchtransient[vis]'."
-        ) from error
-    return Pillow
-
-
 # ------------------------------------------------------------------------------------------- the strip with the time
 
 
@@ -381,11 +364,8 @@ def moment(axis: TimeAxis | None, index: int, bins: int, word: str = "bin") -> s
     if axis is None:
         return f"{word} {index} of {bins}"
     opl = axis.start_opl + (index + 0.5) * axis.bin_width_opl
-    return f"{_digits(opl, axis.bin_width_opl)} m   {_digits(*_nanoseconds(opl, axis.bin_width_opl))} ns"
-
-
-def _nanoseconds(*lengths: float) -> list[float]:
-    return [1e9 * opl_to_seconds(length) for length in lengths]
+    time_ns, width_ns = (1e9 * opl_to_seconds(length) for length in (opl, axis.bin_width_opl))
+    return f"{_digits(opl, axis.bin_width_opl)} m   {_digits(time_ns, width_ns)} ns"
 
 
 def _digits(value: float, step: float) -> str:
@@ -402,15 +382,11 @@ def with_strip(image: Image, text: str, share: float | None = None) -> Image:
         text: text in the strip.
         share: 0 to 1, draws a bar that fills from left to right.
     """
-    try:
-        from PIL import Image as Pillow
-        from PIL import ImageDraw
-    except ImportError as error:
-        raise missing("pillow") from error
-
     height, width = image.shape[:2]
     rows = max(16, round(0.075 * max(height, width)))
-    strip = Pillow.new("RGB", (width, rows), GROUND)
+    strip = pillow().new("RGB", (width, rows), GROUND)
+    from PIL import ImageDraw
+
     draw = ImageDraw.Draw(strip)
     bar = max(2, rows // 9)
     font = _font(draw, text, 0.58 * rows, width - rows // 2)

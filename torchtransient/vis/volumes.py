@@ -88,7 +88,7 @@ def volume_views(
         if name == "depth":
             _depth_panel(figure, panel, _map("depth", depth, size[1:]), kept, box)
         else:
-            _normals_panel(panel, _normals(normals, size[1:]), kept, box)
+            _normals_panel(panel, _map("normals", normals, (3, *size[1:])), kept, box)
         _label(panel, name, f"x ({unit})", f"y ({unit})")
     if title:
         figure.suptitle(title, fontsize=10)
@@ -158,13 +158,6 @@ def _map(name: str, values: Any, size: tuple[int, ...]) -> Tensor:
     plain = _plain(name, values)
     if tuple(plain.shape) != size:
         raise ShapeError(f"{name}: expected {size}, got {tuple(plain.shape)}; choose an item and a channel.")
-    return plain
-
-
-def _normals(values: Any, size: tuple[int, ...]) -> Tensor:
-    plain = _plain("normals", values)
-    if tuple(plain.shape) != (3, *size):
-        raise ShapeError(f"normals: expected {(3, *size)}, got {tuple(plain.shape)}.")
     return plain
 
 

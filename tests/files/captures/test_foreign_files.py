@@ -64,19 +64,15 @@ def test_what_tal_leaves_open(tmp_path):
         Capture.read(path)
 
 
-def test_origins_are_assumed_a_diagonal_before_the_middle(tmp_path):
-    path = made(PLAIN["confocal"]).write(tmp_path / "a.h5", "tal")
-    found = Capture.read(changed(path, {"sensor_xyz": None, "scene_info": None})).scan
-    points = found.sensor_points.reshape(-1, 3)
-    diagonal = float((points.amax(0) - points.amin(0)).norm())
-    torch.testing.assert_close(found.sensor_origin, points.mean(0) + diagonal * found.sensor_normals[0, 0])
-
-
 def test_what_others_took_out_of_a_file_of_ours(tmp_path):
+    """Origins are assumed a diagonal before the middle of the points."""
     path = made(PLAIN["confocal"]).write(tmp_path / "a.h5", "tal")
     assert Capture.read(path).metadata == {}
     gone = ("sensor_xyz", "t_start", "t_accounts_first_and_last_bounces")
-    told = Capture.read(changed(path, {**dict.fromkeys(gone), "laser_more": 1.0})).metadata
+    found = Capture.read(changed(path, {**dict.fromkeys(gone), "laser_more": 1.0}))
+    told, scan, points = found.metadata, found.scan, found.scan.sensor_points.reshape(-1, 3)
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    torch.testing.assert_close(scan.sensor_origin, points.mean(0) + diagonal * scan.sensor_normals[0, 0])
     assert set(told["assumed"]) == {"sensor_origin", "start_s", "t_accounts_first_and_last_bounces"}
     assert told["not_read"] == ["laser_more"]
 
@@ -172,7 +168,7 @@ def test_confocal_up_to_single_precision_wherever_the_origin_is(tmp_path, layout
 # ----------------------------------------------------------------------------------------------------------- zaragoza
 
 
-@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+@together("kind", ["confocal", "single", "exhaustive"])
 def test_zaragoza_files_of_both_orders(tmp_path, kind):
     """`data order`: row-major turns all axes round, of data and of positions."""
     capture = made(LEGS[kind])
@@ -231,8 +227,8 @@ def test_sizes_of_grids_stand_beside_their_points(tmp_path):
         assert file["t"][()] == 7 and file["t0"][()] == 1.1 and file["deltaT"][()] == 0.003
 
 
-@pytest.mark.parametrize("value", [5, {"hiddenVolumeSize": "big", "minimalpos": [1.0]}, None])
-@pytest.mark.parametrize(("layout", "scan"), [("zaragoza", LEGS["confocal"]), ("phasor_field", listed("single"))])
+@together("value", [5, {"hiddenVolumeSize": "big", "minimalpos": [1.0]}, None])
+@together("layout, scan", [("zaragoza", LEGS["confocal"]), ("phasor_field", listed("single"))])
 def test_hidden_volumes_of_any_metadata(tmp_path, layout, scan, value):
     path = made(scan, metadata={"hidden_volume": value}).write(
         tmp_path / ("a.h5" if layout == "zaragoza" else "a.mat"), layout
@@ -257,7 +253,7 @@ def test_old_matlab_files_are_as_the_new_ones(tmp_path):
         assert old == new and old.metadata["reciprocal"] is new.metadata["reciprocal"] is True
 
 
-@pytest.mark.parametrize("compressed", [False, True])
+@together("compressed", [False, True])
 def test_numbers_of_old_matlab_files_against_scipy(tmp_path, compressed):
     """Every kind of numbers, stored in fewer bytes; counts of few photons, packed into less than a bit each."""
     import scipy.io
@@ -318,12 +314,12 @@ def test_rectified_data_say_little(tmp_path):
         with pytest.raises(StorageError) as caught:
             Capture.read(path, "rect_data", wall_size=1.0, **given)
         assert "damaged" not in str(caught.value)
-    for size in (0.0, -1.0, (1.0, 0.0), (1.0, math.inf), (1.0, 2.0, 3.0), "wide", math.nan):
+    for size in (0.0, (1.0, 0.0), (1.0, math.inf), (1.0, 2.0, 3.0), "wide", math.nan):
         with pytest.raises(StorageError, match="wall_size"):
             Capture.read(path, "cdt", wall_size=size)
 
 
-@pytest.mark.parametrize(("off", "taken"), [(1.0, True), (-1.0, True), (1.05, False), (-1.05, False)])
+@together("off, taken", [(1.0, True), (-1.0, True), (1.05, False), (-1.05, False)])
 def test_widths_and_spacings_differ_by_a_cell(tmp_path, off, taken):
     # Four cells, or three or five: what some take for the width of a scan.
     said = {"rect_data": np.ones((9, 4, 4)), "width": (4 + off) * 0.25 / 2, "ts": 4e-12, "sampling_spacing": 0.25}
@@ -401,43 +397,35 @@ FILES = {
 LEG = "t_accounts_first_and_last_bounces"
 WRONG = {
     "dirac": [
-        {"xg": lambda x: x[:-1]}, {"yg": lambda y: y[:, :-1]}, {"da": lambda t: t[:-1]},
-        {"da": lambda t: t[:1], "data_t": lambda d: d[:1]}, {"da": lambda t: t + 1.1e-3 * 0.003 * (np.arange(7) == 3)},
-        {"da": lambda t: t[::-1]}, {"data_t": lambda d: d[0]}, {"data_t": lambda d: d + 1j}, {"xg": lambda x: x[None]},
-        {"offset_laser": None},
+        {"xg": lambda x: x[:-1]}, {"da": lambda t: t[:-1]}, {"da": lambda t: t[:1], "data_t": lambda d: d[:1]},
+        {"da": lambda t: t + 1.1e-3 * 0.003 * (np.arange(7) == 3)}, {"da": lambda t: t[::-1]},
+        {"data_t": lambda d: d[0]}, {"data_t": lambda d: d + 1j}, {"offset_laser": None},
     ],
     "tal": [
-        {"H": None}, {"H": lambda h: h[0]}, {"H": lambda h: h[..., None, None]}, {"H": lambda h: h[..., None]},
-        {"H": lambda h: h + 1j}, {"H_format": 7}, {"H_format": 1.0}, {"H_format": None}, {"H_format": np.array([1, 1])},
-        {"sensor_grid_format": 1}, {"laser_grid_format": 3}, {"sensor_grid_xyz": lambda p: p[0, 0]},
-        {"sensor_grid_xyz": lambda p: p[..., :2]}, {"sensor_grid_xyz": lambda p: p[None]}, {"sensor_grid_xyz": None},
+        {"H": None}, {"H": lambda h: h[0]}, {"H": lambda h: h[..., None, None]}, {"H": lambda h: h + 1j},
+        {"H_format": 7}, {"H_format": 1.0}, {"H_format": np.array([1, 1])}, {"sensor_grid_format": 1},
+        {"sensor_grid_xyz": lambda p: p[0, 0]}, {"sensor_grid_xyz": lambda p: p[..., :2]}, {"sensor_grid_xyz": None},
         {"sensor_grid_normals": lambda n: n[:-1]}, {"laser_grid_xyz": lambda p: p[:2], "laser_grid_normals": None},
-        {"sensor_xyz": lambda p: p + 0j}, {"delta_t": np.array([0.1, 0.2])}, {"t_start": np.array([[0.1, 0.2]])},
-        {"sensor_xyz": np.zeros(4)}, {"scene_info": None, "volume_format": 2.0},
-        *({LEG: value} for value in (np.nan, -1, 2.0, 1j, np.array([False, True]), "False")),
+        {"sensor_xyz": lambda p: p + 0j}, {"delta_t": np.array([0.1, 0.2])}, {"sensor_xyz": np.zeros(4)},
+        {"scene_info": None, "volume_format": 2.0}, *({LEG: value} for value in (np.nan, 2.0, 1j, "False")),
     ],
     "tal phasor": [{"H": lambda h: h.real}, {"scene_info": None}],
     "tal single": [{"laser_grid_xyz": lambda p: np.repeat(p, 2, 0), "laser_grid_normals": None}],
     "zaragoza": [
-        {"cameraGridPositions": None}, {"laserGridPositions": None}, {"deltaT": GONE}, {"data": lambda d: d[0, 0, 0]},
-        {"data": lambda d: d[0, 0]}, {"data": lambda d: d[..., None, None, None]}, {"data": lambda d: d + 1j},
-        {"data": lambda d: d[:, :0]}, {"data": lambda d: d[:, :, :0]}, {"cameraGridPositions": lambda p: p[:2]},
-        {"cameraGridPositions": lambda p: p[..., None]}, {"cameraGridPositions": lambda p: p + 0j},
-        {"cameraGridNormals": lambda n: n[..., :-1]}, {"laserGridNormals": lambda n: n[:, :-1]},
-        {"deltaT": np.array([0.1, 0.2])}, {"t0": 1j}, {"cameraPosition": np.zeros(2)},
-        {"laserGridPositions": lambda p: p + 0.1},
+        {"cameraGridPositions": None}, {"deltaT": GONE}, {"data": lambda d: d[0, 0, 0]}, {"data": lambda d: d[0, 0]},
+        {"data": lambda d: d + 1j}, {"data": lambda d: d[:, :0]}, {"cameraGridPositions": lambda p: p[:2]},
+        {"cameraGridNormals": lambda n: n[..., :-1]}, {"deltaT": np.array([0.1, 0.2])}, {"t0": 1j},
+        {"cameraPosition": np.zeros(2)}, {"laserGridPositions": lambda p: p + 0.1},
     ],
     "zaragoza pairs": [{"laserGridPositions": lambda p: p[:, :-1], "laserGridNormals": GONE}],
     "phasor_field": [
         {"dataset/data": lambda d: d[0]}, {"dataset/data": None}, {"dataset/t": 8.0},
-        {"dataset/data": lambda d: d + 1j},
-        {"dataset/laserPos": lambda p: p[:2]}, {"dataset/laserPos": lambda p: p[..., None]}, {"dataset/laserPos": None},
+        {"dataset/data": lambda d: d + 1j}, {"dataset/laserPos": lambda p: p[:2]}, {"dataset/laserPos": None},
         {"dataset/cameraNorm": lambda n: n[:, :2]}, {"dataset/deltat": np.array([0.1, 0.2])},
         {"dataset/laserOrigin": np.zeros((4, 1))},
     ],
     "rect_data": [
-        *({"SPAD_index": np.array(index)} for index in (
-            [[4.0], [0.0]], [[0.0], [4.0]], [[-1.0], [0.0]], [[0.0], [-1.0]], [[0.5], [0.0]], [[0.0]], [[0.0]] * 3)),
+        *({"SPAD_index": np.array(index)} for index in ([[4.0], [0.0]], [[-1.0], [0.0]], [[0.5], [0.0]], [[0.0]])),
         {"ts": 0.0}, {"ts": np.array([1.0, 2.0])}, {"ts": math.inf}, {"sampling_spacing": -0.1},
         {"rect_data": lambda d: d[0]}, {"rect_data": lambda d: d + 1j},
     ],
@@ -450,7 +438,6 @@ TAKEN = [
 ]  # fmt: skip
 
 
-@pytest.mark.slow
 @together("name, entries, taken", [*((name, entries, False) for name in WRONG for entries in WRONG[name]),
                                    *((name, entries, True) for name, entries in TAKEN)])  # fmt: skip
 def test_entries_that_are_wrong(tmp_path, name, entries, taken):
@@ -476,8 +463,8 @@ def test_layouts_that_are_only_read_with_a_wrong_entry(tmp_path, layout, entries
         Capture.read(tmp_path / "a.mat", layout, **({"wall_size": 1.0} if layout == "cdt" else {}))
 
 
-@pytest.mark.parametrize("given", [
-    {"frequencies": (1.0, 2.0, 3.0)}, {"sensor_origin": (0.0, 1.0)}, {"wall_size": 1.0}, {"sensor_origin": (0, 0, 1)},
+@together("given", [
+    {"frequencies": (1.0, 2.0, 3.0)}, {"wall_size": 1.0}, {"sensor_origin": (0, 0, 1)},
 ])  # fmt: skip
 def test_arguments_that_a_file_has_no_use_for(tmp_path, given):
     path = FILES["tal phasor"][1].write(tmp_path / "a.h5", "tal")

@@ -10,7 +10,8 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ _ENDINGS = {
 }  # fmt: skip
 
 
-class Contents(Protocol):
+class Contents:
     """Open file of another program.
 
     Attributes:
@@ -37,20 +38,44 @@ class Contents(Protocol):
         shapes: root arrays and structures by name, None for entries without a shape.
         attributes: texts beside the arrays.
         links: names that lead elsewhere, which are not followed.
-
-    ``array(name)`` returns numbers, None for a name that is missing or empty; a field of a structure is
-    ``structure/field``. ``text(name)`` likewise. ``fields(name)``: names in a structure, empty for other entries.
     """
 
     source: Path
     reader: str
     shapes: Mapping[str, tuple[int, ...] | None]
-    attributes: Mapping[str, str]
-    links: frozenset[str]
+    attributes: Mapping[str, str] = MappingProxyType({})
+    links: frozenset[str] = frozenset()
 
-    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None: ...
-    def text(self, name: str) -> str | None: ...
-    def fields(self, name: str) -> frozenset[str]: ...
+    def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
+        """Return numbers, None for a name that is missing or empty.
+
+        Args:
+            name: of the array; a field of a structure is ``structure/field``.
+            part: index of the part that is returned, () for all of it.
+
+        Raises:
+            StorageError: for anything but numbers.
+        """
+        raise NotImplementedError
+
+    def text(self, name: str) -> str | None:
+        """Return a text, None if it is missing or empty.
+
+        Args:
+            name: of the text.
+
+        Raises:
+            StorageError: for anything else.
+        """
+        raise NotImplementedError
+
+    def fields(self, name: str) -> frozenset[str]:
+        """Return the names in a structure, empty for other entries.
+
+        Args:
+            name: of the structure.
+        """
+        return frozenset()
 
 
 @contextmanager
@@ -83,20 +108,16 @@ def opened(path: str | Path) -> Iterator[Contents]:
             raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file. {hint}".strip())
 
 
-class Hdf5Contents:
+class Hdf5Contents(Contents):
     """Open HDF5 file."""
 
     reader = "h5py.File"
 
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
-        self.shapes: Mapping[str, tuple[int, ...] | None] = {
-            name: self._shape(name) for name in file if name != "#refs#"
-        }
-        self.attributes: Mapping[str, str] = {
-            name: _sole(value) for name, value in read_attributes(file, WHAT, ["data order"]).items()
-        }
-
+        self.shapes = {name: self._shape(name) for name in file if name != "#refs#"}
+        said = read_attributes(file, WHAT, ["data order"])
+        self.attributes = {name: _sole(value) for name, value in said.items()}
         self.links = frozenset(name for name in self.shapes if self._is_link(name))
 
     def _is_link(self, name: str) -> bool:
@@ -120,14 +141,12 @@ class Hdf5Contents:
         return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
-        """Return a text, None if it is missing or empty."""
         value = self._read(name)
         if value is not None and not isinstance(value, str):
             raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
-        """Return the names in a structure, empty for other entries."""
         import h5py
 
         if self._is_link(name):
@@ -145,7 +164,7 @@ def _sole(value: Any) -> str:
     return sole.decode("utf-8", "replace") if isinstance(sole, bytes) else str(sole)
 
 
-class MatContents:
+class MatContents(Contents):
     """MATLAB file of versions 5 to 7."""
 
     reader = "scipy.io.loadmat"
@@ -153,12 +172,8 @@ class MatContents:
     def __init__(self, source: Path) -> None:
         self.source = source
         self._file = Mat5File(source)
-        self.shapes: Mapping[str, tuple[int, ...] | None] = {
-            name: variable.shape for name, variable in self._file.variables.items()
-        }
+        self.shapes = {name: variable.shape for name, variable in self._file.variables.items()}
         self._kept: dict[str, Any] = {}
-        self.attributes: Mapping[str, str] = {}
-        self.links: frozenset[str] = frozenset()
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         value: Any = self._variable(name.split("/")[0])
@@ -188,16 +203,14 @@ class MatContents:
         return self._kept[name]
 
 
-class NpzContents:
+class NpzContents(Contents):
     """Arrays of NumPy in one file. Pickles are not read."""
 
     reader = "numpy.load"
 
     def __init__(self, source: Path) -> None:
         self.source = source
-        self.shapes: Mapping[str, tuple[int, ...] | None] = npz_shapes(source, WHAT)
-        self.attributes: Mapping[str, str] = {}
-        self.links: frozenset[str] = frozenset()
+        self.shapes = npz_shapes(source, WHAT)
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         array = read_npz(self.source, WHAT, name.__eq__).get(name)
@@ -209,11 +222,8 @@ class NpzContents:
         array = read_npz(self.source, WHAT, name.__eq__).get(name)
         return None if array is None else _sole(array)
 
-    def fields(self, name: str) -> frozenset[str]:
-        return frozenset()
 
-
-class JsonContents:
+class JsonContents(Contents):
     """JSON object, or list of objects: frames whose entries have one shape each. Arrays are (frames, ...)."""
 
     reader = "json.load"
@@ -227,9 +237,7 @@ class JsonContents:
         if not self._frames or not all(isinstance(frame, dict) for frame in self._frames):
             raise StorageError(f"{WHAT}: '{source}': expected a JSON object or a list of objects, got something else.")
         names = set.intersection(*(set(frame) for frame in self._frames))
-        self.shapes: Mapping[str, tuple[int, ...] | None] = dict.fromkeys(sorted(names))
-        self.attributes: Mapping[str, str] = {}
-        self.links: frozenset[str] = frozenset()
+        self.shapes = dict.fromkeys(sorted(names))
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         values = [self._entry(frame, name) for frame in self._frames]
@@ -252,7 +260,12 @@ class JsonContents:
         return frozenset(value) if isinstance(value, dict) else frozenset()
 
     def entry(self, name: str, frame: int = 0) -> Any:
-        """Return plain data of one frame, None if it has no such entry."""
+        """Return plain data of one frame, None if it has no such entry.
+
+        Args:
+            name: of the entry.
+            frame: index of the frame.
+        """
         return self._entry(self._frames[frame], name)
 
     @staticmethod

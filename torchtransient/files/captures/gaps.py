@@ -53,7 +53,12 @@ class Gaps:
         self._used: set[str] = set()
 
     def fill(self, name: str, stored: Any, default: Any = _NEEDED) -> Any:
-        """Return ``stored``, the file's value; else the given one; else ``default``, as an assumption.
+        """Return the file's value; else the given one; else the default, as an assumption.
+
+        Args:
+            name: argument of :func:`read_capture`.
+            stored: value of the file, None without one.
+            default: value that is assumed; without it the argument is needed.
 
         Raises:
             StorageError: if both file and argument, or neither, have it.
@@ -72,12 +77,22 @@ class Gaps:
         return default
 
     def width(self, stored: float | None, default_s: Any = _NEEDED) -> float:
-        """Return the width of the bins in metres: ``stored`` in metres, or ``bin_width_s``."""
+        """Return the width of the bins, metres.
+
+        Args:
+            stored: width in the file, metres, or None for ``bin_width_s``.
+            default_s: width that is assumed, seconds.
+        """
         found = self.fill("bin_width_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(positive("read_capture: bin_width_s", found))
 
     def start(self, stored: float | None, default_s: float = 0.0) -> float:
-        """Return the start of the bins in metres: ``stored`` in metres, or ``start_s``, or its default."""
+        """Return the start of the bins, metres.
+
+        Args:
+            stored: start in the file, metres, or None for ``start_s``.
+            default_s: start that is assumed, seconds.
+        """
         found = self.fill("start_s", stored, default_s)
         return float(found) if stored is not None else seconds_to_opl(finite("read_capture: start_s", found))
 
@@ -99,7 +114,14 @@ class Gaps:
         return found
 
     def frame(self, frames: int) -> int:
-        """Return the index of the frame that is read: ``frame``, which a file of one frame does not need."""
+        """Return the index of the frame that is read: ``frame``, which a file of one frame does not need.
+
+        Args:
+            frames: number of frames in the file.
+
+        Raises:
+            StorageError: for an index out of range, and without one.
+        """
         given = self.fill("frame", None, 0) if frames == 1 else self._given.get("frame")
         self._used.add("frame")
         self.assumed.pop("frame", None)
@@ -111,7 +133,14 @@ class Gaps:
         return number
 
     def extent(self, stored: tuple[float, float] | None) -> tuple[float, float]:
-        """Return width along x and height along y of a scanned area, metres."""
+        """Return width along x and height along y of a scanned area, metres.
+
+        Args:
+            stored: those of the file, or None for ``wall_size``.
+
+        Raises:
+            StorageError: for other sizes, and without any.
+        """
         given = self.fill("wall_size", stored)
         sides = real_array(given)
         if sides is None or sides.shape not in ((), (2,)) or not bool(np.isfinite(sides).all() and (sides > 0).all()):
@@ -132,7 +161,11 @@ class Gaps:
         return {"format": self._layout, **said, **{name: value for name, value in entries.items() if value is not None}}
 
     def error(self, message: str) -> StorageError:
-        """Return an error that names file and layout."""
+        """Return an error that names file and layout.
+
+        Args:
+            message: what is wrong and what to do.
+        """
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
 

@@ -89,7 +89,12 @@ class Mat5File:
             self.variables = {variable.name: variable for variable in self._listed(file)}
 
     def read(self, name: str, what: str) -> Value | Other:
-        """Return numbers in the order of HDF5, a text, a structure by its fields; None for an empty value."""
+        """Return numbers in the order of HDF5, a text, a structure by its fields; None for an empty value.
+
+        Args:
+            name: of a variable.
+            what: subject of messages.
+        """
         variable = self.variables[name]
         what = f"{what}: '{name}' {variable.shape or ''}".rstrip()
         check_size(variable.unpacked, variable.stored, what)

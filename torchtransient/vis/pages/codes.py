@@ -53,7 +53,11 @@ class Table:
     decades: float = 0.0
 
     def encode(self, x: Tensor) -> NDArray[Any]:
-        """Return the codes of real numbers of any shape, uint8, uint16 of the kind "wide"."""
+        """Return the codes of numbers in their shape: uint8, or uint16 of the kind "wide".
+
+        Args:
+            x: real numbers of any shape.
+        """
         if self.kind == "wide":
             counts = torch.where(torch.isfinite(x), x, float(_MOST_COUNTS + 1)).to(torch.int32)
             return counts.numpy().astype("<u2")

@@ -66,7 +66,11 @@ class Planes:
         return found | ({} if self.error is None else {"error": self.error})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Planes:
-        """Return the planes with ``function`` applied to each tensor."""
+        """Return the planes with a function applied to each tensor.
+
+        Args:
+            function: of one tensor (..., T, H, W).
+        """
         parts = (self.light, self.ratios, self.phase, self.error)
         light, *others = (None if part is None else function(part) for part in parts)
         assert light is not None
@@ -128,7 +132,11 @@ def time_slider(centers_opl: NDArray[np.float64]) -> Slider:
 
 
 def bin_slider(bins: int) -> Slider:
-    """Return the slider of ``bins`` bins of unknown time."""
+    """Return the slider of bins of unknown time.
+
+    Args:
+        bins: number of bins.
+    """
     return Slider("bin", "", np.arange(bins, dtype=np.float64))
 
 

@@ -196,10 +196,10 @@ def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
 
 def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     """One channel or three; the mean of other numbers, and a note about it."""
-    count = len(cube)
-    if count in (1, 3):
+    if len(cube) in (1, 3):
         return cube, ()
-    return cube.mean(0, keepdim=True), (f"Mean over {count} channels.",)
+    mean, notes = _over_channels(cube)
+    return mean[None], notes
 
 
 def light_content(
@@ -218,10 +218,9 @@ def light_content(
         ShapeError: for other shapes.
     """
     if cube.ndim == 5 and cube.shape[0] == 4:
-        mean = cube.mean(1)
+        mean, notes = _over_channels(cube.transpose(0, 1))
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
         planes = Planes(mean[:1], ratios=ratios, error=error)
-        notes: tuple[str, ...] = () if cube.shape[1] == 1 else (f"Mean over {cube.shape[1]} channels.",)
         return Content("polarized", slider, ("",), ("",), (planes,), notes=notes)
     if cube.ndim != 4 or not cube.numel():
         raise ShapeError(
@@ -301,16 +300,8 @@ def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
     mean, notes = _rows(cube, who, "beats (C, 2, T, H, W)")
     planes = tuple(Planes(part[None]) for part in mean)
     slider = slider_of(mean.shape[1], axis, who)
-    return Content(
-        "beats",
-        slider,
-        ("",),
-        ("up chirp", "down chirp"),
-        planes,
-        quantity="beat power",
-        layer_name="chirp",
-        notes=notes,
-    )
+    names = ("up chirp", "down chirp")
+    return Content("beats", slider, ("",), names, planes, quantity="beat power", layer_name="chirp", notes=notes)
 
 
 def _capture(capture: Capture, who: str) -> Content:

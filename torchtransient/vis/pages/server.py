@@ -108,11 +108,21 @@ class LargeResult:
         return time_slider(start + (np.arange(bins, dtype=np.float64) + 0.5) * width)
 
     def frame(self, plane: str, t: int) -> NDArray[np.uint16]:
-        """Return the upper halves of the pixels that the picture shows of a bin."""
+        """Return the upper halves of the pixels that the picture shows of a bin.
+
+        Args:
+            plane: name of the plane, as of ``Planes.named``.
+            t: number of the bin.
+        """
         return _upper_halves(self._numbers(plane, (t,))[..., :: self._stride, :: self._stride])
 
     def curve(self, plane: str, row: int, column: int) -> NDArray[np.uint16]:
-        """Return the upper halves of a pixel, (T,)."""
+        """Return the upper halves of a pixel, (T,).
+
+        Args:
+            plane: name of the plane.
+            row, column: place of the pixel in the file's light.
+        """
         return _upper_halves(self._numbers(plane, (slice(None), row, column)))
 
     def _numbers(self, plane: str, where: tuple[Any, ...]) -> NDArray[Any]:
