@@ -279,3 +279,13 @@ def test_all_carriers_are_set_free_during_the_dead_time(tau_s):
     counts = spad.sample(x, torch.Generator().manual_seed(0))
     afterpulsing.grad = "straight_through"
     assert torch.equal(afterpulsing(counts, generator=torch.Generator().manual_seed(0)), counts)
+
+
+def test_hardly_any_afterpulses_in_bright_light():
+    """Hundreds of photons a bin, in a step and in pulses: the counts of the detector alone."""
+    rate = torch.full((1, 60, 1, 2), 1e-3, dtype=torch.float64)
+    rate[0, 5:, 0, 0], rate[0, ::7, 0, 1] = 80.0, 300.0
+    alone = sensing.SynchronousSPAD(100, dead_time_s=20.3e-10, bin_width_s=1e-10)
+    afterpulsing = sensing.Afterpulsing(1e-9, 30e-10, 20.3e-10, bin_width_s=1e-10)
+    found = sensing.AfterpulsingSPAD(alone, afterpulsing).expected(rate)
+    torch.testing.assert_close(found, alone.expected(rate), rtol=0, atol=1e-7)

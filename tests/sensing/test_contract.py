@@ -36,6 +36,15 @@ def test_batch_invariance(entry):
             torch.testing.assert_close(of_all[i], alone, rtol=1e-10, atol=1e-12)
 
 
+def test_light_is_given_by_its_name():
+    spad, x = sensing.SynchronousSPAD(20), torch.rand(1, 1, 6, 2, 2, generator=torch.Generator().manual_seed(0))
+    counts = spad(x=x, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(counts, spad(x, torch.Generator().manual_seed(1)))
+    assert torch.equal(spad.expected(x=x), spad.expected(x))
+    for found in (spad.log_prob(counts, x=x), spad.log_prob(x=x, measurement=counts)):
+        assert torch.equal(found, spad.log_prob(counts, x))
+
+
 @each
 @together("what", ["no transient", "output"])
 def test_what_a_film_does_not_measure_is_refused(entry, what):

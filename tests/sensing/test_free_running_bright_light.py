@@ -162,7 +162,6 @@ def test_a_phase_that_is_remembered():
     assert bool(((first > 0.99) | (first < 0.01)).all()) and 0 < float(first.mean()) < 1
 
 
-@pytest.mark.slow
 def test_totals_in_saturation():
     """Renewal theory: a Fano factor of 1/(1 + n d)^2, 0.010 where independent periods have 0.41."""
     n, dead, periods = 1.5, 6.0, 10_000

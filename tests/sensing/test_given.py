@@ -159,6 +159,14 @@ def test_parameters_that_are_kept_may_be_used_on_the_way():
     with pytest.raises(GradientError, match="Doubled: expected gain"):
         Doubled(gain, keep=False)
 
+    class Summed(sensing.Sensor):
+        def __init__(self, *gains):
+            super().__init__()
+            self.first = gains[0]
+
+    with pytest.raises(GradientError, match="Summed: expected argument 1"):
+        Summed(gain, gain.square())
+
 
 @pytest.mark.parametrize("name", ["phase_offset_rad", "phase_map_rad", "depth_map_m"])
 def test_calibrations_are_learnt(name):

@@ -150,14 +150,17 @@ def test_very_long_responses_lose_no_digits():
     np.testing.assert_allclose(weights.numpy(), stats.norm(0, sigma).pdf(t), rtol=1e-8)
 
 
-def test_composition_of_gaussians_is_a_gaussian():
+@pytest.mark.parametrize("bins", [0, 5000])
+def test_composition_of_gaussians_is_a_gaussian(bins):
+    """Wherever it stands: a delay is no length."""
+    delay = bins * 10 * PS
     together = sensing.ComposedResponse(
-        [sensing.GaussianResponse(30 * PS), sensing.GaussianResponse(40 * PS)], oversampling=33
+        [sensing.GaussianResponse(30 * PS, delay), sensing.GaussianResponse(40 * PS)], oversampling=33
     )
     # (10/33)^2/12 of variance twice on the grid; none in the closed form
     for within, error in (("center", 2e-5), ("uniform", 1e-8)):
         first, weights = together.kernel(10 * PS, within)
-        begin, wanted = sensing.GaussianResponse(50 * PS).kernel(10 * PS, within)
+        begin, wanted = sensing.GaussianResponse(50 * PS, delay).kernel(10 * PS, within)
         inner = weights[begin - first :][: wanted.numel()]
         assert float((inner - wanted).abs().max()) < error
 
