@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchtransient.data import crew as crews
 from torchtransient.data.crew import DIED, MEASURING, MOST_IN_A_ROW, MOST_OF_A_SHARD, Crew, Ledger, Member, SampleBar
 from torchtransient.errors import TorchTransientError
 
@@ -29,7 +28,7 @@ class Played(Crew):
 
     def __init__(self, ledger, workers=2, timeout_s=None, script=()):
         super().__init__(SimpleNamespace(), workers, ledger, timeout_s)
-        self.script, self.started, self.closed = deque(script), [], None
+        self.script, self.started = deque(script), []
 
     def start(self):
         self.started.append(Worker())
@@ -39,7 +38,7 @@ class Played(Crew):
         self.script.popleft()(self)
 
     def close(self, stopped):
-        self.closed = stopped
+        pass
 
     def says(self, number, *message):
         self.receive(self.started[number], *message)
@@ -48,43 +47,13 @@ class Played(Crew):
 @pytest.fixture
 def clock(monkeypatch):
     found = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(crews.time, "monotonic", lambda: found.now)
+    monkeypatch.setattr("time.monotonic", lambda: found.now)
     return found
 
 
 @pytest.fixture
 def ledger():
     return Ledger(2, lambda *words, **facts: None, SampleBar(0, 0, shown=False))
-
-
-def test_shards_are_handed_to_ready_workers(ledger):
-    """As many workers as there is work for, each with one shard at a time, and the samples that are given up."""
-    ledger.skipped[4] = {9: "why"}
-    steps = [
-        lambda c: c.says(1, "ready"),
-        lambda c: c.says(1, "begin", 4, 8),
-        lambda c: (c.says(1, "end", 4, 8, None), c.says(1, "wrote", 4, 1, 0, 50)),
-        lambda c: c.says(1, "wrote", 5, 2, 1, 70),
-        lambda c: c.says(1, "wrote", 6, 2, 0, 90),
-    ]
-    with Played(ledger, 2, script=steps) as crew:
-        crew.make([4, 5, 6], {"about": 1})
-    assert len(crew.started) == 2 and crew.closed is False and not crew.started[0].tasks
-    assert crew.started[1].tasks == [
-        ("shard", 4, {"about": 1}, {9: "why"}, []), ("shard", 5, {"about": 1}, {}, []),
-        ("shard", 6, {"about": 1}, {}, []),
-    ]  # fmt: skip
-    assert (ledger.samples, ledger.failed, ledger.bytes) == (4, 1, 210)
-    with pytest.raises(KeyError), Played(ledger) as crew:
-        raise KeyError
-    assert crew.closed is True
-
-
-def test_errors_of_workers_are_raised(ledger):
-    steps = [lambda c: c.says(0, "ready"), lambda c: c.says(0, "fatal", "UnitError", "too much", "lines")]
-    with pytest.raises(TorchTransientError, match="too much") as caught:
-        Played(ledger, 1, script=steps).make([4], {})
-    assert type(caught.value).__name__ == "UnitError" and "lines" in str(caught.value.__cause__)
 
 
 @pytest.mark.parametrize(
@@ -99,21 +68,15 @@ def test_errors_of_workers_are_raised(ledger):
 def test_silent_workers_end(clock, ledger, samples, timeout_s, limit):
     """Their shard is made by another worker, without the sample at which they were silent if that goes on."""
     ledger.retries = 0
-
-    def waits(seconds):
-        # A poll takes less than two seconds: longer gaps are those of a process that was stopped.
-        return [lambda c: setattr(clock, "now", clock.now + 1.0)] * int(seconds)
-
-    made = [
-        step
-        for index, seconds in enumerate(samples)
-        for step in (lambda c, n=index: c.says(0, "begin", 4, n), *waits(seconds),
-                     lambda c, n=index: c.says(0, "end", 4, n, None))
-    ]  # fmt: skip
-    steps = [lambda c: c.says(0, "ready"), *made, lambda c: c.says(0, "begin", 4, 5), *waits(limit)]
-    steps += [lambda c: alive.append(not c.started[0].ended), *waits(1)]
-    steps += [lambda c: c.says(1, "ready"), lambda c: c.says(1, "wrote", 4, 3, 1, 9)]
+    # A poll takes less than two seconds: longer gaps are those of a process that was stopped.
+    second = [lambda c: setattr(clock, "now", clock.now + 1.0)]
+    steps = [lambda c: c.says(0, "ready")]
+    for index, seconds in enumerate(samples):
+        steps += [lambda c, n=index: c.says(0, "begin", 4, n), *second * int(seconds)]
+        steps += [lambda c, n=index: c.says(0, "end", 4, n, None)]
     alive = []
+    steps += [lambda c: c.says(0, "begin", 4, 5), *second * limit, lambda c: alive.append(not c.started[0].ended)]
+    steps += [*second, lambda c: c.says(1, "ready"), lambda c: c.says(1, "wrote", 4, 3, 1, 9)]
     crew = Played(ledger, 1, timeout_s, steps)
     crew.make([4], {})
     assert alive == [True] and crew.started[0].ended and not crew.started[1].ended
@@ -144,9 +107,6 @@ def test_workers_that_never_start(ledger):
     with pytest.raises(TorchTransientError, match="while it started"):
         crew.make([5], {})
     assert len(crew.started) == 1
-
-
-# --------------------------------------------------------------------------------------------------------- the ledger
 
 
 @pytest.mark.parametrize(("own_fault", "deaths"), [(True, 3), (False, 6)])

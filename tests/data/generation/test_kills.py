@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -14,17 +12,7 @@ from pathlib import Path
 import pytest
 
 from support.fake_recipe import FakeRecipe
-from support.generation_runs import (
-    alive,
-    data_files,
-    environment,
-    finish,
-    kill,
-    leftovers,
-    start,
-    wait_until,
-    workers_of,
-)
+from support.generation_runs import alive, data_files, finish, kill, leftovers, start, wait_until, workers_of
 from torchtransient.data import generate, verify
 
 # Samples take a little, and so does every write to a shard.
@@ -144,38 +132,6 @@ def test_two_runs_at_once(tmp_path, calm):
         status, _, err = finish(child)
         assert status == 0, err
     assert data_files(tmp_path) == calm and verify(tmp_path).complete and leftovers(tmp_path) == []
-
-
-IN_A_CALLBACK = """
-import signal, sys, time, weakref
-from pathlib import Path
-from torchtransient.array_files.part_files import whole_file
-from torchtransient.data import local_engine
-
-class Thing:
-    pass
-
-def called_back(_):
-    print("here", flush=True)
-    time.sleep(60)
-
-signal.signal(signal.SIGTERM, local_engine._end)
-with whole_file(Path(sys.argv[1]) / "a", "test"):
-    thing = Thing()
-    kept = weakref.ref(thing, called_back)
-    del thing
-"""
-
-
-@pytest.mark.slow
-def test_a_worker_is_told_to_end_in_a_callback(tmp_path):
-    """Of a weak reference, for instance: Python forgets what is raised there."""
-    command = [sys.executable, "-c", IN_A_CALLBACK, str(tmp_path)]
-    child = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert child.stdout.readline() == "here\n"
-    child.terminate()
-    _, said = child.communicate(timeout=20)
-    assert (child.returncode, said, list(tmp_path.iterdir())) == (3, "", [])
 
 
 @pytest.mark.soak

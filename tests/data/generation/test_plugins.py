@@ -94,13 +94,10 @@ def test_what_is_registered_is_handed_on(theirs, tmp_path):
     _registry._state.third_party = []
     with tt.threads(1):
         ShardMaker(settings_of(FakeRecipe(), tmp_path, added)).close()
+        wanted = r"the process that renders cannot use the plugin module 'their\.absent': .* PYTHONPATH"
+        with pytest.raises(PluginRegistrationError, match=wanted):
+            ShardMaker(settings_of(FakeRecipe(), tmp_path, (("their.absent", ()),)))
     assert registered_plugins() == added
-
-
-def test_what_cannot_be_imported_there_is_said(tmp_path):
-    wanted = r"generate: the process that renders cannot use the plugin module 'their\.absent': .* PYTHONPATH"
-    with tt.threads(1), pytest.raises(PluginRegistrationError, match=wanted):
-        ShardMaker(settings_of(FakeRecipe(), tmp_path, (("their.absent", ()),)))
 
 
 def test_recipes_name_their_modules(theirs):

@@ -17,7 +17,7 @@ vary:
 labels: [depth]
 spp: 64
 variant: llvm_ad_mono
-n: 300
+n: 100
 """
 
 
@@ -31,17 +31,17 @@ def test_killed_and_gone_on(tmp_path):
     rough = tmp_path / "rough"
     options = ("--out", "rough", "--per-shard", "5", "--quiet")
     child = start_command(tmp_path, "dataset", "recipe.yaml", *options)
-    for shards in (2, 12):
+    for shards in (2, 6):
         wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= shards)  # noqa: B023
         kill(workers_of(child.pid)[0])
-    wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= 25)
+    wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= 10)
     kill(child.pid)
     child.communicate()
-    assert len(list(rough.glob("shard-*.h5"))) < 60
+    assert len(list(rough.glob("shard-*.h5"))) < 20
     done = generate(recipe, rough, workers=1, progress=False)
-    assert done.kept >= 100 and done.failed == 0
+    assert done.kept >= 50 and done.failed == 0
     expected, found = data_files(tmp_path / "calm"), data_files(rough)
     # It tells where the recipe lay on the machine that began.
     del expected["recipe.json"], found["recipe.json"]
-    assert len(found) == 61 and found == expected and leftovers(rough) == []
+    assert len(found) == 21 and found == expected and leftovers(rough) == []
     assert verify(rough).complete
