@@ -32,7 +32,6 @@ CASES = {
     "Bounded": (parametrize.Bounded(-2.0, 3.0), torch.tensor([-1.9, 0.0, 2.5], dtype=torch.float64)),
     "Bounded by tensors": (parametrize.Bounded([0.0, 1, 2], torch.tensor([1.0, 2, 4])), SHARES + torch.arange(3)),
     "Albedo": (parametrize.Albedo(), SHARES),
-    "Albedo with a margin": (parametrize.Albedo(margin=1e-3), SHARES),
     "Roughness": (parametrize.Roughness(), torch.tensor(0.1, dtype=torch.float64)),
     "IndexOfRefraction": (parametrize.IndexOfRefraction(), torch.tensor(1.5, dtype=torch.float64)),
     "Anisotropy": (parametrize.Anisotropy(), torch.tensor(-0.7, dtype=torch.float64)),
@@ -91,20 +90,8 @@ def test_batches(name):
     alone = torch.stack([function(one) for one in many])
     assert torch.allclose(function(many), alone, rtol=1e-12, atol=1e-14)
     assert torch.allclose(function.right_inverse(alone), many if "Simplex" not in name else x.expand(3, -1), atol=1e-9)
-    assert torch.allclose(torch.func.vmap(function)(many), alone, rtol=1e-12, atol=1e-14)
     none = many[:0]
     assert function(none).shape == (0, *value.shape) and function.right_inverse(alone[:0]).shape == none.shape
-
-
-@ALL
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.bfloat16, 0.05)])
-def test_precisions(name, dtype, tolerance):
-    if dtype == torch.bfloat16 and ("Pose" in name or "2" in name):
-        pytest.skip("no rotation and no number just above 2 survives eight bits")
-    function, value = CASES[name]
-    found = function(function.right_inverse(value.to(dtype)))
-    assert found.dtype == dtype
-    assert torch.allclose(found.double(), value.to(dtype).double(), rtol=4 * tolerance, atol=tolerance)
 
 
 @ALL
@@ -129,13 +116,15 @@ def test_pickle_and_precision_of_the_module(name):
     x = function.right_inverse(value)
     twin = pickle.loads(pickle.dumps(function))
     assert torch.equal(twin(x), function(x)) and repr(twin) == repr(function)
-    assert torch.allclose(twin.float()(x.float()).double(), function(x), rtol=1e-5, atol=1e-5)
+    single = twin.float()
+    assert torch.allclose(single(x.float()).double(), function(x), rtol=1e-5, atol=1e-5)
+    assert torch.allclose(single(single.right_inverse(value.float())).double(), value, rtol=1e-5, atol=2e-6)
 
 
 @ALL
 def test_what_it_refuses(name):
     function, value = CASES[name]
-    for wrong in (None, "text", torch.ones(3, dtype=torch.long), value.to(torch.complex64)):
+    for wrong in (None, torch.ones(3, dtype=torch.long), value.to(torch.complex64)):
         with pytest.raises(ShapeError, match="expected"):
             function(wrong)
         with pytest.raises(ShapeError, match="expected"):

@@ -58,10 +58,9 @@ def test_a_state_of_another_order():
     for other in (Batches(11, 4), Batches(10, 5), Batches(10, 4, seed=1), Batches(10, 4, shuffle=False)):
         with pytest.raises(StorageError, match="repeat some samples"):
             other.load_state_dict(state)
-    with pytest.raises(StorageError, match="expected the order"):
-        Batches(10, 4).load_state_dict({})
-    with pytest.raises(StorageError, match="expected a state"):
-        Batches(10, 4).load_state_dict(None)
+    for other in ({}, None):
+        with pytest.raises(StorageError, match="expected (the order|a state)"):
+            Batches(10, 4).load_state_dict(other)
 
 
 def test_its_loader_leaves_random_numbers_alone():
@@ -97,18 +96,14 @@ def test_a_position_that_is_left_behind():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 1])
-def test_workers_of_ranks_draw_other_numbers(workers):
+def test_workers_of_ranks_draw_other_numbers():
     def drawn(rank, step=0, seed=0):
         batches = Batches(8, 4, rank=rank, world_size=2, seed=seed)
         batches.step = step
-        return next(iter(batches.loader(Drawing(), workers=workers))).tolist()
+        return next(iter(batches.loader(Drawing(), workers=1))).tolist()
 
-    if workers:
-        cases = [drawn(0), drawn(1), drawn(0, step=1), drawn(0, seed=1)]
-        assert len({tuple(case) for case in cases}) == 4 and drawn(0) == cases[0]
-    own = torch.Generator().manual_seed(5)
-    assert Batches(8, 4).loader(Drawing(), generator=own).generator is own
+    cases = [drawn(0), drawn(1), drawn(0, step=1), drawn(0, seed=1)]
+    assert len({tuple(case) for case in cases}) == 4 and drawn(0) == cases[0]
 
 
 class Drawing(torch.utils.data.Dataset):

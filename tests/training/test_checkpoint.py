@@ -117,12 +117,8 @@ def test_written_whole_or_not_at_all(tmp_path, monkeypatch):
         assert model.weight[0, 0] == 1.0
     save_checkpoint(path, {"model": tiny(2.0)}, step=2)
     assert load_checkpoint(path, {"model": tiny()}).step == 2
-    with pytest.raises(StorageError, match=r"cannot be written: the folder '.*nowhere' does not exist") as told:
+    with pytest.raises(StorageError, match=r"cannot be written: the folder '.*nowhere' does not exist"):
         save_checkpoint(tmp_path / "nowhere" / "run.pt", {}, step=0)
-    assert str(told.value).count("save_checkpoint") == 1
-    monkeypatch.setattr(os, "access", lambda *arguments: False)
-    with pytest.raises(StorageError, match=r"^save_checkpoint: [^:]*run.pt cannot be written: no permission for "):
-        save_checkpoint(path, {}, step=0)
 
 
 def test_torn_and_damaged_files(tmp_path):
@@ -142,8 +138,6 @@ def test_torn_and_damaged_files(tmp_path):
     assert model.weight[0, 0] == 3.0
     with pytest.raises(StorageError, match="is not there"):
         load_checkpoint(tmp_path / "other.pt", {})
-    with pytest.raises(StorageError, match="cannot be read"):
-        load_checkpoint(tmp_path, {})
 
 
 class _Harmful:
@@ -193,14 +187,20 @@ def test_checkpoints_of_other_runs_change_nothing(tmp_path):
 
 
 def test_of_other_numbers_of_ranks(tmp_path, monkeypatch):
-    path, model = tmp_path / "run.pt", tiny(3.0)
+    path, model, noise = tmp_path / "run.pt", tiny(3.0), torch.Generator().manual_seed(1)
     save_checkpoint(path, {"model": tiny(1.0)}, step=1)
+    save_checkpoint(tmp_path / "noise.pt", {"noise": noise}, step=1)
+    expected = torch.rand(1, generator=noise)
+    load_checkpoint(tmp_path / "noise.pt", {"noise": noise})
+    assert torch.equal(torch.rand(1, generator=noise), expected)
     monkeypatch.setattr(checkpoint, "_size", lambda: 2)
     with pytest.raises(StorageError, match="random numbers of 1 ranks, expected those of 2"):
         load_checkpoint(path, {"model": model})
     assert model.weight[0, 0] == 3.0
     assert load_checkpoint(path, {"model": model}, random=False).step == 1
     assert model.weight[0, 0] == 1.0
+    with pytest.raises(StorageError, match="a generator of each of 1 ranks, expected 2"):
+        load_checkpoint(tmp_path / "noise.pt", {"noise": noise}, random=False)
 
 
 def test_other_libraries_are_told(tmp_path, monkeypatch):
@@ -265,37 +265,21 @@ def test_a_full_disk(tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["run.pt"]
 
 
-def test_lazy_modules(tmp_path):
-    path = tmp_path / "run.pt"
-    save_checkpoint(path, {"model": nn.Linear(3, 2)}, step=1)
-    lazy = nn.LazyLinear(2)
-    load_checkpoint(path, {"model": lazy})
-    assert lazy.weight.shape == (2, 3)
-
-
-def stepped(kind, model, **options):
-    """An optimiser that has made a step."""
-    optimizer = kind(model.parameters(), lr=0.1, **options)
-    model(torch.ones(1, 2)).sum().backward()
-    optimizer.step()
-    return optimizer
-
-
 def test_what_one_part_refuses_changes_no_other(tmp_path):
     """Also what torch would take, and fail with at the next step."""
     path, donor = tmp_path / "run.pt", tiny(1.0)
-    adam = stepped(torch.optim.Adam, donor)
+    adam = torch.optim.Adam(donor.parameters(), lr=0.1)
+    donor(torch.ones(1, 2)).sum().backward()
+    adam.step()
     weight = float(donor.weight[0, 0].detach())
     save_checkpoint(path, {"model": donor, "other": adam, "batches": Batches(10, 4)}, step=1)
     model, order = tiny(3.0), Batches(10, 4)
-    wide, extra = nn.Linear(3, 1), nn.Linear(1, 1)
-    split = [{"params": [model.weight]}, {"params": [model.bias]}]
+    wide, split = nn.Linear(3, 1), [{"params": [model.weight]}, {"params": [model.bias]}]
     wrong = [
         (torch.optim.Adam(model.parameters()), Batches(10, 5), StorageError, "repeat some samples"),
         (torch.optim.SGD(model.parameters()), order, StorageError, "another kind of optimiser, .*Adam.; here is .*SGD"),
         (torch.optim.Adam(wide.parameters()), order, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
         (torch.optim.Adam(split), order, StorageError, r"groups of \[2\] parameters in the file, here of \[1, 1\]"),
-        (torch.optim.Adam([*model.parameters(), *extra.parameters()]), order, StorageError, r"here of \[4\]"),
     ]
     for optimizer, batches, error, message in wrong:
         with pytest.raises(error, match=message):
@@ -304,68 +288,6 @@ def test_what_one_part_refuses_changes_no_other(tmp_path):
     right = torch.optim.Adam(model.parameters())
     load_checkpoint(path, {"model": model, "other": right, "batches": order})
     assert float(model.weight[0, 0].detach()) == weight and right.state_dict()["state"].keys() == {0, 1}
-
-
-@pytest.mark.slow
-def test_compiled_modules_are_stored_as_they_were(tmp_path):
-    path, model = tmp_path / "run.pt", tiny(3.0)
-    save_checkpoint(path, {"model": torch.compile(tiny(1.0))}, step=1)
-    load_checkpoint(path, {"model": model})
-    assert model.weight[0, 0] == 1.0
-    save_checkpoint(path, {"model": model}, step=1)
-    other = tiny(3.0)
-    load_checkpoint(path, {"model": torch.compile(other)})
-    assert other.weight[0, 0] == 1.0
-
-
-def test_generators_are_those_of_every_rank(tmp_path, monkeypatch):
-    path, noise = tmp_path / "run.pt", torch.Generator().manual_seed(1)
-    save_checkpoint(path, {"noise": noise}, step=1)
-    expected = torch.rand(1, generator=noise)
-    load_checkpoint(path, {"noise": noise})
-    assert torch.equal(torch.rand(1, generator=noise), expected)
-    monkeypatch.setattr(checkpoint, "_size", lambda: 2)
-    with pytest.raises(StorageError, match="a generator of each of 1 ranks, expected 2"):
-        load_checkpoint(path, {"noise": noise}, random=False)
-
-
-class _Converted(nn.Linear):
-    """Its weights of version 1 were transposed."""
-
-    _version = 2
-
-    def __init__(self):
-        super().__init__(2, 2, bias=False)
-
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *others):
-        if local_metadata.get("version", 1) < 2:
-            state_dict[prefix + "weight"] = state_dict[prefix + "weight"].T
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, *others)
-
-
-def test_versions_of_modules_come_along(tmp_path):
-    path, module, other = tmp_path / "run.pt", _Converted(), _Converted()
-    save_checkpoint(path, {"m": nn.Sequential(module)}, step=0)
-    load_checkpoint(path, {"m": nn.Sequential(other)})
-    assert torch.equal(other.weight, module.weight)
-
-
-def test_what_cannot_be_written_or_read(tmp_path):
-    path, itself = tmp_path / "run.pt", []
-    itself.append(itself)
-    for where, parts, values, message in (
-        (path, {}, {"a": itself}, "hold themselves"),
-        (path, {"m": nn.LazyLinear(2)}, {}, "has no shape yet"),
-        (".", {}, {}, "no name of a file"),
-        (tmp_path, {}, {}, "cannot be written"),
-    ):
-        with pytest.raises(StorageError, match=message):
-            save_checkpoint(where, parts, step=0, values=values)
-    with pytest.raises(ArgumentError, match="values as a dictionary"):
-        save_checkpoint(path, {}, step=0, values=[1, 2])
-    save_checkpoint(path, {"m": tiny(1.0).double()}, step=0)
-    with pytest.raises(ShapeError, match=r"expected torch\.float32, the file has torch\.float64"):
-        load_checkpoint(path, {"m": tiny()})
 
 
 class Remembers(nn.Module):
@@ -382,8 +304,42 @@ class Remembers(nn.Module):
         self.said = state["said"]
 
 
+class _Converted(nn.Linear):
+    """Its weights of version 1 were transposed."""
+
+    _version = 2
+
+    def __init__(self):
+        super().__init__(2, 2, bias=False)
+
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, *others):
+        if local_metadata.get("version", 1) < 2:
+            state_dict[prefix + "weight"] = state_dict[prefix + "weight"].T
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, *others)
+
+
 def test_states_beside_tensors(tmp_path):
-    save_checkpoint(tmp_path / "a.pt", {"model": Remembers("before")}, step=1)
-    other = Remembers("after")
-    load_checkpoint(tmp_path / "a.pt", {"model": other})
-    assert other.said == "before"
+    """Extra states, versions of modules, shapes of lazy and names of compiled ones come along."""
+    path, module, other = tmp_path / "run.pt", _Converted(), _Converted()
+    parts = {"converted": nn.Sequential(module), "extra": Remembers("before"), "lazy": nn.Linear(3, 2)}
+    save_checkpoint(path, {**parts, "compiled": torch.compile(tiny(1.0))}, step=0)
+    extra, lazy, plain = Remembers("after"), nn.LazyLinear(2), tiny(3.0)
+    load_checkpoint(path, {"converted": nn.Sequential(other), "extra": extra, "lazy": lazy, "compiled": plain})
+    assert torch.equal(other.weight, module.weight) and extra.said == "before"
+    assert lazy.weight.shape == (2, 3) and plain.weight[0, 0] == 1.0
+
+
+def test_what_cannot_be_written_or_read(tmp_path):
+    path, itself = tmp_path / "run.pt", []
+    itself.append(itself)
+    for where, parts, values, error, message in (
+        (path, {}, {"a": itself}, StorageError, "hold themselves"),
+        (path, {"m": nn.LazyLinear(2)}, {}, StorageError, "has no shape yet"),
+        (".", {}, {}, StorageError, "no name of a file"),
+        (path, {}, [1, 2], ArgumentError, "values as a dictionary"),
+    ):
+        with pytest.raises(error, match=message):
+            save_checkpoint(where, parts, step=0, values=values)
+    save_checkpoint(path, {"m": tiny(1.0).double()}, step=0)
+    with pytest.raises(ShapeError, match=r"expected torch\.float32, the file has torch\.float64"):
+        load_checkpoint(path, {"m": tiny()})

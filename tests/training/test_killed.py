@@ -119,7 +119,7 @@ def start(script, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "workers"), [("files", 0), ("files", 1), ("recipe", 0)])
+@pytest.mark.parametrize(("kind", "workers"), [("files", 1), ("recipe", 0)])
 def test_ends_with_the_weights_of_a_run_that_was_not_stopped(tmp_path, kind, workers):
     script = tmp_path / "run.py"
     text = textwrap.dedent(SCRIPT).replace("STEPS", str(STEPS)).replace("EVERY", str(EVERY))

@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from torchtransient.errors import StorageError
-from torchtransient.training import checkpoint, load_checkpoint, save_checkpoint
-from torchtransient.training.checkpoint import random_state
+from torchtransient.training import load_checkpoint, save_checkpoint
 
 
 def changed(path, part, state):
@@ -17,25 +16,23 @@ def changed(path, part, state):
     torch.save(content, path)
 
 
-@pytest.mark.parametrize("state", [5, {}, {"device": "cuda", "generators": []}, {"device": "cpu"}])
-def test_what_is_no_state_of_a_generator(tmp_path, state):
+@pytest.mark.parametrize(
+    ("part", "states"),
+    [
+        ("a generator on cpu", [5, {}, {"device": "cuda", "generators": []}, {"device": "cpu"}]),
+        ("an optimiser", [5, {}, {"param_groups": []}, {"param_groups": {}, "state": {}}]),
+    ],
+)
+def test_what_is_no_state(tmp_path, part, states):
     path, noise = tmp_path / "run.pt", torch.Generator().manual_seed(1)
-    save_checkpoint(path, {"noise": noise}, step=1)
-    changed(path, "noise", state)
+    one = torch.optim.Adam(nn.Linear(2, 3).parameters()) if part == "an optimiser" else noise
+    save_checkpoint(path, {"one": one}, step=1)
     before = noise.get_state()
-    with pytest.raises(StorageError, match="the part 'noise' is no state of a generator on cpu"):
-        load_checkpoint(path, {"noise": noise})
+    for state in states:
+        changed(path, "one", state)
+        with pytest.raises(StorageError, match=f"the part 'one' is no state of {part}"):
+            load_checkpoint(path, {"one": one})
     assert torch.equal(noise.get_state(), before)
-
-
-@pytest.mark.parametrize("state", [5, {}, {"param_groups": []}, {"param_groups": {}, "state": {}}])
-def test_what_is_no_state_of_an_optimizer(tmp_path, state):
-    path, model = tmp_path / "run.pt", nn.Linear(2, 3)
-    optimizer = torch.optim.Adam(model.parameters())
-    save_checkpoint(path, {"adam": optimizer}, step=1)
-    changed(path, "adam", state)
-    with pytest.raises(StorageError, match="the part 'adam' is no state of an optimiser"):
-        load_checkpoint(path, {"adam": optimizer})
 
 
 class Adam(torch.optim.Adam):
@@ -44,7 +41,7 @@ class Adam(torch.optim.Adam):
 
 @pytest.mark.parametrize(
     ("there", "here"),
-    [("Adam", "Adamax"), ("Adam", "RAdam"), ("Adam", "AdamW"), ("AdamW", "Adam"), ("NAdam", "RAdam"), ("Adam", None)],
+    [("Adam", "Adamax"), ("AdamW", "Adam"), ("Adam", None)],
 )
 def test_states_of_other_kinds_of_optimizers(tmp_path, there, here):
     """Some have the same settings as the one here, and would go on with its moments as their own."""
@@ -72,25 +69,14 @@ def test_kinds_of_optimizers_move_within_a_package(tmp_path):
             load_checkpoint(path, {"one": optimizer})
 
 
-@pytest.mark.parametrize("scheduled", ["LambdaLR", "OneCycleLR"])
-def test_states_from_before_there_was_a_schedule(tmp_path, scheduled):
+def test_states_from_before_there_was_a_schedule(tmp_path):
     """What a schedule keeps in the optimiser is its own: it stays, and the schedule goes on."""
     path, model = tmp_path / "run.pt", nn.Linear(2, 3)
     save_checkpoint(path, {"one": torch.optim.Adam(model.parameters(), lr=0.25)}, step=1)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.5)
-    settings = {"lr_lambda": lambda step: 1.0} if scheduled == "LambdaLR" else {"max_lr": 1.0, "total_steps": 9}
-    schedule = getattr(torch.optim.lr_scheduler, scheduled)(optimizer, **settings)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=1.0, total_steps=9)
     before = optimizer.param_groups[0]["initial_lr"]
     load_checkpoint(path, {"one": optimizer})
     assert optimizer.param_groups[0]["lr"] == 0.25 and optimizer.param_groups[0]["initial_lr"] == before
     optimizer.step()
     schedule.step()
-
-
-def test_what_goes_wrong_in_another_rank_is_told(tmp_path, monkeypatch):
-    """Its parts are no state: no file is written, and the rank is named."""
-    other = {"random": random_state(), "generators": {}, "failure": "no state"}
-    monkeypatch.setattr(checkpoint, "_of_all_ranks", lambda own: [own, other])
-    with pytest.raises(StorageError, match=r"run\.pt was not written\. rank 1: no state$"):
-        save_checkpoint(tmp_path / "run.pt", {"model": nn.Linear(2, 3)}, step=1)
-    assert not list(tmp_path.iterdir())

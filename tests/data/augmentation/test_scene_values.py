@@ -14,7 +14,7 @@ from support.sweeps import together
 from tools.every_plugin import every_plugin
 from torchtransient import plugins
 from torchtransient.data import Affine, Augment, Crop, Flip, PixelMap, QuarterTurn
-from torchtransient.data.scene_values import OF_DEVICES, UNAFFECTED, check_values, stays_true
+from torchtransient.data.scene_values import OF_DEVICES, UNAFFECTED, stays_true
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 from torchtransient.plugins.parameters import ParameterTracker, can_carry_gradients
@@ -74,20 +74,14 @@ def test_what_stays(key, name):
     assert augmented(OPERATIONS[name], key, kept_values=[key])["values"][key].tolist() == [1, 1, 1]
 
 
-@pytest.mark.parametrize(
-    ("key", "stays"),
-    [
-        ("cam.to_world", f"flip {CAMERA_STAYS}"),
-        ("box.to_world", WORLD_STAYS),
-        ("box.unheard_of", WORLD_STAYS),
-        ("cam.unheard_of", NEVER),
-        ("other.film.size", NEVER),
-        ("other.x_fov", "flip turn shift tilt"),
-        ("camera.to_world", WORLD_STAYS),
-        ("left.sensor.to_world", f"flip {CAMERA_STAYS}"),
-        ("cam", NEVER),
-    ],
-)
+@together(
+    "key, stays",
+    {
+        "cam.to_world": f"flip {CAMERA_STAYS}", "box.to_world": WORLD_STAYS, "box.unheard_of": WORLD_STAYS,
+        "cam.unheard_of": NEVER, "other.film.size": NEVER, "other.x_fov": "flip turn shift tilt",
+        "camera.to_world": WORLD_STAYS, "left.sensor.to_world": f"flip {CAMERA_STAYS}", "cam": NEVER,
+    }.items(),
+)  # fmt: skip
 def test_where_the_camera_is_named(key, stays):
     for name, operation in OPERATIONS.items():
         if name in stays.split():
@@ -103,8 +97,7 @@ def test_values_that_are_none():
     with pytest.raises(SceneError, match="values as a dictionary"):
         augment({"depth": torch.ones(2, 2), "values": [3.0]})
     # Nothing is drawn: nothing is false.
-    untouched = Augment(Flip(p=0.0))({"depth": torch.ones(2, 2), "values": {"box.to_world": 1}})
-    assert untouched["values"] == {"box.to_world": 1}
+    assert augmented(Flip(p=0.0), "box.to_world")["values"]["box.to_world"].tolist() == [1, 1, 1]
 
 
 # ------------------------------------------------------------------------------------- against the table of parameters
@@ -179,13 +172,16 @@ NOT_NUMBERS_OF_A_DEVICE = {
 def test_maps_of_a_device_are_no_numbers():
     """One efficiency for all pixels stays true of a turned image, one for each pixel does not."""
     key = "device.PhotonBudget.quantum_efficiency"
-    turned = PixelMap(np.array([[-1.0, 0, 1], [0, 1, 0], [0, 0, 1]]), (2, 2), (2, 2))
+
+    def turned(value, **options):
+        return Augment(Flip(p=1.0), **options)({"depth": torch.ones(2, 2), "values": {key: value}})
+
     for number in (0.3, np.float32(0.3), torch.tensor([0.3, 0.4])):
-        check_values({key: number}, turned, (), ())
+        turned(number)
     for image in (torch.rand(2, 2), np.ones((1, 2, 2))):
         with pytest.raises(SceneError, match="quantum_efficiency"):
-            check_values({key: image}, turned, (), ())
-        check_values({key: image}, turned, (), (key,))
+            turned(image)
+        turned(image, kept_values=[key])
 
 
 def test_every_argument_of_a_device_is_known():

@@ -31,15 +31,6 @@ def test_each_bin_is_an_image_of_its_own(name):
     assert not spatial_filter(FILTERS[name], alone)[:, :, 4].any()
 
 
-def test_bilateral_of_channels_would_mix_time():
-    """What the room is for: with bins as channels, kornia's bilateral filter weighs by their sum of differences."""
-    light = torch.zeros(1, 2, 5, 5)
-    light[0, 0, :, 2:], light[0, 1, 2, 2] = 1.0, 0.3
-    bilateral = FILTERS["bilateral"]
-    apart = spatial_filter(bilateral, light)
-    assert not torch.allclose(apart[0, 1], bilateral(light)[0, 1], atol=1e-3)
-
-
 def test_gradients_and_empty():
     light = torch.rand(1, 3, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(2)).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: spatial_filter(FILTERS["gaussian"], x), (light,))

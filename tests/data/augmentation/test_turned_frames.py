@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchtransient.data import Affine, Crop, Flip, PixelMap, QuarterTurn
-from torchtransient.data.augment import turned_stokes
+from torchtransient.data import Affine, Augment, Crop, Flip, Operation, PixelMap, QuarterTurn
 from torchtransient.errors import SceneError, ShapeError
 
 SIZE = (2, 3)
@@ -36,39 +35,40 @@ def turned(stokes, ray, rotation):
     return [s0, linear * np.cos(2 * angle), linear * np.sin(2 * angle), s3]
 
 
-@pytest.mark.parametrize("drawn", [QuarterTurn(1).draw(SIZE, None), QuarterTurn(3).draw(SIZE, None), LEAN])
-@pytest.mark.parametrize("dim", [-4, -5])
-def test_the_field_of_each_pixel_stays(drawn, dim):
-    """By batch, channel and bin, with a camera for each entry of the batch."""
-    light = torch.rand(2, 4, *[3, 2][: -dim - 3], *drawn.new_size, dtype=torch.float64) - 0.4
-    found = turned_stokes(light, dim, drawn, CAMERAS)
+class Lean(Operation):
+    def draw(self, size, generator):
+        return LEAN
+
+
+@pytest.mark.parametrize("operation", [QuarterTurn(1), QuarterTurn(3), Lean()])
+def test_the_field_of_each_pixel_stays(operation):
+    """By batch, channel and bin, with a camera for each entry of the batch; of phasors both parts."""
+    light = torch.rand(2, 4, 3, 2, *SIZE, dtype=torch.float64) - 0.4
+    sample = {"steady": light[:, :, :, 0], "transient": light, "phasor": torch.complex(light, 2 * light)}
+    sample["intrinsics"] = CAMERAS
+    found, moved = (Augment(operation, polarized=polarized)(sample) for polarized in (True, False))
+    drawn = operation.draw(SIZE, None)
     cameras = drawn.intrinsics(CAMERAS.double())
     for b in range(2):
         for v, u in np.ndindex(drawn.new_size):
             ray = np.linalg.solve(cameras[b].numpy(), [u, v, 1.0])
             ray /= np.linalg.norm(ray)
-            for at in np.ndindex(*light.shape[2:-2]):
-                expected = turned(light[(b, slice(None), *at, v, u)].numpy(), ray, np.asarray(drawn.rotation))
-                np.testing.assert_allclose(found[(b, slice(None), *at, v, u)], expected, atol=1e-12)
-    # Of phasors both parts.
-    phasors = torch.complex(light, 2 * light)
-    torch.testing.assert_close(turned_stokes(phasors, dim, drawn, CAMERAS), torch.complex(found, 2 * found))
+            for at in np.ndindex(3, 2):
+                expected = turned(moved["transient"][(b, slice(None), *at, v, u)].numpy(), ray, drawn.rotation)
+                np.testing.assert_allclose(found["transient"][(b, slice(None), *at, v, u)], expected, atol=1e-12)
+    torch.testing.assert_close(found["steady"], found["transient"][:, :, :, 0])
+    torch.testing.assert_close(found["phasor"], torch.complex(found["transient"], 2 * found["transient"]))
 
 
-@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("dim", [-4, -5])
-def test_a_mirror_turns_the_handedness_over(direction, dim):
-    light = torch.rand(4, *[3, 5][: -dim - 3], *SIZE)
-    found = turned_stokes(light, dim, Flip(direction, 1.0).draw(SIZE, None), None)
-    assert torch.equal(found, torch.stack([light[0], light[1], -light[2], -light[3]]))
-
-
-def test_half_turns_and_windows_leave_the_frames():
-    light = torch.rand(4, 3, *SIZE)
-    for drawn in (QuarterTurn(2).draw(SIZE, None), Crop((1, 2), (1, 0)).draw(SIZE, None)):
-        assert torch.equal(turned_stokes(light, -4, drawn, None), light)
-    with pytest.raises(SceneError, match="wants intrinsics= of the camera"):
-        turned_stokes(light, -4, QuarterTurn(1).draw(SIZE, None), None)
+def test_mirrors_turn_the_handedness_over_and_half_turns_and_windows_leave_the_frames():
+    light, signs = torch.rand(4, 3, 5, *SIZE), torch.tensor([1.0, 1.0, -1.0, -1.0])[:, None, None, None, None]
+    for operation, expected in (
+        (Flip(p=1.0), light.flip(-1) * signs), (Flip("vertical", 1.0), light.flip(-2) * signs),
+        (QuarterTurn(2), light.flip(-1, -2)), (Crop((1, 2), (1, 0)), light[..., 1:, :2]),
+    ):  # fmt: skip
+        found = Augment(operation, polarized=True)({"transient": light, "steady": light.sum(2)})
+        assert torch.equal(found["transient"], expected)
+        torch.testing.assert_close(found["steady"], expected.sum(2))
 
 
 def test_windows_lie_on_the_image():
@@ -82,7 +82,7 @@ def test_windows_lie_on_the_image():
             Crop(size, offset).draw(SIZE, None)
 
 
-def test_affine_maps_of_kornia_with_a_derivative_of_their_own():
+def test_affine_maps_of_kornia():
     """Only numbers come of them, and torch's generator stays where another one is given."""
     from kornia.augmentation import RandomAffine, RandomPerspective
 
@@ -90,20 +90,19 @@ def test_affine_maps_of_kornia_with_a_derivative_of_their_own():
         def get_transformation_matrix(self, *arguments):
             return super().get_transformation_matrix(*arguments).requires_grad_()
 
-    one = Affine(Learned((30.0, 30.0), p=1.0))
+    def draw(augmentation, seed):
+        return Affine(augmentation).draw((5, 5), torch.Generator().manual_seed(seed))
+
     before = torch.get_rng_state()
-    drawn = one.draw((5, 5), torch.Generator().manual_seed(3))
+    drawn = draw(Learned((30.0, 30.0), p=1.0), 3)
     assert torch.equal(torch.get_rng_state(), before)
-    angle = np.radians(30)
-    side, across = np.cos(angle), np.sin(angle)
+    side, across = np.cos(np.radians(30)), np.sin(np.radians(30))
     np.testing.assert_allclose(np.abs(drawn.matrix[:2, :2]), [[side, across], [across, side]], atol=1e-6)
     assert Affine(RandomAffine(30.0, p=0.0)).draw((5, 5), None) is None
-    first, again = (Affine(RandomAffine(30.0, p=1.0)).draw((5, 5), torch.Generator().manual_seed(n)) for n in (4, 4))
-    assert np.array_equal(first.matrix, again.matrix)
-    eight = [Affine(RandomAffine(30.0, p=1.0)).draw((5, 5), torch.Generator().manual_seed(n)) for n in range(8)]
-    assert len({drawn.matrix.tobytes() for drawn in eight}) == 8
+    drawn = [draw(RandomAffine(30.0, p=1.0), n).matrix.tobytes() for n in (0, 1, 2, 3, 4, 5, 6, 7, 7)]
+    assert len(set(drawn)) == 8 and drawn[-1] == drawn[-2]
     with pytest.raises(SceneError, match="RandomPerspective is no affine map"):
-        Affine(RandomPerspective(0.5, p=1.0)).draw((5, 5), torch.Generator().manual_seed(0))
+        draw(RandomPerspective(0.5, p=1.0), 0)
 
 
 def test_half_of_a_pixel_is_rounded_up():

@@ -32,7 +32,7 @@ def test_killed_and_gone_on(tmp_path):
     options = ("--out", "rough", "--per-shard", "5", "--quiet")
     child = start_command(tmp_path, "dataset", "recipe.yaml", *options)
     for shards in (2, 6):
-        wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= shards)  # noqa: B023
+        wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= shards, 300)  # noqa: B023
         kill(workers_of(child.pid)[0])
     wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= 10)
     kill(child.pid)

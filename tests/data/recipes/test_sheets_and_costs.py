@@ -1,4 +1,4 @@
-"""What a contact sheet shows of a sample and what a forecast says, number by number. Nothing is rendered."""
+"""What a contact sheet shows of a sample, what a forecast says, and arrays of samples. Nothing is rendered."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torchtransient.data import Sample
 from torchtransient.data.checks import Cost, StructureCost
 from torchtransient.data.overview import cell_of
-from torchtransient.data.sample import OutsideLight
+from torchtransient.data.sample import OutsideLight, in_order
 from torchtransient.vis.tone_mapping import tone_map
 
 RANDOM = np.random.default_rng(3)
@@ -90,7 +90,31 @@ def test_curves_are_sums_over_channels_and_pixels():
         np.testing.assert_allclose(curve, cube.sum((0, 2, 3), dtype=np.float64), rtol=1e-12)
     assert cell_of(sample(phasor=cube)).curve is None
     assert cell_of(sample(transient=cube), 4).curve is None
-    np.testing.assert_allclose(cell_of(sample(measurement=cube[0]), 1).curve, cube[0].sum((0, 2)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rates", "beats"])
+def test_rows_are_added_up(name):
+    light = numbers(1, 4, 6, 2, 3)
+    velocity = np.stack([np.full((2, 3), v, np.float32) for v in (0.0, 3.0, 4.0)])
+    cell, plain = cell_of(sample(velocity=velocity, **{name: light})), cell_of(sample(transient=light.sum(1)))
+    np.testing.assert_allclose(cell.curve, plain.curve, rtol=1e-6)
+    np.testing.assert_allclose(cell.images["light"], plain.images["light"], atol=1e-5)
+    np.testing.assert_allclose(cell.images["velocity"], 5.0)
+
+
+# Of films, whose pixels come first in memory: colour in large blocks, of several cameras, rows and columns that are no
+# axis, and small ones.
+FILMS = [
+    ((16, 24, 64, 3), (3, 2, 0, 1)), ((4, 16, 24, 64, 3), (0, 4, 3, 1, 2)), ((24, 16, 128, 1), (3, 2, 1, 0)),
+    ((160, 120, 3), (2, 0, 1)), ((4, 4, 8, 1), (3, 2, 0, 1)), ((1, 128, 16, 24), (0, 1, 2, 3)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("shape", "order"), FILMS)
+def test_arrays_are_in_the_order_of_c(shape, order):
+    tensor = torch.randn(shape, generator=torch.Generator().manual_seed(1)).permute(order)
+    found = in_order(tensor)
+    assert found.flags.c_contiguous and np.array_equal(found, tensor.contiguous().numpy())
 
 
 # -------------------------------------------------------------------------------------------------------------- costs
@@ -112,5 +136,3 @@ def test_seconds_of_a_sample():
     assert cost(seen=1).sample_s == 0.375
     three = (*cost().structures, StructureCost("", 2.0, 0.75))
     assert cost(seen=32, structures=three).sample_s == pytest.approx(0.5 * 1.5 + 0.5 * 0.5)
-
-

@@ -21,13 +21,12 @@ import pytest
 from support.hostile_captures import bytes_changed, structure_changed
 from support.stored_samples import header, sample, write
 from torchtransient.data import Shard, ShardWriter, verify
-from torchtransient.data.shard_format import COMPRESSIONS
 from torchtransient.errors import MissingPackageError, StorageError
 
 
 def sources(folder):
     samples = [sample(0, (1, 1100, 8, 8)), ValueError("dark"), sample(2, (1, 1100, 8, 8))]
-    return [write(folder / f"{name}.h5", samples, compression=name) for name in COMPRESSIONS]
+    return [write(folder / f"{name}.h5", samples, compression=name) for name in ("blosc2", "gzip", "none")]
 
 
 def read_all(path):
@@ -130,23 +129,17 @@ CHUNKS = {"chunks": (1, 1, 256, 16, 16), "fletcher32": True}
         (replaced("there", data=np.zeros(5, np.uint8)), "rows disagree"),
         (about_changed(format="other 3"), "of format 'other 3'"),
         (about_changed(arrays={"transient": {"dtype": "f4"}}), "encoding"),
-        (about_changed(arrays=[]), "damaged"),
         (about_changed(failed=[[0, 5, "x"]]), "doubled or missing"),
         (about_changed(failed=3), "not iterable"),
-        (about_changed(texts={"a": ["x"]}), "does not describe"),
-        (about_changed(texts={"a": "xy"}), "does not describe"),
-        (about_changed(texts={"a": ["x", 3]}), "does not describe"),
-        (about_changed(structure="xy"), "does not describe"),
-        (about_changed(structure=["x"] * 3), "does not describe"),
-        (about_changed(store=3), "does not describe"),
-        (about_changed(compression=None), "does not describe"),
-        (about_changed(arrays={"transient": {"encoding": "half"}}), "does not describe"),
-        (about_changed(values="ab"), "does not describe"),
-        (about_changed(values=["count", 3]), "does not describe"),
+        *((about_changed(**entry), "does not describe") for entry in (
+            {"texts": {"a": ["x"]}}, {"texts": {"a": "xy"}}, {"texts": {"a": ["x", 3]}}, {"structure": "xy"},
+            {"structure": ["x"] * 3}, {"store": 3}, {"arrays": {"transient": {"encoding": "half"}}},
+            {"values": ["count", 3]}, {"header": "x"},
+        )),
         (about_changed(values=["../../about"]), "expected a row of"),
-        (about_changed(header="x"), "does not describe"),
+        (replaced("about", data=np.frombuffer(b"[" * 100_000, np.uint8)), "damaged"),
     ],
-)
+)  # fmt: skip
 def test_what_is_not_believed(tmp_path, change, message):
     path = changed(tmp_path, change)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -177,15 +170,6 @@ def test_what_is_no_shard(tmp_path, content):
     path.mkdir()
     with pytest.raises(StorageError, match="is a folder"):
         Shard(path)
-
-
-def test_deep_headers(tmp_path):
-    def change(file):
-        del file["about"]
-        file["about"] = np.frombuffer(b"[" * 100_000, np.uint8)
-
-    with pytest.raises(StorageError, match="damaged"):
-        Shard(changed(tmp_path, change))
 
 
 def full_disks(folder):
