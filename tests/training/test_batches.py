@@ -59,7 +59,7 @@ def test_a_state_of_another_order():
         with pytest.raises(StorageError, match="repeat some samples"):
             other.load_state_dict(state)
     for other in ({}, None):
-        with pytest.raises(StorageError, match="expected (the order|a state)"):
+        with pytest.raises(StorageError, match=r"expected (the order|a state)"):
             Batches(10, 4).load_state_dict(other)
 
 

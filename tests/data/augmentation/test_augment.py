@@ -122,43 +122,12 @@ def test_it_is_the_scene_rendered_anew(sample, name):
         assert a.shape == b.shape and torch.equal(a.isnan(), b.isnan())
         assert bool(((a - b).abs().nan_to_num() < 1e-4).all()), label
     for light in ("transient", "steady"):
-        # Of S3 there is none after one reflection: the test below.
+        # Of S3 there is none after one reflection; test_turned_frames.py has it.
         for k in range(3):
             s, t = (one[light].select(-5 if light == "transient" else -4, k) for one in (found, known))
             # 512 samples of each: smooth but for pixels on edges.
             off = (s - t).norm() / t.norm()
             assert off < 0.05, (light, k, off.item())
-
-
-@pytest.fixture(scope="module")
-def behind_a_pane():
-    """What a camera sees through a circular polarizer, which is one of the other hand in a mirrored scene."""
-
-    def see(**scene):
-        found = scene_of(**scene)
-        mirror = scene.get("mirror")
-        pane = POSE @ translate([0.0, 0.0, 0.3]) @ scale(2.0)
-        bsdf = {"type": "circular", "left_handed": mirror is not None}
-        found["pane"] = {"type": "rectangle", "to_world": pane if mirror is None else mirror @ pane, "bsdf": bsdf}
-        found["integrator"]["max_depth"] = 3
-        renderer = tt.TransientRenderer(tt.load(found, variant=VARIANT), spp=128)
-        out, matrix = renderer(seed=0), camera_of(renderer).intrinsics
-        return {"steady": out.steady.clone(), "transient": out.transient.clone(), "intrinsics": matrix.clone()}
-
-    return see
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["crop", "turn and flip"])
-def test_circular_light_is_that_of_the_scene_rendered_anew(behind_a_pane, name):
-    operations, scene = CASES[name]
-    before = behind_a_pane()
-    found, known = Augment(operations, polarized=True)(before), behind_a_pane(**scene)
-    for light, dim in (("steady", -4), ("transient", -5)):
-        a, b, old = (one[light].select(dim, 3) for one in (found, known, before))
-        assert (a - b).norm() < 0.15 * b.norm(), light
-        # Its hand is the other one in a mirror, and in nothing else.
-        assert (a.sum() * old.sum() < 0) == ("mirror" in scene)
 
 
 def test_all_labels_are_known():

@@ -59,14 +59,6 @@ def test_what_is_there(calm, tmp_path):
     assert (calm / "latest.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
-def test_equal_bytes_of_many_workers(calm, tmp_path):
-    """Whole numbers of any library count."""
-    numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
-    generate(RECIPE, tmp_path, workers=np.int64(2), progress=False, **numbers)
-    assert data_files(tmp_path) == data_files(calm)
-
-
 # ------------------------------------------------------------------------------------------------- samples that fail
 
 

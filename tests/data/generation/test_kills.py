@@ -112,19 +112,6 @@ def test_ctrl_c(tmp_path, calm, group):
 
 
 @pytest.mark.slow
-def test_a_supervisor_that_was_stopped_for_a_while(tmp_path, calm):
-    """Its workers are not taken for hung ones when it comes back."""
-    child = start(RECIPE, tmp_path, timeout_s=2.5, **ASKED)
-    wait_until(lambda: list(tmp_path.glob("shard-*.h5")))
-    os.killpg(child.pid, signal.SIGSTOP)
-    time.sleep(4)
-    os.killpg(child.pid, signal.SIGCONT)
-    status, out, err = finish(child)
-    assert status == 0 and "replaced" not in out, (out, err)
-    assert data_files(tmp_path) == calm
-
-
-@pytest.mark.slow
 def test_two_runs_at_once(tmp_path, calm):
     """On one folder, from its beginning on: both end, and nothing is lost or doubled."""
     both = [start(RECIPE, tmp_path, **ASKED) for _ in range(2)]

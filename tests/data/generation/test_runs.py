@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -78,25 +77,6 @@ def test_going_on(whole, tmp_path):
     assert (again.samples, again.kept, again.shards) == (0, 7, 0)
 
 
-def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
-    """Those that are there count from the beginning."""
-    shown = []
-
-    def bar(**given):
-        shown.append([given["total"], given["initial"], 0])
-        return SimpleNamespace(
-            update=lambda more: shown[-1].__setitem__(2, shown[-1][2] + more),
-            set_postfix=lambda told, refresh: shown[-1].append(told), close=lambda: shown[-1].append("closed"),
-        )  # fmt: skip
-
-    monkeypatch.setattr("tqdm.auto.tqdm", bar)
-    folder = copied(whole, tmp_path / "set", 1, 3)
-    generate(RECIPE, folder, **SMALL | {"progress": True})
-    assert shown == [[7, 3, 4, "closed"]]
-    generate(FakeRecipe(raising=(1, 3)), tmp_path / "other", retries=0, **SMALL | {"progress": True})
-    assert shown[1] == [7, 0, 7, *({"failed": k, "restarts": 0} for k in (1, 2)), "closed"]
-
-
 # ---------------------------------------------------------------------------------------------- what does not fit
 
 
@@ -113,6 +93,11 @@ def test_shards_that_do_not_fit(whole, tmp_path):
     with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
         generate(replace(RECIPE, versions={"fake": "2"}), folder, **SMALL)
     assert not (folder / "shard-000003.h5").exists()
+    # A run of an earlier format left out samples.
+    described = (whole / "recipe.json").read_text()
+    (folder / "recipe.json").write_text(described.replace("data set 2", "data set"))
+    with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
+        generate(RECIPE, folder, **SMALL)
     (folder / "shard-000000.h5").write_bytes(b"no shard")
     (folder / "recipe.json").unlink()
     assert generate(RECIPE, folder, **SMALL).samples == 3 and data_files(folder) == data_files(whole)
@@ -153,15 +138,6 @@ def test_samples_that_fail(whole, tmp_path):
 
 
 # ------------------------------------------------------------------------------------------- recipe.json, and words
-
-
-def test_a_folder_whose_first_samples_were_left_out(whole, tmp_path):
-    """By the rule of an earlier format: the others do not go beside them."""
-    place = copied(whole, tmp_path / "set", 3)
-    described = json.loads((whole / "recipe.json").read_text())
-    (place / "recipe.json").write_text(json.dumps(described | {"format": "torchtransient data set"}))
-    with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
-        generate(RECIPE, place, **SMALL)
 
 
 @pytest.mark.parametrize("content", [b"[1]", b'{"format": 0, "key": 1, "n": 2}', b"\xff"])

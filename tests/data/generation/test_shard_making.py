@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import torchtransient as tt
-from torchtransient.data import Sample, Shard
+from torchtransient.data import Sample
 from torchtransient.data.run_settings import RunSettings, samples_per_shard
 from torchtransient.data.shard_making import Messages, ShardMaker, raised, reason_of
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
@@ -92,23 +92,12 @@ def of(sent, *kinds):
     return [one if one[0] != "traced" else one[:3] for one in sent if one[0] in kinds]
 
 
-def test_samples_that_pass_at_the_second_attempt(made):
+def test_attempts_at_samples(made):
     """In a scene that is built anew; the traceback of the first failure is sent once."""
     recipe = Making({1: 1})
     (samples, failed, _), sent = made(recipe)
     assert (samples, failed) == (3, 0) and recipe.asked == [2, 1, 1, 0] and recipe.makers == 2
     assert of(sent, "traced", "retry") == [("traced", 0, 1), ("retry", 0, 1, BAD.format(1))]
-
-
-@pytest.mark.parametrize("retries", [0, 2])
-def test_samples_that_fail_throughout(made, tmp_path, retries):
-    recipe = Making({1: 99})
-    (samples, failed, _), sent = made(recipe, retries=retries)
-    assert (samples, failed) == (3, 1) and recipe.asked == [2, *[1] * (retries + 1), 0]
-    assert of(sent, "end")[1] == ("end", 0, 1, BAD.format(1))
-    with Shard(tmp_path / "shard-000000.h5") as shard:
-        assert shard.failed == {1: BAD.format(1)} and sorted(shard.index) == [0, 2]
-        assert [float(shard.read("transient", row).max()) for row in (0, 2)] == [0, 2]
     # Samples under another number are failures.
     assert made(Making(answers=lambda index: index + 1), retries=0)[0][:2] == (3, 3)
 

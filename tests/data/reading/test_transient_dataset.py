@@ -188,15 +188,23 @@ def test_measurements_on_other_axes_are_left_whole(tmp_path):
     assert item["measurement"].shape == (1, 7, 8, 8) and item["transient"].shape == (1, 9, 2, 2)
 
 
-def test_polarized_and_scanned_samples(tmp_path):
-    made = sample(0, (4, 1, 32, 6, 5))
-    path = write(tmp_path / "a.h5", [made], about={"axis": {**AXIS, "num_bins": 32}, "variant": "llvm_mono_polarized"})
-    assert TransientDataset(path, window=slice(0, 9))[0]["transient"].shape == (4, 1, 9, 6, 5)
-    made = sample(0)
-    made.arrays.pop("normals")
-    made.arrays.update({"transient": np.ones((1, 32, 2, 3, 4, 5), np.float32), "steady": np.ones((1, 2, 3, 4, 5))})
-    path = write(tmp_path / "b.h5", [made], about={"axis": {**AXIS, "num_bins": 32}})
-    assert TransientDataset(path, window=slice(0, 9))[0]["transient"].shape == (1, 9, 2, 3, 4, 5)
+@pytest.mark.parametrize(
+    ("shape", "time"),
+    [
+        ((4, 1, 32, 6, 5), None), ((1, 32, 2, 3, 4, 5), None),
+        # As many bins as rows, sensors or components: the header says where the time is.
+        ((2, 1, 4, 4, 4), 2), ((4, 4, 4, 5), 1), ((2, 4, 1, 4, 4, 5), 3), ((1, 4, 4), 1), ((1, 4, 4, 4, 4, 4), 1),
+    ],
+)  # fmt: skip
+def test_polarized_and_scanned_samples(tmp_path, shape, time):
+    about = {"behind_time": len(shape) - 1 - time} if time else {"variant": "llvm_mono_polarized"}
+    place = time or shape.index(32)
+    transient = np.random.default_rng(0).random(shape, dtype=np.float32)
+    made = replace(sample(0), arrays={"transient": transient, "steady": transient.sum(place)})
+    about |= {"axis": {**AXIS, "num_bins": shape[place]}, "measures": "transient"}
+    item = TransientDataset(write(tmp_path / "a.h5", [made], about=about), window=slice(1, 3))[0]
+    assert np.array_equal(item["transient"].numpy(), transient.take([1, 2], place))
+    assert item["steady"].shape == made.arrays["steady"].shape
 
 
 def test_shards_that_do_not_belong_together(data, tmp_path):

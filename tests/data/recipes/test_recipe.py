@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import pickle
-import subprocess
-import sys
 import warnings
 from dataclasses import dataclass, replace
 
@@ -90,23 +87,6 @@ def test_what_is_kept_of_a_sample():
     assert (one.seed, one.outside) == (other.seed, other.outside) and whole.key() != kept.key()
     same(D.Recipe.from_dict(json.loads(json.dumps(kept.to_dict()))).sample(2), other)
     kept.preview(1)
-
-
-@pytest.mark.slow
-def test_another_process_makes_the_same_bytes(tmp_path):
-    recipe = small()
-    recipe.to_yaml(tmp_path / "recipe.yaml")
-    program = (
-        "import sys, hashlib, torchtransient as tt\n"
-        "tt.threads(1)\n"
-        "recipe = tt.data.Recipe.read(sys.argv[1])\n"
-        "print(recipe.key(), hashlib.sha256(recipe.sample(7).arrays['transient'].tobytes()).hexdigest())"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "recipe.yaml")], capture_output=True, text=True, check=True
-    )
-    mine = hashlib.sha256(recipe.sample(7).arrays["transient"].tobytes()).hexdigest()
-    assert done.stdout.split() == [recipe.key(), mine]
 
 
 @pytest.mark.slow
@@ -221,7 +201,7 @@ def test_samples_whose_light_the_window_misses(monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_data_sets_have_the_same_samples(tmp_path):
+def test_all_processes_make_the_same_bytes(tmp_path):
     recipe = small(time_axis=tt.TimeAxis(2.0, 0.2, 40), vary={"white.reflectance.value": D.Uniform(0.1, 0.95)})
     with pytest.warns(PhysicsWarning, match="of 64 samples"):
         done = D.generate(recipe, tmp_path / "set", 8, workers=1, progress=False)
@@ -232,10 +212,9 @@ def test_all_data_sets_have_the_same_samples(tmp_path):
     with pytest.warns(PhysicsWarning, match="of 8 samples"), D.OnlineDataset(recipe, 8, warm=8, uses=9) as online:
         drawn = {one["index"]: one for one in (online.draw() for _ in range(40))}
     for index in range(8):
-        assert torch.allclose(stored[index]["transient"], read[index]["transient"], rtol=1e-4)
-        assert torch.allclose(stored.outside[index], read[index]["outside"], rtol=1e-6)
-    for index in set(drawn) & set(range(8)):
-        assert torch.allclose(drawn[index]["outside"], stored[index]["outside"], rtol=1e-6)
+        for other in (read[index], drawn.get(index, read[index])):
+            assert torch.equal(stored[index]["transient"], other["transient"])
+            assert torch.equal(stored.outside[index], other["outside"])
 
 
 @pytest.mark.slow

@@ -45,16 +45,3 @@ def test_preview_is_a_picture(recipe, tmp_path):
     assert min(picture.shape[:2]) > 200 and picture.std() > 20
     with pytest.raises(SceneError, match="whole number"):
         recipe.preview(0)
-
-
-@pytest.mark.slow
-def test_sheets_of_other_scans(tmp_path):
-    """A list of points, as a row."""
-    wall = tt.nlos.Wall.plane(width=1.0, height=1.0)
-    grid = tt.nlos.Scan.grid(wall, (3, 2), kind="confocal")
-    origins = {"sensor_origin": grid.sensor_origin, "laser_origin": grid.laser_origin}
-    scan = tt.nlos.Scan.points(grid.sensor_points.reshape(-1, 3), kind="confocal", wall=wall, **origins)
-    hidden = {"plate": {"type": "rectangle", "to_world": tt.scenes.transforms.translate([0, 0, 1.0])}}
-    recipe = D.Recipe(hidden, {}, scan=scan, variant="llvm_ad_mono", time_axis=tt.TimeAxis(0, 0.1, 40), spp=4)
-    recipe.preview(2, tmp_path / "sheet.png")
-    assert np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB")).std() > 5

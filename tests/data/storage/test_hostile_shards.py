@@ -5,11 +5,8 @@ from __future__ import annotations
 import functools
 import json
 import multiprocessing
-import os
 import random
 import resource
-import signal
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -170,33 +167,6 @@ def test_what_is_no_shard(tmp_path, content):
     path.mkdir()
     with pytest.raises(StorageError, match="is a folder"):
         Shard(path)
-
-
-def full_disks(folder):
-    """Against limits of every size, over a shard that is there. In a process of its own."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    path = write(folder / "a.h5", [sample(0), sample(1)])
-    before, size = path.read_bytes(), path.stat().st_size
-    for limit in (1, 600, 4096, 20_000, size // 2, size - 100, size - 1):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-        try:
-            with pytest.raises(StorageError, match="could not be written"):
-                write(path, [sample(0), sample(1)])
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-        assert path.read_bytes() == before and list(folder.iterdir()) == [path]
-
-
-@pytest.mark.slow
-def test_full_disks(tmp_path):
-    """A typed error, the old shard, nothing beside it, and a process that lives."""
-    code = f"import sys; sys.path[:0] = {sys.path!r}; import torchtransient; "
-    code += "from data.storage.test_hostile_shards import full_disks; from pathlib import Path; "
-    code += f"full_disks(Path({str(tmp_path)!r})); print('alive')"
-    tests = Path(__file__).parents[2]
-    environment = {**os.environ, "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, cwd=tests)
-    assert (found.returncode, found.stdout) == (0, "alive\n"), found.stderr
 
 
 @pytest.mark.parametrize(("package", "message"), [("hdf5plugin", "gzip"), ("h5py", "torchtransient")])

@@ -5,19 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 import resource
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from support.marks import long_pairs
 from support.stored_samples import cube, header, sample, write
-from torchtransient.array_files.part_files import sweep_parts
 from torchtransient.data import Shard, ShardWriter
 from torchtransient.data.shard_format import chunk_shape
 from torchtransient.errors import ArgumentError, StorageError
@@ -163,32 +158,6 @@ def test_arguments(tmp_path, monkeypatch, arguments, error, message):
     with pytest.raises(error, match=message):
         ShardWriter(**{"path": "a.h5", "rows": 1, "header": {}, **arguments})
     assert list(tmp_path.iterdir()) == []
-
-
-def killed_while_writing(path):
-    with ShardWriter(path, 2, header()) as shard:
-        shard.put(0, sample(0))
-        print("writing", flush=True)
-        time.sleep(60)
-
-
-@pytest.mark.slow
-def test_parts_of_the_dead_are_swept_and_those_of_the_living_stay(tmp_path):
-    tests = Path(__file__).parents[2]
-    code = f"import sys; sys.path[:0] = {sys.path!r}; from data.storage.test_shards import killed_while_writing as k; "
-    code += f"from pathlib import Path; k(Path({str(tmp_path / 'a.h5')!r}))"
-    environment = {**os.environ, "PYTHONPATH": f"{tests}:{os.environ.get('PYTHONPATH', '')}"}
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
-    try:
-        assert process.stdout.readline() == "writing\n"
-        assert sweep_parts(tmp_path) == [] and len(list(tmp_path.iterdir())) == 1
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert len(list(tmp_path.iterdir())) == 1
-        assert len(sweep_parts(tmp_path)) == 1 and list(tmp_path.iterdir()) == []
-    finally:
-        process.kill()
-        process.wait()
 
 
 def test_a_shard_that_is_there_is_replaced_at_the_end(tmp_path):
