@@ -1,4 +1,4 @@
-"""``tt.training.accumulate``: the gradient of a batch, part by part; and what autocast and scaled losses make of it."""
+"""``tt.training.accumulate``: the gradient of a batch, part by part, of scaled and of half losses too."""
 
 from __future__ import annotations
 
@@ -76,37 +76,6 @@ def test_memory_is_that_of_a_part():
 
     accumulate(loss_of, range(3))
     assert events == [(what, part) for part in range(3) for what in ("made", "gone")]
-
-
-@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
-def test_autocast_around_network_renderer_and_loss(model, kind):
-    measured = torch.randn(2, 5, generator=torch.Generator().manual_seed(1))
-
-    def loss_of():
-        out = model.renderer({COLOUR: torch.sigmoid(model.network(measured))}, seed=3)
-        return out, tt.losses.root_loss(out.transient, torch.ones_like(out.transient))
-
-    model.zero_grad()
-    _, exact = loss_of()
-    exact.backward()
-    expected = gradients(model)
-    model.zero_grad()
-    with torch.autocast("cpu", dtype=kind):
-        assert model.network(measured).dtype == kind
-        out, loss = loss_of()
-    # The render takes and gives float32, whatever the network computes in.
-    assert out.transient.dtype == out.steady.dtype == torch.float32
-    scaler = torch.amp.GradScaler("cpu", enabled=kind == torch.float16, init_scale=2.0**10)
-    scaler.scale(loss).backward()
-    optimizer = torch.optim.SGD(model.network.parameters(), lr=0.0)
-    scaler.unscale_(optimizer)
-    found = gradients(model)
-    assert {value.dtype for value in found.values()} == {torch.float32}
-    # Weights and activations keep 8 (bfloat16) or 11 bits.
-    bits = 4 * torch.finfo(kind).eps
-    for name in ("network.weight", "network.bias"):
-        torch.testing.assert_close(found[name], expected[name], rtol=0, atol=bits * expected[name].abs().max().item())
-    assert loss.item() == pytest.approx(exact.item(), rel=bits)
 
 
 def test_a_scaler_skips_a_step_whose_gradient_is_infinite():

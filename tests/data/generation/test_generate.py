@@ -124,7 +124,9 @@ class Unpicklable(FakeRecipe):
         ({"timeout_s": 0}, UnitError, "timeout_s"), ({"timeout_s": float("nan")}, UnitError, "timeout_s"),
         ({"engine": "dask"}, ArgumentError, "engine"), ({"address": "auto"}, UnitError, "ray"),
         ({"store": "half"}, ArgumentError, "store"), ({"compression": "lzma"}, ArgumentError, "compression"),
-        ({"recipe": {}}, ArgumentError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
+        ({"recipe": Path("rec.yaml")}, ArgumentError, r"tt.data.Recipe.read"),
+        ({"recipe": "set", "folder": RECIPE, "n": None}, ArgumentError, "a recipe and then a folder"),
+        ({"recipe": Unpicklable()}, SceneError, "pickles"),
         ({"recipe": Deviceless(), "store": "counts"}, SceneError, "with a device"),
         ({"engine": "ray"}, MissingPackageError, "needs the package ray"),
         ({"folder": Path(__file__)}, StorageError, "cannot be made"),
@@ -136,16 +138,6 @@ def test_arguments(tmp_path, monkeypatch, changes, error, words):
     with pytest.raises(error, match=words):
         generate(given.pop("recipe"), given.pop("folder"), **given)
     assert not list(tmp_path.glob("a/shard*"))
-
-
-def test_what_is_no_recipe_is_said_before_a_number_is_asked_for(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for given, words in (
-        (("folder", RECIPE), "a recipe and then a folder"), ((Path("rec.yaml"), "folder"), r"tt.data.Recipe.read"),
-    ):  # fmt: skip
-        with pytest.raises(ArgumentError, match=words):
-            generate(*given)
-    assert not list(tmp_path.iterdir())
 
 
 def fails(tmp_path, text):

@@ -11,9 +11,20 @@ from pathlib import Path
 
 import pytest
 
+import torchtransient as tt
 from support.fake_recipe import FakeRecipe
-from support.generation_runs import alive, data_files, finish, kill, leftovers, start, wait_until, workers_of
-from torchtransient.data import generate, verify
+from support.generation_runs import (
+    alive,
+    data_files,
+    finish,
+    kill,
+    leftovers,
+    start,
+    start_command,
+    wait_until,
+    workers_of,
+)
+from torchtransient.data import Recipe, generate, verify
 
 # Samples take a little, and so does every write to a shard.
 RECIPE = FakeRecipe(shape=(1, 16, 8, 8), seconds=0.02, slow_disk=0.004)
@@ -119,6 +130,45 @@ def test_two_runs_at_once(tmp_path, calm):
         status, _, err = finish(child)
         assert status == 0, err
     assert data_files(tmp_path) == calm and verify(tmp_path).complete and leftovers(tmp_path) == []
+
+
+RENDERED = """
+scene: {builtin: cornell_box, resolution: 16, num_bins: 200, bin_width_opl: 0.06}
+vary:
+  red.reflectance.value: {uniform: [0.1, 0.9]}
+  small-box.to_world: {turn: {axis: [0, 1, 0], low: -20, high: 20}}
+labels: [depth]
+spp: 64
+variant: llvm_ad_mono
+n: 100
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_of_real_renders(tmp_path):
+    """Two workers and a supervisor are killed; the rest is made by one worker. Threads of this process do not count."""
+    (tmp_path / "recipe.yaml").write_text(RENDERED)
+    recipe = Recipe.read(tmp_path / "recipe.yaml")
+    with tt.threads(2):
+        generate(recipe, tmp_path / "calm", workers=1, per_shard=5, progress=False)
+        assert tt.threads().drjit == 2
+    rough = tmp_path / "rough"
+    options = ("--out", "rough", "--per-shard", "5", "--quiet")
+    child = start_command(tmp_path, "dataset", "recipe.yaml", *options)
+    for shards in (2, 6):
+        wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= shards, 300)  # noqa: B023
+        kill(workers_of(child.pid)[0])
+    wait_until(lambda: len(list(rough.glob("shard-*.h5"))) >= 10)
+    kill(child.pid)
+    child.communicate()
+    assert len(list(rough.glob("shard-*.h5"))) < 20
+    done = generate(recipe, rough, workers=1, progress=False)
+    assert done.kept >= 50 and done.failed == 0
+    expected, found = data_files(tmp_path / "calm"), data_files(rough)
+    # It tells where the recipe lay on the machine that began.
+    del expected["recipe.json"], found["recipe.json"]
+    assert len(found) == 21 and found == expected and leftovers(rough) == []
+    assert verify(rough).complete
 
 
 @pytest.mark.soak

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import multiprocessing
-import random
 import resource
 import sys
 import tempfile
@@ -15,53 +13,9 @@ import h5py
 import numpy as np
 import pytest
 
-from support.hostile_captures import bytes_changed, structure_changed
 from support.stored_samples import header, sample, write
 from torchtransient.data import Shard, ShardWriter, verify
 from torchtransient.errors import MissingPackageError, StorageError
-
-
-def sources(folder):
-    samples = [sample(0, (1, 1100, 8, 8)), ValueError("dark"), sample(2, (1, 1100, 8, 8))]
-    return [write(folder / f"{name}.h5", samples, compression=name) for name in ("blosc2", "gzip", "none")]
-
-
-def read_all(path):
-    """What comes of a file: True for a shard, False for a StorageError. Everything else is raised."""
-    try:
-        with Shard(path) as shard:
-            for row in shard.index.values():
-                shard.values(row)
-                for name in shard.names:
-                    shard.read(name, row)
-                    shard.dtype(name)
-            shard.verify()
-    except StorageError:
-        return False
-    return True
-
-
-def read_mutants(folder, seeds):
-    """How many of the mutants of these seeds are still read, and by how many bytes the process has grown."""
-    folder = Path(folder)
-    found, good = sources(folder), 0
-    read_all(found[0])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for seed in seeds:
-        rng = random.Random(seed)
-        source, target = rng.choice(found), folder / "mutant.h5"
-        (structure_changed if seed % 2 == 0 else bytes_changed)(source, target, rng)
-        good += read_all(target)
-        target.unlink()
-    return good, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
-
-
-@pytest.mark.slow
-def test_mutated_files(tmp_path):
-    """In a process of its own, which survives."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        good, grown = pool.apply_async(read_mutants, (str(tmp_path), range(300))).get(timeout=300)
-    assert good < 150 and grown < 100e6
 
 
 @functools.cache
