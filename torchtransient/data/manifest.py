@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchtransient.array_files.part_files import sweep_parts as sweep_parts
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.array_files.plain_texts import json_data
 from torchtransient.checks import check_special, path_of, shown

@@ -10,7 +10,7 @@ from typing import Any
 
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.array_files.plain_texts import json_data
-from torchtransient.checks import check_special, short_message
+from torchtransient.checks import check_special, short_message, shown
 from torchtransient.data.processes import PluginNames
 from torchtransient.data.serialization import without_places
 from torchtransient.errors import StorageError
@@ -135,13 +135,8 @@ def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int
         Plain data.
     """
     recipe = without_places(described["recipe"])
-    samples = list(_ends(Plan(settings.n, described["per_shard"]), shard))
-    return {**described, "recipe": recipe, "shard": shard, "samples": samples}
-
-
-def _ends(plan: Plan, shard: int) -> tuple[int, int]:
-    indices = plan.indices(shard)
-    return indices.start, indices.stop
+    indices = Plan(settings.n, described["per_shard"]).indices(shard)
+    return {**described, "recipe": recipe, "shard": shard, "samples": [indices.start, indices.stop]}
 
 
 def description(settings: RunSettings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
@@ -277,9 +272,17 @@ def _first_difference(there: Any, here: Any, at: str = "") -> str:
                 return _first_difference(there.get(name), here.get(name), f"{at}.{name}".lstrip("."))
     if there == here:
         return " (a file that it names has changed)"
-    return f" ({at or 'it'} is {_short(there)} there and {_short(here)} here)"
+    return f" ({at or 'it'} is {shown(there)} there and {shown(here)} here)"
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def bytes_text(size: float) -> str:
+    """Return a number of bytes as text, "1.5 MB".
+
+    Args:
+        size: number of bytes.
+    """
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"

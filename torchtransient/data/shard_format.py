@@ -378,7 +378,8 @@ def check_chunks(dataset: Any, rows_there: int, what: str) -> None:
     Raises:
         StorageError: for other chunks, filters, and rows without their chunks.
     """
-    filters = {dataset.id.get_create_plist().get_filter(k)[0] for k in range(_filter_count(dataset))}
+    settings = dataset.id.get_create_plist()
+    filters = {settings.get_filter(k)[0] for k in range(settings.get_nfilters())}
     if not filters <= _KNOWN_FILTERS:
         raise StorageError(f"{what} is packed with the filters {sorted(filters)}, which no writer of shards uses.")
     if _BLOSC2 in filters:
@@ -390,7 +391,3 @@ def check_chunks(dataset: Any, rows_there: int, what: str) -> None:
     stored = dataset.id.get_num_chunks()
     if stored != rows_there * each:
         raise StorageError(f"{what}: expected {rows_there * each} chunks, the file stores {stored}: it is damaged.")
-
-
-def _filter_count(dataset: Any) -> int:
-    return int(dataset.id.get_create_plist().get_nfilters())

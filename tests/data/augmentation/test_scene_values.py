@@ -9,7 +9,7 @@ from kornia.augmentation import RandomAffine, RandomRotation
 
 from support.sweeps import together
 from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
-from torchtransient.data.scene_values import OF_THE_WORLD, UNAFFECTED
+from torchtransient.data.augment import OF_THE_WORLD, UNAFFECTED
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 
