@@ -349,7 +349,7 @@ def as_image(name: str, given: Any) -> Tensor:
 
 
 def size_of(images: Mapping[str, Tensor], known: Sequence[str]) -> tuple[int, int]:
-    """Height and width that all images share.
+    """Return the height and width that all images share.
 
     Args:
         images: tensors (..., H, W) by name.
@@ -416,7 +416,7 @@ def _shape(given: Any) -> tuple[int, ...]:
 
 
 def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tensor | None) -> Tensor:
-    """Stokes components in the frames of a camera that has been turned or mirrored.
+    """Return the Stokes components in the frames of a camera that has been turned or mirrored.
 
     A mirror changes the signs of S2 and S3. A turn of the camera turns the frame of each pixel by an angle that depends
     on its ray; half a turn leaves it.

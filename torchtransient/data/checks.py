@@ -76,7 +76,7 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
 
 
 def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -> OutsideLight:
-    """Light of the first samples outside of the time window.
+    """Measure the light of the first samples outside of the time window.
 
     Args:
         recipe: description.
@@ -100,7 +100,8 @@ def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -
 
 
 def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:
-    """Structures of some samples in the order in which they come, 8 at most, each scene of the recipe among them.
+    """Return the structures of some samples in the order in which they come, 8 at most, each scene of the recipe among
+    them.
 
     Args:
         recipe: description.

@@ -29,7 +29,7 @@ class Draw(Protocol):
     """Source of random numbers of a distribution."""
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """Independent numbers in [0, 1).
+        """Draw independent numbers in [0, 1).
 
         Args:
             shape: of the array.
@@ -54,7 +54,7 @@ class Stream:
         self._generator = np.random.Generator(np.random.Philox(key=np.frombuffer(digest, "<u8").astype(np.uint64)))
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """Independent numbers in [0, 1).
+        """Draw independent numbers in [0, 1).
 
         Args:
             shape: of the array.
@@ -80,7 +80,7 @@ class Fixed:
         self._number = number
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """The constant.
+        """Return the constant.
 
         Args:
             shape: of the array.
@@ -106,7 +106,7 @@ class Extreme:
         self._otherwise = Stream(0, int(upper), "ends")
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """The end of [0, 1), for the first calls.
+        """Return the end of [0, 1), for the first calls.
 
         Args:
             shape: of the array.
@@ -218,7 +218,7 @@ class Distribution(ABC):
             object.__setattr__(self, name, value)
 
     def entries(self) -> dict[str, Any]:
-        """Settings by name, as constructors take them."""
+        """Return the settings by name, as constructors take them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __eq__(self, other: object) -> bool:

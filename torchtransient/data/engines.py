@@ -319,8 +319,8 @@ class RayCrew(Crew["RayWorker"]):
         return self._numbers[number]
 
     def patience_to_start(self) -> float:
-        """Seconds until a worker has to be ready: an hour, unlimited beside workers that are ready (the processors of
-        the cluster may be in use).
+        """Return the seconds until a worker has to be ready: an hour, unlimited beside workers that are ready (the
+        processors of the cluster may be in use).
         """
         return float("inf") if any(worker.ready for worker in self.workers) else 6 * PATIENCE_S
 

@@ -430,7 +430,7 @@ class Schedule:
         return self._next
 
     def order(self, producer: int) -> Order | None:
-        """Next sample for a producer.
+        """Return the next sample for a producer.
 
         Args:
             producer: its number.

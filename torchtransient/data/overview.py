@@ -156,7 +156,7 @@ def summary(folder: str | Path) -> str:
 
 
 def behind_time(about: Mapping[str, Any]) -> int:
-    """Dimensions of a transient behind its bins: rows and columns, or those of a scan.
+    """Return the dimensions of a transient behind its bins: rows and columns, or those of a scan.
 
     Args:
         about: entry ``about`` of a header.
@@ -291,7 +291,7 @@ class LatestPicture:
 
 
 def picture_of(sample: Any) -> NDArray[np.uint8]:
-    """Light of a sample as a picture.
+    """Draw the light of a sample as a picture.
 
     Args:
         sample: of a recipe.

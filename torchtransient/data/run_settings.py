@@ -70,7 +70,7 @@ class Plan:
         return -(-self.n // self.per_shard)
 
     def indices(self, shard: int) -> range:
-        """Samples of a shard; row 0 of the file is the first one.
+        """Return the samples of a shard; row 0 of the file is the first one.
 
         Args:
             shard: its number.
@@ -81,7 +81,7 @@ class Plan:
         return range(shard * self.per_shard, min(self.n, (shard + 1) * self.per_shard))
 
     def share(self, part: int, parts: int) -> range:
-        """Shards of one of several runs that divide the work.
+        """Return the shards of one of several runs that divide the work.
 
         Args:
             part: number of the run.
@@ -106,8 +106,8 @@ def shard_file_name(number: int) -> str:
 
 
 def samples_per_shard(n: int, sample_bytes: int) -> int:
-    """Samples in a shard: 64 MB; up to 256 MB where there would be more than 256 shards; fewer where there would be
-    less than 64. It does not depend on the workers: files are the same everywhere.
+    """Choose the samples in a shard: 64 MB; up to 256 MB where there would be more than 256 shards; fewer where there
+    would be less than 64. It does not depend on the workers: files are the same everywhere.
 
     Args:
         n: samples of the data set.
@@ -123,8 +123,8 @@ def samples_per_shard(n: int, sample_bytes: int) -> int:
 
 
 def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
-    """Header of a shard: description of the data set and number of the shard, without the folders of the recipe's
-    files.
+    """Return the header of a shard: description of the data set and number of the shard, without the folders of the
+    recipe's files.
 
     Args:
         settings: of the run.
@@ -140,7 +140,7 @@ def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int
 
 
 def description(settings: RunSettings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
-    """Content of ``recipe.json``.
+    """Return the content of ``recipe.json``.
 
     Args:
         settings: of the run.
@@ -168,7 +168,7 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
 
 
 def plain(value: Any) -> Any:
-    """Value as JSON gives it back.
+    """Return a value as JSON gives it back.
 
     Args:
         value: of plain data.

@@ -290,7 +290,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
             yield self.dataset.sample(int(number), epoch), int(repeats[number])
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """Numbers of the samples that this process, or worker of a DataLoader, reads in an epoch.
+        """Return the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch.
 
         Args:
             epoch: from 0 on.
@@ -477,7 +477,7 @@ class ShardTable:
 
 
 def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
-    """Time axis of a render.
+    """Return the time axis of a render.
 
     Args:
         about: entry ``about`` of a header.
@@ -498,7 +498,7 @@ def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
 
 
 def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
-    """Bins of a window.
+    """Return the bins of a window.
 
     Args:
         window: ``(start_opl, end_opl)`` in metres, all bins that it touches, None for an open end; or a slice of bins;
@@ -540,7 +540,7 @@ def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
 
 
 def cut_axis(axis: TimeAxis | None, bins: slice | None) -> TimeAxis | None:
-    """Axis of some of its bins.
+    """Return the axis of some of its bins.
 
     Args:
         axis: time axis, or None.
@@ -555,7 +555,7 @@ def cut_axis(axis: TimeAxis | None, bins: slice | None) -> TimeAxis | None:
 
 
 def image_size(shapes: Mapping[str, tuple[int, ...]], measured: Sequence[str]) -> tuple[int, ...]:
-    """Rows and columns of the images of samples: of the steady image and labels, else of measured arrays.
+    """Return the rows and columns of the images of samples: of the steady image and labels, else of measured arrays.
 
     Args:
         shapes: of the arrays by name.
@@ -596,8 +596,8 @@ def pixels_of(pixels: Any, size: tuple[int, ...]) -> tuple[slice, slice] | None:
 
 
 def shard_paths(where: Any) -> list[Path]:
-    """Shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards that are
-    missing.
+    """Return the shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards
+    that are missing.
 
     Args:
         where: as of :class:`TransientDataset`.

@@ -128,6 +128,11 @@ class Bounded(Settings):
 
     @without_autocast
     def forward(self, x: Tensor) -> Tensor:
+        """Return `bounded` of a tensor.
+
+        Args:
+            x: any shape to which the bounds broadcast.
+        """
         # The bounds were looked at when they were given: looking at them again would wait for a GPU.
         return _between(floating(x, type(self).__name__), self.low, self.high, type(self).__name__)
 
@@ -293,6 +298,11 @@ class Positive(Settings):
 
     @without_autocast
     def forward(self, x: Tensor) -> Tensor:
+        """Return `positive` of a tensor.
+
+        Args:
+            x: any shape.
+        """
         return _above(floating(x, "Positive"), self.low.to(x), self.scale.to(x), self.function)
 
     @without_autocast
