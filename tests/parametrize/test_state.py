@@ -110,21 +110,3 @@ def test_states_that_do_not_fit():
     ):  # fmt: skip
         with pytest.raises(error, match=words):
             module.load_state_dict(state)
-
-
-def test_a_renderer_whose_pose_began_elsewhere():
-    """The pose of the state, not the state's step from where this one began."""
-    from tools.small_room import COLOUR, VARIANT, WALL_POSE, make_room
-
-    def made(shift, bounds):
-        room = make_room()
-        room["wall"]["to_world"] = translate(shift) @ np.asarray(room["wall"]["to_world"], dtype=np.float64)
-        renderer = tt.TransientRenderer(tt.load(room, variant=VARIANT), [COLOUR, WALL_POSE], temporal_filter="tent")
-        register(renderer, COLOUR, bounds)
-        register(renderer, WALL_POSE, AxisAnglePose(renderer.values[WALL_POSE]))
-        return renderer
-
-    saved, other = made([0.0, 0.0, 0.0], Albedo()), made([0.1, 0.0, -0.2], Bounded(0.0, 0.9))
-    other.load_state_dict(saved.state_dict())
-    for key in (COLOUR, WALL_POSE):
-        assert torch.equal(saved.values[key], other.values[key])

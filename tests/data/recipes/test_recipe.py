@@ -230,15 +230,6 @@ def test_standard_error_falls_with_samples():
     assert 0.8 < small(spp=1, time_axis=tt.TimeAxis(2.0, 0.01, 1200))._maker.standard_error(0) < 1.1
 
 
-@pytest.mark.slow
-def test_phasors_polarization_and_gates():
-    phasor = small(frequencies=[0.0, 0.5]).sample(0)
-    assert phasor.arrays["phasor"].shape == (1, 2, 8, 8) and phasor.arrays["phasor"].dtype == np.complex64
-    assert small(gates=[tt.Gate.gaussian(8.0, 2.0)]).sample(0).arrays["gated"].shape == (1, 1, 8, 8)
-    stokes = small(variant="llvm_ad_mono_polarized", labels=("first_return",)).sample(0)
-    assert stokes.arrays["transient"].shape == (4, 1, 60, 8, 8) and stokes.arrays["first_return"].shape == (8, 8)
-
-
 def test_devices_measure_and_vary():
     axis = tt.sensing.device("vl53l8_like").axis()
     recipe = small(device="vl53l8_like", time_axis=axis)

@@ -120,12 +120,3 @@ def test_counts_of_a_shard(tmp_path):
         write(tmp_path / "a.h5", samples, "counts")
     with pytest.raises(StorageError, match="measurement of a sensor"):
         write(tmp_path / "b.h5", [sample(0)], "counts")
-
-
-def test_sizes(tmp_path):
-    """Noise of a render: shortened mantissas are less than three quarters as large."""
-    sizes = {
-        store: write(tmp_path / f"{store}.h5", [sample(i, (1, 512, 32, 32)) for i in range(2)], store).stat().st_size
-        for store in ("exact", "rounded")
-    }
-    assert sizes["rounded"] < 0.75 * sizes["exact"]

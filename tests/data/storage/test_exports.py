@@ -112,13 +112,10 @@ def test_damaged_tars(tmp_path):
 
 def test_what_is_no_tar(data, tmp_path):
     path = tmp_path / "a.tar"
-    path.write_bytes(b"x" * 2000)
-    with pytest.raises(StorageError, match="a WebDataset"):
-        list(read_web_dataset(path))
-    whole = export(data, tmp_path / "out")[0]
-    path.write_bytes(whole.read_bytes()[:100_000])
-    with pytest.raises(StorageError):
-        list(read_web_dataset(path))
+    for content in (b"x" * 2000, export(data, tmp_path / "out")[0].read_bytes()[:100_000]):
+        path.write_bytes(content)
+        with pytest.raises(StorageError):
+            list(read_web_dataset(path))
     with tarfile.open(path, "w") as tar:
         entry = tarfile.TarInfo("0.depth.npy")
         entry.type, entry.linkname = tarfile.SYMTYPE, "/etc/passwd"
