@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import io
-
 import pytest
 import torch
 from torch import nn
@@ -36,15 +33,11 @@ def plain(scene):
     return tt.TransientRenderer(scene, KEYS, spp=4, temporal_filter="tent")
 
 
-def parametrized(scene):
+@pytest.fixture
+def renderer(scene):
     made = tt.TransientRenderer(scene, KEYS, spp=4, temporal_filter="tent")
     register(made, COLOUR, Albedo())
     return register(made, WALL_POSE, AxisAnglePose(made.values[WALL_POSE]))
-
-
-@pytest.fixture
-def renderer(scene):
-    return parametrized(scene)
 
 
 def light(renderer, seed=3):
@@ -85,76 +78,6 @@ def test_names_values_and_writing(renderer):
     name = f"parametrizations.{COLOUR.replace('.', '/')}.original"
     out = torch.func.functional_call(renderer, {name: x}, kwargs={"seed": 3}).transient
     assert torch.allclose(out, renderer({COLOUR: torch.sigmoid(x)}, seed=3).transient, rtol=1e-4, atol=1e-9)
-
-
-def copies():
-    def saved(module):
-        file = io.BytesIO()
-        torch.save(module, file)
-        file.seek(0)
-        return torch.load(file, weights_only=False)
-
-    return {
-        "deepcopy": copy.deepcopy,
-        "copy": copy.copy,
-        "torch.save": saved,
-        "variation": lambda module: module.variation(temporal_filter="tent"),
-    }
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", copies())
-def test_copies_are_renderers_of_their_own(renderer, how):
-    with torch.no_grad():
-        original(renderer, COLOUR).add_(0.3)
-    twin = copies()[how](renderer)
-    assert isinstance(twin, tt.TransientRenderer) and repr(twin) == repr(renderer)
-    assert [n for n, _ in twin.named_parameters()] == [n for n, _ in renderer.named_parameters()]
-    assert torch.equal(light(twin), light(renderer))
-    before = light(renderer).detach()
-    shared = original(twin, COLOUR) is original(renderer, COLOUR)
-    assert shared == (how == "copy")  # which shares its tensors, as copies of modules do
-    with torch.no_grad():
-        original(twin, COLOUR).add_(0.0 if shared else 1.0)
-    remove(twin, COLOUR)
-    remove(twin, WALL_POSE)
-    assert type(twin) is tt.TransientRenderer
-    assert torch.allclose(light(twin), before, rtol=1e-3) == shared
-    assert torch.equal(light(renderer), before)
-    light(renderer).sum().backward()
-    assert original(renderer, WALL_POSE).grad.abs().max() > 0
-
-
-def test_state_dict_and_optimiser_go_on(renderer, scene):
-    def step(module, optimizer, seed):
-        optimizer.zero_grad()
-        light(module, seed).square().mean().backward()
-        optimizer.step()
-
-    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)
-    step(renderer, optimizer, 1)
-    saved = copy.deepcopy((renderer.state_dict(), optimizer.state_dict()))
-    step(renderer, optimizer, 2)
-    other = parametrized(scene)
-    again = torch.optim.Adam(other.parameters(), lr=0.05)
-    other.load_state_dict(saved[0])
-    again.load_state_dict(saved[1])
-    step(other, again, 2)
-    for key in KEYS:
-        assert torch.allclose(original(other, key), original(renderer, key), rtol=1e-4, atol=1e-6)
-
-
-def test_inside_of_another_module_and_twice(scene):
-    holder = nn.ModuleDict({"scene": tt.TransientRenderer(scene, [COLOUR], spp=4), "net": nn.Linear(2, 2)})
-    before = holder["scene"].values[COLOUR].detach().clone()
-    register(holder, COLOUR, tt.parametrize.Bounded(-8.0, 8.0))
-    register(holder, "net.weight", tt.parametrize.Bounded(-1.0, 1.0))
-    register(holder, COLOUR, Albedo(margin=1e-3))  # of what the first one makes
-    assert torch.allclose(holder["scene"].values[COLOUR], before, rtol=1e-5)
-    assert len(holder["scene"].parametrizations[COLOUR.replace(".", "/")]) == 2
-    assert bool((holder["net"].weight.abs() < 1).all())
-    twin = copy.deepcopy(holder)
-    assert torch.equal(light(twin["scene"]), light(holder["scene"]))
 
 
 def test_what_is_wrong_is_said(renderer, plain):

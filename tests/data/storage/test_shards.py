@@ -79,15 +79,6 @@ def test_bytes_do_not_tell_the_environment(tmp_path, monkeypatch):
     assert {name: os.environ[name] for name in settings} == settings
 
 
-@pytest.mark.slow
-def test_chunks_are_compressed_without_threads(tmp_path):
-    """Threads of each of 32 chunks would wait 128 times here, and two workers would be hardly faster than one."""
-    samples = [sample(i, (1, 1024, 32, 32)) for i in range(4)]
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
-    write(tmp_path / "a.h5", samples)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw - before < 64
-
-
 def test_failures_are_named(tmp_path):
     samples = [sample(0), ValueError("the box left the room"), sample(2)]
     with Shard(write(tmp_path / "a.h5", samples)) as shard:
