@@ -50,10 +50,6 @@ class Sample:
     outside: tuple[float, float] = (0.0, 0.0)
     structure: str = ""
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return ``arrays`` as tensors, on the same memory."""
-        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in self.arrays.items()}
-
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in self.arrays.items())
         return f"Sample({self.index}: {shapes}; drawn: {', '.join(self.values) or 'nothing'})"
