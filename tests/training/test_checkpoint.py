@@ -256,7 +256,7 @@ def test_what_one_part_refuses_changes_no_other(tmp_path):
         with pytest.raises(error, match=message):
             load_checkpoint(path, right | changes)
         assert model.weight[0, 0] == 3.0 and torch.equal(torch.get_rng_state(), state)
-    with pytest.raises(StorageError, match="has the parts batches, model, noise, other, expected model"):
+    with pytest.raises(StorageError, match="has the parts model, other, batches, noise, expected model"):
         load_checkpoint(path, {"model": model})
     load_checkpoint(path, right)
     assert float(model.weight[0, 0].detach()) == weight and right["other"].state_dict()["state"].keys() == {0, 1}
