@@ -224,12 +224,14 @@ def test_silent_workers_end(clock, ledger, samples, timeout_s, limit):
     assert crew.started[1].tasks[0][3] == {5: DIED} and ledger.restarts == 1
 
 
-def test_a_run_that_was_stopped_takes_no_worker_for_a_silent_one(clock, ledger):
+@pytest.mark.parametrize("seconds", [2.25, 5000.0])
+def test_a_run_that_was_stopped_takes_no_worker_for_a_silent_one(clock, ledger, seconds):
+    """A poll takes less than two seconds."""
     steps = [
         lambda c: c.says(0, "ready"), lambda c: c.says(0, "begin", 4, 5),
-        lambda c: setattr(clock, "now", clock.now + 5000.0), lambda c: c.says(0, "wrote", 4, 1, 0, 9),
+        lambda c: setattr(clock, "now", clock.now + seconds), lambda c: c.says(0, "wrote", 4, 1, 0, 9),
     ]  # fmt: skip
-    crew = Played(ledger, 1, 7.0, steps)
+    crew = Played(ledger, 1, 2.1, steps)
     crew.make([4], {})
     assert not crew.started[0].ended and ledger.restarts == 0
 
