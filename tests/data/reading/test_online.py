@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import math
 import os
 import pickle
 import signal
@@ -241,7 +242,8 @@ def test_a_producer_that_hangs_is_an_error(tmp_path):
 
 @pytest.mark.slow
 def test_more_than_the_shared_memory_is_an_error(monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2**16))
+    needed = 1024 * 4 * (math.prod(SHAPE) + 2 * 8 * 8)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=needed - 1))
     with OnlineDataset(OnlineRecipe(), capacity=1024) as data, pytest.raises(StorageError, match="shared memory"):
         data.draw()
 

@@ -117,6 +117,7 @@ def test_choices_are_copies_in_plain_numbers():
     assert choice.values[1].tolist() == [0, 1, 2] and type(choice.values[2]) is float
     assert choice.values[3] == {"radius": 0.5, "places": [2, [3]]} and choice.values[4] == "text"
     assert choice.draw(Fixed(0.5), Place("x", ANYTHING)) == 4.0
+    assert written([colour, array]) == [[1, 2, 3], [1, 2, 3]]
     first = D.Choice([colour]).draw(Fixed(0.0), COLOUR)
     assert first.tolist() == [1, 2, 3] and first.dtype == np.float64
     # One number for all entries; what is drawn is its receiver's.
