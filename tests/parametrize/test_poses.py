@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 
 import numpy as np
@@ -84,11 +83,6 @@ def test_half_a_turn(there, back, dtype, axis):
     assert bool(torch.isfinite(found).all())
 
 
-def test_twists_add_along_one_screw():
-    x = six(0.7)
-    assert torch.allclose(pose_from_twist(0.25 * x) @ pose_from_twist(0.75 * x), pose_from_twist(x), atol=1e-14)
-
-
 @pytest.mark.parametrize("kind", [AxisAnglePose, SE3Pose])
 @pytest.mark.parametrize("frame", ["world", "local"])
 @pytest.mark.parametrize("about", ["self", "world", [0.5, 1.0, -2.0]])
@@ -114,10 +108,6 @@ def test_moves_along_the_axes_of_its_frame(kind):
     np.testing.assert_allclose(local, BASE @ translate([1.0, 2.0, 3.0]), atol=1e-14)
 
 
-def test_zero_is_the_base():
-    assert torch.equal(AxisAnglePose(BASE)(torch.zeros(6, dtype=torch.float64)), torch.tensor(BASE))
-
-
 def test_batches_of_bases():
     bases = torch.stack([torch.tensor(BASE), torch.tensor(translate([1.0, 0, 0]) @ BASE)])
     x = torch.stack([six(0.5), six(-0.2)])
@@ -125,17 +115,17 @@ def test_batches_of_bases():
     for k in range(2):
         assert torch.allclose(together[k], AxisAnglePose(bases[k])(x[k]), atol=1e-14)
     assert torch.allclose(AxisAnglePose(bases).right_inverse(together), x, atol=1e-10)
-    with pytest.raises(ShapeError, match="goes with a base"):
-        AxisAnglePose(bases)(torch.zeros(3, 6))
-    with pytest.raises(ShapeError, match="that go with a base"):
-        AxisAnglePose(bases).right_inverse(torch.eye(4).expand(3, 4, 4))
+    assert torch.equal(AxisAnglePose(bases)(0 * x), bases)
+    for call, given in ((AxisAnglePose(bases), torch.zeros(3, 6)), (AxisAnglePose(bases).right_inverse, bases[:1])):
+        with pytest.raises(ShapeError, match=r"goe?s? with a base"):
+            call(given.expand(3, *given.shape[1:]))
 
 
 @together("function", [axis_angle_from_pose, twist_from_pose, AxisAnglePose().right_inverse])
 @together(
     "matrix",
     [
-        scale(1.1), scale([1.0, 1.0, -1.0]), np.full((4, 4), np.nan), scale([1, 2, 1]), np.diag([1.0, 1.0, 1.0, 2.0]),
+        scale(1.1), scale([1.0, 1.0, -1.0]), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 2.0]), BASE,
         np.eye(4) + 0.1 * np.eye(4, k=-3), np.eye(4) + np.eye(4, k=-1) * [0, 0, 0.01, 0],
     ],
 )  # fmt: skip
@@ -144,18 +134,12 @@ def test_what_is_no_rigid_motion(function, matrix):
         function(torch.tensor(matrix))
 
 
-def test_a_scale_needs_its_base():
-    with pytest.raises(UnitError, match=r"of the base; give base=renderer.values\[key\]"):
-        AxisAnglePose().right_inverse(torch.tensor(BASE))
-    assert torch.allclose(AxisAnglePose(BASE).right_inverse(torch.tensor(BASE)), torch.zeros(6).double(), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
         ({"base": np.zeros((4, 4))}, UnitError, "with an inverse"),
         ({"base": np.eye(3)}, ShapeError, r"\(\.\.\., 4, 4\)"),
-        ({"base": np.diag([1.0, 1.0, 1.0, 2.0])}, UnitError, "last row 0, 0, 0, 1"),
+        ({"base": np.eye(4) + 2e-8 * np.eye(4, k=-2)}, UnitError, "last row 0, 0, 0, 1"),
         ({"base": np.where(np.eye(4, k=3), np.nan, np.eye(4))}, UnitError, "with an inverse"),
         ({"about": [math.nan, 0.0, 0.0]}, UnitError, "finite numbers"),
         ({"about": "there"}, ArgumentError, "'self', 'world' or a point"),
@@ -179,11 +163,3 @@ def test_motions_are_rigid_to_the_precision_they_have(inverse, dtype, near, far)
     assert inverse(scaled[0].to(dtype)).abs().max() < 0.02
     with pytest.raises(UnitError, match="expected a rigid motion"):
         inverse(scaled[1].to(dtype))
-
-
-def test_the_last_row_of_a_base_is_exact_but_for_rounding():
-    for off in (0.5e-8, 2e-8):
-        base = np.eye(4)
-        base[3, 1] = off
-        with contextlib.nullcontext() if off < 1e-8 else pytest.raises(UnitError, match="last row 0, 0, 0, 1"):
-            AxisAnglePose(base)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +25,8 @@ class UnpicklableError(Exception):
 class OnlineRecipe:
     """``fail``, ``bug``, ``die``, ``hang``, ``odd``: numbers of samples that fail as scenes do, raise something else,
     end their process by signal 9, never end, or have another shape; ``late``: those
-    with light outside of the window. ``once``: a folder in which a death is noted, so
-    that it happens once. ``group``: samples by number modulo it are rendered together. ``pids``: a folder where each
-    producer leaves its process number.
+    with light outside of the window. ``group``: samples by number modulo it are rendered together. ``pids``: a folder
+    where each producer leaves its process number.
     """
 
     seconds: float = 0.0
@@ -38,11 +37,9 @@ class OnlineRecipe:
     odd: tuple = ()
     late: tuple = ()
     unpicklable: tuple = ()
-    once: str = ""
     pids: str = ""
     group: int = 1
-    shape: tuple = SHAPE
-    broken: str = field(default="")
+    broken: str = ""
 
     def maker(self):
         if self.broken:
@@ -50,7 +47,7 @@ class OnlineRecipe:
         return FakeMaker(self)
 
 
-def arrays_of(index, shape=SHAPE):
+def arrays_of(index, shape):
     """All numbers of a sample are its index: a torn one has two."""
     return {
         "transient": np.full(shape, index, np.float32),
@@ -78,14 +75,10 @@ class FakeMaker:
         if index in recipe.unpicklable:
             raise UnpicklableError(1, 2)
         if index in recipe.die:
-            note = Path(recipe.once) / f"died-{index}"
-            if not recipe.once or not note.exists():
-                if recipe.once:
-                    note.touch()
-                os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
         if index in recipe.hang:
             time.sleep(1000.0)
-        shape = (2, *recipe.shape[1:]) if index in recipe.odd else recipe.shape
+        shape = (2, *SHAPE[1:]) if index in recipe.odd else SHAPE
         values = {"wall.reflectance": np.float32([index, 0.5, 0.25]), "box.filename": f"{index % 3}.ply"}
         outside = (0.25, 0.5) if index in recipe.late else (0.0, 0.0)
         return Sample(index, index, arrays=arrays_of(index, shape), values=values, outside=outside)

@@ -44,12 +44,6 @@ def test_iterators_draw_from_the_global_generator(names):
 
 
 @pytest.mark.slow
-def test_one_rank_is_the_run_without_ranks(names):
-    assert len(names["losses"]) == 2
-    assert all(0 < loss < 1e3 for loss in names["losses"])
-
-
-@pytest.mark.slow
 def test_parts_have_the_gradient_of_the_whole(names):
     torch.testing.assert_close(names["in_parts"], names["in_one"], rtol=1e-6, atol=0)
     assert names["loss"] > 0

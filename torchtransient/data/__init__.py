@@ -35,8 +35,8 @@ from torchtransient.data.shards import ShardWriter as ShardWriter
 from torchtransient.data.spatial_filters import SpatialFilter as SpatialFilter
 from torchtransient.data.spatial_filters import spatial_filter as spatial_filter
 from torchtransient.data.specification import OneOf as OneOf
-from torchtransient.data.stream import TransientStream as TransientStream
 from torchtransient.data.transient_dataset import TransientDataset as TransientDataset
+from torchtransient.data.transient_dataset import TransientStream as TransientStream
 from torchtransient.rendering.labels import first_return as first_return
 from torchtransient.rendering.labels import label_names as label_names
 from torchtransient.rendering.labels import material_names as material_names

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torchtransient.checks import count
 from torchtransient.data.distributions import POSE, Choice, Draw, Extreme, Fixed, Stream
 from torchtransient.data.maker import Kept, Maker
+from torchtransient.data.run_settings import bytes_text
 from torchtransient.data.sample import OutsideLight, Sample
 from torchtransient.data.specification import Specification, Structure
 from torchtransient.errors import (
@@ -75,7 +76,7 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
 
 
 def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -> OutsideLight:
-    """Light of the first samples outside of the time window.
+    """Measure the light of the first samples outside of the time window.
 
     Args:
         recipe: description.
@@ -99,7 +100,8 @@ def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -
 
 
 def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[Structure, list[int]]]:
-    """Structures of some samples in the order in which they come, 8 at most, each scene of the recipe among them.
+    """Return the structures of some samples in the order in which they come, 8 at most, each scene of the recipe among
+    them.
 
     Args:
         recipe: description.
@@ -378,18 +380,16 @@ class Cost:
         for one in self.structures:
             name = f" ({one.text})" if one.text else ""
             yield f"seconds           {one.first_s:.2f} for the first sample, then {one.sample_s:.4f} each{name}"
-        yield f"bytes a sample    {_bytes(self.sample_bytes)} before compression"
+        yield f"bytes a sample    {bytes_text(self.sample_bytes)} before compression"
         for store, size in self.stored_bytes.items():
             if size is not None:
-                yield f"  store={store!r:<10} {_bytes(size)}, {self.sample_bytes / size:.1f} times smaller"
+                yield f"  store={store!r:<10} {bytes_text(size)}, {self.sample_bytes / size:.1f} times smaller"
         yield f"light outside     {self.outside}"
         yield f"standard error    {self.standard_error:.1%} of a sample's numbers (root mean square)"
         if self.n is not None:
             sizes = [self.n * size for size in (*self.stored_bytes.values(), self.sample_bytes) if size]
-            hours = self.n * self.sample_s / 3600
-            yield (
-                f"{self.n} samples    {_duration(hours)} of one worker, {_bytes(min(sizes))} to {_bytes(max(sizes))}"
-            )
+            least, most = bytes_text(min(sizes)), bytes_text(max(sizes))
+            yield f"{self.n} samples    {_duration(self.n * self.sample_s / 3600)} of one worker, {least} to {most}"
 
 
 def _duration(hours: float) -> str:
@@ -398,12 +398,7 @@ def _duration(hours: float) -> str:
     return f"{60 * hours:.1f} minutes" if hours >= 1 / 60 else f"{3600 * hours:.2g} seconds"
 
 
-def _bytes(size: float) -> str:
-    for unit in ("B", "kB", "MB", "GB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} TB"
+
 
 
 def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool, outside: OutsideLight) -> Cost:
@@ -419,30 +414,23 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool, 
     Returns:
         Cost.
     """
-    wanted = count("cost: samples", samples)
+    steps = _WARM + count("cost: samples", samples)
     found = structures_of(recipe, range(SAMPLES))
-    bar = None
-    if progress:
-        from tqdm.auto import tqdm
-
-        bar = tqdm(total=len(found[:_MEASURED]) * (wanted + _WARM), desc="cost", unit="sample")
     costs, rendered = [], []
+    times: list[float] = []
     # Workers compute with one thread.
     with threads(1):
-        for structure, indices in found[:_MEASURED]:
-            # From nothing, without the scenes that check() has built.
-            maker.forget(structure)
-            times = []
-            for step in range(_WARM + wanted):
-                index = indices[step % len(indices)]
-                start = time.perf_counter()
-                rendered.append(maker.sample(index))
-                times.append(time.perf_counter() - start)
-                if bar is not None:
-                    bar.update()
-            costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
-    if bar is not None:
-        bar.close()
+        calls = [(one, step) for one in found[:_MEASURED] for step in range(steps)]
+        for (structure, indices), step in with_bar(calls, "cost", progress):
+            if step == 0:
+                # From nothing, without the scenes that check() has built.
+                maker.forget(structure)
+                times = []
+            start = time.perf_counter()
+            rendered.append(maker.sample(indices[step % len(indices)]))
+            times.append(time.perf_counter() - start)
+            if step == steps - 1:
+                costs.append(StructureCost(structure.text, times[0], float(np.median(times[_WARM:]))))
     return Cost(
         values=tuple(key for key in recipe.vary if key not in recipe.exchanged),
         exchanged=tuple(recipe.exchanged),

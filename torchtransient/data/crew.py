@@ -200,7 +200,7 @@ class Crew(ABC, Generic[AnyMember]):
                 self.remove(worker, f"by no sign of life for {silent:.0f} s", own_fault=True)
 
     def patience_to_start(self) -> float:
-        """Seconds until a worker has to be ready."""
+        """Return the seconds until a worker has to be ready."""
         return PATIENCE_S
 
     def _limit(self, worker: AnyMember) -> float:
@@ -408,7 +408,7 @@ class Ledger:
         return shard
 
     def skip(self, shard: int) -> dict[int, str]:
-        """Samples of a shard that are given up, with the reason.
+        """Return the samples of a shard that are given up, with the reason.
 
         Args:
             shard: its number.
@@ -419,7 +419,8 @@ class Ledger:
         return self.skipped.get(shard, {})
 
     def suspects(self, shard: int) -> list[int]:
-        """Samples of a shard at which workers died; they are made first, so that no sample before them can be to blame.
+        """Return the samples of a shard at which workers died; they are made first, so that no sample before them can
+        be to blame.
 
         Args:
             shard: its number.
@@ -498,7 +499,7 @@ class Ledger:
             self._give_up(f"{self._in_a_row} workers died one after another without a sample, the last one {reason}")
 
     def totals(self) -> dict[str, int]:
-        """Totals of the run, as log and result name them."""
+        """Return the totals of the run, as log and result name them."""
         return {name: getattr(self, name) for name in ("shards", "samples", "failed", "bytes", "restarts")}
 
     def _charge(self, shard: int, index: int, own_fault: bool) -> None:

@@ -29,7 +29,7 @@ class Draw(Protocol):
     """Source of random numbers of a distribution."""
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """Independent numbers in [0, 1).
+        """Draw independent numbers in [0, 1).
 
         Args:
             shape: of the array.
@@ -54,7 +54,7 @@ class Stream:
         self._generator = np.random.Generator(np.random.Philox(key=np.frombuffer(digest, "<u8").astype(np.uint64)))
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """Independent numbers in [0, 1).
+        """Draw independent numbers in [0, 1).
 
         Args:
             shape: of the array.
@@ -80,7 +80,7 @@ class Fixed:
         self._number = number
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """The constant.
+        """Return the constant.
 
         Args:
             shape: of the array.
@@ -106,7 +106,7 @@ class Extreme:
         self._otherwise = Stream(0, int(upper), "ends")
 
     def random(self, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
-        """The end of [0, 1), for the first calls.
+        """Return the end of [0, 1), for the first calls.
 
         Args:
             shape: of the array.
@@ -212,8 +212,13 @@ class Distribution(ABC):
             ShapeError: for a shape that it does not fit.
         """
 
+    def _keep(self, **settings: Any) -> None:
+        """Replace settings by their checked values."""
+        for name, value in settings.items():
+            object.__setattr__(self, name, value)
+
     def entries(self) -> dict[str, Any]:
-        """Settings by name, as constructors take them."""
+        """Return the settings by name, as constructors take them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __eq__(self, other: object) -> bool:
@@ -287,21 +292,16 @@ def spread(who: str, place: Place, random: Draw, same: bool, *numbers: Any) -> t
     Raises:
         ShapeError: for arrays that do not fit.
     """
-    if place.kind == ANYTHING:
-        arrays = [np.asarray(number, dtype=np.float64) for number in numbers]
-        shape = np.broadcast_shapes(*(array.shape for array in arrays))
-    else:
-        shape, arrays = place.shape, [np.asarray(number, dtype=np.float64) for number in numbers]
-        for array in arrays:
-            try:
-                fits = np.broadcast_shapes(array.shape, shape) == shape
-            except ValueError:
-                fits = False
-            if not fits:
-                raise ShapeError(
-                    f"{place.key!r}: {who} has numbers of shape {array.shape}, the key has {shape or 'one number'}. "
-                    "Give one number, or an array of the key's shape."
-                )
+    arrays = [np.asarray(number, dtype=np.float64) for number in numbers]
+    shape = np.broadcast_shapes(*(array.shape for array in arrays)) if place.kind == ANYTHING else place.shape
+    for array in arrays:
+        try:
+            np.broadcast_to(array, shape)
+        except ValueError:
+            raise ShapeError(
+                f"{place.key!r}: {who} has numbers of shape {array.shape}, the key has {shape or 'one number'}. "
+                "Give one number, or an array of the key's shape."
+            ) from None
     u = np.broadcast_to(random.random(() if same else shape), shape)
     return (u, *arrays)
 
@@ -340,9 +340,7 @@ class Uniform(Distribution):
 
     def __post_init__(self) -> None:
         low, high = bounds("Uniform", self.low, self.high)
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
-        flag("Uniform: same", self.same)
+        self._keep(low=low, high=high, same=flag("Uniform: same", self.same))
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -383,9 +381,7 @@ class LogUniform(Distribution):
         low, high = bounds("LogUniform", self.low, self.high)
         if (np.asarray(low) <= 0).any():
             raise UnitError(f"LogUniform: expected low greater than zero, got {shown(self.low)}. Use Uniform.")
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
-        flag("LogUniform: same", self.same)
+        self._keep(low=low, high=high, same=flag("LogUniform: same", self.same))
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -437,14 +433,14 @@ class Normal(Distribution):
             if array is None or not np.isfinite(array).all() or (array < least).any():
                 wanted = "finite numbers" if name == "mean" else "finite numbers of at least 0"
                 raise UnitError(f"Normal: expected {name} as {wanted}, got {shown(given)}.")
-            object.__setattr__(self, name, array.tolist())
+            self._keep(**{name: array.tolist()})
         for name in ("low", "high"):
             given = getattr(self, name)
             number = None if given is None else as_number(given)
             if given is not None and (number is None or math.isnan(number)):
                 raise UnitError(f"Normal: expected {name} as a number or None, got {shown(given)}.")
             # An end at infinity is none.
-            object.__setattr__(self, name, number if number is not None and math.isfinite(number) else None)
+            self._keep(**{name: number if number is not None and math.isfinite(number) else None})
         low, high = self._ends()
         means, stds = np.broadcast_arrays(np.asarray(self.mean, np.float64), np.asarray(self.std, np.float64))
         if ((stds == 0) & ((means < low) | (means > high))).any():
@@ -513,9 +509,7 @@ class Scale(Distribution):
 
     def __post_init__(self) -> None:
         low, high = bounds("Scale", self.low, self.high, least=0.0)
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
-        flag("Scale: same", self.same)
+        self._keep(low=low, high=high, same=flag("Scale: same", self.same))
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -558,8 +552,7 @@ class Choice(Distribution):
 
     def __post_init__(self) -> None:
         values, weights = checked_choices("Choice", self.values, self.weights)
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "weights", weights)
+        self._keep(values=values, weights=weights)
 
     def share(self, number: int) -> float:
         """Number in [0, 1) that draws a value.

@@ -24,6 +24,7 @@ from torchtransient.data.run_settings import (
     SHARD_FILES,
     Plan,
     RunSettings,
+    bytes_text,
     check_same,
     description,
     plain,
@@ -72,7 +73,7 @@ class Generated:
         return self.samples / self.seconds if self.seconds > 0 else math.nan
 
     def __str__(self) -> str:
-        parts = [f"{self.samples} samples in {self.shards} shards, {_size(self.bytes)}"]
+        parts = [f"{self.samples} samples in {self.shards} shards, {bytes_text(self.bytes)}"]
         parts += [f"{self.failed} failed"] if self.failed else []
         parts += [f"{self.kept} were there"] if self.kept else []
         parts += [f"{self.restarts} worker{'s' * (self.restarts != 1)} replaced"] if self.restarts else []
@@ -308,12 +309,10 @@ def _write_manifest(place: Path) -> None:
 def _engine(
     name: str, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
 ) -> Any:
+    from torchtransient.data.engines import InProcessCrew, RayCrew, Supervisor
+
     if name == "ray":
-        from torchtransient.data.ray_engine import RayCrew
-
         return RayCrew(settings, workers, ledger, timeout_s, address)
-    from torchtransient.data.local_engine import InProcessCrew, Supervisor
-
     return (Supervisor if workers else InProcessCrew)(settings, workers, ledger, timeout_s)
 
 
@@ -389,11 +388,3 @@ def _folder(folder: Any) -> Path:
     if not os.access(place, os.W_OK | os.X_OK):
         raise StorageError(f"{_WHAT}: no permission to write into '{place}'. Choose another folder.")
     return place
-
-
-def _size(count: int) -> str:
-    for unit in ("bytes", "kB", "MB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000  # type: ignore[assignment]
-    return f"{count:.4g} GB"

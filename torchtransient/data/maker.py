@@ -142,14 +142,14 @@ class Maker:
         )
 
     def measures(self) -> Measures:
-        """Measurement of sample 0, which all samples share."""
+        """Return the measurement of sample 0, which all samples share."""
         if self._measures is None:
             self._measures = self.kept(self.recipe.structure(0)).measures
         return self._measures
 
     def standard_error(self, index: int) -> float:
-        """Relative standard error of a sample: root mean square of the errors over the cube, by that of the numbers as
-        they are rendered, so that 1 is noise alone. From two renders.
+        """Return the relative standard error of a sample: root mean square of the errors over the cube, by that of the
+        numbers as they are rendered, so that 1 is noise alone. From two renders.
 
         Args:
             index: of the sample.
@@ -168,9 +168,9 @@ class Maker:
         return float(np.sqrt(noise / (power + second))) if power + second > 0 else 0.0
 
     def about(self) -> dict[str, Any]:
-        """Description of the measurement as plain data, for headers. Of several scenes, ``plan`` and names of shapes
-        and materials stand under the scene's name; of scans that vary all stand in ``scans``, in the order of the
-        choices.
+        """Return the description of the measurement as plain data, for headers. Of several scenes, ``plan`` and names
+        of shapes and materials stand under the scene's name; of scans that vary all stand in ``scans``, in the order of
+        the choices.
         """
         recipe, first = self.recipe, self.recipe.structure(0)
         # Sample 0's scene last, since the last one is kept.
@@ -351,7 +351,7 @@ class Kept:
         return self.drawn({key: Stream(self.recipe.seed, index, key) for key in self.recipe.vary})
 
     def drawn(self, streams: Mapping[str, Draw]) -> dict[str, Any]:
-        """Values by key from given random numbers.
+        """Draw values by key from given random numbers.
 
         Args:
             streams: sources of numbers by key.
@@ -369,7 +369,7 @@ class Kept:
         return found
 
     def arrays(self, index: int, drawn: Mapping[str, Any], seed: int) -> tuple[dict[str, NDArray[Any]], Any]:
-        """Arrays of a sample.
+        """Make the arrays of a sample.
 
         Args:
             index: of the sample.
@@ -401,7 +401,7 @@ class Kept:
         return names if keep is None else [name for name in names if name in keep]
 
     def light(self, drawn: Mapping[str, Any], seed: int) -> NDArray[Any]:
-        """Light of a sample as the film measures it.
+        """Return the light of a sample as the film measures it.
 
         Args:
             drawn: values by key.
@@ -413,7 +413,7 @@ class Kept:
         return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
 
     def outside(self, index: int) -> tuple[float, float]:
-        """Shares of the light of a sample before and after the window, from 65536 camera paths at most.
+        """Return the shares of the light of a sample before and after the window, from 65536 camera paths at most.
 
         Args:
             index: of the sample.
@@ -426,7 +426,7 @@ class Kept:
         return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
 
     def seed(self, index: int) -> int:
-        """Seed of the render of a sample.
+        """Return the seed of the render of a sample.
 
         Args:
             index: of the sample.
@@ -437,7 +437,7 @@ class Kept:
         return Stream(self.recipe.seed, index, RENDER).seed()
 
     def values(self, drawn: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-        """Drawn values as the renderer takes them.
+        """Return drawn values as the renderer takes them.
 
         Args:
             drawn: values by key.
@@ -526,7 +526,7 @@ class Kept:
         return built.integrator + ("" if depth is None else f", max_depth {'unbounded' if depth > 2**31 else depth}")
 
     def about(self) -> dict[str, Any]:
-        """Plain data, the same for all structures of a recipe."""
+        """Return plain data, the same for all structures of a recipe."""
         renderer = self.renderer
         film = renderer.film
         found: dict[str, Any] = {
@@ -548,7 +548,7 @@ class Kept:
         return found
 
     def named(self) -> dict[str, list[str]]:
-        """Lines of the plan, and the names that the labels of the scene number."""
+        """Return the lines of the plan, and the names that the labels of the scene number."""
         renderer, labels = self.renderer, self.recipe.settings.labels
         film = f"film: {renderer.film.describe(renderer.effective_filter)}"
         found = {"plan": [film, f"variant: {self.recipe.variant}", f"integrator: {self._integrator()}"]}
@@ -621,7 +621,7 @@ def _check_label_names(names: tuple[str, ...]) -> None:
 
 
 def changed_device(device: Device, key: str, value: Any) -> Device:
-    """Device with another argument of a stage.
+    """Make a device with another argument of a stage.
 
     Args:
         device: description.
@@ -645,7 +645,7 @@ def changed_device(device: Device, key: str, value: Any) -> Device:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that determine the numbers, and of plugins that others have added."""
+    """Return the versions of the packages that determine the numbers, and of plugins that others have added."""
     # The version of the running code: a checkout may differ from the installed package.
     from torchtransient import __version__
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from torchtransient.array_files.part_files import sweep_parts as sweep_parts
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.array_files.plain_texts import json_data
 from torchtransient.checks import check_special, path_of, shown
@@ -67,7 +66,7 @@ class Verified:
 
 
 def shards_of(folder: str | Path) -> list[Path]:
-    """Shards of a folder by name.
+    """Return the shards of a folder by name.
 
     Args:
         folder: of a data set.
@@ -125,7 +124,7 @@ def manifest_of(folder: str | Path, paths: Sequence[Path]) -> dict[str, Any]:
 
 
 def named_shards(folder: Path) -> dict[str, tuple[str, int]]:
-    """Checksums and sizes of the shards in ``manifest.json``.
+    """Return the checksums and sizes of the shards in ``manifest.json``.
 
     Args:
         folder: of a data set.
@@ -141,7 +140,7 @@ def named_shards(folder: Path) -> dict[str, tuple[str, int]]:
 
 
 def fault_of(path: Path, named: Mapping[str, tuple[str, int]]) -> str | None:
-    """Fault of the bytes of a shard, which are read unless the manifest names its checksum.
+    """Return the fault of the bytes of a shard, which are read unless the manifest names its checksum.
 
     Args:
         path: of the shard.
@@ -343,7 +342,7 @@ def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
 
 
 def ranges(numbers: Iterable[int]) -> list[list[int]]:
-    """Whole numbers as ranges.
+    """Return whole numbers as ranges.
 
     Args:
         numbers: in any order.
@@ -361,7 +360,7 @@ def ranges(numbers: Iterable[int]) -> list[list[int]]:
 
 
 def ranges_text(numbers: Iterable[int], most: int = 8) -> str:
-    """Whole numbers as text, "0 to 3, 7".
+    """Return whole numbers as text, "0 to 3, 7".
 
     Args:
         numbers: in any order.

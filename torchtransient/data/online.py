@@ -142,13 +142,6 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         return self._producers.schedule.made
 
     @property
-    def next_index(self) -> int:
-        """Number of the first sample that was not asked for: ``first`` of a data set that goes on after this one. Its
-        ring fills anew, so that its draws differ from those of a run that was not stopped.
-        """
-        return self._producers.schedule.next_index
-
-    @property
     def failed(self) -> int:
         """Samples that could not be rendered."""
         return self._producers.failed
@@ -424,13 +417,8 @@ class Schedule:
         self._readable: deque[int] = deque()
         self._random = random.Random(seed)
 
-    @property
-    def next_index(self) -> int:
-        """Number after the samples that were ordered."""
-        return self._next
-
     def order(self, producer: int) -> Order | None:
-        """Next sample for a producer.
+        """Return the next sample for a producer.
 
         Args:
             producer: its number.

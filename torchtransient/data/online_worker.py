@@ -147,7 +147,7 @@ class _Producer:
 
 
 def layout_of(arrays: dict[str, np.ndarray]) -> Layout:
-    """Shapes and types of the arrays of a sample.
+    """Return the shapes and types of the arrays of a sample.
 
     Args:
         arrays: by name.
@@ -159,7 +159,7 @@ def layout_of(arrays: dict[str, np.ndarray]) -> Layout:
 
 
 def layout_text(layout: Layout) -> str:
-    """Layout as text.
+    """Return a layout as text.
 
     Args:
         layout: of a sample.

@@ -312,7 +312,7 @@ class PixelMap:
         return self.size != self.new_size or float(np.abs(upper - np.eye(2)).max()) > 1e-6
 
     def intrinsics(self, camera_matrix: Tensor) -> Tensor:
-        """Intrinsics of the camera that has taken the result.
+        """Return the intrinsics of the camera that has taken the result.
 
         Args:
             camera_matrix: (..., 3, 3) before the map.
@@ -325,7 +325,8 @@ class PixelMap:
         return torch.matmul(torch.matmul(_like(self.matrix, camera_matrix), camera_matrix), orthogonal.mT)
 
     def to_world(self, to_world: Tensor) -> Tensor:
-        """Pose of the camera that has taken the result. Turns about the axis are the same in Mitsuba's frame.
+        """Return the pose of the camera that has taken the result. Turns about the axis are the same in Mitsuba's
+        frame.
 
         Args:
             to_world: (..., 4, 4) before the map.

@@ -21,6 +21,7 @@ from torchtransient.data.sample import OutsideLight, Sample
 from torchtransient.data.shards import Shard
 from torchtransient.data.specification import Specification
 from torchtransient.errors import StorageError
+from torchtransient.rendering.progress import with_bar
 from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
 from torchtransient.vis.tone_mapping import tone_map
@@ -51,11 +52,7 @@ def contact_sheet(
     Returns:
         Figure of matplotlib without a path.
     """
-    wanted = maker.order(indices)
-    if progress:
-        from tqdm.auto import tqdm
-
-        wanted = tqdm(wanted, desc="preview", unit="sample")
+    wanted = with_bar(maker.order(indices), "preview", progress)
     samples = sorted((maker.sample(index) for index in wanted), key=lambda sample: sample.index)
     about = maker.about()
     return sheet_of(samples, path, about.get("axis"), repr(recipe), behind_time(about))
@@ -159,7 +156,7 @@ def summary(folder: str | Path) -> str:
 
 
 def behind_time(about: Mapping[str, Any]) -> int:
-    """Dimensions of a transient behind its bins: rows and columns, or those of a scan.
+    """Return the dimensions of a transient behind its bins: rows and columns, or those of a scan.
 
     Args:
         about: entry ``about`` of a header.
@@ -294,7 +291,7 @@ class LatestPicture:
 
 
 def picture_of(sample: Any) -> NDArray[np.uint8]:
-    """Light of a sample as a picture.
+    """Draw the light of a sample as a picture.
 
     Args:
         sample: of a recipe.

@@ -60,8 +60,7 @@ class Turn(Distribution):
                 raise ArgumentError(f"Turn: expected about='self', 'world' or a point [x, y, z], got {about!r}.")
         else:
             about = _three("Turn: about", about)
-        for name, value in (("low", low), ("high", high), ("axis", axis), ("about", about)):
-            object.__setattr__(self, name, value)
+        self._keep(low=low, high=high, axis=axis, about=about)
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a pose.
@@ -103,8 +102,7 @@ class Offset(Distribution):
 
     def __post_init__(self) -> None:
         low, high = bounds("Offset", self.low, self.high)
-        object.__setattr__(self, "low", low)
-        object.__setattr__(self, "high", high)
+        self._keep(low=low, high=high)
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -153,8 +151,8 @@ class LookAt(Distribution):
         for name in ("origin", "target"):
             given = getattr(self, name)
             if not isinstance(given, Distribution):
-                object.__setattr__(self, name, _three(f"LookAt: {name}", given))
-        object.__setattr__(self, "up", _three("LookAt: up", self.up))
+                self._keep(**{name: _three(f"LookAt: {name}", given)})
+        self._keep(up=_three("LookAt: up", self.up))
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a pose.
@@ -204,7 +202,7 @@ class Compose(Distribution):
         wrong = [step for step in given if not isinstance(step, Distribution)]
         if wrong:
             raise SceneError(f"Compose: expected distributions, got {shown(wrong[0])}.")
-        object.__setattr__(self, "steps", tuple(given))
+        self._keep(steps=tuple(given))
 
     def draw(self, random: Draw, place: Place) -> Any:
         """Draw a value.

@@ -22,7 +22,7 @@ class WorkerError(Exception):
 
 
 def traced(error: BaseException) -> str:
-    """Traceback as text, of its last 40 lines.
+    """Return the traceback as text, of its last 40 lines.
 
     Args:
         error: that was raised.
@@ -64,7 +64,9 @@ PluginNames = tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
 
 
 def registered_plugins() -> PluginNames:
-    """Plugin modules that were added in this process with ``plugins.register_module``, with the plugins of each."""
+    """Return the plugin modules that were added in this process with ``plugins.register_module``, with the plugins of
+    each.
+    """
     from torchtransient.plugins import modules_of_others
 
     return tuple((entry.module, entry.plugins) for entry in modules_of_others())

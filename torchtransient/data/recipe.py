@@ -123,7 +123,7 @@ class Recipe(Specification):
         return self.maker()
 
     def maker(self) -> Maker:
-        """Maker of samples, which keeps the scene that it has built. One for each process."""
+        """Make a maker of samples, which keeps the scene that it has built. One for each process."""
         return Maker(self)
 
     def sample(self, index: int) -> Sample:
@@ -209,7 +209,7 @@ class Recipe(Specification):
     # ------------------------------------------------------------------------------------------------- as plain data
 
     def to_dict(self) -> dict[str, Any]:
-        """The recipe as data that JSON can hold; :meth:`from_dict` makes an equal recipe of it."""
+        """Return the recipe as data that JSON can hold; :meth:`from_dict` makes an equal recipe of it."""
         return _recipe_data(self)
 
     @classmethod
@@ -271,7 +271,7 @@ class Recipe(Specification):
         return cls.from_dict(*read_yaml(source, "recipe"))
 
     def key(self) -> str:
-        """Hash of all that determines the samples; files that the recipe names count with their contents."""
+        """Return the hash of all that determines the samples; files that the recipe names count with their contents."""
         plain = {name: entry for name, entry in self.to_dict().items() if name not in _NO_NUMBERS}
         exchanged = [written(self.vary[key]) for key in self.exchanged]
         files = {name: files_of(description, exchanged) for name, description in self.scenes.descriptions.items()}

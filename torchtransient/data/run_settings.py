@@ -10,7 +10,7 @@ from typing import Any
 
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.array_files.plain_texts import json_data
-from torchtransient.checks import check_special, short_message
+from torchtransient.checks import check_special, short_message, shown
 from torchtransient.data.processes import PluginNames
 from torchtransient.data.serialization import without_places
 from torchtransient.errors import StorageError
@@ -70,7 +70,7 @@ class Plan:
         return -(-self.n // self.per_shard)
 
     def indices(self, shard: int) -> range:
-        """Samples of a shard; row 0 of the file is the first one.
+        """Return the samples of a shard; row 0 of the file is the first one.
 
         Args:
             shard: its number.
@@ -81,7 +81,7 @@ class Plan:
         return range(shard * self.per_shard, min(self.n, (shard + 1) * self.per_shard))
 
     def share(self, part: int, parts: int) -> range:
-        """Shards of one of several runs that divide the work.
+        """Return the shards of one of several runs that divide the work.
 
         Args:
             part: number of the run.
@@ -106,8 +106,8 @@ def shard_file_name(number: int) -> str:
 
 
 def samples_per_shard(n: int, sample_bytes: int) -> int:
-    """Samples in a shard: 64 MB; up to 256 MB where there would be more than 256 shards; fewer where there would be
-    less than 64. It does not depend on the workers: files are the same everywhere.
+    """Choose the samples in a shard: 64 MB; up to 256 MB where there would be more than 256 shards; fewer where there
+    would be less than 64. It does not depend on the workers: files are the same everywhere.
 
     Args:
         n: samples of the data set.
@@ -123,8 +123,8 @@ def samples_per_shard(n: int, sample_bytes: int) -> int:
 
 
 def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int) -> dict[str, Any]:
-    """Header of a shard: description of the data set and number of the shard, without the folders of the recipe's
-    files.
+    """Return the header of a shard: description of the data set and number of the shard, without the folders of the
+    recipe's files.
 
     Args:
         settings: of the run.
@@ -135,17 +135,12 @@ def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int
         Plain data.
     """
     recipe = without_places(described["recipe"])
-    samples = list(_ends(Plan(settings.n, described["per_shard"]), shard))
-    return {**described, "recipe": recipe, "shard": shard, "samples": samples}
-
-
-def _ends(plan: Plan, shard: int) -> tuple[int, int]:
-    indices = plan.indices(shard)
-    return indices.start, indices.stop
+    indices = Plan(settings.n, described["per_shard"]).indices(shard)
+    return {**described, "recipe": recipe, "shard": shard, "samples": [indices.start, indices.stop]}
 
 
 def description(settings: RunSettings, per_shard: int, about: Any, standard_error: float | None) -> dict[str, Any]:
-    """Content of ``recipe.json``.
+    """Return the content of ``recipe.json``.
 
     Args:
         settings: of the run.
@@ -173,7 +168,7 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
 
 
 def plain(value: Any) -> Any:
-    """Value as JSON gives it back.
+    """Return a value as JSON gives it back.
 
     Args:
         value: of plain data.
@@ -277,9 +272,17 @@ def _first_difference(there: Any, here: Any, at: str = "") -> str:
                 return _first_difference(there.get(name), here.get(name), f"{at}.{name}".lstrip("."))
     if there == here:
         return " (a file that it names has changed)"
-    return f" ({at or 'it'} is {_short(there)} there and {_short(here)} here)"
+    return f" ({at or 'it'} is {shown(there)} there and {shown(here)} here)"
 
 
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def bytes_text(size: float) -> str:
+    """Return a number of bytes as text, "1.5 MB".
+
+    Args:
+        size: number of bytes.
+    """
+    for unit in ("B", "kB", "MB", "GB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} TB"

@@ -50,10 +50,6 @@ class Sample:
     outside: tuple[float, float] = (0.0, 0.0)
     structure: str = ""
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """``arrays`` as tensors, on the same memory."""
-        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in self.arrays.items()}
-
     def __repr__(self) -> str:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in self.arrays.items())
         return f"Sample({self.index}: {shapes}; drawn: {', '.join(self.values) or 'nothing'})"
@@ -109,7 +105,7 @@ class OutsideLight:
         return max(low, 0.0) if self.cut else 0.0, min(high, 1.0) if self.cut < n else 1.0
 
     def shares(self) -> str:
-        """Figures of these samples as text."""
+        """Return the figures of these samples as text."""
         if not self.samples:
             return "not looked at"
         return (
@@ -170,9 +166,9 @@ class Epochs:
 
 
 def in_order(tensor: torch.Tensor) -> NDArray[Any]:
-    """Tensor as an array in C order. Films have the pixels first in memory and torch has them last: large arrays are
-    copied in blocks, since a copy from end to end meets one line of the cache again and again where bins are a power of
-    two.
+    """Return a tensor as an array in C order. Films have the pixels first in memory and torch has them last: large
+    arrays are copied in blocks, since a copy from end to end meets one line of the cache again and again where bins are
+    a power of two.
 
     Args:
         tensor: any shape.
@@ -197,7 +193,7 @@ def in_order(tensor: torch.Tensor) -> NDArray[Any]:
 
 
 def sample_number(what: str, number: Any, size: int) -> int:
-    """Place of a sample, negative numbers counted from the end.
+    """Return the place of a sample, negative numbers counted from the end.
 
     Args:
         what: caller for messages.
@@ -220,7 +216,7 @@ def sample_number(what: str, number: Any, size: int) -> int:
 
 
 def outside_tensor(shares: Any) -> Tensor:
-    """Shares of light before and after the window as a tensor.
+    """Return shares of light before and after the window as a tensor.
 
     Args:
         shares: two numbers.
@@ -248,7 +244,7 @@ def checked_seed(what: str, seed: Any) -> int | None:
 
 
 def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None, *more: int) -> torch.Generator | None:
-    """Generator of one sample in one epoch: the same draws in every process.
+    """Return the generator of one sample in one epoch: the same draws in every process.
 
     Args:
         what: caller for messages.
@@ -303,7 +299,7 @@ def takes_generator(transform: Any) -> bool:
 
 
 def value_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Drawn values as tensors of the caller's own; texts stay texts.
+    """Return drawn values as tensors of the caller's own; texts stay texts.
 
     Args:
         values: of a sample, by key.

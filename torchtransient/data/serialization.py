@@ -39,7 +39,7 @@ _PIXELS, _VOXELS, _SCAN = "__pixels__", "__voxels__", "__scan__"
 
 
 def written(value: Any) -> Any:
-    """Plain data for a value.
+    """Return plain data for a value.
 
     Args:
         value: numbers, texts, lists, mappings, arrays, transforms, pixels, scans and distributions.
@@ -160,7 +160,7 @@ def _nested(where: str, content: Any) -> Any:
 
 
 def record_fields(record: TimeAxis | Gate | Pulse | None) -> dict[str, Any] | None:
-    """Fields of an axis, a gate or a pulse.
+    """Return the fields of an axis, a gate or a pulse.
 
     Args:
         record: dataclass, or None.
@@ -188,7 +188,7 @@ def read_record(kind: type[Record], data: Any) -> Record | None:
 
 
 def written_frequencies(axis: FrequencyAxis | None) -> dict[str, Any] | None:
-    """Plain data for frequencies.
+    """Return plain data for frequencies.
 
     Args:
         axis: frequencies, or None.
@@ -223,7 +223,7 @@ _DEEPEST = 16
 
 
 def without_places(plain: Mapping[str, Any]) -> dict[str, Any]:
-    """Recipe without the folders of its files: the same recipe elsewhere is equal.
+    """Return a recipe without the folders of its files: the same recipe elsewhere is equal.
 
     Args:
         plain: plain data of a recipe.
@@ -247,7 +247,7 @@ def _placeless(value: Any) -> Any:
 
 
 def files_of(description: Plain, choices: Iterable[Any]) -> dict[str, str]:
-    """Hashes of the files that a scene names.
+    """Return the hashes of the files that a scene names.
 
     Args:
         description: of the scene.

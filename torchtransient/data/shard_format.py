@@ -34,8 +34,8 @@ _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 
 def measured_names(about: Any) -> tuple[str, ...]:
-    """Arrays that were measured: by the film under its own name, and by sensors. Others are labels, and the steady
-    image.
+    """Return the arrays that were measured: by the film under its own name, and by sensors. Others are labels, and the
+    steady image.
 
     Args:
         about: entry ``about`` of a header.
@@ -105,7 +105,7 @@ def rounded_mantissa(array: NDArray[Any], bits: int = MANTISSA_BITS) -> NDArray[
 
 
 def counts_of(array: NDArray[Any], what: str) -> NDArray[Any]:
-    """Whole numbers in the smallest unsigned type.
+    """Convert whole numbers to the smallest unsigned type.
 
     Args:
         array: whole numbers from 0 on, of any real dtype.
@@ -138,7 +138,7 @@ def counts_of(array: NDArray[Any], what: str) -> NDArray[Any]:
 
 
 def encoding_of(name: str, dtype: np.dtype[Any], store: str, measured: Sequence[str]) -> str:
-    """Encoding of an array. Only measured arrays may lose digits.
+    """Return the encoding of an array. Only measured arrays may lose digits.
 
     Args:
         name: of the array.
@@ -222,8 +222,8 @@ def check_compression(compression: Any, what: str) -> str:
 
 
 def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Chunk of an array by its shape alone: small arrays whole, larger ones in slabs of 32 bins or 64 KiB of float32,
-    whichever is more, and slabs above 4 MiB in rows of the image.
+    """Return the chunk of an array by its shape alone: small arrays whole, larger ones in slabs of 32 bins or 64 KiB of
+    float32, whichever is more, and slabs above 4 MiB in rows of the image.
 
     Args:
         shape: of an array of one sample.
@@ -252,8 +252,8 @@ def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def time_axis(shape: tuple[int, ...]) -> int | None:
-    """Probable axis of the bins: (C, T, H, W), (C, T, N) and (C, T, Ly, Lx, Sy, Sx) have them second, polarized images
-    (4, C, T, H, W) third. Images of several components are thus cut into rows.
+    """Return the probable axis of the bins: (C, T, H, W), (C, T, N) and (C, T, Ly, Lx, Sy, Sx) have them second,
+    polarized images (4, C, T, H, W) third. Images of several components are thus cut into rows.
 
     Args:
         shape: of an array of one sample.
@@ -378,7 +378,8 @@ def check_chunks(dataset: Any, rows_there: int, what: str) -> None:
     Raises:
         StorageError: for other chunks, filters, and rows without their chunks.
     """
-    filters = {dataset.id.get_create_plist().get_filter(k)[0] for k in range(_filter_count(dataset))}
+    settings = dataset.id.get_create_plist()
+    filters = {settings.get_filter(k)[0] for k in range(settings.get_nfilters())}
     if not filters <= _KNOWN_FILTERS:
         raise StorageError(f"{what} is packed with the filters {sorted(filters)}, which no writer of shards uses.")
     if _BLOSC2 in filters:
@@ -390,7 +391,3 @@ def check_chunks(dataset: Any, rows_there: int, what: str) -> None:
     stored = dataset.id.get_num_chunks()
     if stored != rows_there * each:
         raise StorageError(f"{what}: expected {rows_there * each} chunks, the file stores {stored}: it is damaged.")
-
-
-def _filter_count(dataset: Any) -> int:
-    return int(dataset.id.get_create_plist().get_nfilters())

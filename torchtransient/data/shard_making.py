@@ -242,8 +242,8 @@ def execute(task: tuple[Any, ...], maker: ShardMaker, messages: Messages) -> tup
 
 
 def reason_of(error: BaseException) -> str:
-    """Reason of a failure in one line, the same in every run and place: without addresses in memory, and with the names
-    alone of files in other folders.
+    """Return the reason of a failure in one line, the same in every run and place: without addresses in memory, and
+    with the names alone of files in other folders.
 
     Args:
         error: that was raised.
@@ -257,7 +257,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def fatal(error: BaseException) -> tuple[str, str, str]:
-    """Error as plain texts, since not all errors pickle.
+    """Return an error as plain texts, since not all errors pickle.
 
     Args:
         error: that was raised.
@@ -269,7 +269,7 @@ def fatal(error: BaseException) -> tuple[str, str, str]:
 
 
 def raised(kind: str, message: str) -> Exception:
-    """Error of another process, of the library's class of that name.
+    """Make the error of another process, of the library's class of that name.
 
     Args:
         kind: name of the class.

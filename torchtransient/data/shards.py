@@ -108,7 +108,7 @@ class Shard:
             return self._read(name, row, window, pixels, as_stored)
 
     def values(self, row: int) -> dict[str, NDArray[Any] | str]:
-        """Drawn values of a row.
+        """Return drawn values of a row.
 
         Args:
             row: of the sample.
@@ -129,7 +129,7 @@ class Shard:
             return {key: found[key] for key in sorted(found)}
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Shape of an array of one sample.
+        """Return the shape of an array of one sample.
 
         Args:
             name: of the array.
@@ -141,7 +141,7 @@ class Shard:
             return tuple(self._dataset(name).shape[1:])
 
     def time_axis(self, name: str) -> int | None:
-        """Axis of the bins of an array.
+        """Return the axis of the bins of an array.
 
         Args:
             name: of the array.
@@ -173,7 +173,7 @@ class Shard:
         return next((place for place in places if len(shape) > place + 1 and shape[place] == bins), None)
 
     def dtype(self, name: str, *, as_stored: bool = False) -> str:
-        """Dtype of an array.
+        """Return the dtype of an array.
 
         Args:
             name: of the array.
@@ -187,7 +187,7 @@ class Shard:
             return str(found if as_stored else decoded(np.empty(0, found), self.encoding(name)).dtype)
 
     def encoding(self, name: str) -> str:
-        """Encoding of an array.
+        """Return the encoding of an array.
 
         Args:
             name: of the array.
@@ -514,7 +514,7 @@ def seal(path: Path) -> None:
 
 
 def hash_of(file: Any, size: int) -> bytes:
-    """SHA-256 of the beginning of a file.
+    """Return the SHA-256 of the beginning of a file.
 
     Args:
         file: open file.
@@ -535,7 +535,7 @@ def hash_of(file: Any, size: int) -> bytes:
 
 
 def member_name(key: str) -> str:
-    """Key as the name of a member of an HDF5 group, where slashes and single points mean something else.
+    """Return a key as the name of a member of an HDF5 group, where slashes and single points mean something else.
 
     Args:
         key: of a value.
@@ -578,7 +578,7 @@ def _json(value: Any, what: str) -> str:
 
 
 def stored_checksum(path: Path) -> str:
-    """Checksum at the end of a shard, without comparing it.
+    """Return the checksum at the end of a shard, without comparing it.
 
     Args:
         path: of the file.

@@ -142,7 +142,7 @@ class Scenes:
         return all(_has(description, key, self.scan) for description in self.descriptions.values())
 
     def parameters(self, bounces: Any, energy: Any) -> frozenset[str]:
-        """Keys with a derivative in the first scene as it is described.
+        """Return the keys with a derivative in the first scene as it is described.
 
         Args:
             bounces: of a capture.
@@ -159,7 +159,7 @@ class Scenes:
         return frozenset(given.parameters().differentiable())
 
     def build(self, structure: Structure) -> tuple[Any, Scan | None]:
-        """Scene of a structure.
+        """Build the scene of a structure.
 
         Args:
             structure: of the recipe.
@@ -389,7 +389,7 @@ class Specification:
     # ----------------------------------------------------------------------------------------------- structures
 
     def structure(self, index: int) -> Structure:
-        """Structure of a sample.
+        """Return the structure of a sample.
 
         Args:
             index: of the sample.
@@ -493,7 +493,7 @@ def is_entry(value: Any) -> bool:
 
 
 def label_of(distribution: Distribution, value: Any) -> str:
-    """Short text for a drawn entry: texts and numbers themselves, others by their number among the choices.
+    """Return a short text for a drawn entry: texts and numbers themselves, others by their number among the choices.
 
     Args:
         distribution: of the key.

@@ -1,18 +1,23 @@
-"""Values between two bounds, by the logistic function: albedo, roughness, index of refraction."""
+"""Values between two bounds, by the logistic function: albedo, roughness, index of refraction; and values above one:
+light, extinction, lengths, optical constants of metals.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchtransient.checks import as_number, shown
+from torchtransient.checks import as_number, finite, shown
+from torchtransient.checks import positive as greater_than_zero
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, number_tensor, without_autocast
-from torchtransient.parametrize.settings import Settings
+from torchtransient.parametrize.settings import Settings, choice_code, choice_of
 
 Bound = float | Tensor
+PositiveFunction = Literal["softplus", "exp"]
+_FUNCTIONS: tuple[str, ...] = get_args(PositiveFunction)
 # What single precision makes of the ends of a range, as a share of it.
 _SLACK = 1e-5
 # Mitsuba renders the square of a principled roughness, no smaller than 0.001.
@@ -123,6 +128,11 @@ class Bounded(Settings):
 
     @without_autocast
     def forward(self, x: Tensor) -> Tensor:
+        """Return `bounded` of a tensor.
+
+        Args:
+            x: any shape to which the bounds broadcast.
+        """
         # The bounds were looked at when they were given: looking at them again would wait for a GPU.
         return _between(floating(x, type(self).__name__), self.low, self.high, type(self).__name__)
 
@@ -207,6 +217,121 @@ class Anisotropy(Bounded):
 
     def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:
         super().__init__(low, high, margin)
+
+
+@without_autocast
+def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> Tensor:
+    """Map all real numbers above a bound: `low + scale * log(1 + exp(x))`, or with `function="exp"` `low + scale *
+    exp(x)`.
+
+    "softplus" is linear in `x` above `scale` and goes to `low` exponentially: steps of an optimiser are steps of the
+    value. With "exp" steps are factors, for values whose order of magnitude is not known.
+
+    Args:
+        x: any shape.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero.
+        function: "softplus" or "exp".
+
+    Returns:
+        Values above `low`, or `low` itself where the precision of `x` has no number in between (float32: below -104
+            with low=0, below -17 with low=1). With "exp" infinite where it ends (float32: above 88).
+
+    Raises:
+        UnitError, ShapeError: for other settings and tensors.
+    """
+    base, unit = _checked_positive(low, scale, function, "positive")
+    return _above(floating(x, "positive"), base, unit, function)
+
+
+def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str) -> Tensor:
+    return base + unit * (torch.exp(x) if function == "exp" else nn.functional.softplus(x))
+
+
+@without_autocast
+def positive_inverse(
+    value: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
+) -> Tensor:
+    """Return the `x` of which `positive` makes `value`.
+
+    Args:
+        value: any shape, finite, above `low`.
+        low, scale, function: as of `positive`.
+
+    Raises:
+        UnitError: for other values.
+    """
+    where = "positive_inverse"
+    base, unit = _checked_positive(low, scale, function, where)
+    return _above_inverse(floating(value, where), base, unit, function, where)
+
+
+def _above_inverse(value: Tensor, base: float | Tensor, unit: float | Tensor, function: str, where: str) -> Tensor:
+    y = (value - base) / unit
+    if not holds((y > 0) & torch.isfinite(y)):
+        raise UnitError(
+            f"{where}: expected finite values above {float(base):g}, got some from {value.min().item():g} to "
+            f"{value.max().item():g}. Start from greater ones."
+        )
+    # log(exp(y) - 1), which neither overflows for large nor loses digits for small y.
+    return torch.log(y) if function == "exp" else y + torch.log(-torch.expm1(-y))
+
+
+class Positive(Settings):
+    """`positive` as a parametrization: `forward` from all real numbers to above `low`, `right_inverse` back.
+
+    All three settings are part of `state_dict`.
+
+    Args:
+        low, scale, function: as of `positive`.
+    """
+
+    low: Tensor
+    scale: Tensor
+
+    def __init__(self, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus") -> None:
+        super().__init__()
+        base, unit = _checked_positive(low, scale, function, "Positive")
+        self._keep("low", base)
+        self._keep("scale", unit)
+        self.function: str = function
+
+    @without_autocast
+    def forward(self, x: Tensor) -> Tensor:
+        """Return `positive` of a tensor.
+
+        Args:
+            x: any shape.
+        """
+        return _above(floating(x, "Positive"), self.low.to(x), self.scale.to(x), self.function)
+
+    @without_autocast
+    def right_inverse(self, value: Tensor) -> Tensor:
+        """Return `positive_inverse` of a value.
+
+        Args:
+            value: of any shape, positive.
+
+        Raises:
+            UnitError: for values out of range.
+        """
+        value = floating(value, "Positive")
+        return _above_inverse(value, self.low.to(value), self.scale.to(value), self.function, "Positive")
+
+    def get_extra_state(self) -> Tensor:
+        return choice_code(_FUNCTIONS, self.function)
+
+    def set_extra_state(self, state: Any) -> None:
+        self.function = choice_of(_FUNCTIONS, state, "Positive")
+
+    def extra_repr(self) -> str:
+        return f"above {self.low.item():g}, scale={self.scale.item():g}, {self.function}"
+
+
+def _checked_positive(low: float, scale: float, function: str, where: str) -> tuple[float, float]:
+    if function not in _FUNCTIONS:
+        raise UnitError(f"{where}: expected function 'softplus' or 'exp', got {shown(function)}.")
+    return finite(f"{where}: low", low), greater_than_zero(f"{where}: scale", scale)
 
 
 # ------------------------------------------------------------------------------------------------------------- checks

@@ -81,6 +81,11 @@ class Simplex(Settings):
 
     @without_autocast
     def forward(self, x: Tensor) -> Tensor:
+        """Return `simplex` of a tensor.
+
+        Args:
+            x: any shape that has the dimension of the module.
+        """
         return simplex(x, self.dim)
 
     @without_autocast

@@ -12,8 +12,7 @@ from torch import Tensor
 from torchtransient.checks import count, real_array, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, single, without_autocast
-from torchtransient.parametrize.bounded import Albedo
-from torchtransient.parametrize.positive import Positive
+from torchtransient.parametrize.bounded import Albedo, Positive
 from torchtransient.parametrize.settings import Settings
 
 

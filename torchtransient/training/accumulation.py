@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.checks import Numbers, as_number, function, shown
+from torchtransient.checks import Numbers, as_number
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 
 Part = TypeVar("Part")
@@ -48,28 +48,19 @@ def accumulate(
         UnitError: for weights that are not finite.
         GradientError: for a loss without a gradient. Nothing has been differentiated then, except by parts before it.
     """
-    try:
-        each = iter(parts)
-    except TypeError:
-        raise ArgumentError(f"accumulate: expected parts as a list or any iterable, got {shown(parts)}.") from None
-    listed = list(each)
+    listed = list(parts)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
-    if weights is not None and (not isinstance(weights, Iterable) or getattr(weights, "ndim", None) == 0):
-        raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {shown(weights)}.")
     shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
     if len(shares) != len(listed):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
     if model is not None and not isinstance(model, nn.Module):
         raise ArgumentError(f"accumulate: expected model as a module, got {type(model).__name__}.")
-    function("accumulate: loss_of", loss_of, "a part")
-    if scaler is not None and not callable(getattr(scaler, "scale", None)):
-        raise ArgumentError(f"accumulate: expected scaler as a torch.amp.GradScaler, got {shown(scaler)}.")
     values = []
     for n, (part, share) in enumerate(zip(listed, shares, strict=True)):
         waits = isinstance(model, DistributedDataParallel) and n + 1 < len(listed)
         # The forward pass stands inside: DDP prepares there for what its backward pass does.
-        with _no_exchange(model) if waits else nullcontext():
+        with model.no_sync() if waits else nullcontext():  # type: ignore[union-attr, operator]
             loss = loss_of(part)
             if not isinstance(loss, torch.Tensor) or loss.numel() != 1 or loss.is_complex():
                 came = f"{loss.dtype} {tuple(loss.shape)}" if isinstance(loss, torch.Tensor) else type(loss).__name__
@@ -85,10 +76,6 @@ def accumulate(
             values.append(scaled.detach())
             del loss, scaled
     return sum(float(value) for value in values)
-
-
-def _no_exchange(model: Any) -> Any:
-    return model.no_sync()
 
 
 def _weight(value: Any) -> float:

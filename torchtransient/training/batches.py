@@ -190,8 +190,6 @@ def _take_device(found: Ranks) -> None:
 
 
 _WHAT = "Batches"
-# What these batches say themselves to a DataLoader.
-_OURS = ("batch_size", "batch_sampler", "sampler", "shuffle", "drop_last", "num_workers")
 
 
 class Batches(Sampler[list[int]]):
@@ -291,7 +289,7 @@ class Batches(Sampler[list[int]]):
             options: others of the DataLoader.
 
         Raises:
-            UnitError: for streams, data sets of another size, and options that the batches set.
+            UnitError: for streams and data sets of another size.
             ArgumentError: for other objects than data sets.
         """
         processes = count(f"{_WHAT}: workers", workers, 0, UnitError)
@@ -302,9 +300,6 @@ class Batches(Sampler[list[int]]):
             )
         if not isinstance(data, Dataset):  # one of torch's need not know its length
             by_number(_WHAT, data)
-        said = [name for name in options if name in _OURS]
-        if said:
-            raise UnitError(f"{_WHAT}: {', '.join(said)} of a DataLoader are said by the batches; processes: workers=.")
         size = len(data) if hasattr(data, "__len__") else self.size
         if size != self.size:
             raise UnitError(f"{_WHAT}: they are of {self.size} samples, the data set has {size}.")

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import pickle
 
 import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from support.online_recipe import OnlineRecipe
 from support.stored_samples import folder
-from torchtransient.data import (
-    Augment,
-    Augmented,
-    AugmentedStream,
-    Crop,
-    Flip,
-    OnlineDataset,
-    TransientDataset,
-    TransientStream,
-)
-from torchtransient.errors import ArgumentError, SceneError, TorchTransientError, UnitError
+from torchtransient.data import Augment, Augmented, AugmentedStream, Flip, TransientDataset, TransientStream
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 
 N = 11
 
@@ -39,28 +28,27 @@ def by_index(stream):
 
 
 def test_maps_belong_to_samples_and_epochs(data):
-    augment = Augment(Flip(p=0.5))
-    stream = AugmentedStream(TransientStream(data, fields=["depth"]), augment, seed=4)
-    first = by_index(stream)
-    plain = by_index(TransientStream(data, fields=["depth"]))
+    def streamed(seed=4, **order):
+        return AugmentedStream(TransientStream(data, fields=["depth"], **order), Augment(Flip(p=0.5)), seed=seed)
+
+    def same(found, other):
+        return all(torch.equal(found[i][0], other[i][0]) for i in range(N))
+
+    stream = streamed()
+    first, plain = by_index(stream), by_index(TransientStream(data, fields=["depth"]))
     assert {i: len(one) for i, one in first.items()} == dict.fromkeys(range(N), 1)
     flipped = {i: torch.equal(first[i][0], plain[i][0].flip(-1)) for i in range(N)}
     assert set(flipped.values()) == {True, False}
     assert all(done or torch.equal(first[i][0], plain[i][0]) for i, done in flipped.items())
     # Other readers, other orders.
-    other = AugmentedStream(TransientStream(data, fields=["depth"], seed=9), augment, seed=4)
-    halves = [
-        by_index(AugmentedStream(TransientStream(data, fields=["depth"], rank=r, world_size=2), augment, seed=4))
-        for r in (0, 1)
-    ]
-    for found in (by_index(other), {**halves[0], **halves[1]}, by_index(pickle.loads(pickle.dumps(stream)))):
-        assert all(torch.equal(found[i][0], first[i][0]) for i in range(N))
+    halves = [by_index(streamed(rank=r, world_size=2)) for r in (0, 1)]
+    for found in (by_index(streamed(seed=4, shuffle=False)), halves[0] | halves[1]):
+        assert same(found, first)
+    assert same(by_index(pickle.loads(pickle.dumps(stream))), first)
     stream.set_epoch(1)
     second = by_index(stream)
-    assert stream.num_samples == N and stream.epoch == 1
-    assert any(not torch.equal(second[i][0], first[i][0]) for i in range(N))
-    assert any(not torch.equal(by_index(AugmentedStream(stream.dataset, augment, seed=5))[i][0], second[i][0])
-               for i in range(N))  # fmt: skip
+    assert stream.num_samples == N and stream.epoch == 1 and not same(second, first)
+    assert not same(by_index(streamed(seed=5)), first)
     sizes = {tuple(batch["depth"].shape) for batch in DataLoader(stream, batch_size=N)}
     assert sizes == {(N, *plain[0][0].shape)}
 
@@ -100,37 +88,30 @@ def test_samples_of_two_folders_with_one_number(data, tmp_path):
 class Again(torch.utils.data.IterableDataset):
     """The same sample again and again."""
 
+    def __init__(self, **entries):
+        self.entries, self.closed = entries, False
+
     def __iter__(self):
-        yield from ({"index": 3, "depth": torch.arange(6.0).reshape(2, 3)} for _ in range(40))
+        yield from ({"depth": torch.arange(6.0).reshape(2, 3), **self.entries} for _ in range(40))
+
+    def close(self):
+        self.closed = True
 
 
 def test_samples_that_are_used_again_are_turned_anew():
-    def found(seed):
-        return [sample["depth"][0, 0].item() for sample in AugmentedStream(Again(), Augment(Flip(p=0.5)), seed=seed)]
+    def found(seed, **entries):
+        with AugmentedStream(Again(**entries), Augment(Flip(p=0.5)), seed=seed) as stream:
+            drawn = [sample["depth"][0, 0].item() for sample in stream]
+        assert stream.closed  # other attributes are those of the stream
+        return drawn
 
     # 40 tosses of a coin are all alike once in 5e11 seeds.
-    assert set(found(0)) == {0.0, 2.0}
-    assert found(0) == found(0) != found(1)
-
-
-@pytest.mark.slow
-def test_samples_that_are_rendered_meanwhile():
-    online = OnlineDataset(OnlineRecipe(), capacity=4, warm=4, uses=8.0)
-    with AugmentedStream(online, Augment(Crop((1, 1))), seed=0) as stream:
-        given = list(itertools.islice(stream, 24))
-        assert all(sample["transient"].shape[-2:] == (1, 1) for sample in given)
-        assert all((sample["transient"] == sample["index"]).all() for sample in given)
-        assert stream.drawn >= 24
-    with pytest.raises(TorchTransientError):
-        stream.draw()
-
-
-class Numbered(torch.utils.data.IterableDataset):
-    def __init__(self, index):
-        self.index = index
-
-    def __iter__(self):
-        yield {"index": self.index, "depth": torch.ones(2, 2)}
+    assert set(found(0, index=3)) == {0.0, 2.0}
+    assert found(0, index=3) == found(0, index=3) != found(1, index=3)
+    assert set(found(None)) == {0.0, 2.0}
+    for entries in ({}, {"index": -1}):
+        with pytest.raises(SceneError, match="index"):
+            found(0, **entries)
 
 
 def noisy(light, generator=None):
@@ -153,24 +134,12 @@ def test_an_epoch_is_one_of_the_data_set_too(data):
         (lambda data: Augmented(TransientStream(data), Augment(Flip())), ArgumentError, "AugmentedStream"),
         (lambda data: AugmentedStream([1], Augment(Flip())), ArgumentError, "expected a stream.*Augmented"),
         (lambda data: AugmentedStream(TransientStream(data), "flip"), ArgumentError, "expected an Augment"),
-        (lambda data: AugmentedStream(TransientStream(data), Augment(Flip()), seed=-1), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=-1), UnitError, "seed"),
         (lambda data: Augmented([1], Augment(Flip()), seed=0).sample(0, -1), UnitError, "epoch"),
         (lambda data: Augmented([1, 2], Augment(Flip()))[2], IndexError, "from 0 to 1"),
-        (lambda data: next(iter(AugmentedStream(Numbered(-1), Augment(Flip()), seed=0))), SceneError, "index"),
         (lambda data: AugmentedStream(TransientStream(data), Augment(Flip())).nothing, AttributeError, "nothing"),
     ],
 )
 def test_what_it_refuses(data, call, error, message):
     with pytest.raises(error, match=message):
         call(data)
-
-
-def test_a_seed_needs_an_index():
-    class Unnumbered(torch.utils.data.IterableDataset):
-        def __iter__(self):
-            yield {"depth": torch.ones(2, 2)}
-
-    assert len(list(AugmentedStream(Unnumbered(), Augment(Flip())))) == 1
-    with pytest.raises(SceneError, match="index"):
-        list(AugmentedStream(Unnumbered(), Augment(Flip()), seed=0))

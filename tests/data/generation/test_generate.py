@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,6 @@ import torchtransient as tt
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, finish, leftovers, start
 from torchtransient.data import Shard, generate, verify
-from torchtransient.data.crew import DIED
-from torchtransient.data.overview import LatestPicture
 from torchtransient.errors import ArgumentError, MissingPackageError, SceneError, StorageError, UnitError
 
 
@@ -36,8 +33,6 @@ def calm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calm") / "set"
     done = generate(RECIPE, folder, workers=1, **QUICK)
     assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (23, 0, 0, 0, 6)
-    assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5"))
-    assert "23 samples in 6 shards" in str(done)
     return folder
 
 
@@ -45,16 +40,9 @@ def events(folder):
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def failures(folder):
-    found = {}
-    for path in folder.glob("shard-*.h5"):
-        with Shard(path) as shard:
-            found |= shard.failed
-    return found
-
-
 def test_what_is_there(calm, tmp_path):
     """A worker's bytes are those of this process."""
+    (tmp_path / "latest.png").mkdir()  # a picture that cannot be written is no reason to fail
     with tt.threads(2) as before:
         generate(RECIPE, tmp_path, workers=0, **QUICK)
         assert tt.threads() == before
@@ -69,17 +57,6 @@ def test_what_is_there(calm, tmp_path):
                 shard.read("transient", shard.index[index]), maker.sample(index).arrays["transient"]
             )
     assert (calm / "latest.png").read_bytes().startswith(b"\x89PNG")
-    log = events(calm)
-    assert [e["event"] for e in log] == ["begin", *["shard"] * 6, "end"]
-    assert json.loads((calm / "recipe.json").read_text())["standard_error"] == 0.25
-
-
-@pytest.mark.slow
-def test_equal_bytes_of_many_workers(calm, tmp_path):
-    """Whole numbers of any library count."""
-    numbers = {"n": np.int64(23), "per_shard": np.int32(4), "retries": np.uint8(2), "shard": (np.int64(0), np.int64(1))}
-    generate(RECIPE, tmp_path, workers=np.int64(2), progress=False, **numbers)
-    assert data_files(tmp_path) == data_files(calm)
 
 
 # ------------------------------------------------------------------------------------------------- samples that fail
@@ -87,25 +64,23 @@ def test_equal_bytes_of_many_workers(calm, tmp_path):
 
 @pytest.mark.slow
 def test_what_fails_is_named(tmp_path, calm):
-    """Every kind of failure in one run; all other samples are there."""
-    recipe = FakeRecipe(raising=(3,), crashing=(7,), dying=(12,), hanging=(18,))
+    """Every kind of failure in one run, of the first samples too; all other samples are there."""
+    recipe = FakeRecipe(raising=(0, 3), crashing=(1, 7), dying=(12,), hanging=(18,))
     done = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
-    assert (done.samples, done.failed) == (19, 4) and done.restarts == 4
-    assert failures(tmp_path) == {
-        3: "SceneError: sample 3 cannot be made by <object at 0x...>",
-        7: DIED, 12: DIED, 18: DIED,
-    }  # fmt: skip
-    assert verify(tmp_path).complete and len(verify(tmp_path).failed) == 4
-    with Shard(tmp_path / "shard-000001.h5") as found, Shard(calm / "shard-000001.h5") as expected:
-        assert sorted(found.index) == [4, 5, 6]
-        for index, row in found.index.items():
-            np.testing.assert_array_equal(
-                found.read("transient", row), expected.read("transient", expected.index[index])
-            )
+    assert (done.samples, done.failed) == (17, 6) and done.restarts >= 4
+    found = verify(tmp_path)
+    assert found.complete and sorted(found.failed) == [0, 1, 3, 7, 12, 18]
+    assert found.failed[3] == "SceneError: sample 3 cannot be made by <object at 0x...>"
+    assert {found.failed[index] for index in (1, 7, 12, 18)} == {found.failed[7]} and "died" in found.failed[7]
+    with Shard(tmp_path / "shard-000001.h5") as made, Shard(calm / "shard-000001.h5") as expected:
+        assert sorted(made.index) == [4, 5, 6]
+        for index, row in made.index.items():
+            other = expected.read("transient", expected.index[index])
+            np.testing.assert_array_equal(made.read("transient", row), other)
     ways = {(e["sample"], e["how"].split(" for")[0]) for e in events(tmp_path) if e["event"] == "death"}
-    assert ways == {(7, "by SIGSEGV"), (12, "by SIGKILL"), (18, "by no sign of life")}
+    assert ways >= {(7, "by SIGSEGV"), (12, "by SIGKILL"), (18, "by no sign of life")}
     again = generate(recipe, tmp_path, timeout_s=1.5, retries=0, **QUICK)
-    assert (again.kept, again.samples, again.failed) == (19, 0, 0)
+    assert (again.kept, again.samples, again.failed) == (17, 0, 0)
 
 
 @pytest.mark.slow
@@ -120,24 +95,14 @@ def test_what_passes_leaves_no_trace(tmp_path, calm):
 
 
 @pytest.mark.slow
-def test_the_first_samples_fail(tmp_path):
-    done = generate(FakeRecipe(raising=(0,), crashing=(1,)), tmp_path, retries=0, workers=1, **QUICK)
-    assert (done.samples, done.failed) == (21, 2)
-
-
-@pytest.mark.slow
 def test_no_sample_can_be_made(tmp_path):
-    with pytest.raises(SceneError, match=r"none of the samples 0 to 15 .* The last one: SceneError: sample 15"):
-        generate(FakeRecipe(raising=tuple(range(23))), tmp_path, **QUICK)
-    first = next(e for e in events(tmp_path) if e["event"] == "traceback")
-    assert first["sample"] == 0 and 'fake_recipe.py", line' in first["trace"]
     with pytest.raises(SceneError, match="no light in it") as caught:
         generate(FakeRecipe(unbuilt="no light in it"), tmp_path, **QUICK)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.jsonl"]
-    assert [e["event"] for e in events(tmp_path)].count("stopped") == 2
     # File and line, where it is raised and in the log.
     (said,) = (e["trace"] for e in events(tmp_path) if e["event"] == "error" and "no light" in e["error"])
     assert 'fake_recipe.py", line' in said and said in str(caught.value.__cause__)
+    assert events(tmp_path)[-1]["event"] == "stopped"
 
 
 # --------------------------------------------------------------------------------------------------------- arguments
@@ -152,82 +117,59 @@ class Unpicklable(FakeRecipe):
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"n": 0}, UnitError, "n: expected"), ({"n": 2.5}, UnitError, "n: expected"),
-        ({"n": None}, ArgumentError, "how many"),
+        ({"n": 2.5}, UnitError, "n: expected"), ({"n": None}, ArgumentError, "how many"),
         ({"workers": -1}, UnitError, "workers"), ({"workers": 0, "engine": "ray"}, UnitError, "workers"),
-        ({"retries": -1}, UnitError, "retries"),
         ({"per_shard": 0}, UnitError, "per_shard"), ({"shard": (2, 2)}, UnitError, "shard"),
-        ({"shard": "0/2"}, UnitError, "shard"), ({"shard": (True, 2)}, UnitError, "shard"),
-        ({"n": True}, UnitError, "n: expected"), ({"shard": (0, 1, 2)}, UnitError, "shard"),
+        ({"shard": "0/2"}, UnitError, "shard"), ({"retries": -1}, UnitError, "retries"),
         ({"timeout_s": 0}, UnitError, "timeout_s"), ({"timeout_s": float("nan")}, UnitError, "timeout_s"),
         ({"engine": "dask"}, ArgumentError, "engine"), ({"address": "auto"}, UnitError, "ray"),
         ({"store": "half"}, ArgumentError, "store"), ({"compression": "lzma"}, ArgumentError, "compression"),
-        ({"recipe": {}}, ArgumentError, "recipe"), ({"recipe": Unpicklable()}, SceneError, "pickles"),
-        ({"folder": 3}, StorageError, "folder|name of a file"),
+        ({"recipe": Path("rec.yaml")}, ArgumentError, r"tt.data.Recipe.read"),
+        ({"recipe": "set", "folder": RECIPE, "n": None}, ArgumentError, "a recipe and then a folder"),
+        ({"recipe": Unpicklable()}, SceneError, "pickles"),
         ({"recipe": Deviceless(), "store": "counts"}, SceneError, "with a device"),
+        ({"engine": "ray"}, MissingPackageError, "needs the package ray"),
+        ({"folder": Path(__file__)}, StorageError, "cannot be made"),
     ],
 )  # fmt: skip
-def test_arguments(tmp_path, changes, error, words):
+def test_arguments(tmp_path, monkeypatch, changes, error, words):
+    monkeypatch.setitem(sys.modules, "ray", None)
     given = {"recipe": RECIPE, "folder": tmp_path / "a", **QUICK, **changes}
     with pytest.raises(error, match=words):
         generate(given.pop("recipe"), given.pop("folder"), **given)
-    assert not (tmp_path / "a").exists()
+    assert not list(tmp_path.glob("a/shard*"))
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (("folder", RECIPE), "a recipe and then a folder, got the recipe behind 'folder'"),
-        (({}, "folder"), r"expected a recipe, with maker\(\), got {}\. tt.data.Recipe.from_dict reads"),
-        ((Path("rec.yaml"), "folder"), r"\. tt.data.Recipe.read reads files\.$"),
-    ],
-)
-def test_what_is_no_recipe_is_said_before_a_number_is_asked_for(given, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ArgumentError, match=words):
-        generate(*given)
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_ray(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingPackageError, match="needs the package ray"):
-        generate(RECIPE, tmp_path, engine="ray", **QUICK)
-
-
-def test_a_folder_that_is_a_file(tmp_path):
-    (tmp_path / "a").write_text("")
-    with pytest.raises(StorageError, match="cannot be made"):
-        generate(RECIPE, tmp_path / "a", **QUICK)
-
-
-@pytest.mark.slow
-def test_a_script_without_a_guard(tmp_path):
-    """Its workers import it; they may not begin runs of their own without end."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
-        "from torchtransient.data.generation import generate\n"
-        f"generate(FakeRecipe(), {str(tmp_path / 'set')!r}, 4, progress=False)\n"
-    )
-    found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
-    assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("call", ["generate(Mine(), FOLDER, 4, progress=False)", "OnlineDataset(Mine(), 4).draw()"])
-def test_a_class_that_workers_do_not_find(tmp_path, call):
-    """It is no missing guard."""
+def fails(tmp_path, text):
+    """Last line of what a script says that fails."""
     script = tmp_path / "script.py"
     script.write_text(
         "import torchtransient\nfrom support.fake_recipe import FakeRecipe\n"
         "from torchtransient.data import OnlineDataset, generate\n"
-        f"FOLDER = {str(tmp_path / 'set')!r}\n"
-        f"if __name__ == '__main__':\n    class Mine(FakeRecipe):\n        pass\n    {call}\n"
+        f"FOLDER = {str(tmp_path / 'set')!r}\n{text}\n"
     )
     found = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, timeout=100)
-    last = found.stderr.rstrip().splitlines()[-1]
-    assert found.returncode == 1 and last.startswith("torchtransient.errors.SceneError") and "attribute 'Mine'" in last
+    assert found.returncode == 1
+    return found.stderr.rstrip().splitlines()[-1]
+
+
+CALLS = ["generate({}(), FOLDER, 4, progress=False)", "OnlineDataset({}(), 4).draw()"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", CALLS)
+def test_a_script_without_a_guard(tmp_path, call):
+    """Its workers import it; they may not begin runs of their own without end."""
+    assert "__main__" in fails(tmp_path, call.format("FakeRecipe"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", CALLS)
+def test_a_class_that_workers_do_not_find(tmp_path, call):
+    """It is no missing guard."""
+    text = f"if __name__ == '__main__':\n    class Mine(FakeRecipe):\n        pass\n    {call.format('Mine')}"
+    last = fails(tmp_path, text)
+    assert last.startswith("torchtransient.errors.SceneError") and "attribute 'Mine'" in last
     assert "outside of `if __name__ == '__main__':`" in last
 
 
@@ -247,13 +189,3 @@ def test_a_full_disk(tmp_path):
     generate(recipe, tmp_path / "a", progress=False, **asked)
     generate(recipe, tmp_path / "b", progress=False, **asked)
     assert data_files(tmp_path / "a") == data_files(tmp_path / "b")
-    assert resource.getrlimit(resource.RLIMIT_FSIZE)[0] == resource.RLIM_INFINITY
-
-
-def test_a_picture_is_no_reason_to_fail(tmp_path):
-    sample = RECIPE.maker().sample(0)
-    LatestPicture(tmp_path / "nowhere")(sample)
-    LatestPicture(tmp_path)(replace(sample, arrays={"transient": np.zeros(3)}))
-    assert list(tmp_path.iterdir()) == []
-    LatestPicture(tmp_path)(sample)
-    assert [path.name for path in tmp_path.iterdir()] == ["latest.png"]

@@ -18,42 +18,24 @@ from torchtransient.errors import PluginRegistrationError, SceneError, StorageEr
 from torchtransient.plugins import _registry
 
 PAINT = """
-import drjit as dr
 import mitsuba as mi
 from torchtransient.plugins import register
 
-class Paint(mi.BSDF):
-    can_be_recorded = True
-
+class Paint(mi.Texture):
     def __init__(self, props):
         super().__init__(props)
         self.gain = mi.Float(props.get("gain", 0.5))
-        self.m_flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-        self.m_components = [self.m_flags]
 
     def traverse(self, callback):
         callback.put("gain", self.gain, mi.ParamFlags.Differentiable)
 
-    def sample(self, ctx, si, sample1, sample2, active=True):
-        bs = dr.zeros(mi.BSDFSample3f)
-        bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
-        bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
-        bs.eta, bs.sampled_type = 1, +mi.BSDFFlags.DiffuseReflection
-        there = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (bs.pdf > 0)
-        return bs, dr.select(there, mi.Spectrum(self.gain), 0)
+    def eval(self, si, active=True):
+        return mi.UnpolarizedSpectrum(self.gain)
 
-    def eval(self, ctx, si, wo, active=True):
-        there = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-        return dr.select(there, mi.Spectrum(self.gain) * mi.Frame3f.cos_theta(wo) / dr.pi, 0)
+    def mean(self):
+        return self.gain
 
-    def pdf(self, ctx, si, wo, active=True):
-        there = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-        return dr.select(there, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
-
-    def eval_pdf(self, ctx, si, wo, active=True):
-        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-register("bsdf", "their_paint", Paint)
+register("texture", "their_paint", Paint)
 """
 QUICK = {"n": 4, "per_shard": 2, "workers": 1, "progress": False}
 
@@ -77,8 +59,8 @@ def theirs(tmp_path, monkeypatch):
 
 def painted(**more):
     scene = tt.scenes.cornell_box(resolution=8, num_bins=60, bin_width_opl=0.2, start_opl=2.0)
-    scene["red"] = {"type": "their_paint", "gain": 0.3}
-    vary = {"red.gain": tt.data.Uniform(0.1, 0.9)}
+    scene["red"] = {"type": "diffuse", "reflectance": {"type": "their_paint", "gain": 0.3}}
+    vary = {"red.reflectance.gain": tt.data.Uniform(0.1, 0.9)}
     return tt.data.Recipe(scene, vary, variant="llvm_ad_mono", spp=4, **more)
 
 
@@ -88,19 +70,16 @@ def settings_of(recipe, folder, added):
 
 def test_what_is_registered_is_handed_on(theirs, tmp_path):
     assert registered_plugins() == ()
-    plugins.register_module(theirs.stem, (("bsdf", "their_paint"),))
+    plugins.register_module(theirs.stem, (("texture", "their_paint"),))
     added = registered_plugins()
-    assert added == (("their_paint_module", (("bsdf", "their_paint"),)),)
+    assert added == (("their_paint_module", (("texture", "their_paint"),)),)
     _registry._state.third_party = []
     with tt.threads(1):
         ShardMaker(settings_of(FakeRecipe(), tmp_path, added)).close()
+        wanted = r"the process that renders cannot use the plugin module 'their\.absent': .* PYTHONPATH"
+        with pytest.raises(PluginRegistrationError, match=wanted):
+            ShardMaker(settings_of(FakeRecipe(), tmp_path, (("their.absent", ()),)))
     assert registered_plugins() == added
-
-
-def test_what_cannot_be_imported_there_is_said(tmp_path):
-    wanted = r"generate: the process that renders cannot use the plugin module 'their\.absent': .* PYTHONPATH"
-    with tt.threads(1), pytest.raises(PluginRegistrationError, match=wanted):
-        ShardMaker(settings_of(FakeRecipe(), tmp_path, (("their.absent", ()),)))
 
 
 def test_recipes_name_their_modules(theirs):
@@ -111,7 +90,7 @@ def test_recipes_name_their_modules(theirs):
     assert again == recipe and registered_plugins() == (("their_paint_module", ()),)
     before = recipe.maker().about()["versions"]["their_paint_module"]
     assert before.startswith("sha256 ")
-    theirs.write_text(PAINT.replace("self.gain)", "self.gain * 2)"))
+    theirs.write_text(PAINT.replace("trum(self.gain)", "trum(self.gain / 2)"))
     assert recipe.maker().about()["versions"]["their_paint_module"] != before
     with pytest.raises(SceneError, match="plugins: expected several names of modules in a list"):
         painted(plugins="their_paint_module")
@@ -128,7 +107,7 @@ def test_other_processes_have_them(theirs, tmp_path):
         assert data.draw()["transient"].shape == (1, 60, 8, 8)
     # Another source makes other samples: they are not put beside these.
     (tmp_path / "set" / "shard-000001.h5").unlink()
-    theirs.write_text(PAINT.replace("mi.Spectrum(self.gain)", "mi.Spectrum(self.gain) * 2"))
+    theirs.write_text(PAINT.replace("trum(self.gain)", "trum(self.gain / 2)"))
     with pytest.raises(StorageError, match="versions is"):
         generate(recipe, tmp_path / "set", **QUICK)
     assert verify(tmp_path / "set").missing == (2, 3)

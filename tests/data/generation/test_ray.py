@@ -12,7 +12,6 @@ import pytest
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import data_files, environment, kill, leftovers
 from torchtransient.data import generate, verify
-from torchtransient.data.crew import DIED
 from torchtransient.errors import StorageError, TorchTransientWarning
 
 pytestmark = pytest.mark.slow
@@ -55,9 +54,14 @@ def actors():
 
 
 def test_the_same_bytes(cluster, tmp_path, calm):
-    done = generate(FakeRecipe(shape=(1, 16, 8, 8)), tmp_path, workers=2, **ASKED)
+    with pytest.warns(TorchTransientWarning, match="2 processors, and 5 workers were asked for; 2 are started"):
+        done = generate(FakeRecipe(shape=(1, 16, 8, 8)), tmp_path, workers=5, **ASKED)
     assert (done.samples, done.restarts) == (48, 0)
     assert data_files(tmp_path) == calm and cluster.is_initialized()
+    # Errors of workers are those of the run.
+    (tmp_path / "shard-000001.h5").unlink()
+    with pytest.raises(StorageError, match="versions is"):
+        generate(FakeRecipe(shape=(1, 16, 8, 8), versions={"fake": "2"}), tmp_path, **ASKED)
 
 
 def test_killed_workers(cluster, tmp_path, calm):
@@ -84,17 +88,5 @@ def test_what_fails_is_named(cluster, tmp_path):
     generate(recipe, tmp_path, timeout_s=2, retries=0, **ASKED)
     found = verify(tmp_path)
     assert found.complete and found.samples == 45
-    assert found.failed == {3: "SceneError: sample 3 cannot be made by <object at 0x...>", 7: DIED, 20: DIED}
-
-
-def test_more_workers_than_processors(cluster, tmp_path):
-    with pytest.warns(TorchTransientWarning, match="2 processors, and 5 workers were asked for; 2 are started"):
-        assert generate(FakeRecipe(), tmp_path, workers=5, **ASKED).samples == 48
-
-
-def test_errors_of_workers(cluster, tmp_path):
-    folder = tmp_path / "a"
-    generate(FakeRecipe(), folder, workers=1, **ASKED)
-    (folder / "shard-000001.h5").unlink()
-    with pytest.raises(StorageError, match="versions is"):
-        generate(FakeRecipe(versions={"fake": "2"}), folder, **ASKED)
+    assert sorted(found.failed) == [3, 7, 20] and found.failed[7] == found.failed[20]
+    assert found.failed[3] == "SceneError: sample 3 cannot be made by <object at 0x...>"

@@ -1,26 +1,25 @@
-"""Runs of `generate` in this process: what is made, kept and made again, and what is said of it."""
+"""Runs of `generate` in this process: what is made, kept and made again byte for byte, and what is said of it."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+import os
+import shutil
+from dataclasses import replace
 
 import pytest
+from click.testing import CliRunner
 
 from support.fake_recipe import FakeRecipe
 from support.generation_runs import damage, data_files, leftovers
-from torchtransient.data import Shard, generate, verify
-from torchtransient.data.overview import drawn_sheet, summary
+from support.stored_samples import sample
+from torchtransient.__main__ import main
+from torchtransient.data import Shard, ShardWriter, generate, verify
 from torchtransient.errors import SceneError, StorageError
 
 SMALL = {"n": 7, "per_shard": 2, "progress": False, "compression": "none", "workers": 0}
 RECIPE = FakeRecipe(shape=(1, 4, 2, 3))
-
-
-@dataclass(frozen=True)
-class Counted(FakeRecipe):
-    n: int = 5
+NAMES = [f"shard-{number:06d}.h5" for number in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +28,7 @@ def whole(tmp_path_factory):
     done = generate(RECIPE, folder, **SMALL)
     assert (done.samples, done.failed, done.kept, done.restarts, done.shards) == (7, 0, 0, 0, 4)
     assert done.bytes == sum(path.stat().st_size for path in folder.glob("*.h5")) and done.folder == folder
+    assert "7 samples in 4 shards" in str(done)
     return folder
 
 
@@ -40,8 +40,7 @@ def events(folder, *names):
 def copied(whole, folder, *numbers):
     folder.mkdir()
     for number in numbers:
-        name = f"shard-{number:06d}.h5"
-        (folder / name).write_bytes((whole / name).read_bytes())
+        shutil.copy(whole / NAMES[number], folder)
     return folder
 
 
@@ -51,12 +50,9 @@ def copied(whole, folder, *numbers):
 def test_a_run_and_its_log(whole):
     assert verify(whole).complete and verify(whole).samples == 7 and leftovers(whole) == []
     first, *shards, last = events(whole)
-    assert (first["event"], first["n"], first["workers"], first["engine"], first["shard"]) == (
-        "begin", 7, 0, "local", None,
-    )  # fmt: skip
+    assert (first["event"], first["n"], first["workers"], first["engine"]) == ("begin", 7, 0, "local")
     assert [one["shard"] for one in shards] == [0, 1, 2, 3] and {one["event"] for one in shards} == {"shard"}
     assert (last["event"], last["samples"], last["shards"], last["failed"]) == ("end", 7, 4, 0)
-    assert json.loads((whole / "recipe.json").read_text())["about"]["plan"] == ["fake"]
 
 
 def test_two_shares_are_the_whole(whole, tmp_path):
@@ -65,7 +61,6 @@ def test_two_shares_are_the_whole(whole, tmp_path):
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == ["shard-000001.h5", "shard-000003.h5"]
     second = generate(RECIPE, tmp_path, shard=(0, 2), **SMALL)
     assert (second.samples, second.kept) == (4, 0) and data_files(tmp_path) == data_files(whole)
-    assert events(tmp_path, "begin")[0]["shard"] == [1, 2]
 
 
 def test_going_on(whole, tmp_path):
@@ -85,34 +80,10 @@ def test_going_on(whole, tmp_path):
     assert (again.samples, again.kept, again.shards) == (0, 7, 0)
 
 
-def test_how_many_samples_a_recipe_says(tmp_path):
-    done = generate(Counted(shape=(1, 4, 2, 3)), tmp_path, workers=0, per_shard=4, compression="none", progress=False)
-    assert (done.samples, done.shards) == (5, 2)
-
-
-def test_a_bar_over_the_samples(whole, tmp_path, monkeypatch):
-    """Those that are there count from the beginning."""
-    shown = []
-
-    def bar(**given):
-        shown.append([given["total"], given["initial"], 0])
-        return SimpleNamespace(
-            update=lambda more: shown[-1].__setitem__(2, shown[-1][2] + more),
-            set_postfix=lambda told, refresh: shown[-1].append(told), close=lambda: shown[-1].append("closed"),
-        )  # fmt: skip
-
-    monkeypatch.setattr("tqdm.auto.tqdm", bar)
-    folder = copied(whole, tmp_path / "set", 1, 3)
-    generate(RECIPE, folder, **SMALL | {"progress": True})
-    assert shown == [[7, 3, 4, "closed"]]
-    generate(FakeRecipe(raising=(1, 3)), tmp_path / "other", retries=0, **SMALL | {"progress": True})
-    assert shown[1] == [7, 0, 7, *({"failed": k, "restarts": 0} for k in (1, 2)), "closed"]
-
-
 # ---------------------------------------------------------------------------------------------- what does not fit
 
 
-def test_shards_without_their_recipe(whole, tmp_path):
+def test_shards_that_do_not_fit(whole, tmp_path):
     """What the shards say counts where recipe.json was lost; what does not open says nothing."""
     folder = copied(whole, tmp_path / "set", 1)
     with pytest.raises(StorageError, match=r"shard-000001\.h5' belongs to another data set: its recipe is another"):
@@ -120,35 +91,36 @@ def test_shards_without_their_recipe(whole, tmp_path):
     with pytest.raises(StorageError, match="has a data set, and resume=False"):
         generate(RECIPE, folder, resume=False, **SMALL)
     assert generate(RECIPE, folder, **SMALL).kept == 2 and data_files(folder) == data_files(whole)
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    (broken / "shard-000000.h5").write_bytes(b"no shard")
-    assert generate(RECIPE, broken, **SMALL).samples == 7
-
-
-def test_shards_of_other_versions(whole, tmp_path):
-    folder = copied(whole, tmp_path / "set", 0, 2, 3)
-    (folder / "recipe.json").write_bytes((whole / "recipe.json").read_bytes())
+    # Others are not put beside them.
+    (folder / "shard-000003.h5").unlink()
     with pytest.raises(StorageError, match=r"versions is .'fake': '1'. there and .'fake': '2'. here"):
         generate(replace(RECIPE, versions={"fake": "2"}), folder, **SMALL)
-    assert not (folder / "shard-000001.h5").exists()
+    assert not (folder / "shard-000003.h5").exists()
+    # A run of an earlier format left out samples.
+    described = (whole / "recipe.json").read_text()
+    (folder / "recipe.json").write_text(described.replace("data set 2", "data set"))
+    with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
+        generate(RECIPE, folder, **SMALL)
+    (folder / "shard-000000.h5").write_bytes(b"no shard")
+    (folder / "recipe.json").unlink()
+    assert generate(RECIPE, folder, **SMALL).samples == 3 and data_files(folder) == data_files(whole)
 
 
 def test_a_run_that_is_stopped(whole, tmp_path, monkeypatch):
     """In the middle of a shard: finished ones stay, nothing is half-written; the same call goes on."""
-    sample = RECIPE.maker().__class__.sample
+    make = RECIPE.maker().__class__.sample
 
     def interrupted(self, index):
         if index == 3:
             raise KeyboardInterrupt
-        return sample(self, index)
+        return make(self, index)
 
     monkeypatch.setattr("support.fake_recipe.FakeMaker.sample", interrupted)
     with pytest.raises(KeyboardInterrupt):
         generate(RECIPE, tmp_path, **SMALL)
     assert [path.name for path in tmp_path.glob("*.h5")] == ["shard-000000.h5"] and leftovers(tmp_path) == []
     assert events(tmp_path)[-1]["event"] == "stopped" and not (tmp_path / "manifest.json").exists()
-    monkeypatch.setattr("support.fake_recipe.FakeMaker.sample", sample)
+    monkeypatch.undo()
     assert generate(RECIPE, tmp_path, **SMALL).kept == 2 and data_files(tmp_path) == data_files(whole)
 
 
@@ -156,34 +128,19 @@ def test_samples_that_fail(whole, tmp_path):
     recipe = replace(RECIPE, raising=(0, 3), late=(5,))
     done = generate(recipe, tmp_path, retries=1, **SMALL)
     assert (done.samples, done.failed, done.kept) == (5, 2, 0)
-    failed = {}
-    for path in tmp_path.glob("*.h5"):
-        with Shard(path) as shard:
-            failed |= shard.failed
     reason = "SceneError: sample {} cannot be made by <object at 0x...>"
-    assert failed == {0: reason.format(0), 3: reason.format(3)}
+    assert verify(tmp_path).failed == {0: reason.format(0), 3: reason.format(3)}
     assert [one["sample"] for one in events(tmp_path, "failed")] == [0, 3]
     # Sample 0 is tried first where it is measured, too.
     assert [one["sample"] for one in events(tmp_path, "retry")] == [0, 0, 3]
     again = generate(recipe, tmp_path, retries=1, **SMALL)
     assert (again.kept, again.samples, again.failed) == (5, 0, 0)
-    with pytest.raises(SceneError, match=r"none of the samples 0 to 6 .* The last one: SceneError: sample 6 cannot"):
-        generate(replace(RECIPE, raising=tuple(range(7))), tmp_path / "none", **SMALL)
-    with pytest.raises(SceneError, match=r"none of the samples 0 to 15 "):
-        generate(replace(RECIPE, raising=tuple(range(40))), tmp_path / "none", **SMALL | {"n": 40})
+    for n, last in ((7, 6), (40, 15)):
+        with pytest.raises(SceneError, match=rf"none of the samples 0 to {last} .* SceneError: sample {last} "):
+            generate(replace(RECIPE, raising=tuple(range(n))), tmp_path / "none", **SMALL | {"n": n})
 
 
 # ------------------------------------------------------------------------------------------- recipe.json, and words
-
-
-def test_a_folder_whose_first_samples_were_left_out(whole, tmp_path):
-    """By the rule of an earlier format: the others do not go beside them."""
-    place = copied(whole, tmp_path / "set", 3)
-    described = json.loads((whole / "recipe.json").read_text())
-    earlier = described | {"format": "torchtransient data set", "max_outside": 0.01}
-    (place / "recipe.json").write_text(json.dumps(earlier))
-    with pytest.raises(StorageError, match="format is 'torchtransient data set' there"):
-        generate(RECIPE, place, **SMALL)
 
 
 @pytest.mark.parametrize("content", [b"[1]", b'{"format": 0, "key": 1, "n": 2}', b"\xff"])
@@ -193,34 +150,125 @@ def test_recipe_json_that_is_none(tmp_path, content):
         generate(RECIPE, tmp_path, **SMALL)
 
 
-def test_shards_that_are_somewhere_else(tmp_path, monkeypatch):
-    """A worker has written one that this machine does not see."""
-    monkeypatch.setattr("torchtransient.data.local_engine.InProcessCrew.make", lambda self, left, found: None)
-    with pytest.raises(StorageError, match=r"shard 0 was written, and '.*shard-000000\.h5' is not there"):
-        generate(RECIPE, tmp_path, **SMALL)
-    assert events(tmp_path, "stopped") and not events(tmp_path, "end")
-
-
 def test_summaries_of_folders(whole, tmp_path):
     """From the description, and without it from the shards."""
+
+    def info(folder):
+        result = CliRunner().invoke(main, ["dataset", "info", str(folder)])
+        return result.stdout if result.exit_code == 0 else result.stderr
+
     size = sum(path.stat().st_size for path in whole.glob("*.h5")) / 1e6
-    lines = summary(whole).splitlines()
+    lines = info(whole).splitlines()
     assert lines[0] == f"{whole}: 7 of 7 samples in 4 shards, 0 failed, {size:.4g} MB"
     assert {"  depth: 2 x 3 float32", "  transient: 1 x 4 x 2 x 3 float32", "  values: albedo, name"} <= set(lines)
     alone = copied(whole, tmp_path / "set", 3)
-    assert summary(alone).splitlines()[1:] == lines[1:]
+    assert info(alone).splitlines()[1:] == lines[1:]
     described = json.loads((whole / "recipe.json").read_text())
     axis = {"start_opl": 1.5, "bin_width_opl": 0.25, "num_bins": 6}
     described["about"] |= {"axis": axis, "frequencies": {"per_metre": [2.0, 0.5, 3]}}
     (alone / "recipe.json").write_text(json.dumps(described))
-    text = summary(alone)
+    text = info(alone)
     assert "6 bins of 0.25 m of optical path, from 1.5 to 3 m" in text and "3 frequencies, 0.5 to 3 cycles" in text
-    chosen = drawn_sheet(whole, tmp_path / "sheet.png", 2, 2)
-    assert len(set(chosen)) == 2 and set(chosen) <= set(range(7)) and (tmp_path / "sheet.png").exists()
+    assert "holds no shard" in info(tmp_path)
 
 
-def test_folders_without_samples(tmp_path):
-    with pytest.raises(StorageError, match="holds no shard"):
-        summary(tmp_path)
-    with pytest.raises(StorageError, match="holds no samples"):
-        drawn_sheet(tmp_path, tmp_path / "sheet.png", 3, 0)
+# ---------------------------------------------------------------------------------------------------- damaged shards
+
+
+@pytest.fixture
+def folder(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "set")
+
+
+def flip(path, place=0.9):
+    raw = bytearray(path.read_bytes())
+    raw[int(place * len(raw))] ^= 4
+    path.write_bytes(raw)
+
+
+def flip_in_header(folder):
+    """In the key of its recipe, which another data set would have, too."""
+    path = folder / NAMES[1]
+    with Shard(path) as shard:
+        key = json.dumps(shard.header["key"]).encode()
+    raw = bytearray(path.read_bytes())
+    raw[raw.index(key) + 2] ^= 1
+    path.write_bytes(raw)
+
+
+def cut(folder, left_out):
+    os.truncate(folder / NAMES[1], (folder / NAMES[1]).stat().st_size - left_out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: cut(folder, 1),
+        lambda folder: shutil.copy(folder / NAMES[2], folder / NAMES[1]),
+        lambda folder: shutil.copy(folder / NAMES[3], folder / NAMES[1]),
+        lambda folder: flip(folder / NAMES[1], 0.99999),
+    ],
+    ids=["cut by 1", "another shard", "a shorter shard", "its checksum"],
+)
+def test_what_is_seen_at_once(whole, folder, damage):
+    damage(folder)
+    made_again(whole, folder)
+    assert [event["shard"] for event in events(folder, "damaged")] == [1]
+
+
+def made_again(whole, folder):
+    """The shard with the number 1, and no other one."""
+    done = generate(RECIPE, folder, **SMALL)
+    assert (done.samples, done.kept) == (2, 5) and data_files(folder) == data_files(whole)
+    assert verify(folder).complete
+
+
+@pytest.mark.parametrize("change", [lambda folder: flip(folder / NAMES[1]), flip_in_header])
+def test_what_verify_has_found(whole, folder, change):
+    change(folder)
+    assert verify(folder).damaged == (NAMES[1],)
+    made_again(whole, folder)
+
+
+@pytest.mark.parametrize("manifest", [None, '{"shards": {"shard-000001.h5": 5}}'])
+def test_bytes_are_compared_without_a_manifest(whole, folder, manifest):
+    flip(folder / NAMES[1])
+    (folder / "manifest.json").unlink()
+    if manifest is not None:
+        (folder / "manifest.json").write_text(manifest)
+    assert generate(RECIPE, folder, **SMALL).kept == 5 and data_files(folder) == data_files(whole)
+
+
+def test_no_shard_is_sound(whole, folder):
+    """The manifest names none of them any more."""
+    for name in NAMES:
+        flip(folder / name)
+    assert verify(folder).damaged == tuple(NAMES)
+    assert json.loads((folder / "manifest.json").read_text())["shards"] == {}
+    assert generate(RECIPE, folder, shard=(0, 2), **SMALL).kept == 0
+    assert list(json.loads((folder / "manifest.json").read_text())["shards"]) == NAMES[::2]
+    assert generate(RECIPE, folder, **SMALL).kept == 4 and data_files(folder) == data_files(whole)
+
+
+def test_shards_of_other_shares_stay_out_of_the_manifest(whole, folder):
+    """What verify has found there is for the run whose share it is."""
+    flip(folder / NAMES[1])
+    verify(folder)
+    assert generate(RECIPE, folder, shard=(0, 2), **SMALL).kept == 4
+    assert list(json.loads((folder / "manifest.json").read_text())["shards"]) == [NAMES[0], *NAMES[2:]]
+    done = generate(RECIPE, folder, shard=(1, 2), **SMALL)
+    assert (done.samples, done.kept) == (2, 1) and data_files(folder) == data_files(whole)
+
+
+def test_shards_of_other_versions_of_packages(folder):
+    """They are sound, and are not replaced."""
+    with Shard(folder / NAMES[1]) as shard:
+        header = shard.header
+    with ShardWriter(folder / NAMES[1], 2, header | {"about": {"spp": 1}, "shard": 2}, compression="none") as writer:
+        for row in range(2):
+            writer.put(row, sample(2 + row))
+    before = (folder / NAMES[1]).read_bytes()
+    with pytest.raises(StorageError, match=rf"{NAMES[1]}' is of this recipe and differs in 'about', as when"):
+        generate(RECIPE, folder, **SMALL)
+    assert (folder / NAMES[1]).read_bytes() == before

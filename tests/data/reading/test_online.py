@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import gc
 import itertools
+import math
 import os
 import pickle
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -124,31 +125,24 @@ def test_samples_are_whole_and_come_from_the_recipe(tmp_path):
     before = shared()
     recipe = OnlineRecipe(pids=str(tmp_path), group=3)
     with OnlineDataset(recipe, capacity=16, workers=2, uses=2.0, warm=8, first=100) as data:
-        seen = []
-        while len(seen) < 400 or len(list(tmp_path.iterdir())) < 2:
-            seen.append(index_of(data.draw()))
-        assert data.drawn == len(seen) <= 2 * data.made
+        kept = [data.draw()]
+        while len(kept) < 400 or len(list(tmp_path.iterdir())) < 2:
+            kept.append(data.draw())
+        # Tensors are the caller's own: later draws leave them, and what is done to them leaves the ring.
+        seen = [index_of(sample) for sample in kept]
+        kept[-1]["transient"].fill_(-1.0)
+        draws(data, 60)
+        assert [index_of(sample) for sample in kept[:-1]] == seen[:-1] and not kept[0]["transient"].is_shared()
+        assert data.drawn == len(seen) + 60 <= 2 * data.made
         # Without a hole but for what is being made.
         assert set(seen) <= set(range(100, 100 + data.made + 16)) and min(seen) < 116
         assert len(set(seen)) > 150
-        sample = data.draw()
-        assert sample["transient"].shape == SHAPE and sample["shape"].dtype == torch.int32
+        assert kept[0]["transient"].shape == SHAPE and kept[0]["shape"].dtype == torch.int32
     assert gone(tmp_path) and len(list(tmp_path.iterdir())) == 2
     assert shared() <= before
     with pytest.raises(TorchTransientError, match="closed"):
         data.draw()
-    assert index_of(sample) >= 100
-
-
-@pytest.mark.slow
-def test_tensors_are_the_callers_own():
-    with OnlineDataset(OnlineRecipe(), capacity=4, uses=1.0, warm=1) as data:
-        kept = [data.draw() for _ in range(60)]
-        numbers = [sample["index"] for sample in kept]
-        data.draw()["transient"].fill_(-1.0)
-        later = [index_of(data.draw()) for _ in range(60)]
-    assert [index_of(sample) for sample in kept] == numbers and min(later) >= 0
-    assert not kept[0]["transient"].is_shared()
+    assert index_of(kept[0]) >= 100
 
 
 def test_loader_makes_batches():
@@ -172,42 +166,9 @@ def test_loader_makes_batches():
 
 
 @pytest.mark.slow
-def test_a_slow_producer_makes_the_trainer_wait():
-    with OnlineDataset(OnlineRecipe(seconds=0.02), capacity=16, uses=2.0, warm=2) as data:
-        for _ in range(60):
-            data.draw()
-            assert data.drawn <= 2.0 * data.made
-        assert data.waited_s > 0.2
-
-
-@pytest.mark.slow
-def test_a_slow_trainer_makes_producers_wait():
-    with OnlineDataset(OnlineRecipe(), capacity=16, uses=4.0, warm=2) as data:
-        for _ in range(40):
-            data.draw()
-            time.sleep(0.01)
-        time.sleep(0.5)
-        data.draw()
-        assert data.made <= 41 / 4 + 16 + 2
-
-
-@pytest.mark.slow
 def test_threads_draw_together():
-    wrong = []
-    with OnlineDataset(OnlineRecipe(), capacity=8, workers=2, uses=3.0, warm=2) as data:
-
-        def work():
-            for _ in range(100):
-                sample = data.draw()
-                if not (sample["transient"] == sample["index"]).all():
-                    wrong.append(sample["index"])
-
-        threads = [threading.Thread(target=work) for _ in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert data.drawn == 400 and not wrong
+    with OnlineDataset(OnlineRecipe(), capacity=8, workers=2, uses=3.0, warm=2) as data, ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(lambda _: index_of(data.draw()) >= 0, range(400))) and data.drawn == 400
 
 
 # ---------------------------------------------------------------------------------------------------- what goes wrong
@@ -231,7 +192,7 @@ def test_errors_of_producers_are_raised(tmp_path, recipe, error, words):
     for _ in range(2):
         with pytest.raises(error, match=words) as caught:
             draws(data, 100)
-        assert "fail" in recipe or "online_recipe.py" in str(caught.value.__cause__) or "odd" in recipe
+        assert "bug" not in recipe or "online_recipe.py" in str(caught.value.__cause__)
     assert gone(tmp_path)
 
 
@@ -248,8 +209,7 @@ def test_samples_that_fail_are_left_out():
 def test_producers_killed_from_outside_are_started_again(tmp_path):
     recipe = OnlineRecipe(seconds=0.005, pids=str(tmp_path))
     with OnlineDataset(recipe, capacity=16, workers=2, uses=1.0, warm=4) as data:
-        for _ in range(4):
-            data.draw()
+        draws(data, 4)
         os.kill(running(tmp_path)[0], signal.SIGKILL)
         with pytest.warns(UserWarning, match="another one takes its place"):
             seen = draws(data, 200)
@@ -282,18 +242,16 @@ def test_a_producer_that_hangs_is_an_error(tmp_path):
 
 @pytest.mark.slow
 def test_more_than_the_shared_memory_is_an_error(monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=2**16))
+    needed = 1024 * 4 * (math.prod(SHAPE) + 2 * 8 * 8)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=needed - 1))
     with OnlineDataset(OnlineRecipe(), capacity=1024) as data, pytest.raises(StorageError, match="shared memory"):
         data.draw()
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        {"capacity": 1}, {"capacity": 2.5}, {"workers": 0}, {"uses": 0.0}, {"uses": float("nan")}, {"warm": 0},
-        {"first": -1}, {"seed": "x"}, {"timeout_s": -1.0}, {"workers": True},
-    ],
-)  # fmt: skip
+    [{"capacity": 1}, {"workers": 0}, {"uses": 0.0}, {"uses": float("nan")}, {"first": -1}, {"timeout_s": -1.0}],
+)
 def test_mistakes_start_nothing(wrong, tmp_path):
     with pytest.raises(UnitError, match=next(iter(wrong))):
         OnlineDataset(OnlineRecipe(pids=str(tmp_path)), **wrong)
@@ -361,16 +319,3 @@ def test_the_end_of_the_interpreter_leaves_nothing(end, tmp_path):
     else:
         assert process.returncode == code
     assert shared() <= before
-
-
-@pytest.mark.slow
-def test_a_script_without_a_guard_is_told(tmp_path):
-    script = tmp_path / "train.py"
-    script.write_text(
-        f"import sys\nsys.path.insert(0, {str(TESTS)!r})\nfrom support.online_recipe import OnlineRecipe\n"
-        "from torchtransient.data.online import OnlineDataset\n"
-        "OnlineDataset(OnlineRecipe(), capacity=4).draw()\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
-    assert done.returncode == 1 and "__main__" in done.stderr.splitlines()[-1]

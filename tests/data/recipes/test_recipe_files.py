@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ import torch
 
 import torchtransient as tt
 from support.text_files import RECIPES
-from torchtransient.data.run_settings import check_same
-from torchtransient.data.serialization import without_places
 from torchtransient.errors import MissingPackageError, SceneError, StorageError, UnitError
 
 D = tt.data
@@ -73,36 +70,22 @@ def test_scenes_of_several_samplers_and_varied_ones_keep_theirs():
     assert samplers == {"independent", "multijitter"}
 
 
-def old_sample(scene, seed):
-    scene["sensor"]["sampler"]["seed"] = seed
-    return D.Recipe(scene, variant="llvm_ad_mono", sampler="scene").sample(0).arrays["steady"]
-
-
-def test_files_that_say_nothing_of_samplers_keep_those_of_their_scenes():
+def test_files_that_say_nothing_of_samplers_keep_those_of_their_scenes(tmp_path):
     """As recipes of versions without the setting were rendered: the same numbers, and the same key."""
-    scene = tt.scenes.cornell_box(resolution=4, num_bins=20, bin_width_opl=0.5)
-    scene["sensor"]["sampler"] = {"type": "independent", "sample_count": 4, "seed": 7}
-    written = D.Recipe(scene, variant="llvm_ad_mono").to_dict()
-    del written["sampler"]
+    scene = tt.scenes.cornell_box(resolution=4, num_bins=60, bin_width_opl=0.5)
+    scene["sensor"]["sampler"] = {"type": "independent", "sample_count": 4}
+    new = D.Recipe(scene, variant="llvm_ad_mono")
+    written = new.to_dict()
+    assert written.pop("sampler") == "owen"
     old = D.Recipe.from_dict(written)
     assert old.to_dict() == written and old == D.Recipe(scene, variant="llvm_ad_mono", sampler="scene")
-    # The very sampler of the scene, with its seed.
-    light = {seed: old_sample(scene, seed) for seed in (0, 7)}
-    assert not np.array_equal(light[0], light[7]) and np.array_equal(light[7], old.sample(0).arrays["steady"])
     renderer = tt.TransientRenderer(tt.load(scene, "llvm_ad_mono"), sampler="independent")
     with torch.no_grad():
         plain = renderer(seed=old.sample(0).seed).steady.numpy()
-    assert np.array_equal(light[0], plain)
+    assert np.array_equal(old.sample(0).arrays["steady"], plain)
+    D.generate(old, tmp_path, 1, workers=0, progress=False)
     with pytest.raises(StorageError, match=r"sampler is None there and 'owen' here.*sampler='scene'"):
-        check_same({"key": "a", "recipe": written}, {"key": "b", "recipe": written | {"sampler": "owen"}}, Path("here"))
-
-
-def test_captures(tmp_path):
-    recipe = D.Recipe.read(CAPTURE)
-    assert recipe.scan.kind == "confocal"
-    recipe.to_yaml(tmp_path / "again.yaml")
-    again = D.Recipe.read(tmp_path / "again.yaml")
-    assert again == recipe and again.key() == recipe.key()
+        D.generate(new, tmp_path, 1, workers=0, progress=False)
 
 
 def changed(**entries):
@@ -142,10 +125,10 @@ def test_scenes_weights_pictures_and_gates_are_written(monkeypatch):
 def test_keys_tell_recipes_apart():
     base = changed().key()
     assert changed(n=13).key() == base
+    axis = {"start_opl": 2, "bin_width_opl": 0.2, "num_bins": 61}
     others = [
         changed(seed=1), changed(spp=8), changed(labels=[]), changed(device=None), changed(variant="llvm_ad_rgb"),
-        changed(vary={}), changed(temporal_filter="tent"),
-        changed(time_axis={"start_opl": 2, "bin_width_opl": 0.2, "num_bins": 61}),
+        changed(vary={}), changed(temporal_filter="tent"), changed(time_axis=axis),
         changed(scene={"builtin": "cornell_box", "resolution": 9}),
     ]  # fmt: skip
     assert len({base, *(one.key() for one in others)}) == len(others) + 1
@@ -233,6 +216,7 @@ def test_keys_follow_files_wherever_they_are_named(tmp_path, monkeypatch):
         "vary: {thing.filename: {choice: [thing.obj, other.obj]}}\n"
     )
     assert changes(lambda: D.Recipe.read(folder / "dict.yaml"), folder / "other.obj")
+    # Names are those beside the recipe, not in the folder that it is read from.
     key = D.Recipe.read(folder / "dict.yaml").key()
     monkeypatch.chdir(folder)
     assert D.Recipe.read(folder / "dict.yaml").key() == key
@@ -244,10 +228,13 @@ def test_captures_are_the_same_elsewhere(tmp_path):
     (folder / "letter.obj").write_text(OBJ)
     (folder / "recipe.yaml").write_text(CAPTURE.replace("shape: rectangle", "file: letter.obj"))
     recipe = D.Recipe.read(folder / "recipe.yaml")
+    assert recipe.scan.kind == "confocal"
     shutil.copytree(folder, tmp_path / "b")
     assert D.Recipe.read(tmp_path / "b" / "recipe.yaml").key() == recipe.key()
-    assert str(tmp_path) not in json.dumps(without_places(recipe.to_dict()))
     assert changes(lambda: D.Recipe.read(folder / "recipe.yaml"), folder / "letter.obj")
+    recipe.to_yaml(tmp_path / "again.yaml")
+    again = D.Recipe.read(tmp_path / "again.yaml")
+    assert again == recipe and again.key() == recipe.key()
 
 
 @pytest.mark.parametrize(
@@ -255,18 +242,14 @@ def test_captures_are_the_same_elsewhere(tmp_path):
     [
         ("scene: {builtin: cornell_box}\ngates: 3\n", SceneError, "not what it should be"),
         ("scene: {builtin: cornell_box}\nlabels: 3\n", SceneError, "list of names"),
-        ("scene: {builtin: cornell_box}\nbounces: 2.5\n", SceneError, "bounces"),
         ("scene: {one_of: 3}\nspp: 3\n", SceneError, "not what it should be"),
-        ("scene: {builtin: cornell_box}\npulse: {x: 3}\n", SceneError, "not what it should be"),
         ("scene: {builtin: cornell_box}\nfrequencies: {a: 3}\n", SceneError, "not what it should be"),
         ("scene: {a: 3}\nspp: 3\n", SceneError, "'type', 'builtin'"),
         ("scene: {type: scene, xml: {type: sphere}}\nvary: {xml.type: {uniform: [0, .inf]}}\n", UnitError, "finite"),
         ("sceen: a\nvary: {}\n", SceneError, "Did you mean 'scene'"),
         ("vary: {}\nspp: 3\n", SceneError, "'scene', or 'hidden'"),
-        ("scene: nowhere.xml\nspp: 3\n", SceneError, "nowhere.xml"),
         ("scene: {builtin: cornel_box}\nspp: 3\n", SceneError, "cornell_box"),
         ("scene: {builtin: cornell_box, resolutoin: 3}\nspp: 3\n", SceneError, "resolutoin"),
-        ("scene: {builtin: cornell_box}\nvary: 3\n", SceneError, "by key"),
         ("scene: {builtin: cornell_box}\nvary: {a: {unifrm: [0, 1]}}\n", SceneError, "unknown distribution 'unifrm'"),
         ("scene: {builtin: cornell_box}\nspp: 0\n", SceneError, "spp"),
         ("scene: {builtin: cornell_box}\nformat: torchtransient recipe 7\n", SceneError, "recipe 1"),
@@ -277,24 +260,3 @@ def test_captures_are_the_same_elsewhere(tmp_path):
 def test_what_is_wrong_with_a_file(text, error, words):
     with pytest.raises(error, match=words):
         D.Recipe.read(text)
-
-
-def test_exchanged_files_count_wherever_one_stands(tmp_path, monkeypatch):
-    """Their names are those beside the recipe, not in the folder that it is read from."""
-    folder = tmp_path / "recipes"
-    folder.mkdir()
-    for name in ("a.obj", "b.obj"):
-        (folder / name).write_text(OBJ)
-    (folder / "recipe.yaml").write_text(
-        "scene: {type: scene, light: {type: point, position: [0, 0, 3], intensity: 1},"
-        " thing: {type: obj, filename: a.obj}}\n"
-        "variant: llvm_ad_mono\nvary: {thing.filename: {choice: [a.obj, b.obj]}}\n"
-    )
-    keys = []
-    for place in (tmp_path, folder):
-        monkeypatch.chdir(place)
-        keys.append(D.Recipe.read(folder / "recipe.yaml").key())
-    assert keys[0] == keys[1]
-    (folder / "b.obj").write_text(OBJ + "# another one\n")
-    monkeypatch.chdir(tmp_path)
-    assert D.Recipe.read(folder / "recipe.yaml").key() != keys[0]

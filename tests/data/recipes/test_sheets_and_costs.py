@@ -1,15 +1,18 @@
-"""What a contact sheet shows of a sample and what a forecast says, number by number. Nothing is rendered."""
+"""What a contact sheet shows of a sample, what a forecast says, number by number; arrays of samples."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+import torchtransient as tt
 from torchtransient.data import Sample
 from torchtransient.data.checks import Cost, StructureCost
 from torchtransient.data.overview import cell_of
-from torchtransient.data.sample import OutsideLight
+from torchtransient.data.sample import OutsideLight, in_order
+from torchtransient.errors import SceneError
 from torchtransient.vis.tone_mapping import tone_map
 
 RANDOM = np.random.default_rng(3)
@@ -90,7 +93,31 @@ def test_curves_are_sums_over_channels_and_pixels():
         np.testing.assert_allclose(curve, cube.sum((0, 2, 3), dtype=np.float64), rtol=1e-12)
     assert cell_of(sample(phasor=cube)).curve is None
     assert cell_of(sample(transient=cube), 4).curve is None
-    np.testing.assert_allclose(cell_of(sample(measurement=cube[0]), 1).curve, cube[0].sum((0, 2)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["rates", "beats"])
+def test_rows_are_added_up(name):
+    light = numbers(1, 4, 6, 2, 3)
+    velocity = np.stack([np.full((2, 3), v, np.float32) for v in (0.0, 3.0, 4.0)])
+    cell, plain = cell_of(sample(velocity=velocity, **{name: light})), cell_of(sample(transient=light.sum(1)))
+    np.testing.assert_allclose(cell.curve, plain.curve, rtol=1e-6)
+    np.testing.assert_allclose(cell.images["light"], plain.images["light"], atol=1e-5)
+    np.testing.assert_allclose(cell.images["velocity"], 5.0)
+
+
+# Of films, whose pixels come first in memory: colour in large blocks, of several cameras, rows and columns that are no
+# axis, and small ones.
+FILMS = [
+    ((16, 24, 64, 3), (3, 2, 0, 1)), ((4, 16, 24, 64, 3), (0, 4, 3, 1, 2)), ((24, 16, 128, 1), (3, 2, 1, 0)),
+    ((160, 120, 3), (2, 0, 1)), ((4, 4, 8, 1), (3, 2, 0, 1)), ((1, 128, 16, 24), (0, 1, 2, 3)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("shape", "order"), FILMS)
+def test_arrays_are_in_the_order_of_c(shape, order):
+    tensor = torch.randn(shape, generator=torch.Generator().manual_seed(1)).permute(order)
+    found = in_order(tensor)
+    assert found.flags.c_contiguous and np.array_equal(found, tensor.contiguous().numpy())
 
 
 # -------------------------------------------------------------------------------------------------------------- costs
@@ -114,3 +141,42 @@ def test_seconds_of_a_sample():
     assert cost(seen=32, structures=three).sample_s == pytest.approx(0.5 * 1.5 + 0.5 * 0.5)
 
 
+# ----------------------------------------------------------------------------------------------------------- of recipes
+
+
+D = tt.data
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    scene = tt.scenes.cornell_box(resolution=16, num_bins=64, bin_width_opl=0.2, start_opl=2.0)
+    vary = {
+        "red.reflectance.value": D.Uniform(0.05, 0.9),
+        "small-box.to_world": D.Turn(),
+        "small-box.type": D.Choice(["cube", "sphere"]),
+    }
+    return D.Recipe(scene, vary, variant="llvm_ad_rgb", spp=4, labels=("depth", "normals"), n=1000)
+
+
+@pytest.mark.slow
+def test_cost(recipe):
+    cost = recipe.cost(2)
+    assert cost.values == ("red.reflectance.value", "small-box.to_world") and cost.exchanged == ("small-box.type",)
+    assert cost.seen == 2 and [one.text for one in cost.structures] == ["small-box.type=cube", "small-box.type=sphere"]
+    sample = recipe.sample(0)
+    assert cost.sample_bytes == sum(array.nbytes for array in sample.arrays.values())
+    assert 0 < cost.stored_bytes["rounded"] < cost.stored_bytes["exact"] < cost.sample_bytes
+    # A histogram of radiances is no number of photons.
+    assert cost.stored_bytes["counts"] is None
+    assert cost.outside.samples == 64 and 0 <= cost.outside.mean <= cost.outside.most < 1
+    assert 0 < cost.standard_error < 3 and all(one.sample_s > 0 for one in cost.structures)
+    assert "built when new    small-box.type; 2 structures in 64 samples" in str(cost)
+
+
+@pytest.mark.slow
+def test_preview_is_a_picture(recipe, tmp_path):
+    recipe.preview(4, tmp_path / "sheet.png")
+    picture = np.asarray(Image.open(tmp_path / "sheet.png").convert("RGB"))
+    assert min(picture.shape[:2]) > 200 and picture.std() > 20
+    with pytest.raises(SceneError, match="whole number"):
+        recipe.preview(0)
