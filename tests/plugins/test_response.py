@@ -102,6 +102,19 @@ def test_channels_are_integrals_over_wavelength():
     assert result.passed, str(result)
 
 
+def test_lines_narrower_than_a_nanometre_are_found():
+    line = {"type": "irregular", "wavelengths": "532.2, 532.4, 532.6", "values": "0, 5, 0"}
+    broad = {"type": "spectrum", "value": [(500, 1.0), (560, 1.0)]}
+    node = description(film(bands={"line": line, "broad": broad}), lamp=1.0, wall=0.5)
+    node["integrator"]["max_depth"] = 2
+    del node["side"]
+    steady, _ = runs(mi.load_dict(node))
+    means = steady.mean((1, 2))
+    # a triangle of 0.4 nm and height 5 beside 60 nm
+    result = z_test((means[:, 0] * 60 - means[:, 1])[:, None], np.zeros(1))
+    assert result.passed, str(result)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono"])
 def test_a_variant_without_wavelengths_is_refused(variant):
     mi.set_variant(variant)
