@@ -130,3 +130,12 @@ def test_rows_without_an_axis_have_that_of_the_scenes_film():
         out = renderer()
         assert films.layout_of_output(out) == choice_for(argument)
         assert tuple(choice_for(argument).tensor(out).shape) == (3, *choice_for(argument).shape, 4, 4)
+
+
+def test_frequencies_replace_a_pulse_that_the_scene_describes():
+    pulse = {"wl_mean": 2.0, "wl_sigma": 1.0, "temporal_bins": 32, "bin_width_opl": 0.1}
+    scene = tt.scenes.cornell_box(resolution=2)
+    scene["sensor"]["film"] = {"type": "phasor_hdr_film", "width": 2, "height": 2, "rfilter": {"type": "box"}, **pulse}
+    asked = GIVEN["frequencies"]
+    out = tt.TransientRenderer(tt.load(scene, variant=VARIANT), frequencies=asked, spp=1)(seed=0)
+    assert out.frequencies == asked and out.phasor.shape[1] == len(asked.frequencies)
