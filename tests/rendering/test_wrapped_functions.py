@@ -153,7 +153,9 @@ def test_numbers_that_the_function_draws_are_drawn_again():
     out = tt.wrap(noisy)(x)
     state = torch.get_rng_state()
     out.backward()
-    assert torch.equal(x.grad, out.detach()) and torch.equal(torch.get_rng_state(), state)
+    # other draws would be other by far more than the rounding of a product in the other order
+    torch.testing.assert_close(x.grad, out.detach(), rtol=1e-6, atol=0)
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 # --------------------------------------------------------------------------------------------------------- PyTrees
