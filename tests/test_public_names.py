@@ -172,6 +172,71 @@ def test_a_type_checker_knows_every_name(tmp_path):
         assert not kind.endswith(("-> Any", "-> builtins.object")) or name in OF_ANY_TYPE, f"{name}: {kind}"
 
 
+# Endings of words that British and American spelling differ in. Units are spelled as the SI brochure does: `per_metre`.
+BRITISH = re.compile(
+    r"centre|colour|grey|behaviour|neighbour|fibre|favour|catalogue|modell|labell|travell|cancell|licence|defence|"
+    r"artefact|analys(e|ing)|programme|learnt|(?<!no)is(e|ed|es|er|ers|ing|ation)(_|$)"
+)
+# Words that end like these in either spelling.
+SAME_IN_BOTH = {"rise", "precise", "otherwise", "promise", "raise", "piecewise"}
+
+
+def british(name):
+    """The British words of an identifier."""
+    words = re.findall(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])", name.replace(".", "_"))
+    return [word for word in words if BRITISH.search(word.lower()) and word.lower() not in SAME_IN_BOTH]
+
+
 def members_of(value):
     """The public members of a class by name; nothing of other objects."""
     return {k: getattr(value, k) for k in vars(value) if not k.startswith("_")} if inspect.isclass(value) else {}
+
+
+def signature_of(value):
+    """The parameters of a function or class; nothing of other objects, nor of errors, which have none of their own."""
+    if not callable(value) or (inspect.isclass(value) and issubclass(value, BaseException)):
+        return {}
+    own = inspect.isfunction(value) or inspect.ismethod(value) or inspect.isclass(value)
+    return inspect.signature(value).parameters if own else {}
+
+
+def names_within(name, value):
+    """Names of a public object: its own, its members', and those of all arguments."""
+    members = members_of(value)
+    yield name
+    yield from (f"{name}.{member}" for member in {**members, **getattr(value, "__annotations__", {})})
+    for member in (value, *members.values()):
+        yield from (f"{name}({argument})" for argument in signature_of(member))
+
+
+def test_names_are_spelled_in_one_way():
+    """American, as torch's and Mitsuba's: `polarization`, `center_of_mass`, `color`."""
+    wrong = {inner for name in public_names() for inner in names_within(name, found(name)) if british(inner)}
+    assert not wrong
+    assert [british(name) for name in ("centre_of_mass", "StabilisedRoot", "read_noise", "domain_colors")] == [
+        ["centre"], ["Stabilised"], [], []
+    ]  # fmt: skip
+
+
+# What takes more than three arguments by place, and why.
+MANY_BY_PLACE = {
+    "losses.surface_distance": "two meshes, each of vertices and faces",
+    "sensing.emg_cdf": "arguments in the order of its formula: x, mean, sigma, tau",
+    "sensing.emg_survival": "as emg_cdf",
+}
+
+
+def by_place(value):
+    """The arguments that a function or class takes by place, the object itself left out."""
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [name for name, one in dict(signature_of(value)).items() if one.kind in places and name != "self"]
+
+
+def test_at_most_three_arguments_are_taken_by_place():
+    many = {}
+    for name in public_names():
+        value = found(name)
+        for member, inner in {"": value, **members_of(value)}.items():
+            if len(by_place(inner)) > 3:
+                many[f"{name}.{member}".rstrip(".")] = by_place(inner)
+    assert set(many) == set(MANY_BY_PLACE), many
