@@ -60,17 +60,6 @@ def lead_elsewhere(file, name, way):
 WAYS = 8
 
 
-def bytes_changed(source: Path, target: Path, rng: random.Random) -> None:
-    """Some bytes are others, or the file ends early."""
-    data = bytearray(source.read_bytes())
-    if rng.random() < 0.15:
-        data = data[: rng.randrange(len(data))]
-    else:
-        for _ in range(rng.choice([1, 2, 5, 20])):
-            data[rng.randrange(len(data))] = rng.choice([0, 255, rng.randrange(256)])
-    target.write_bytes(data)
-
-
 def structure_changed(source: Path, target: Path, rng: random.Random) -> None:
     """A dataset of an HDF5 file is missing, or is another in shape, kind, size or place."""
     shutil.copyfile(source, target)
