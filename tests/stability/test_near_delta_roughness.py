@@ -109,3 +109,27 @@ def test_roughness_below_the_clamp_is_said():
         mi.load_dict({"type": "diff_rough_dielectric", "alpha": 2e-3})
     finally:
         logger.set_error_level(level)
+
+
+@pytest.mark.slow
+def test_index_passing_through_one():
+    """Guards against 0 / 0 when an optimiser moves an index through exactly one, where the refracted lobe is a
+    delta function."""
+    bsdf = plugin(0.1)
+    wi = hard_directions(1000)
+    n = len(wi)
+    rng = np.random.default_rng(9)
+    u1, u2 = mi.Float(rng.random(n)), mi.Point2f(rng.random((2, n)))
+    params = mi.traverse(bsdf)
+    for eta in (1 - 1e-6, 1.0, 1 + 1e-6):
+        params["eta"] = dr.opaque(mi.Float, eta)
+        dr.enable_grad(params["eta"])
+        params.update()
+        v = mi.Vector3f(wi.T)
+        dr.enable_grad(v)
+        bs, weight = bsdf.sample(mi.BSDFContext(), interaction(v), u1, u2)
+        f, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction(v), -v)
+        outputs = (bs.pdf, weight[0], f[0], pdf)
+        dr.backward(sum(outputs))
+        for found in (*dr.detach(outputs), dr.grad(params["eta"]), dr.grad(v)):
+            assert np.isfinite(found.numpy()).all()
