@@ -124,3 +124,15 @@ def test_mean_arrival_of_a_moving_wall(filter):
     # the gaussian is cut at four standard deviations, where it is 3e-4 of its height
     assert float(torch.autograd.grad(found, pose)[0][2, 3]) == pytest.approx(-2, abs=2e-3)
     assert float(torch.func.jvp(arrival, (pose.detach(),), (up,))[1]) == pytest.approx(-2, abs=2e-3)
+
+
+def test_box_filter_keeps_gradients_of_light():
+    """The light is linear in the lamp's intensity, in bins without a slope, too."""
+    key, lamp = "light.intensity.value", {"type": "point", "position": [0.0, 0.0, 4.0], "intensity": 5.0}
+    integrator, view = {"type": "transient_path", "max_depth": 2}, camera(fov=0.1, start=5.513, bin_width=0.05)
+    scene = {"type": "scene", "integrator": integrator, "wall": {"type": "rectangle"}, "sensor": view, "light": lamp}
+    renderer = tt.TransientRenderer(tt.load(scene, variant=VARIANT), [key], spp=64, temporal_filter="box")
+    light = renderer(seed=0).transient.sum()
+    (slope,) = torch.autograd.grad(light, renderer.values[key])
+    assert light.item() > 0
+    assert slope.sum().item() == pytest.approx(light.item() / 5.0, rel=1e-5)

@@ -7,7 +7,7 @@ import torch
 import torchtransient as tt
 from support.marks import long
 from support.media_scenes import camera, film
-from torchtransient.scenes import look_at, rotate, scale
+from torchtransient.scenes import look_at, rotate, scale, translate
 
 VARIANT = "llvm_ad_mono"
 pytestmark = pytest.mark.filterwarnings("ignore::torchtransient.errors.GradientWarning")  # of edges outside of the view
@@ -70,6 +70,16 @@ def test_light_next_to_the_surface(height):
     """Guards against 1 / d^2 of no distance: a point light next to the wall, and one on it."""
     objects, keys = {"floor": floor(), "light": point([0.011, 0.007, height])}, ["light.position", "floor.to_world"]
     check_finite(camera([0, 0, 2], fov=20, filter="tent"), objects, [*keys, "light.intensity.value"], lit=False)
+
+
+@pytest.mark.slow
+def test_area_light_on_the_surface():
+    lamp = {"type": "rectangle", "to_world": scale(0.2), "emitter": {"type": "area", "radiance": 2.0}}
+    pose = translate([1, 0, 1]) @ rotate([0, 1, 0], -60)
+    other = {"type": "rectangle", "to_world": pose, "bsdf": {"type": "diffuse"}}
+    keys = ["lamp.emitter.radiance.value", "floor.to_world", "lamp.to_world", "other.to_world"]
+    view = camera([0, 0, 4], fov=20, filter="tent")
+    check_finite(view, {"floor": floor(), "lamp": lamp, "other": other}, keys)
 
 
 @pytest.mark.parametrize("angle", [0.0, 89.0])

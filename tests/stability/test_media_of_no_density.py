@@ -1,4 +1,6 @@
-"""Hard case: derivatives of media of no density at all, and of grids that are their majorant."""
+"""Hard case: light and derivatives of media of no density at all, of grids that are their majorant, and of media whose
+transmittance underflows behind rough glass.
+"""
 
 import drjit as dr
 import mitsuba as mi
@@ -6,6 +8,8 @@ import numpy as np
 import pytest
 
 from support.media_scenes import block, camera, clouds, film, homogeneous, load, volume
+from support.runs import runs
+from torchtransient.accuracy import z_test
 
 VARIANT = "llvm_ad_mono"
 
@@ -36,6 +40,30 @@ def gradient(scene, key, seed, spp):
     result = np.array(dr.grad(params[key]), dtype=float)
     dr.disable_grad(params[key])
     return result
+
+
+@pytest.mark.slow
+def test_no_density_is_air():
+    """In time and in brightness."""
+    _, a = runs(load(block(homogeneous(0.0, 0.9)), camera()), count=8)
+    air = block(homogeneous())
+    del air["block"]
+    _, b = runs(load(air, camera(), integrator="transient_path"), count=8, seed=50)
+    result = z_test(a.sum((1, 2, 3)), b.sum((1, 2, 3)).mean(0), rounding=3 * b.sum((1, 2, 3)).std() / np.sqrt(8))
+    assert result.passed, str(result)
+    lit = [x.sum((0, 1, 2, 4)) > 0 for x in (a, b)]
+    assert np.array_equal(*[np.flatnonzero(x)[[0, -1]] for x in lit])
+
+
+@pytest.mark.slow
+def test_dense_behind_rough_glass():
+    """An optical depth of 20000: transmittances are zero in single precision, which must stay a number."""
+    bsdf = {"type": "diff_rough_dielectric", "alpha": 0.3}
+    scene = load(block(homogeneous(1e4, 0.9), bsdf), camera(bins=60, filter="tent"))
+    steady, transient = runs(scene, count=2, spp=64)
+    assert np.isfinite(steady).all() and np.isfinite(transient).all() and steady.sum() > 0
+    for key in ("sigma_t.value.value", "albedo.value.value"):
+        assert np.isfinite(gradient(scene, f"block.interior_medium.{key}", 1, 64)).all()
 
 
 @pytest.mark.slow

@@ -118,3 +118,14 @@ def test_rounding_does_not_go_below_zero():
     s = torch.stack([torch.ones_like(angle), torch.cos(2 * angle), torch.sin(2 * angle), torch.zeros_like(angle)])
     raw = PolarizationMosaic(mosaic_rows(((0, 45), (90, 135)))).expected(s.reshape(4, 1, 1, 2, -1))
     assert float(raw.min()) >= 0.0
+
+
+def test_noise_makes_degrees_above_one():
+    """Few photons: degrees of polarization above one come out as they are, and the projection ends at one."""
+    mosaic = PolarizationMosaic.polarsens()
+    s = 3 * flat("horizontal", torch.float64)
+    raw = Compose([mosaic, PixelElectronics(read_noise_e=2.0)]).sample(s, torch.Generator().manual_seed(0))
+    found = mosaic.stokes(raw)
+    assert float(st.degree_of_linear_polarization(found, -5).max()) > 1
+    mended = st.degree_of_linear_polarization(project_physical(found), -5)
+    assert float(mended.max()) <= 1 + 1e-12

@@ -61,6 +61,14 @@ def test_time_far_from_the_origin(how):
 
 
 @pytest.mark.slow
+def test_many_small_terms():
+    """2^22 samples of one point lose no mass against 2^12: beyond 2^16 sums are kept in doubles."""
+    few = captures(scan_scene({"a": plane()}, film=film(1)), 2**12, 4)
+    many = captures(scan_scene({"a": plane()}, film=film(1)), 2**22, 1)
+    assert many.sum() == pytest.approx(few.sum() / 4, rel=2e-4)
+
+
+@pytest.mark.slow
 def test_the_first_arrival_moves():
     """The edge of the first arrival moves with a plate's depth: through a tent its derivative is that of finite
     differences, bin by bin.
