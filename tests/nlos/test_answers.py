@@ -59,6 +59,8 @@ def test_bins_that_nobody_gave():
     assert made.axis == scan().default_axis(tt.scenes.bounds(HIDDEN), tt.units.seconds_to_opl(16e-12))
     assert made.axis == simulated(time_axis=None).axis
     torch.testing.assert_close(made.total().detach(), made.steady.detach(), rtol=1e-2, atol=0)
+    plain = renderer(time_axis=None)(seed=0)
+    torch.testing.assert_close(plain.total(), plain.steady, rtol=1e-5, atol=0)
     phasors = renderer(frequencies=[1.0], time_axis=None)(seed=0)
     assert phasors.axis is None and phasors.phasor.shape == (1, 1, 4, 4)
 
