@@ -15,6 +15,9 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "gradients_table.md"
 BEGIN, END = "<!-- support-table:begin -->", "<!-- support-table:end -->"
+TESTED_ELSEWHERE = (
+    ("shape to_world behind or of glass", "correct: `glass_moves` of `tests/transport/test_moving_edges.py`"),
+)
 NOT_SUPPORTED = (
     (
         "`alpha`, `eta` and reflectances of Mitsuba's own `plastic`, `roughplastic`",
@@ -70,7 +73,7 @@ def table(rows) -> str:
             cells.append(f"{case.name}: {r:.5g} ± {se_r:.1g}, {d:.5g} ± {se_d:.1g}, {z:+.1f}")
             ratios.append(f"{ratio:.5f}")
         lines.append(f"| {row} | correct | {'<br>'.join(cells)} | {'<br>'.join(ratios)} |")
-    lines += [f"| {what} | {status} | | |" for what, status in NOT_SUPPORTED]
+    lines += [f"| {what} | {status} | | |" for what, status in TESTED_ELSEWHERE + NOT_SUPPORTED]
     return "\n".join(lines)
 
 

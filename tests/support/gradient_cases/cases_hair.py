@@ -35,6 +35,7 @@ CASES = [
     of_hair("scale_tilt", "scale_tilt", 2.0, 0.5),
     of_hair("index", "eta", 1.55, 0.006, spp=8192),
     of_hair("eumelanin", "eumelanin", 0.3, 0.01, "llvm_ad_rgb", **PIGMENTS),
+    of_hair("pheomelanin", "pheomelanin", 0.4, 0.015, "llvm_ad_rgb", **PIGMENTS),
     of_hair("pigments_in_wavelengths", "eumelanin", 0.3, 0.01, "llvm_ad_spectral", **PIGMENTS),
     of_hair("coloured_absorption", "sigma_a.value", 0.3, 0.008, "llvm_ad_rgb", **COLOURED),
     Case(

@@ -98,4 +98,5 @@ CASES = [
         2e-3,
         spp=2048,
     ),
+    Case("wall_rgb", "shape to_world", room, move("wall.to_world", (0, 0, 1)), 0.0, 2e-3, "llvm_ad_rgb", 2048),
 ]
