@@ -170,7 +170,6 @@ def mean_and_error(values):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the derivative by 'body.vertex_normals'")  # normals do not turn as a ball moves
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_derivatives_are_those_of_finite_differences(case):
     """Within four standard errors, and forward mode is reverse mode at each seed."""
