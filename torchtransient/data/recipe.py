@@ -123,7 +123,7 @@ class Recipe(Specification):
         return self.maker()
 
     def maker(self) -> Maker:
-        """Make a maker of samples, which keeps the scene that it has built. One for each process."""
+        """Return a new `Maker` of samples, which keeps the scene that it has built. Each process needs its own."""
         return Maker(self)
 
     def sample(self, index: int) -> Sample:
