@@ -83,7 +83,7 @@ def opened(path: str | Path) -> Iterator[Contents]:
     """Open an HDF5, MATLAB, NumPy or JSON file.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Yields:
         Its contents.
