@@ -133,7 +133,7 @@ def test_the_loop_of_an_optimizer(room):
 
 
 def test_inside_of_dr_wrap(room):
-    """One call and one backward are right; what is not: tests/rendering/test_dr_wrap.py."""
+    """One call and one backward are right; what is not: tests/rendering/test_wrap.py."""
     scene, params = room
 
     @dr.wrap(source="torch", target="drjit")

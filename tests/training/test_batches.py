@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.errors import DeviceError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, DeviceError, StorageError, UnitError
 from torchtransient.training import Batches, Seeds, ranks, worker_init
 
 
@@ -82,6 +82,8 @@ def test_its_loader_leaves_random_numbers_alone():
     assert (apart.worker_init_fn, apart.persistent_workers) == (worker_init, True)
     with pytest.raises(UnitError, match="of 3 samples, the data set has 2"):
         batches.loader([1.0, 2.0])
+    with pytest.raises(ArgumentError, match="expected workers=2"):
+        batches.loader([1.0, 2.0, 3.0], num_workers=2)
 
 
 def test_a_position_that_is_left_behind():

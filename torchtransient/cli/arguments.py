@@ -1,4 +1,4 @@
-"""Groups of options, and types of values, for every command. Nothing here imports torch."""
+"""Types of values, and how options are put together. Nothing here imports torch."""
 
 from __future__ import annotations
 

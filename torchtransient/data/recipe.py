@@ -94,7 +94,7 @@ class Recipe(Specification):
         temporal_filter: "auto" is that of the scene's film, whatever varies.
         variant: None settles it here as :func:`torchtransient.load` does.
         scan: makes it a capture around a corner, which needs a time axis (or frequencies), since hidden things move.
-        bounces: of a capture, as in :class:`~torchtransient.nlos.CaptureRenderer`.
+        bounces: bounces of a capture, as in :class:`~torchtransient.nlos.CaptureRenderer`.
         energy: likewise.
         device: :class:`~torchtransient.sensing.Device`, or its name or file: its draw from the transient is
             ``measurement``. A chain of one's own is written as one, see docs/data_sheet_to_chain.md.
@@ -123,14 +123,14 @@ class Recipe(Specification):
         return self.maker()
 
     def maker(self) -> Maker:
-        """Make a maker of samples, which keeps the scene that it has built. One for each process."""
+        """Return a new `Maker` of samples, which keeps the scene that it has built. Each process needs its own."""
         return Maker(self)
 
     def sample(self, index: int) -> Sample:
         """Render a sample, whatever was made before.
 
         Args:
-            index: of the sample.
+            index: index of the sample.
 
         Returns:
             :class:`Sample`.
@@ -144,7 +144,7 @@ class Recipe(Specification):
         """Draw the values of a sample without rendering it.
 
         Args:
-            index: of the sample.
+            index: index of the sample.
 
         Returns:
             Values by key, numbers as float64 arrays.
@@ -197,7 +197,7 @@ class Recipe(Specification):
 
         Args:
             samples: number of them.
-            path: of the picture (.png, .pdf, .svg), or None.
+            path: path of the picture (.png, .pdf, .svg), or None.
             progress: show a bar.
 
         Returns:
@@ -218,7 +218,7 @@ class Recipe(Specification):
 
         Args:
             data: result of :meth:`to_dict`, or the content of a YAML file.
-            folder: of files that it names, None for where they were.
+            folder: folder of the files that it names, None for where they were.
 
         Returns:
             Recipe.
@@ -234,7 +234,7 @@ class Recipe(Specification):
         """Write the recipe as YAML.
 
         Args:
-            path: of the file, or None.
+            path: path of the file, or None.
 
         Returns:
             Text.

@@ -188,9 +188,10 @@ def _hinges(index: Tensor) -> Tensor:
 
 
 def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, *, cells: int = 4) -> Tensor:
-    """Compute the mean distance of two surfaces, from points of each to the nearest point of the other, over the area.
+    """Compute the mean distance of two surfaces both ways, from points of each to the nearest point of the other.
 
-    Independent of how the surfaces are meshed. Time and memory grow with F times G.
+    A mean over the area of each surface, then of the two. Independent of how the surfaces are meshed. Time and memory
+    grow with F times G.
 
     Args:
         vertices: (V, 3).

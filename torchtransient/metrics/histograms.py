@@ -59,7 +59,7 @@ def histogram_wasserstein_opl(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Compute the Wasserstein-1 distance over time of each pixel, metres: how far light has to be moved.
+    """Compute the Wasserstein-1 distance over time of each pixel, metres of path: how far light has to move.
 
     Light counts as at the middle of its bin. `tt.losses.wasserstein_loss` fills up dark pixels instead of refusing
     them.

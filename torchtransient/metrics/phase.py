@@ -108,7 +108,7 @@ def phase_bias(
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Compute the circular mean of the difference of phases: the angle of the mean of `exp(i (input - target))`.
+    """Compute the signed circular mean of phase differences: the angle of the mean of `exp(i (input - target))`.
 
     Right across the jump, where a mean of wrapped differences is wrong; meaningless for differences spread evenly over
     the circle. Source: Fisher 1993.

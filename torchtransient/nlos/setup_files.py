@@ -354,9 +354,9 @@ def read_setup(path: str | Path, **xml_parameters: Any) -> dict[str, Any]:
     by one factor for all points.
 
     Args:
-        path: a YAML file of this library (above), a scene file of y-tal's renderer or its folder
-            (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient with the
-            integrator ``transient_nlos_path``.
+        path: a YAML file of this library (``docs/nlos.md``, "As a file"), a scene file of y-tal's renderer or its
+            folder (:mod:`.tal_yaml`), which are told apart by their entries, or an XML file of Mitsuba or mitransient
+            with the integrator ``transient_nlos_path``.
         xml_parameters: fill the ``$parameters`` of an XML file.
 
     Raises:

@@ -1,5 +1,5 @@
-"""Values between two bounds, by the logistic function: albedo, roughness, index of refraction; and values above one:
-light, extinction, lengths, optical constants of metals.
+"""Values between two bounds, by the logistic function: albedo, roughness, index of refraction; and values above a
+bound: light, extinction, lengths, optical constants of metals.
 """
 
 from __future__ import annotations
@@ -310,7 +310,7 @@ class Positive(Settings):
         """Return `positive_inverse` of a value.
 
         Args:
-            value: of any shape, positive.
+            value: any shape, above `low`.
 
         Raises:
             UnitError: for values out of range.

@@ -1,8 +1,8 @@
 """Dependencies on classes and versions of Mitsuba: names of its classes, and mistakes that are corrected elsewhere.
 
-Written against Mitsuba 3.9.1 (Dr.Jit 1.5). Most of what a later version may mend has a test in
-``tests/plugins/test_mitsuba_compat.py`` that shows the mistake on Mitsuba alone: when one of them fails, the entry here
-and what asks for it can go. Our own plugins are told by what they declare, never by name.
+Written against Mitsuba 3.9.1 (Dr.Jit 1.5). ``tests/plugins/test_mitsuba_compat.py`` shows some of the mistakes on
+Mitsuba alone: when one of its tests fails, the entry that it names and what asks for it can go. Other entries have no
+such test there. Our own plugins are told by what they declare, never by name.
 """
 
 from __future__ import annotations

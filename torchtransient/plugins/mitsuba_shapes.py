@@ -1,6 +1,7 @@
 """Shapes of Mitsuba by their classes: what they are, and mistakes of their interactions that are corrected elsewhere.
 
-Written against Mitsuba 3.9.1; ``tests/plugins/test_mitsuba_compat_shapes.py`` shows the mistakes on Mitsuba alone.
+Written against Mitsuba 3.9.1. ``tests/plugins/test_mitsuba_compat.py`` shows one of the mistakes on Mitsuba alone, the
+bounds of merged rectangles (:func:`bounds_of`); the others have none there.
 """
 
 from __future__ import annotations

@@ -292,7 +292,7 @@ class ErrorBars:
             weights: real numbers or truth values that broadcast to (T, H, W) ((F, H, W) of phasors, (G, H, W) of
                 gates, (R, T, H, W) of rates, (2, T, H, W) of beats), behind dimensions of Stokes components and items;
                 None for ones. (H, W) with ``steady``.
-            steady: of the steady image.
+            steady: return that of the steady image.
 
         Returns:
             (...), without the dimensions of one film, or of its steady image.
@@ -324,7 +324,7 @@ class ErrorBars:
         (3 x 3 pixels of gates and frequencies): single dark bins have seen too few events to know their own.
 
         Args:
-            steady: of the steady image.
+            steady: return that of the steady image.
 
         Raises:
             ArgumentError: for a render without ``errors=``.

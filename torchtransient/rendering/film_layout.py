@@ -86,7 +86,7 @@ class FilmLayout(abc.ABC):
         return None
 
     def describe(self, temporal_filter: str) -> str:
-        """Return the film's part of ``print(renderer)``; ``temporal_filter``: name of the one in use.
+        """Return the film's part of ``print(renderer)``.
 
         Args:
             temporal_filter: name of the filter in use, empty for none.

@@ -52,7 +52,7 @@ class Seeding:
     grad_seed: int | str | None
 
     def items(self, seed: Any) -> tuple[Item, ...]:
-        """Return one item for each entry and sensor; ``seed`` is a whole number, or one for each entry.
+        """Return one item for each entry and sensor.
 
         Args:
             seed: a whole number, or one for each entry.

@@ -186,13 +186,14 @@ class Arrivals:
         return low
 
     def enough_depth_of_all_times(self, tail: float) -> int:
-        """Return the smallest depth beyond which no eighth of the time of the light has more than ten times ``tail``.
+        """Return the smallest depth that leaves out at most ten times ``tail`` of the light in each eighth of the time.
 
-        Of the light after which ``tail`` of it comes. Late parts have few arrivals: what they show counts as it is, so
-        that the last eighth may lose some times as much.
+        The time ends where ``tail`` of all light is yet to come. The share of an eighth is that of its own arrivals,
+        without an allowance for their noise: late eighths have few, and the last may lose several times more.
 
         Args:
-            tail: a tenth of the largest share, and the share of the light that is left out at the end.
+            tail: share of all light that may arrive after the last eighth; an eighth may lose ten times that share of
+                its own light.
         """
         first, last = self.window(-1, tail)
         depth = 1

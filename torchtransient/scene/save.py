@@ -209,7 +209,7 @@ _DERIVED = {("spot", "cutoff_angle"): ("beam_width",)}
 
 
 class _Place(NamedTuple):
-    """_Place of a built object in the description.
+    """Place of a built object in the description.
 
     Attributes:
         node: index of the node that the object was made of, or of one above it.

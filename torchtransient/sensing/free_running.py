@@ -1,8 +1,8 @@
 """A SPAD that runs free of the laser: dead time carries over from one period to the next.
 
 Non-paralyzable (a photon during the dead time is ignored): the stationary distribution of a Markov chain, see
-`renewal_chain`. Paralyzable (a photon during the dead time prolongs it): closed form, a photon counts if none came
-before it for as long as the dead time.
+`sensing.dead_time.renewal`. Paralyzable (a photon during the dead time prolongs it): closed form, a photon counts if
+none came before it for as long as the dead time.
 
 Sources: Rapp, Ma, Dawson, Goyal, Dead time compensation for high-flux ranging, IEEE TSP 67 (2019); Gupta et al.,
 Asynchronous single-photon 3D imaging, ICCV 2019.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
 
 from torchtransient.checks import as_number, by_number, count, flag, is_one_of, positive, shown
-from torchtransient.errors import DeviceError, StorageError, UnitError
+from torchtransient.errors import ArgumentError, DeviceError, StorageError, UnitError
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
@@ -290,8 +290,10 @@ class Batches(Sampler[list[int]]):
 
         Raises:
             UnitError: for streams and data sets of another size.
-            ArgumentError: for other objects than data sets.
+            ArgumentError: for other objects than data sets, and for ``num_workers``.
         """
+        if "num_workers" in options:
+            raise ArgumentError(f"{_WHAT}: expected workers={shown(options['num_workers'])} in place of num_workers=.")
         processes = count(f"{_WHAT}: workers", workers, 0, UnitError)
         if isinstance(data, IterableDataset):
             raise UnitError(

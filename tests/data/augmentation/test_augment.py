@@ -122,7 +122,7 @@ def test_it_is_the_scene_rendered_anew(sample, name):
         assert a.shape == b.shape and torch.equal(a.isnan(), b.isnan())
         assert bool(((a - b).abs().nan_to_num() < 1e-4).all()), label
     for light in ("transient", "steady"):
-        # Of S3 there is none after one reflection; test_turned_frames.py has it.
+        # Of S3 there is none after one reflection; test_the_field_of_each_pixel_stays has it.
         for k in range(3):
             s, t = (one[light].select(-5 if light == "transient" else -4, k) for one in (found, known))
             # 512 samples of each: smooth but for pixels on edges.

@@ -50,7 +50,7 @@ class Contents:
         """Return numbers, None for a name that is missing or empty.
 
         Args:
-            name: of the array; a field of a structure is ``structure/field``.
+            name: name of the array; a field of a structure is ``structure/field``.
             part: index of the part that is returned, () for all of it.
 
         Raises:
@@ -62,7 +62,7 @@ class Contents:
         """Return a text, None if it is missing or empty.
 
         Args:
-            name: of the text.
+            name: name of the text.
 
         Raises:
             StorageError: for anything else.
@@ -73,7 +73,7 @@ class Contents:
         """Return the names in a structure, empty for other entries.
 
         Args:
-            name: of the structure.
+            name: name of the structure.
         """
         return frozenset()
 
@@ -83,7 +83,7 @@ def opened(path: str | Path) -> Iterator[Contents]:
     """Open an HDF5, MATLAB, NumPy or JSON file.
 
     Args:
-        path: the file.
+        path: path of the file.
 
     Yields:
         Its contents.
@@ -263,7 +263,7 @@ class JsonContents(Contents):
         """Return plain data of one frame, None if it has no such entry.
 
         Args:
-            name: of the entry.
+            name: name of the entry.
             frame: index of the frame.
         """
         return self._entry(self._frames[frame], name)

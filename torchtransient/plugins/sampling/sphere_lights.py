@@ -181,7 +181,7 @@ class SphereLights:
         others: :class:`ShapeLights`, which samples these.
         textured: one of the spheres has a texture.
         marks: table of emitters: one plus the place of each sphere in the table, zero for other lights.
-        least_pmf: probability below which a light is rarely drawn (:func:`.lights.is_rare`).
+        least_pmf: probability below which a light is rarely drawn (:func:`.lights.least_probability`).
     """
 
     def __init__(self, scene: Any, numbers: list[int]) -> None:

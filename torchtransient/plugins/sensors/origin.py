@@ -226,7 +226,7 @@ def sensor_rotation(seen, ray):
     axis; they keep the implicit frame of their direction.
 
     Args:
-        seen: :class:`~.origin.View` of every sensor that the rays belong to.
+        seen: :class:`View` of every sensor that the rays belong to.
         ray: primary rays.
     """
     up = seen[0].sensor.world_transform() @ mi.Vector3f(0, 1, 0)

@@ -191,7 +191,7 @@ class Reverse:
     """Reverse mode: detached sums of events times the adjoint of the film, times attached speeds.
 
     Args:
-        term: :class:`.term.BoundaryTerm` of the job.
+        term: :class:`BoundaryTerm` of the job.
         incoming: :class:`~...integrators.job.IncomingAdjoint` of the film.
     """
 
@@ -289,7 +289,7 @@ class Forward:
     """Forward mode: events written to the film, times the tangents of the speeds.
 
     Args:
-        term: :class:`.term.BoundaryTerm` of the job.
+        term: :class:`BoundaryTerm` of the job.
         job: launch, whose band of the film is written.
     """
 
