@@ -123,3 +123,11 @@ def test_layer_does_not_depend_on_what_it_rendered_first():
     assert layer_arrival(second, 3.0) == pytest.approx(expected, abs=1e-4)
 
 
+def test_batch_starts_with_the_description():
+    renderer, alone = layer(), layer()
+    expected = layer_arrival(alone, 3.0)
+    values = torch.tensor(np.stack([square(0, -d, 0.1)["to_world"] for d in (40.0, 3.0)]), dtype=torch.float32)
+    out = renderer({"far.to_world": values}, seed=0, spp=256)
+    bins = out.transient.double().sum((1, 3, 4))
+    centers = (AXIS["start"] + (torch.arange(AXIS["bins"]) + 0.5) * AXIS["width"]).double()
+    np.testing.assert_allclose((bins @ centers / bins.sum(-1)).detach(), expected, atol=0.02)

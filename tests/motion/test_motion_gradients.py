@@ -14,6 +14,7 @@ from support.moving_scenes import (
     PER_METRE,
     corner,
     moving_scene,
+    plate,
     wall,
     wall_phasor,
 )
@@ -103,6 +104,34 @@ def test_differences_in_a_corner(name):
     assert error < 0.1 * abs(float(found.mean))
     forward = float(torch.func.jvp(lambda x: image(x, 100), (torch.tensor(0.0),), (torch.tensor(1.0),))[1])
     assert forward == pytest.approx(reverse[0], rel=2e-2)
+
+
+@pytest.mark.slow
+def test_differences_where_an_outline_crosses_pixels():
+    """The light that the outline hides and uncovers is in the derivative by the velocity."""
+    scene, motion = plate()
+    loaded = tt.load(scene, variant=VARIANT)
+    renderer = tt.TransientRenderer(loaded, ["front.to_world"], spp=2048, frequencies=FREQUENCIES)
+    along = torch.tensor([1.0, 0.3, 0.5])
+    weights = torch.randn(8, 8, generator=torch.Generator().manual_seed(0))
+
+    def image(x, seed):
+        moving = {"front": tt.Motion(linear=torch.tensor(motion["linear"]) + x * along)}
+        out = tt.over_time(renderer, moving, HETERODYNE, seed=seed)
+        return 1e4 * (weights * (0.3 * out.phasor.real + 0.8 * out.phasor.imag)).mean()
+
+    def gradient(seed):
+        x = torch.tensor(0.0, requires_grad=True)
+        return float(torch.autograd.grad(image(x, seed), x)[0])
+
+    with torch.no_grad():
+        found = finite_differences.central_difference(
+            lambda x, seed: float(image(torch.tensor(float(x)), seed)), 0.0, 1.0, range(12)
+        )
+    reverse = np.array([gradient(seed) for seed in range(100, 112)])
+    error = np.hypot(float(found.standard_error), reverse.std(ddof=1) / 12**0.5)
+    assert abs(reverse.mean() - float(found.mean)) < 3 * error
+    assert error < 0.1 * abs(float(found.mean))
 
 
 def test_velocities_of_a_rolling_shutter_by_vmap_and_reverse_mode():

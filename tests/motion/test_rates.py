@@ -402,3 +402,45 @@ def test_a_chirp_simulated_in_time():
         assert beat == pytest.approx(simulated_beat(CHIRPS, distance, speed, sign, 2000), abs=1e-3 * line)
 
 
+@pytest.mark.slow
+def test_chirps_simulated_in_time_of_a_turning_disc():
+    """Mean power of 100 chirps of 1000 paths with random phases: the film's spectra, within the speckle of so many."""
+    chirps, n, repeats, paths = tt.Chirps(1e9, 20e-6, WAVELENGTH), 256, 100, 1000
+    center, turns, drift = np.array([0.0, 0.0, 2.0]), 2.0, np.array([0, 0, 0.3])
+    normal = np.array([0.7, 0.0, -math.sqrt(0.51)])
+    pose = look_at(tuple(center), tuple(center + normal)) @ scale(0.4)
+    disc = {"type": "disk", "to_world": pose, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    motion = tt.Motion(linear=drift, angular=turns * normal, center=center)
+    loaded = tt.load(scene(fov=20, disc=disc), variant=VARIANT).moving({"disc": motion})
+    axis = tt.TimeAxis(-12.0, chirps.resolution_opl / 8, 960)
+    out = tt.TransientRenderer(loaded, chirps=chirps, time_axis=axis, temporal_filter="box", spp=1 << 16)(seed=0)
+    film = out.beats[0, :, :, 0, 0].double().numpy()
+
+    t = ((np.arange(n) + 0.5) / n - 0.5) * chirps.duration_s
+    window = 0.5 + 0.5 * np.cos(2 * np.pi * t / chirps.duration_s)
+    rng, k = np.random.default_rng(0), math.tan(math.radians(10))
+    power = np.zeros((2, 8 * n))
+    for _ in range(repeats):
+        d = np.stack([rng.uniform(-k, k, paths), rng.uniform(-k, k, paths), np.ones(paths)], -1)
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        s = (center @ normal) / (d @ normal)
+        p = d * s[:, None]
+        inside = np.linalg.norm(p - center, axis=1) < 0.4
+        weight = np.where(inside, 0.5 / math.pi * np.abs(d @ normal) / s**2, 0) / paths
+        rate = 2 * ((drift + np.cross(turns * normal, p - center)) * d).sum(1)
+        field = np.sqrt(weight) * np.exp(2j * np.pi * rng.random(paths))
+        for row, sign in enumerate((1, -1)):
+            beat = chirps.hertz_per_metre * (2 * s + sign * chirps.rate_scale_s * rate)
+            signal = np.exp(2j * np.pi * t[:, None] * beat) @ field
+            power[row] += np.abs(np.fft.fft(signal * window, 8 * n)) ** 2 / repeats
+    power /= (window**2).sum() * 8 * n  # Parseval: sums to the energy
+    at = np.fft.fftshift(np.fft.fftfreq(8 * n, chirps.duration_s / n)) / chirps.hertz_per_metre
+    for expected, simulated in zip(film, np.fft.fftshift(power, axes=1), strict=True):
+        places = axis.centers_opl.numpy()
+        got = np.interp(places, at, simulated)
+        assert got.sum() == pytest.approx(expected.sum(), rel=0.1)
+        # Rates shift the means of the two chirps by 2 m each; speckle by 0.1 m.
+        mean = (expected * places).sum() / expected.sum()
+        assert (got * places).sum() / got.sum() == pytest.approx(mean, abs=0.3)
+        # A bin of N chirps deviates by 0.8 / sqrt(N) in the mean; without rates the difference is near 2.
+        assert np.abs(got / got.sum() - expected / expected.sum()).sum() < 2 * 0.8 / repeats**0.5

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from support.hidden_shapes import ball, join, mesh
+from support.hidden_shapes import ball, disc, join, mesh
+from torchtransient.plugins.cache import Cache
 from torchtransient.plugins.edges.table import EdgeTable
-from torchtransient.plugins.edges.topology import Topology
+from torchtransient.plugins.edges.topology import Topology, topology_of
 
 VARIANT = "llvm_ad_mono"
 STRETCH = (0.8, 0.5, 1.2)
@@ -135,3 +136,51 @@ def test_lengths_are_those_of_all_edges_and_limbs(scene):
         assert found[name] == pytest.approx(length, rel=5e-3), name
 
 
+def test_rims_of_two_meshes_are_one_until_they_part():
+    """A roof of two plates: the ridge once, with a face of each; pulled apart, two rims."""
+    turned = [mi.ScalarAffineTransform4f().rotate([0, 1, 0], 40 * s).translate([s, 0, 0]) for s in (-1, 1)]
+    halves = {f"r{i}": {"type": "rectangle", "to_world": T} for i, T in enumerate(turned)}
+    scene = mi.load_dict({"type": "scene", **halves}, optimize=False)
+    topology, params = Topology(scene), mi.traverse(scene)
+
+    def length_and_two():
+        table = EdgeTable(topology, frozenset())
+        u = mi.Float((np.arange(2000, dtype=np.float32) + 0.5) / 2000)
+        b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(0, 0.1, 9), True)
+        return np.array(b.inv_pdf).mean(), np.array(b.crease).mean()
+
+    length, crease = length_and_two()
+    assert length == pytest.approx(14, rel=1e-3) and crease == pytest.approx(1 / 7, abs=0.01)
+    params["r0.to_world"] = mi.AffineTransform4f().translate([-0.1, 0, 0]) @ params["r0.to_world"]
+    params.update()
+    length, crease = length_and_two()
+    assert length == pytest.approx(16, rel=1e-3) and not crease
+
+
+def total_length(scene, V=(0, 0.1, 9)):
+    """Of all outlines and creases, seen from ``V``."""
+    table = EdgeTable(topology_of(scene, Cache()), frozenset())
+    u = mi.Float((np.arange(4000, dtype=np.float32) + 0.5) / 4000)
+    b = table.seen_from(table.pick(table.by_length, u, u), mi.Point3f(*V), True)
+    return np.array(dr.select(b.valid, b.inv_pdf, 0), np.float64).mean()
+
+
+@pytest.mark.parametrize("corners", [1500, 4000])
+def test_short_rims_far_from_the_origin(corners):
+    """Ten micrometres are what a coordinate of a hundred metres is rounded to."""
+    v, f = disc(0.3, 1.2, corners)
+    scene = mi.load_dict({"type": "scene", "fan": mesh("fan", (v + np.array([100, 0, 0]), f))})
+    assert total_length(scene, (100, 0.1, 9)) == pytest.approx(0.6 * np.pi, rel=0.02)
+
+
+def test_faces_that_get_an_area():
+    """A mesh of none, which has no edges; then it has three, and none again."""
+    flat = mesh("flat", (np.zeros((3, 3)), np.array([[0, 1, 2]])))
+    scene = mi.load_dict({"type": "scene", "r": {"type": "rectangle"}, "flat": flat}, optimize=False)
+    params, memory = mi.traverse(scene), Cache()
+    for area in (0, 1, 2, 0):
+        params["flat.vertex_positions"] = mi.Float(3, 0, 0, 3, area, 0, 3, 0, area)
+        params.update()
+        topology = topology_of(scene, memory)
+        assert (len(topology.bodies), topology.count - 5) == ((2, 3) if area else (1, 0))
+        EdgeTable(topology, frozenset())

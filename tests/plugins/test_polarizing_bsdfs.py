@@ -130,12 +130,14 @@ def weighted_sum(bsdf, wi):
 PLUGINS = {
     "diff_conductor": ({"eta": 0.5, "k": 2.0}, ("eta.value", "k.value")),
     "diff_polarizer": ({"theta": 20.0, "transmittance": 0.9}, ("theta.value", "transmittance.value")),
+    "absorber": ({"theta": 20.0, "transmittance": 0.0}, ("theta.value", "transmittance.value")),
     "diff_retarder": ({"theta": 30.0, "delta": 80.0}, ("theta.value", "delta.value")),
 }
 
 
 @pytest.mark.parametrize(
-    ("plugin", "wi"), [("diff_retarder", (0, 0, 1)), *((plugin, (0.3, -0.2, 0.93)) for plugin in PLUGINS)]
+    ("plugin", "wi"),
+    [("diff_retarder", (0, 0, 1)), ("diff_conductor", (0, 0, 1)), *((name, (0.3, -0.2, 0.93)) for name in PLUGINS)],
 )
 def test_derivatives(plugin, wi):
     """Reverse mode against central differences, by every parameter and by the direction's two angles."""
@@ -145,7 +147,7 @@ def test_derivatives(plugin, wi):
     tangents = np.linalg.svd(wi[None])[2][1:]
 
     def evaluate(unknown, key, tangent, differentiate):
-        bsdf = mi.load_dict({"type": plugin, **settings})
+        bsdf = mi.load_dict({"type": "diff_polarizer" if plugin == "absorber" else plugin, **settings})
         x = mi.Float(unknown)
         if differentiate:
             dr.enable_grad(x)

@@ -231,16 +231,25 @@ def test_cube_that_does_not_fit_is_refused_before_it_is_allocated(room):
 @pytest.mark.slow
 def test_a_film_in_two_bands(room_scene, monkeypatch):
     """As if arrays were limited to two rows of pixels. Each pass has its own samples: amounts can be compared."""
-    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR], spp=512, grad_seed="same")
-    x, found = renderer.values[COLOUR], []
+    placed, along = "box.to_world", torch.tensor([0.5, 0.3, 0.4, 0.0])[:, None] * torch.tensor([0.0, 0.0, 0.0, 1.0])
+    renderer = tt.TransientRenderer(room_scene, parameters=[COLOUR, placed], spp=512, grad_seed="same")
+    x, at, found, tangents = renderer.values[COLOUR], renderer.values[placed].detach(), [], []
+
+    def moved(value):
+        return renderer({placed: value}, seed=0, spp=1 << 15).transient.sum((0, 1))
+
     for most in (None, 2 * 4 * 24 * 3):
         if most is not None:  # holds while the scene's variant stays active
             monkeypatch.setattr("torchtransient.plugins.films.base.MAX_ARRAY_ENTRIES", most)
         out = renderer(seed=0).transient
         found.append((out.detach(), torch.autograd.grad(out.sum(), x)[0]))
+        tangents.append(torch.func.jvp(moved, (at,), (along,))[1].detach())
     (whole, whole_slope), (banded, slope) = found
     pushed = torch.func.jvp(lambda y: renderer({COLOUR: y}, seed=0).transient.sum(), (START,), (torch.ones(3),))[1]
     assert banded.shape == whole.shape and not torch.equal(banded, whole)
     torch.testing.assert_close(banded.sum((0, 1, 3)), whole.sum((0, 1, 3)), rtol=0.05, atol=0)
     torch.testing.assert_close(slope, whole_slope, rtol=0.05, atol=0)
     torch.testing.assert_close(pushed, slope.sum(), rtol=1e-4, atol=0)
+    # The outline crosses pixels of all rows. Without their share of the whole film, tangents are off by 0.065 and more.
+    assert bool((tangents[0].abs().amax(1) > 0.1).all())
+    torch.testing.assert_close(tangents[1], tangents[0], rtol=0, atol=0.04)

@@ -8,6 +8,7 @@ import pytest
 from support.gradient_cases.cases_gaps import OFF, corner, lamp, plates
 from support.gradient_cases.problem import Case, Problem
 from support.gradient_cases.unknowns import move
+from support.walks import no_flat_shortcut
 
 SCENES = {"plates": (plates, (0, 0, 1)), "corner": (corner, (1, 0, 0)), "lamp": (lamp, (0, 0, 1))}
 GAPS = (1e-2, 1e-3, 1e-4)
@@ -43,3 +44,11 @@ def test_mean_at_a_millimetre():
     error = np.hypot(found.std(ddof=1) / 4, slopes.std(ddof=1) / np.sqrt(8))
     assert abs(found.mean() - slopes.mean()) < 3 * error + OFF * abs(slopes.mean())
     assert error < 0.05 * abs(slopes.mean())
+
+
+@pytest.mark.slow
+def test_plain_surfaces_are_no_special_case(monkeypatch):
+    """Guards against a slide of flat plain surfaces that is not that of a ray which is shifted."""
+    plain = problem("plates", 5e-3).reverse(1)
+    no_flat_shortcut(monkeypatch)
+    assert problem("plates", 5e-3).reverse(1) == pytest.approx(plain, rel=1e-4)

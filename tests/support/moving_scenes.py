@@ -42,6 +42,12 @@ def corner():
     return moving_scene(depth=3, first=first, second=second, lamp=lamp), motion
 
 
+def plate():
+    """A plate before a wall, whose outline crosses pixels: (scene, motion)."""
+    front, back = wall((0.05, 0, 1.5), (0.05, 0, 0), 0.11), wall((0, 0, 2.5), (0, 0, 0), 2.0)
+    return moving_scene(size=8, fov=12.0, front=front, back=back), {"linear": (6.0, 0.0, -6.0)}
+
+
 def wall_phasor(z):
     """Phasor of a wall that faces camera and lamp from the distance z."""
     z = np.asarray(z)

@@ -7,7 +7,7 @@ Renders, their gradients and errors are the first choice. Each name stands for a
 - mathematics with a closed form, at single points: `attached_interaction` and `attached_distance`, hits of curves,
   ellipsoids and instances with the derivatives that Mitsuba lacks; `varies_by_place`, a property of every
   plugin that costs time or derivatives where it is wrong;
-- the same numbers by another way: `limit_records`;
+- the same numbers by another way: `no_flat_shortcut`, `limit_records`;
 - moments in the middle of a trace, for interrupts, errors and scenes that are dropped there: `before_each_turn`.
 
 Beside it, `toy_strategies` and `toy_integrators` import what an author of strategies does.
@@ -39,6 +39,7 @@ __all__ = [
     "attached_interaction",
     "before_each_turn",
     "limit_records",
+    "no_flat_shortcut",
     "primary_rays",
     "recorded_paths",
     "varies_by_place",
@@ -135,6 +136,11 @@ def varies_by_place(plugin):
 
 # --------------------------------------------------------------------------------------------------------------------
 # Other ways to the same numbers.
+
+def no_flat_shortcut(monkeypatch):
+    """Points slide on flat surfaces as on all others."""
+    monkeypatch.setattr(f"{CORE}.scene_contents.is_flat", lambda shape: False)
+
 
 def limit_records(monkeypatch, stack, memory=None):
     """Set the bytes that the record of a path may take: of the stack, and of memory (None: as it is)."""

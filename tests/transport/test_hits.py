@@ -226,3 +226,28 @@ def test_distance_of_where_a_ray_leaves(copied):
     dr.backward(t)
     assert dr.grad(x)[0] == pytest.approx(-0.9 / 1.2, rel=1e-5)
     assert dr.grad(scale)[0] == pytest.approx(1.5 * 1.5 / 1.2, rel=1e-5)
+
+
+def test_idle_lanes_reach_no_pose():
+    """What nothing was met by may hold what is no number, or lie at the ray's start: the poses, which all lanes share,
+    and its own ray hear nothing of it.
+    """
+    group, copy = {"type": "shapegroup", "ball": {"type": "sphere"}}, {"type": "ref", "id": "group"}
+    objects = {"group": group, "copy": {"type": "instance", "group": copy}}
+    scene, x = mi.load_dict({"type": "scene", **objects}, optimize=False), mi.Float(0)
+    params = mi.traverse(scene)
+    dr.enable_grad(x)
+    params["copy.to_world"] = mi.AffineTransform4f().translate(mi.Vector3f(0.1, 0.2, 0.3) * x)
+    params.update()
+    ray = mi.Ray3f(mi.Point3f([0.1, 0.2, 5, 6], 0.3, -4), mi.Vector3f(0, 0, 1) + dr.zeros(mi.Vector3f, 4))
+    pi = scene.ray_intersect_preliminary(ray)
+    missed, lane = ~pi.is_valid(), dr.arange(mi.UInt32, 4)
+    ray.o = dr.select(missed, dr.select(lane == 2, 0, mi.Float(np.nan)), ray.o)
+    ray.d = dr.select(lane == 3, np.nan, ray.d)
+    dr.enable_grad(ray.o)
+    si = attached_interaction(scene, pi, ray, mi.RayFlags.All | mi.RayFlags.FollowShape)
+    dr.backward(dr.sum(si.t + si.n.x + si.p.z))
+    slope = np.array(dr.grad(ray.o))
+    # Distance and place of each of the two hits are carried along.
+    assert dr.grad(x)[0] == pytest.approx(2 * (0.3 + 0.3), rel=1e-5) and np.isfinite(slope).all() and slope.any()
+    assert np.array(missed).sum() == 2 and not slope[:, np.array(missed)].any()
