@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from typing import Any
 import torch
 
 import torchtransient as tt
-from support.capture_files import WALL, grids, listed, made, sound_files, volume
+from support.capture_files import WALL, grids, listed, made, read_answered, sound_files, volume
 from support.hostile_captures import old_mat
 from support.sealed_files import as_first_version
 from support.stored_samples import sample, write
@@ -87,24 +86,7 @@ def _foreign(layout: str) -> Reader:
         found = [path for _, path in sound_files(folder, (layout,))]
         return [*found, old_mat(folder / "old.mat")] if layout == "phasor_field" else found
 
-    def read(path: Path) -> None:
-        answers = {
-            "wall_size": 0.6, "bin_width_s": 1e-11, "start_s": 0.0, "sensor_origin": (0.0, 0.0, 1.0),
-            "laser_origin": (0.0, 0.0, 1.0), "frame": 0,
-        }  # fmt: skip
-        said: dict[str, Any] = {}
-        while True:
-            try:
-                tt.nlos.read_capture(path, **said)
-            except tt.errors.StorageError as error:
-                asked = re.search(r"Give (\w+)=", str(error))
-                if asked is None or asked[1] in said or asked[1] not in answers:
-                    raise
-                said[asked[1]] = answers[asked[1]]
-            else:
-                return
-
-    return Reader(sources, read)
+    return Reader(sources, read_answered)
 
 
 def _shards(folder: Path) -> list[Path]:

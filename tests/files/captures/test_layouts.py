@@ -6,11 +6,13 @@ import functools
 import re
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
 
 from support.capture_files import (
+    ANSWERS,
     AXIS,
     ENDINGS,
     FROM_ZERO,
@@ -22,6 +24,7 @@ from support.capture_files import (
     holdable,
     listed,
     made,
+    read_answered,
     read_only,
     write_content,
     write_mat,
@@ -296,18 +299,56 @@ def foreign_files():
     return [*files, *read_only()]
 
 
+def foreign_file(folder, number, **more):
+    """Layout and path of a small file, with more entries."""
+    layout, content = foreign_files()[number]
+    path = folder / f"a{ENDINGS[layout]}"
+    if isinstance(content, Capture):
+        with h5py.File(content.write(path, format=layout), "a") as file:
+            file.update(more)
+    else:
+        write_content(path, content | more if isinstance(content, dict) else [frame | more for frame in content])
+    return layout, path
+
+
 @together("number", range(len(foreign_files())))
 def test_no_file_is_read_as_another(tmp_path, number):
     """An axis would be taken for another one."""
-    layout, content = foreign_files()[number]
-    path = tmp_path / f"a{ENDINGS[layout]}"
-    if isinstance(content, Capture):
-        content.write(path, format=layout)
-    else:
-        write_content(path, content)
+    layout, path = foreign_file(tmp_path, number)
     for other in sorted(set(ENDINGS) - {layout, "torchtransient"})[number % 2 :: 2]:
         with pytest.raises(StorageError, match=f"got one of '{layout}'"):
             Capture.read(path, other, wall_size=0.6, bin_width_s=16e-12)
+
+
+@together("number", range(len(foreign_files())))
+def test_every_layout_names_what_it_assumes(tmp_path, number):
+    """An argument that a file takes and does not need is in `assumed` without it, whether others are given or not."""
+    layout, path = foreign_file(tmp_path, number)
+    capture, needed = read_answered(path)
+    assert capture.metadata.get("format", layout) == layout
+    left_open = {}
+    for name in ANSWERS.keys() - needed.keys() - {"frame"}:
+        try:
+            Capture.read(path, **needed, **{name: ANSWERS[name]})
+        except StorageError:
+            assert name not in capture.metadata.get("assumed", {})
+        else:
+            left_open[name] = ANSWERS[name]
+    for name in left_open:
+        others = {other: value for other, value in left_open.items() if other != name}
+        for given in ({}, others):
+            found = Capture.read(path, **needed, **given)
+            assert name in found.metadata.get("assumed", {}), f"{layout}: {name}= with {sorted(given)} given"
+
+
+@together("number", range(len(foreign_files())))
+def test_every_layout_names_what_it_does_not_read(tmp_path, number):
+    layout, path = foreign_file(tmp_path, number, unheard_of=1.0)
+    capture, _ = read_answered(path)
+    # Files that this library writes hold nothing else; those of others may.
+    assert "unheard_of" in capture.metadata.get("not_read", []), layout
+    if number < len(HOLDABLE):
+        assert capture.metadata["not_read"] == ["unheard_of"], layout
 
 
 def test_files_of_no_layout_name_what_reads_them(tmp_path):

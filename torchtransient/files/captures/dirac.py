@@ -28,6 +28,8 @@ from torchtransient.files.captures.gaps import (
 
 NAME = "dirac"
 _REQUIRED = {"data_t", "xg", "yg", "da", "offset_laser"}
+_KEPT = ("offset_laser", "offset_camera", "sample_x", "sample_y")
+_KNOWN = {*_REQUIRED, *_KEPT, "xa", "ya"}
 # Bins are equal to what single precision makes of their starts.
 _UNEVEN = 1e-3
 
@@ -72,12 +74,11 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         gaps.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
     )
     scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs)
-    offsets = {
-        name: array.tolist() for name in ("offset_laser", "offset_camera", "sample_x", "sample_y")
-        if (array := contents.array(name)) is not None
-    }  # fmt: skip
+    kept = {name: array.tolist() for name in _KEPT if (array := contents.array(name)) is not None}
     axis = time_axis(gaps, float(da[0]), width, len(da))
-    return Capture(tensor_of(data).transpose(1, 2)[None], axis, scan, metadata=gaps.metadata(**offsets))
+    left = sorted(set(contents.shapes) - _KNOWN)
+    metadata = gaps.metadata(**kept, not_read=left or None)
+    return Capture(tensor_of(data).transpose(1, 2)[None], axis, scan, metadata=metadata)
 
 
 def write(target: Path, capture: Capture) -> None:

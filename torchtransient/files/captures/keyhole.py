@@ -57,6 +57,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     if track:
         points[:, 0], points[:, 2] = -track["xpos"], track["zpos"]
     axis = time_axis(gaps, None, None, data.shape[1], BIN_WIDTH_S)
+    scan = flat_scan("confocal", points, gaps)
     left = sorted(set(contents.shapes) - {name, *track})
     metadata = gaps.metadata(**{part: array.tolist() for part, array in track.items()}, not_read=left or None)
-    return Capture(tensor_of(data).transpose(0, 1)[None], axis, flat_scan("confocal", points, gaps), metadata=metadata)
+    return Capture(tensor_of(data).transpose(0, 1)[None], axis, scan, metadata=metadata)

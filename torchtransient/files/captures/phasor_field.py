@@ -34,6 +34,7 @@ from torchtransient.files.captures.matlab import write_mat
 NAME = "phasor_field"
 _VOLUME = {"minimalpos": 3, "maximalpos": 3, "sampling_grid_spacing": 1}
 _REQUIRED = {"data", "laserPos", "cameraPos", "deltat"}
+_FIELDS = {*_REQUIRED, "laserNorm", "cameraNorm", "laserOrigin", "cameraOrigin", "t", "t0"}
 
 
 def recognises(contents: Contents) -> bool:
@@ -80,9 +81,10 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     tensor = tensor[:, 0] if reciprocal else tensor.transpose(1, 2)
     axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltat", gaps), len(data))
     volume = {name: array.reshape(-1).tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
-    return Capture(
-        tensor[None], axis, scan, metadata=gaps.metadata(reciprocal=reciprocal, hidden_volume=volume or None)
-    )
+    fields = {f"dataset/{name}" for name in contents.fields("dataset") - _FIELDS}
+    left = sorted(fields | set(contents.shapes) - {"dataset", *_VOLUME})
+    metadata = gaps.metadata(reciprocal=reciprocal, hidden_volume=volume or None, not_read=left or None)
+    return Capture(tensor[None], axis, scan, metadata=metadata)
 
 
 def _field(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:

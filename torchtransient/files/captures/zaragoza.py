@@ -35,7 +35,12 @@ from torchtransient.files.captures.gaps import (
 
 NAME = "zaragoza"
 _REQUIRED = {"data", "cameraGridPositions", "laserGridPositions", "deltaT"}
+_GRID = ("Positions", "Normals", "Points", "Size")
 _VOLUME = ("hiddenVolumePosition", "hiddenVolumeRotation", "hiddenVolumeSize")
+_KNOWN = {
+    *_REQUIRED, *_VOLUME, "t0", "t", "isConfocal", "cameraPosition", "laserPosition",
+    *(f"{who}Grid{entry}" for who in ("camera", "laser") for entry in _GRID),
+}  # fmt: skip
 # What y-tal tells the axes of pairs by. The first is empty in all files: light of the second is off hidden things.
 _BOUNCES, _OURS = 6, 1
 _CONFOCAL, _PAIRS = 4, 6
@@ -91,7 +96,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
     axis = time_axis(gaps, number_in(contents, "t0", gaps), number_in(contents, "deltaT", gaps), transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
-    return Capture(transient, axis, scan, metadata=gaps.metadata(bounces=bounces, hidden_volume=volume or None))
+    left = sorted(set(contents.shapes) - _KNOWN)
+    metadata = gaps.metadata(bounces=bounces, hidden_volume=volume or None, not_read=left or None)
+    return Capture(transient, axis, scan, metadata=metadata)
 
 
 def _reversed(contents: Contents) -> bool:
