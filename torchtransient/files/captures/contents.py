@@ -24,6 +24,8 @@ from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File, Other
 
 WHAT = "capture file"
 _BLOCK = 64
+# Root attributes that layouts ask for.
+_ATTRIBUTES = ("data order",)
 _ENDINGS = {
     ".json": "JSON", ".npz": "NumPy's files", ".mat": "MATLAB's files", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5",
 }  # fmt: skip
@@ -36,7 +38,7 @@ class Contents:
         source: path of the file.
         reader: function of another package that reads it, for messages.
         shapes: root arrays and structures by name, None for entries without a shape.
-        attributes: texts beside the arrays.
+        attributes: root attributes of HDF5 files as texts, those of `_ATTRIBUTES` alone.
         links: names that lead elsewhere, which are not followed.
     """
 
@@ -116,7 +118,7 @@ class Hdf5Contents(Contents):
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
         self.shapes = {name: self._shape(name) for name in file if name != "#refs#"}
-        said = read_attributes(file, WHAT, ["data order"])
+        said = read_attributes(file, WHAT, _ATTRIBUTES)
         self.attributes = {name: _sole(value) for name, value in said.items()}
         self.links = frozenset(name for name in self.shapes if self._is_link(name))
 

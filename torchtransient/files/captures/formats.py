@@ -41,10 +41,10 @@ class Layout:
 
     Attributes:
         name: in `format=` and metadata.
-        recognises: predicate of contents.
+        recognises: predicate of contents of any kind of file, True for those of this layout alone.
         read: capture of contents and of the arguments of :func:`read_capture`.
         write: writer of a capture to a checked path, None for layouts that are only read.
-        endings: endings of files that are written.
+        endings: endings of its files; one that is written has one of them, one that is read any.
     """
 
     name: str
@@ -87,7 +87,7 @@ def read_capture(
             finds it from the content, independent of the name of the file.
         wall_size: metres, one number or (width, height) of a scanned area whose points are the centres of its cells.
         bin_width_s: width of a bin, seconds.
-        start_s: start of the first bin, seconds.
+        start_s: start of the first bin, seconds after light leaves the wall, or the laser where the legs count.
         sensor_origin: (3,) metres.
         laser_origin: (3,) metres.
         frequencies: frequencies of phasors.

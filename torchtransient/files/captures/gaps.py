@@ -76,25 +76,25 @@ class Gaps:
         self.assumed[name] = default.tolist() if isinstance(default, np.ndarray) else default
         return default
 
-    def width(self, stored: float | None, default_s: Any = _NEEDED) -> float:
-        """Return the width of the bins, metres.
+    def width(self, stored_opl: float | None, default_s: Any = _NEEDED) -> float:
+        """Return the width of the bins, metres of optical path.
 
         Args:
-            stored: width in the file, metres, or None for ``bin_width_s``.
+            stored_opl: width in the file, metres of optical path, or None for ``bin_width_s``.
             default_s: width that is assumed, seconds.
         """
-        found = self.fill("bin_width_s", stored, default_s)
-        return float(found) if stored is not None else seconds_to_opl(positive("read_capture: bin_width_s", found))
+        found = self.fill("bin_width_s", stored_opl, default_s)
+        return float(found) if stored_opl is not None else seconds_to_opl(positive("read_capture: bin_width_s", found))
 
-    def start(self, stored: float | None, default_s: float = 0.0) -> float:
-        """Return the start of the bins, metres.
+    def start(self, stored_opl: float | None, default_s: float = 0.0) -> float:
+        """Return the start of the first bin, metres of optical path.
 
         Args:
-            stored: start in the file, metres, or None for ``start_s``.
+            stored_opl: start in the file, metres of optical path, or None for ``start_s``.
             default_s: start that is assumed, seconds.
         """
-        found = self.fill("start_s", stored, default_s)
-        return float(found) if stored is not None else seconds_to_opl(finite("read_capture: start_s", found))
+        found = self.fill("start_s", stored_opl, default_s)
+        return float(found) if stored_opl is not None else seconds_to_opl(finite("read_capture: start_s", found))
 
     def origin(self, name: str, stored: NDArray[Any] | None, points: NDArray[Any], normals: Any, legs: bool) -> Any:
         """Return the place of a sensor or a laser, (3,).
@@ -156,7 +156,13 @@ class Gaps:
             raise self.error(f"{names} has no meaning for this layout. Leave it out.")
 
     def metadata(self, **entries: Any) -> dict[str, Any]:
-        """Return ``format``, ``assumed`` unless it is empty, and ``entries`` that are not None."""
+        """Return ``format``, ``assumed`` unless it is empty, and ``entries`` that are not None.
+
+        Later assumptions may be missing: a reader makes its scan and its axis before.
+
+        Args:
+            entries: what else the file says; ``not_read`` are names of entries that were left alone.
+        """
         said = {"assumed": self.assumed} if self.assumed else {}
         return {"format": self._layout, **said, **{name: value for name, value in entries.items() if value is not None}}
 
@@ -188,7 +194,7 @@ def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = Non
     return array
 
 
-def number_in(contents: Contents, name: str, gaps: Gaps) -> float | None:
+def optional_number(contents: Contents, name: str, gaps: Gaps) -> float | None:
     """Return one real number, None if it is missing.
 
     Args:
@@ -325,7 +331,7 @@ def flat_scan(
         points: grid or list (..., 3), metres.
         gaps: arguments of the reader.
         spot: (3,) of a single scan.
-        origin: (3,), place of laser and sensor in the file.
+        origin: (3,), place of laser and sensor in the file, None to take the arguments, else to assume one.
     """
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     laser = points if spot is None else np.asarray(spot, np.float64)
@@ -426,20 +432,25 @@ def cannot(layout: str, holds: str, got: str) -> StorageError:
 
 
 def time_axis(
-    gaps: Gaps, start: float | None, width: float | None, bins: int, default_s: Any = _NEEDED, start_bins: float = 0.0
+    gaps: Gaps,
+    start_opl: float | None,
+    bin_width_opl: float | None,
+    bins: int,
+    default_s: Any = _NEEDED,
+    start_bins: float = 0.0,
 ) -> TimeAxis:
-    """Return the axis of a file that has its start and width in metres, or leaves them open.
+    """Return the axis of a file, whose start and width are asked for or assumed where it leaves them open.
 
     Args:
         gaps: arguments of the reader.
-        start: metres of optical path, or None.
-        width: metres of optical path, or None.
+        start_opl: metres of optical path, or None.
+        bin_width_opl: metres of optical path, or None.
         bins: their number.
         default_s: width that is assumed, seconds.
         start_bins: start that is assumed, in bins.
     """
-    found = gaps.width(width, default_s)
-    return TimeAxis(gaps.start(start, opl_to_seconds(start_bins * found)), found, bins)
+    found = gaps.width(bin_width_opl, default_s)
+    return TimeAxis(gaps.start(start_opl, opl_to_seconds(start_bins * found)), found, bins)
 
 
 def frequency_axis(gaps: Gaps, stored: FrequencyAxis | None) -> FrequencyAxis:

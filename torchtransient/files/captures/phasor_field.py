@@ -22,9 +22,9 @@ from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
-    number_in,
     numbers_in,
     only_transient,
+    optional_number,
     scan_of,
     tensor_of,
     time_axis,
@@ -111,7 +111,7 @@ def _normals(contents: Contents, name: str, points: NDArray[Any], gaps: Gaps) ->
 
 
 def _number(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    return number_in(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
+    return optional_number(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
 
 
 def write(target: Path, capture: Capture) -> None:

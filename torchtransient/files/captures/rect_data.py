@@ -26,9 +26,9 @@ from torchtransient.files.captures.gaps import (
     flat_scan,
     grid_points,
     hidden_side,
-    number_in,
     numbers_in,
     only_transient,
+    optional_number,
     tensor_of,
     time_axis,
 )
@@ -89,7 +89,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _positive(contents: Contents, name: str, gaps: Gaps) -> float | None:
-    value = number_in(contents, name, gaps)
+    value = optional_number(contents, name, gaps)
     if value is not None and not (np.isfinite(value) and value > 0):
         raise gaps.error(f"expected {name} as one number above zero, got {value!r}.")
     return value

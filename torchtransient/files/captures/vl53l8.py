@@ -12,7 +12,15 @@ import numpy as np
 
 from torchtransient.capture import Capture
 from torchtransient.files.captures.contents import Contents
-from torchtransient.files.captures.gaps import Gaps, flat_scan, number_in, numbers_in, tensor_of, time_axis, zone_grid
+from torchtransient.files.captures.gaps import (
+    Gaps,
+    flat_scan,
+    numbers_in,
+    optional_number,
+    tensor_of,
+    time_axis,
+    zone_grid,
+)
 
 NAME = "vl53l8"
 BIN_WIDTH_S = 250e-12
@@ -42,7 +50,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     data, points = numbers_in(contents, "hists", gaps, 2), numbers_in(contents, "pt_cloud", gaps, 2)
     if points.shape != (len(data), 3):
         raise gaps.error(f"expected pt_cloud ({len(data)}, 3), got {points.shape}.")
-    height = number_in(contents, "cam_z", gaps)
+    height = optional_number(contents, "cam_z", gaps)
     origin = None if height is None else np.array([0.0, 0.0, height])
     zones = zone_grid(len(data))
     axis = time_axis(gaps, None, None, data.shape[1], BIN_WIDTH_S)

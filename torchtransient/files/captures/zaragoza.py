@@ -25,8 +25,8 @@ from torchtransient.files.captures.gaps import (
     Gaps,
     cannot,
     hidden_volume,
-    number_in,
     only_transient,
+    optional_number,
     same_points,
     scan_of,
     tensor_of,
@@ -94,7 +94,8 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     elif transient.ndim == _CONFOCAL:
         raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
     scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
-    axis = time_axis(gaps, number_in(contents, "t0", gaps), number_in(contents, "deltaT", gaps), transient.shape[1])
+    start, width = (optional_number(contents, name, gaps) for name in ("t0", "deltaT"))
+    axis = time_axis(gaps, start, width, transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
     left = sorted(set(contents.shapes) - _KNOWN)
     metadata = gaps.metadata(bounces=bounces, hidden_volume=volume or None, not_read=left or None)
