@@ -21,7 +21,7 @@ file_options = combined(
     click.option("--format", "layout", help="Layout of CAPTURE (docs/capture_files.md).  [default: found]"),
     click.option("--wall-size", type=NumberList(float, "WIDTH[,HEIGHT]", 2), help="Of the scanned area, metres."),
     click.option("--bin-width-s", type=float, help="Seconds."),
-    click.option("--start-s", type=float, help="When the first bin begins, seconds."),
+    click.option("--start-s", type=float, help="Start of the first bin after light leaves the wall."),
     click.option("--sensor-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
     click.option("--laser-origin", type=_XYZ, metavar="X Y Z", help="Metres."),
     click.option("--frame", type=click.IntRange(min=0), help="Of a file with several."),
