@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import shutil
 
@@ -11,6 +12,7 @@ import torch
 from click.testing import CliRunner
 
 import torchtransient as tt
+from support.capture_files import ANSWERS
 from support.marks import long_rows
 from support.sweeps import together
 from tools.point_captures import point_capture
@@ -74,6 +76,20 @@ def test_without_a_method_the_one_that_suits_is_taken(folder):
     assert volume.method == "phasor" and volume.metadata["reason"].startswith("a single scan")
     assert volume.metadata["capture"] == "a.npz"
     assert "v.npz: 1 x " in result.stdout and (folder / "v.png").stat().st_size > 5000
+
+
+def test_what_a_file_leaves_open_has_an_option(folder):
+    """Every argument of `read_capture` but `frequencies`, of which a volume is not made."""
+    named = inspect.signature(tt.nlos.read_capture).parameters.values()
+    arguments = {one.name for one in named if one.kind is one.KEYWORD_ONLY} - {"frequencies"}
+    assert arguments == set(ANSWERS), "tests/support/capture_files.py: a value for each"
+    captured("confocal").write("a.h5")
+    for name in arguments:
+        value = ANSWERS[name]
+        option = f"--{name.replace('_', '-')}"
+        # The library's own files leave nothing open.
+        said = run("a.h5", option, *(value if isinstance(value, tuple) else (value,)))
+        assert said.exit_code and f"{option} has no meaning" in said.output, said.output
 
 
 def test_lists_of_points_go_to_filtered_backprojection(folder):
