@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from torchtransient.chirps import Chirps as Chirps
     from torchtransient.gates import Gate as Gate
     from torchtransient.motion.over_time import over_time as over_time
+    from torchtransient.motion.rigid_motion import Motion as Motion
     from torchtransient.motion.slow_times import Exposure as Exposure
     from torchtransient.motion.slow_times import Frames as Frames
-    from torchtransient.motion.slow_times import Motion as Motion
     from torchtransient.motion.slow_times import PhaseSteps as PhaseSteps
     from torchtransient.motion.slow_times import RollingShutter as RollingShutter
     from torchtransient.pulses import Pulse as Pulse
@@ -65,7 +65,7 @@ _LAZY = {
     "Frames": "torchtransient.motion.slow_times",
     "FrequencyAxis": "torchtransient.axes",
     "Gate": "torchtransient.gates",
-    "Motion": "torchtransient.motion.slow_times",
+    "Motion": "torchtransient.motion.rigid_motion",
     "PhaseSteps": "torchtransient.motion.slow_times",
     "Plan": "torchtransient.rendering.plan",
     "Pulse": "torchtransient.pulses",

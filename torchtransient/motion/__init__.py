@@ -5,9 +5,9 @@ A render of several instants is a batch of poses with one seed; what an exposure
 """
 
 from torchtransient.motion.over_time import over_time as over_time
+from torchtransient.motion.rigid_motion import Motion as Motion
 from torchtransient.motion.slow_times import Exposure as Exposure
 from torchtransient.motion.slow_times import Frames as Frames
-from torchtransient.motion.slow_times import Motion as Motion
 from torchtransient.motion.slow_times import PhaseSteps as PhaseSteps
 from torchtransient.motion.slow_times import RollingShutter as RollingShutter
 from torchtransient.motion.slow_times import SlowTimes as SlowTimes

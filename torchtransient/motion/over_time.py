@@ -11,7 +11,8 @@ from torch import Tensor
 from torchtransient.checks import as_whole, function, mapping, of_class, shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError, UnknownKeyError
 from torchtransient.floating import holds
-from torchtransient.motion.slow_times import Exposure, Frames, Motion, SlowTimes
+from torchtransient.motion.rigid_motion import Motion
+from torchtransient.motion.slow_times import Exposure, Frames, SlowTimes
 from torchtransient.plugins.mitsuba_compat import POSITIONS, VELOCITY
 from torchtransient.rendering.job import draw_seed
 from torchtransient.rendering.output import RenderOutput
