@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-pytestmark = pytest.mark.slow
 
 
 def run(script, tmp_path, *arguments, baseline=ROOT):
@@ -20,6 +19,7 @@ def run(script, tmp_path, *arguments, baseline=ROOT):
     return done, json.loads(report.read_text(encoding="utf-8")) if report.is_file() else None
 
 
+@pytest.mark.slow
 def test_kernels_are_the_same_in_every_process(tmp_path):
     done, report = run("kernels.py", tmp_path, "--variants", "llvm_ad_mono")
     assert done.returncode == 0, done.stderr
@@ -32,6 +32,7 @@ def test_kernels_are_the_same_in_every_process(tmp_path):
     assert len(render) == 1 and render[0]["hash"] == colour[0]["hash"]
 
 
+@pytest.mark.soak
 def test_every_row_is_compared(tmp_path):
     done, report = run("backward_cost.py", tmp_path, "--quick")
     assert done.returncode == 0, done.stderr
@@ -49,6 +50,7 @@ def test_every_row_is_compared(tmp_path):
         assert call["torchtransient"]["compile_seconds"]["min"] > 0.02
 
 
+@pytest.mark.slow
 def test_a_folder_without_the_package_is_refused(tmp_path):
     done, _ = run("kernels.py", tmp_path, baseline=tmp_path)
     assert done.returncode == 2 and "expected the root of a checkout" in done.stderr

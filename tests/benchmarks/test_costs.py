@@ -36,7 +36,7 @@ def test_steps_and_their_parts(tmp_path):
     assert "within" not in json.dumps(report["ratios"]) and "phasor film" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_batches_and_cameras(tmp_path):
     report, _ = run("batch_cost.py", tmp_path, "--only", "cameras, render and", "--threads", "1")
     assert list(report["peak_bytes"]) == ["cameras, render and sum", "cameras, render and squares"]
@@ -44,7 +44,7 @@ def test_batches_and_cameras(tmp_path):
     assert [ratio["to"] for ratio in report["ratios"]] == [f"{name}: loop" for name in report["peak_bytes"]]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_recordings_stay_what_they_are(tmp_path):
     report, printed = run("frozen_memory.py", tmp_path)
     assert report["recordings_added"] == report["calls_traced_when_settled"] == 0
@@ -52,8 +52,13 @@ def test_recordings_stay_what_they_are(tmp_path):
     assert report["every"][-1]["step"] == 60 and "60 steps, 3 parameters" in printed
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("script", "cases", "ratios"), [("thread_cost.py", 6, 4), ("wrap_cost.py", 20, 12)])
+@pytest.mark.parametrize(
+    ("script", "cases", "ratios"),
+    [
+        pytest.param("thread_cost.py", 6, 4, marks=pytest.mark.soak),
+        pytest.param("wrap_cost.py", 20, 12, marks=pytest.mark.slow),
+    ],
+)
 def test_threads_and_functions_across(tmp_path, script, cases, ratios):
     report, _ = run(script, tmp_path)
     assert len(report["cases"]) == cases and len(report["ratios"]) == ratios
@@ -70,7 +75,7 @@ def test_ways_to_store(tmp_path):
         assert rows["counts"]["smaller"] > rows["rounded"]["smaller"] > rows["exact"]["smaller"] > 1
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_data_sets(tmp_path):
     report, printed = run("dataset.py", tmp_path, "--only", "samples", "views", "captures", "reading", "loader", "new")
     rows = {row["name"]: row for row in report["rows"]}
@@ -103,8 +108,10 @@ def test_bias_of_noisy_renders(tmp_path):
     assert "the start" in report["priors"] and "`expected_root_loss`" in printed
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("script", ["accuracy_curve.py", "nlos_accuracy.py"])
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param("nlos_accuracy.py", marks=pytest.mark.slow), pytest.param("accuracy_curve.py", marks=pytest.mark.soak)],
+)
 def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
     """Their kept files have paths below the folder that they are started in: none of these comes into being."""
     (tmp_path / "temporary").mkdir()
@@ -142,7 +149,7 @@ def test_scenes_of_mitsuba_beside_it(tmp_path):
     assert "same 1, different 0, refused 1, absent 1" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @together("command, names", [
     (["cases", "plate"], ["plate"]), (["room", "meter", "--depth", "3"], ["meter, depth 3"]),
     (["spread", "corner"], ["corner, depth 3"]), (["step"], ["wall", "cpu", "memory"]), (["fit"], ["start 0"]),

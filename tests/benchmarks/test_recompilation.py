@@ -43,7 +43,7 @@ def test_other_samples_are_traced_once_more():
     assert kinds == [(how, how) for how in ("traced", "recorded", "launched", "launched", "traced")]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_verdicts_are_those_of_a_run(tmp_path):
     report = tmp_path / "report.json"
     command = [sys.executable, str(ROOT / "benchmarks" / "recompilation.py"), "--smoke", "--json", str(report)]

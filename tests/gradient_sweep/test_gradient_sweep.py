@@ -259,10 +259,13 @@ def sample():
     return [*bare, *random.Random(3).sample(nested, 6)]
 
 
-@pytest.mark.parametrize("half", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.soak)])
-def test_against_finite_differences(tmp_path, half):
+EIGHTHS = [pytest.param(eighth, marks=pytest.mark.soak if eighth else pytest.mark.slow) for eighth in range(8)]
+
+
+@pytest.mark.parametrize("eighth", EIGHTHS)
+def test_against_finite_differences(tmp_path, eighth):
     """Few samples: what they cannot decide, the whole sweep does."""
-    file, settings = ResultFile(tmp_path / "results.jsonl"), sample()[half::2]
+    file, settings = ResultFile(tmp_path / "results.jsonl"), sample()[eighth::8]
     runner.sweep(settings, file, quick=True)
     results = file.results()
     assert {line["setting"] for line in results} >= {setting.name for setting in settings if setting.kind == "bsdf"}

@@ -21,7 +21,7 @@ SIGMAS = 3.0
 ROUNDING = 2e-3
 # So many cases of each row of the support table are in the default set, and so many in the set of slow tests; the soak
 # runs the others.
-FIRST, SECOND = 1, 3
+FIRST, SECOND = 1, 1
 # Neither are cases of more than a second that need many samples in the default set.
 LONG = {
     "pattern_grows", "plastic_alpha", "hair_coloured_absorption", "plastic_index", "medium_albedo",
