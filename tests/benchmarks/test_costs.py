@@ -110,7 +110,10 @@ def test_bias_of_noisy_renders(tmp_path):
 
 @pytest.mark.parametrize(
     "script",
-    [pytest.param("nlos_accuracy.py", marks=pytest.mark.slow), pytest.param("accuracy_curve.py", marks=pytest.mark.soak)],
+    [
+        pytest.param("nlos_accuracy.py", marks=pytest.mark.slow),
+        pytest.param("accuracy_curve.py", marks=pytest.mark.soak),
+    ],
 )
 def test_quick_runs_leave_the_kept_numbers(script, tmp_path):
     """Their kept files have paths below the folder that they are started in: none of these comes into being."""
