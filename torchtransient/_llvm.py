@@ -248,7 +248,7 @@ def library_version(path: str) -> tuple[int, ...]:
     """Return the version of an LLVM shared library without loading it into this process; empty if unknown.
 
     Args:
-        path: of the library.
+        path: path of the library.
     """
     real = os.path.realpath(path)
     return _version_in_name(os.path.basename(real)) or _version_by_subprocess(real)

@@ -93,12 +93,12 @@ def measure(
         candidates: tasks by name, of each choice.
         spp: different sample counts, at least 1.
         reference_spp: samples of a candidate's own reference, at least four times the largest of `spp`; None: pairs.
-        repeats: runs at each count; even without a reference.
-        seed: of the first run; no two runs share one.
+        repeats: number of runs at each count, at least 2, and an even number where there is no reference.
+        seed: seed of the first run; no two runs share one.
         progress: show a bar that counts the samples.
-        settings: kept in the report.
-        finest: by name of a task, the choice whose reference all choices are compared with as well, which gives the
-            total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
+        settings: facts to keep in the report.
+        finest: choice for each task, by its name, whose reference all choices are compared with as well, which gives
+            the total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
             `spp`.
 
     Returns:
@@ -243,8 +243,8 @@ def checked_counts(spp: Sequence[int], repeats: int, reference_spp: int | None) 
 
     Args:
         spp: different counts.
-        repeats: of each count.
-        reference_spp: of the reference, or None.
+        repeats: number of runs at each count, at least 2, and an even number where there is no reference.
+        reference_spp: samples per pixel of the reference, or None for pairs of runs.
 
     Raises:
         UnitError: for other numbers.

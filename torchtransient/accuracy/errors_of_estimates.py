@@ -154,8 +154,9 @@ class ErrorTally:
         """Return the figures of all runs so far.
 
         Args:
-            tail: of the estimate, from runs of its own: of a heavy one all figures are NaN, of others the standard
-                error comes from its spread, which a few runs do not show.
+            tail: tail of the estimate's distribution, from runs of its own: where it is heavy all figures are NaN,
+                elsewhere the standard error comes from its spread, which a few runs do not show. None: from these runs
+                alone.
 
         Raises:
             ShapeError: without any run, and of a single one without a reference.

@@ -197,8 +197,8 @@ class AccuracyReport:
         the same number of entries.
 
         Args:
-            point: of this report.
-            total: of the total error.
+            point: point of this report.
+            total: return the interval of the total error.
 
         Returns:
             (low, high), NaN where there is none.
@@ -322,7 +322,7 @@ class AccuracyReport:
 
         Args:
             error: relative error (`CostPoint.relative_error`), 0.05 for 5 %.
-            quantity, choice: of the curve; None: the first one of the report.
+            quantity, choice: quantity and choice of the curve; None: the first one of the report.
 
         Raises:
             UnitError: for an error that is not positive.
@@ -436,7 +436,7 @@ class AccuracyReport:
         """Write `to_dict()` to a file.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             StorageError: when it cannot be written.
@@ -448,7 +448,7 @@ class AccuracyReport:
         """Return the report of a file that `to_json` wrote.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             StorageError: for other files.
@@ -468,7 +468,7 @@ class AccuracyReport:
         and the Pareto front.
 
         Args:
-            path: of the picture.
+            path: path of the picture.
 
         Raises:
             StorageError: when it cannot be written.

@@ -118,8 +118,8 @@ def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
     axis=-1)`. Bins left at the end join the last group.
 
     Args:
-        expected: (T,).
-        minimum: of a group.
+        expected: expected number of events in each bin, (T,).
+        minimum: smallest expected number of events in a group.
 
     Raises:
         UnitError: when all bins together hold less.

@@ -138,7 +138,7 @@ class RollingShutter(SlowTimes):
     negative where a body crosses bins between them. Each row sees one instant.
 
     Args:
-        row_s: from one row to the next, seconds; negative from the bottom to the top.
+        row_s: time from one row to the next, seconds; negative from the bottom to the top.
         poses: number of renders.
 
     Raises:
@@ -190,7 +190,7 @@ class PhaseSteps(SlowTimes):
 
     Args:
         number: exposures: phase steps times frequencies, in the order of the sensor's taps.
-        period_s: from one exposure to the next, seconds.
+        period_s: time from one exposure to the next, seconds.
 
     Raises:
         UnitError: for other numbers.

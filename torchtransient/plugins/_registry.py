@@ -276,8 +276,8 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
     Args:
         module: dotted name that Python can import.
-        plugins: what it registers, as (kind, name). Listed names answer with a clear VariantError in scalar variants,
-            and a listed name that the module fails to register is an error.
+        plugins: plugins that the module registers, as (kind, name). Listed names answer with a clear VariantError in
+            scalar variants, and a listed name that the module fails to register is an error.
 
     Raises:
         PluginRegistrationError: for a module that cannot be found or executed.

@@ -199,7 +199,7 @@ class LabelJob:
 
     @staticmethod
     def state_of(jobs: list[LabelJob]) -> tuple[tuple[Any, ...], list[Any]]:
-        """Return (structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
+        """Return (structure, arrays), see :func:`torchtransient.plugins.integrators.job.state_of`."""
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]

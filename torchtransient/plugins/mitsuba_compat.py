@@ -330,8 +330,8 @@ def flat_array(value: Any) -> Any:
     """Return the numbers of an array of a mesh in a row.
 
     Args:
-        value: what ``mi.traverse`` shows of the mesh: a tensor with a row for each vertex in newer versions of Mitsuba,
-            a flat array in others.
+        value: array of the mesh as ``mi.traverse`` shows it: a tensor with a row for each vertex in newer versions of
+            Mitsuba, a flat array in others.
     """
     return value.array if dr.is_tensor_v(value) else value
 

@@ -43,8 +43,8 @@ class ParameterEffect:
             rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction;
             "velocity": how fast it moves, which films of rates alone measure; "value": none.
         supported: it has a derivative.
-        biased: that derivative is wrong in some scenes, beside what it lacks of moving edges, which integrators answer
-            (``silhouettes``).
+        biased: the derivative is wrong in some scenes, apart from what it lacks of moving edges, for which integrators
+            answer (``silhouettes``).
         reason: the state in words.
         trusted: the derivative is right although Mitsuba marks the parameter as not differentiable.
         stand_in: name of the plugin that is built in place of Mitsuba's when the derivative is asked for; for a
@@ -113,7 +113,7 @@ def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | 
 
     Args:
         plugin: the class, or the name by which Mitsuba calls it.
-        effects: by key (the last name of the parameter, "*" for all others), an effect, or rows with conditions.
+        effects: an effect, or rows with conditions, by key (the last name of the parameter, "*" for all others).
 
     Raises:
         PluginRegistrationError: for an unknown role.

@@ -53,8 +53,8 @@ class Attached(NamedTuple):
     Attributes:
         node, key: plugin, and its name there.
         value: the attached number.
-        owners: all that holds the plugin, directly or not, as (holder, name there).
-        holders: what holds it directly.
+        owners: all objects that hold the plugin, directly or not, as (holder, name there).
+        holders: objects that hold it directly.
     """
 
     node: Any

@@ -53,10 +53,10 @@ class BatchErrors:
         rows: the film has several histograms a pixel, which come before H.
 
     Attributes:
-        differences: for each run of the job (R, items, [4,] [rows,] H, W, T), summed over cells; R is 1 for two
-            batches.
-        squares: likewise (items, [4,] [rows,] H, W, T), their squares, summed over R and cells.
-        steady: likewise (R, items, [4,] H, W), pixel by pixel.
+        differences: differences of the batches for each run of the job (R, items, [4,] [rows,] H, W, T), summed over
+            cells; R is 1 for two batches.
+        squares: squares of the differences (items, [4,] [rows,] H, W, T), summed over R and cells.
+        steady: differences of the steady images (R, items, [4,] H, W), pixel by pixel.
     """
 
     cells: ErrorCells
@@ -78,7 +78,7 @@ class BatchErrors:
         Args:
             array: (H, W, ..., channels) of ``dims + 1`` dimensions, with or without one of items.
             dims: number of dimensions of a film without channels.
-            is_complex: as in :func:`channel_mean`.
+            is_complex: channels have real and imaginary parts in turn, and the mean is complex.
 
         Returns:
             (items, [4,] H, W, ...), of several histograms a pixel (items, [4,] rows, H, W, T).

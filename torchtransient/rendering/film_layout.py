@@ -240,7 +240,7 @@ def measured(output: Any, name: str) -> Any:
 
     Args:
         output: `RenderOutput` or `Result`.
-        name: what the film measures, such as "transient".
+        name: name of the quantity that the film measures, such as "transient".
     """
     found = getattr(output, name, None)
     return getattr(output, "others", {}).get(name) if found is None else found

@@ -30,14 +30,14 @@ class RenderStats:
         seconds: wall time, without loading and without the wait for other threads.
         samples_per_second: camera paths per second.
         variant, integrator: names.
-        temporal_filter: of the film; empty for films without one.
+        temporal_filter: temporal filter of the film; empty for films without one.
         seeds: one per item (entry of the batch and sensor); of a mean of passes those of all, in turn.
         energy_before, energy_after: light outside of the time axis, per item: sum over pixels of the mean over
             channels; zero for films without a window (phasors, gates). ``RenderOutput.outside`` has the shares.
-        energy_total: likewise, all light of ``steady``.
+        energy_total: all light of ``steady``, per item, summed in the same way.
         recorded: per item "launched", "recorded", or "traced: " and the reason.
         derivatives_recorded: the same of the derivatives since.
-        max_depth: of the paths, -1 for no limit, None for integrators without one.
+        max_depth: bound on the depth of the paths, -1 for no limit, None for integrators without one.
         light_beyond: share of the light in deeper paths, where a pilot run has found ``max_depth`` for derivatives of a
             scene that states none; else None. It is that of the described values: brighter ones, given or learnt, have
             the same ``max_depth`` and more light beyond it.

@@ -141,8 +141,8 @@ class Plan(Effects):
         parameters: keys of the parameters that will have gradients.
         reasons: one line per decision.
         pilot: results of the pilot run, None without one.
-        scene, variant, integrator, temporal_filter: as the renderer uses them; the filter is empty for phasor and
-            gated films.
+        scene, variant, integrator, temporal_filter: scene, and names of variant, integrator and filter, as the renderer
+            uses them; the filter is empty for phasor and gated films.
         max_depth: bound on the depth, None for the scene's.
         sensor: sensor of the plan, which the renderer takes; another one is refused.
     """

@@ -20,7 +20,7 @@ def pose_of(renderer: TransientRenderer, values: Mapping[str, Any] | None, name:
 
     Args:
         renderer: the renderer.
-        values: as of a call.
+        values: values by key, see the call of the renderer.
         name: name of the function, for messages.
 
     Raises:

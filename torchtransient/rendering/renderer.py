@@ -430,9 +430,9 @@ class TransientRenderer(CopiesParametrized):
         """Render the scene with the module's parameters, or with ``values`` in their place.
 
         Args:
-            values: by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of the
-                shapes that ``scene.parameters()`` lists, or with one leading batch dimension B more; values without it
-                are used for every entry. Any real dtype is taken and computed in float32.
+            values: values by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of
+                the shapes that ``scene.parameters()`` lists, or with one leading batch dimension B more; values without
+                it are used for every entry. Any real dtype is taken and computed in float32.
             seed: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
                 every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed
                 per entry.
@@ -543,7 +543,7 @@ class TransientRenderer(CopiesParametrized):
         ``max_spp`` the render may take arbitrarily long; Ctrl-C ends it with what there is.
 
         Args:
-            values: as of a call.
+            values: values by key of ``parameters``, in place of the module's own, see :meth:`forward`.
             rtol: relative error, 0.05 for 5 %.
             quantile: share of the bins with light whose error is to be at most that.
             on: None for bins whose local mean is at least 2 % of the mean over all bins; a mask of truth values that
@@ -566,7 +566,7 @@ class TransientRenderer(CopiesParametrized):
 
         Raises:
             UnitError, ArgumentError, ShapeError: for other arguments, and a ``resume`` of another render.
-            SceneError, DeviceError, StorageError: as of a call.
+            SceneError, DeviceError, StorageError: as :meth:`forward` raises them.
         """
         request = Request(rtol, quantile, on, max_seconds, max_spp)
         number = whole_number(seed)

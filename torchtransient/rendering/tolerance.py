@@ -57,7 +57,7 @@ def quantile_of(values: torch.Tensor, quantile: float) -> float:
 
     Args:
         values: any shape.
-        quantile: in (0, 1].
+        quantile: share of the values, in (0, 1].
     """
     number = values.numel()
     if number == 0:
@@ -336,10 +336,11 @@ class ToleranceResult:
         reason: why the render has ended, in words.
         passes, spp: number of passes, and their samples per pixel together.
         seconds: wall time, of all calls together.
-        rtol, quantile: as asked.
+        rtol, quantile: relative error and share of the bins that were asked for.
         heavy_tailed: few passes hold most of the deviations: the error may be larger than it looks.
-        standard_error: of the mean in each bin (..., T, H, W), float32: channels averaged (S0 of polarized light),
-            drawn to that of the neighbours; of phasors the root of the summed variances of real and imaginary parts.
+        standard_error: standard error of the mean in each bin (..., T, H, W), float32: channels averaged (S0 of
+            polarized light), drawn to that of the neighbours; of phasors the root of the summed variances of real and
+            imaginary parts.
         looks: estimates on the way, one after the other.
         state: sums of the passes, for ``resume``.
     """

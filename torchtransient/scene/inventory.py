@@ -83,7 +83,7 @@ class SceneInventory:
         albedo: largest share of the light that a surface or medium scatters, 1 if unknown.
         brightest: label of the node with that share.
         integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
-        connections: what the integrator says of connections, None if nothing.
+        connections: property ``connections`` of the integrator, None without it.
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
         sampler: sampler that integrator or sensor name, None if neither does.

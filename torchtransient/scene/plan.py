@@ -272,7 +272,7 @@ class Draft:
         film_choice: settings of the film that were asked for, None to keep or find them.
         described_film: settings of the scene's own film, None where they are not known before it is built.
         described_axis: time axis of the scene's own film, None without one.
-        scene, variant, integrator, pulse, irf, parameters, sensor: as in the plan.
+        scene, variant, integrator, pulse, irf, parameters, sensor: attributes of the plan of the same names.
     """
 
     scene: Scene

@@ -154,7 +154,7 @@ def gather_one_or_each(array: Any, index: Any, active: Any = True) -> Any:
     """Gather entries of an array that has one entry for all, or one each.
 
     Args:
-        array: of any type, of width one or of one entry each.
+        array: array of any type, of width one or of one entry each.
         index: numbers of the entries (UInt32).
         active: mask.
     """

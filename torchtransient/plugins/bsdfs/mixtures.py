@@ -213,7 +213,7 @@ class Mixture:
     Attributes:
         always: it is taken apart in renders, too.
         for_derivatives: it is taken apart where there are derivatives.
-        parts: what it is taken apart into.
+        parts: BSDFs or phase functions that it is taken apart into.
         textures: weights.
     """
 
@@ -394,7 +394,8 @@ class MixtureChoice:
 
     Args:
         mixtures: mixtures of the scene.
-        chosen: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+        chosen: how each mixture is taken apart, by its address: a pair of truth values, everywhere and where a weight
+            is about 0 or 1.
 
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """

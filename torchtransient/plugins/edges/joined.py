@@ -25,7 +25,7 @@ class Triangles:
     Faces without area are left out.
 
     Attributes:
-        vertices: of all meshes in their order, (V, 3).
+        vertices: vertices of all meshes in their order, (V, 3).
         first: number of the first vertex of each mesh, (M,).
         faces: numbers of vertices, (F, 3).
         joined: numbers of places, (F, 3).

@@ -71,7 +71,7 @@ class EdgeTable:
     """Edges and limbs of a scene for one job, with their numbers as they are now.
 
     Args:
-        topology: of the scene.
+        topology: topology of the scene.
         moving: addresses of the shapes that move.
 
     Attributes:

@@ -164,7 +164,8 @@ class TimeResolvedFilm(mi.Film):
         """Add the derivative of an event, ``k df + f k' dtau`` with the film's response ``k``, in forward mode.
 
         Args:
-            band, base, opl_from_start, active: as of :meth:`put`.
+            band, base, opl_from_start, active: number of the band, index of the pixel's first value there, optical path
+                length of the arrival (metres) and mask of lanes, see :meth:`put`.
             d_value: ``df`` by channel.
             value_d_opl: ``f dtau`` by channel.
         """

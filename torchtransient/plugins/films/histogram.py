@@ -223,7 +223,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None):
-        """Add a contribution, as of :meth:`~.base.TimeResolvedFilm.put`.
+        """Add a contribution, see :meth:`~.base.TimeResolvedFilm.put`.
 
         Args:
             laser: index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None

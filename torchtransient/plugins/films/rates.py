@@ -24,7 +24,7 @@ class Row:
     Attributes:
         number: number of the array, UInt32.
         inside: mask, the array exists.
-        shift: what is added to the arrival's length, metres (Float64).
+        shift: length that is added to the arrival's, metres (Float64).
         k: derivative of ``shift`` by the rate, seconds.
         weight, slope: share of the arrival, and its derivative by the rate.
     """

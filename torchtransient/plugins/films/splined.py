@@ -317,7 +317,7 @@ def swept(sweep, at, to):
     Args:
         sweep: :class:`Sweep`.
         at: index of each row's first node and channel.
-        to: that of the first bin.
+        to: index of each row's first bin and channel.
 
     Returns:
         (sum of bins before the first one, list of those behind the last one and a zero).
@@ -342,7 +342,7 @@ def swept_back(sweep, at, stride, to):
     Args:
         sweep: :class:`Sweep` with the adjoint of the bins.
         at: index of each row's first bin and channel.
-        stride: from one bin to the next.
+        stride: step of the index from one bin to the next.
         to: index of the first node and channel.
     """
     values, number = [mi.Float(0) for _ in range(sweep.most)], mi.UInt32(0)

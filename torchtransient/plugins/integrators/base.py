@@ -169,7 +169,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Return a copy of the sampler that draws for a sensor, with the sensor's number of samples.
 
         Args:
-            plugin: in place of the integrator's ``sampler``.
+            plugin: name of a sampler plugin in place of the integrator's ``sampler``, which None takes.
         """
         return self._seen_scene(scene).sampler(sensor, self.sampler if plugin is None else plugin).clone()
 
@@ -508,7 +508,8 @@ class TransientIntegrator(mi.CppADIntegrator):
             grad_in: (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W, T, C)``, or
                 the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
                 a copy.
-            sensor, seed, spp: as of :meth:`render`.
+            sensor, seed, spp: sensor or its index, seed, and samples per pixel (0 for those of the sampler), see
+                :meth:`render`.
 
         Raises:
             GradientError: if a path length can change and the temporal filter has no slope, or without a bound on the
@@ -587,13 +588,14 @@ class TransientIntegrator(mi.CppADIntegrator):
 
         Args:
             params: not used; parameters are found through Dr.Jit's graph.
-            sensor, seed, spp, develop: as of :meth:`render`.
+            sensor, seed, spp, develop: sensor or its index, seed, samples per pixel (0 for those of the sampler), and
+                whether images are returned, see :meth:`render`.
 
         Returns:
             Steady ``(H, W, C)`` and transient ``(H, W, T, C)`` TensorXf, or None.
 
         Raises:
-            GradientError: as of :meth:`render_backward`.
+            GradientError: as :meth:`render_backward` raises it.
         """
         with dr.suspend_grad():
             job = self.prepared(scene, sensor, seed, spp, FORWARD)

@@ -279,7 +279,7 @@ def facing_weight(elements: AreaElements, points: np.ndarray, normals: np.ndarra
 
     Args:
         elements: elements of hidden shapes.
-        points, normals: of the wall, (P, 3), metres.
+        points, normals: points (metres) and normals of the wall, (P, 3).
         chunk: number of elements that are computed at once.
     """
     weight = np.zeros(len(elements))

@@ -137,9 +137,9 @@ class PrimitiveDensity:
     Args:
         shapes: shapes of the elements.
         uncut: elements before they are cut.
-        cuts: parts of each triangle's edges.
-        place, cell: for each part the element that it belongs to, and its cell there, (M,).
-        density: (tiles, M).
+        cuts: number of parts that each triangle's edges are cut into.
+        place, cell: number of the element that each part belongs to, and of its cell there, (M,).
+        density: density of each part per square metre, (tiles, M).
     """
 
     def __init__(
@@ -298,7 +298,7 @@ class HiddenElements:
         Args:
             memory: cache of the scene.
             shapes: hidden shapes.
-            points, normals: as of the class.
+            points, normals: wall points and their normals, see the class.
             beside: other shapes of the scene.
         """
         every, others = AreaElements.from_shapes(shapes), AreaElements.from_shapes(list(beside))
@@ -395,7 +395,7 @@ class HiddenElements:
             x, y: uniform numbers in [0, 1), Float64 and Float.
 
         Returns:
-            (Point3f, geometric Normal3f, place on the primitive as of :meth:`coordinates`, ShapePtr, primitive).
+            (Point3f, geometric Normal3f, place on the primitive, see :meth:`coordinates`, ShapePtr, primitive).
         """
         element, a = self.select_element(x, active)
         point, n = self.point(element, a, y, active)
@@ -462,7 +462,7 @@ class HiddenElements:
 
         Args:
             element: number in the table, UInt32.
-            a, y: numbers in [0, 1), as of :meth:`point`.
+            a, y: numbers in [0, 1), see :meth:`point`.
         """
         row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])

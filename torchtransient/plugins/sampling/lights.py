@@ -20,7 +20,7 @@ class DistantReference:
     """Sphere whose tangent planes distant light leaves at t = 0.
 
     Args:
-        center, radius: of the sphere around the scene, metres.
+        center, radius: center and radius of the sphere around the scene, metres.
     """
 
     def __init__(self, center: tuple[float, float, float], radius: float):

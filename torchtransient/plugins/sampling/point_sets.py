@@ -163,7 +163,7 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
     Args:
         index: numbers of the points, UInt32.
-        dimension: of the coordinate, 0 to ``DIMENSIONS - 1``.
+        dimension: number of the coordinate, 0 to ``DIMENSIONS - 1``.
         seed: UInt32 of width one, in memory, which scrambles every dimension in its own way.
     """
     if dimension == 0:

@@ -32,8 +32,8 @@ class ScanTiles:
     """Tiles of a scan, one where the scan is not wider than twice the distance of the hidden geometry.
 
     Args:
-        points, normals: of the scan, (P, 3).
-        distance: of the nearest hidden geometry, metres.
+        points, normals: points (metres) and normals of the scan, (P, 3).
+        distance: distance of the nearest hidden geometry, metres.
 
     Attributes:
         count: number of tiles.

@@ -111,7 +111,7 @@ class Group:
         seed: UInt32, of all that these groups draw.
 
     Attributes:
-        rows: for each anchor and point of its group ``r`` and ``F``.
+        rows: ``r`` and ``F`` for each anchor and point of its group.
         inverse: one over the density of each point in its group.
         first: path length up to each anchor, minus the film's start (Float64).
         earliest: length at which the first anchor of a group sees each point, minus the film's start (Float64).

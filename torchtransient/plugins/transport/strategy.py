@@ -195,7 +195,7 @@ class AttachedVertex(Local):
         velocity: attached velocity, of films that measure rates (segment).
         rate_slope: Float, zero with the derivative of the rate up to the vertex, where ``wanted.rate`` (segment).
         damping_radius: distance below which points are dragged along, with moving geometry (segment).
-        bsdf, delay: as of :class:`Vertex` (scattering).
+        bsdf, delay: BSDF and delay of the scattering, see :class:`Vertex` (scattering).
         scattered_si: ``si`` with the wavelengths behind the surface (scattering).
         scattered_slope, scattered_opl: slope and optical path length behind the delay (scattering).
         rotation: rotation of Stokes vectors to the frame of the segment (scattering).
@@ -328,7 +328,7 @@ class Segment(Strategy):
 
         Args:
             pi: PreliminaryIntersection3f of the surface.
-            medium: MediumPtr in front of it, as of :meth:`medium_towards`; None in vacuum.
+            medium: MediumPtr in front of it, see :meth:`medium_towards`; None in vacuum.
         """
         raise NotImplementedError
 
@@ -365,9 +365,9 @@ class Segment(Strategy):
         """Trace a shadow ray from a vertex.
 
         Args:
-            ds: point of the light, ``p, d, dist`` as of a DirectionSample3f.
+            ds: point of the light, with ``p``, ``d`` and ``dist`` of a DirectionSample3f.
             u: two uniform numbers, drawn for this vertex, which seed a generator.
-            seen: as of :meth:`depart`.
+            seen: the ray is part of a primary ray, which passes lights where ``context.hide_emitters``.
 
         Returns:
             (mask of points that are visible, transmittance per colour).

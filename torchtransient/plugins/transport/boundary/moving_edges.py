@@ -145,7 +145,7 @@ class MovingEdges:
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
-        """Return the reason of an effect, with what the derivative lacks; arguments as of :meth:`lacking`."""
+        """Return the reason of an effect, with what the derivative lacks; arguments as in :meth:`lacking`."""
         words = list(self.words) if effect.supported and moves_edges(key, effect) else []
         words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:

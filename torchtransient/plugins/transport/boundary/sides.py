@@ -54,9 +54,9 @@ def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, nee
     """Trace the two sides of outlines.
 
     Args:
-        view: film block or adjoint block of the samples, as of ``mode.view``.
+        view: film block or adjoint block of the samples, see ``mode.view``.
         b: outlines seen from x.
-        past: ray past them and its leg, as of :func:`past_edge`.
+        past: ray past them and its leg, see :func:`past_edge`.
         first: fields of the paths at x: ``ray``, ``medium`` and those of :class:`~..walk.Path`.
         factor: detached weight of a sample.
         speeds: attached (inner, outer).
