@@ -133,7 +133,7 @@ def ensure_llvm() -> LLVMLibrary:
     """Return the LLVM that Dr.Jit has bound. Called before an `llvm_*` variant is set.
 
     Raises:
-        VariantError: without a usable LLVM, with what to install.
+        VariantError: without a usable LLVM; the message says which package to install.
     """
     version = _bound_version()
     if version and version[0] >= MIN_MAJOR:

@@ -443,7 +443,7 @@ def _variations(
     max_depths: Sequence[int] | None,
     bin_widths: Numbers | None,
 ) -> dict[Choice, TransientRenderer]:
-    """A renderer for every combination; choices name what is compared beside sampler and filter."""
+    """A renderer for every combination; choices name the compared settings beside sampler and filter."""
     filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
     if not samplers or not filters:
         raise ArgumentError("expected at least one sampler and one temporal filter, got none")
@@ -482,7 +482,7 @@ def _blur(choice: Choice) -> tuple[float, float, int, bool]:
 
 
 def _checked_quantities(given: Mapping[str, Loss], own: Sequence[str]) -> dict[str, Loss]:
-    """Return functions by name. ``own``: names of what is measured in any case."""
+    """Return functions by name. ``own``: names of quantities that are measured in any case."""
     checked = {}
     for name, each in mapping("quantities", given, "{name: function of a RenderOutput}").items():
         text("quantities", name, "names, texts")
@@ -497,7 +497,7 @@ def _checked_quantities(given: Mapping[str, Loss], own: Sequence[str]) -> dict[s
 
 @dataclass
 class _Quantities:
-    """Functions of a render by name. ``shapes``: of what each returned first, and the setting of that render."""
+    """Functions of a render by name. ``shapes``: shape that each returned first, and the setting of that render."""
 
     functions: Mapping[str, Loss]
     shapes: dict[str, tuple[torch.Size, str]] = field(default_factory=dict)

@@ -42,10 +42,10 @@ def over_time(
     spp: int | None = None,
     progress: bool = False,
 ) -> RenderOutput:
-    """Render a scene that moves, as a camera sees it that looks for a while.
+    """Render a moving scene as a camera sees it during an exposure.
 
-    One batch of poses is rendered, all with the same samples, so that noise does not differ between instants; what the
-    exposure makes of it is linear. Costs as many renders as poses, and holds their pictures.
+    One batch of poses is rendered, all with the same samples, so that noise does not differ between instants; the
+    result of the exposure is linear in their pictures. Costs as many renders as poses, and holds their pictures.
 
     Args:
         renderer: a renderer whose parameters include what moves, ``parameters=["fan.to_world"]``.
@@ -71,8 +71,8 @@ def over_time(
             that do not measure what the exposure needs; for a motion of a value that is no place, and without motions.
         UnknownKeyError: for keys and names that the renderer does not have.
         ShapeError: for batches, and functions that return other than one value for each time.
-        PhysicsError: with ``physics="error"`` of the renderer, for a body that moves further than the scene is large, or
-            turns around, while the camera looks (of ``Frames``: from one frame to the next). Otherwise that is a
+        PhysicsError: with ``physics="error"`` of the renderer, for a body that moves further than the scene is large,
+            or turns around, while the camera looks (of ``Frames``: from one frame to the next). Otherwise that is a
             ``PhysicsWarning``, as is a motion that slow phasors follow already, by the velocity of the same body.
         SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
 
@@ -150,7 +150,7 @@ def _check_once(renderer: TransientRenderer, moved: Iterable[str]) -> None:
 
 
 def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the values (K, *shape) of what moves; ``own``: values of all keys at t = 0."""
+    """Return the values (K, *shape) of all moving keys; ``own``: values of all keys at t = 0."""
     if isinstance(moving, Mapping):
         at = {name: how if isinstance(how, Motion) else _called(name, how, time_s) for name, how in moving.items()}
     else:

@@ -34,7 +34,7 @@ _MOST_BEATS = 1000
 
 
 class SlowTimes(abc.ABC):
-    """Base of what `tt.over_time` takes: times of poses, and a map from their pictures to the result.
+    """Base class of exposures for `tt.over_time`: times of poses, and a map from their pictures to the result.
 
     Attributes:
         needs_phasors: only phasor films have a result.
@@ -111,7 +111,7 @@ class Exposure(SlowTimes):
         return float(self.duration_s) / 2 * torch.tensor(_nodes(int(self.poses)))
 
     def weights(self) -> Tensor:
-        """Return what each pose counts with, complex128 (poses,); their sum is the beat's average."""
+        """Return the weight of each pose, complex128 (poses,); their sum is the beat's average."""
         return torch.tensor(_beat_weights(int(self.poses), float(self.beat_hz) * float(self.duration_s)))
 
     def combine(self, pictures: Tensor) -> Tensor:
@@ -186,7 +186,7 @@ class RollingShutter(SlowTimes):
 class PhaseSteps(SlowTimes):
     """Exposures of an iToF camera one after another, a render each; the middle of them is t = 0.
 
-    The output has a leading dimension of exposures. `taps` puts together what each of them sees.
+    The output has a leading dimension of exposures. `taps` puts together the taps of each of them.
 
     Args:
         number: exposures: phase steps times frequencies, in the order of the sensor's taps.

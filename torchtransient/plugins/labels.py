@@ -158,7 +158,7 @@ class LabelJob:
 
     @no_collection()
     def prepare(self) -> LabelJob:
-        """Look up what is not part of what is recorded."""
+        """Look up all data that is not part of the recorded code."""
         _check_sensor(self.sensor, self.names)
         self.tables.seen.follow_derivatives(self.scene, False)
         self.plugins = self.tables.seen.python_plugins(self.scene)

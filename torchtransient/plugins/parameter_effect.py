@@ -43,8 +43,8 @@ class ParameterEffect:
             rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction;
             "velocity": how fast it moves, which films of rates alone measure; "value": none.
         supported: it has a derivative.
-        biased: the derivative is wrong in some scenes, apart from what it lacks of moving edges, for which integrators
-            answer (``silhouettes``).
+        biased: the derivative is wrong in some scenes, apart from the missing part of moving edges, for which
+            integrators answer (``silhouettes``).
         reason: the state in words.
         trusted: the derivative is right although Mitsuba marks the parameter as not differentiable.
         stand_in: name of the plugin that is built in place of Mitsuba's when the derivative is asked for; for a
@@ -187,13 +187,13 @@ _NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
 def location_of(site: Site) -> tuple[str, ...]:
-    """Return the names of a parameter and of what its plugin is in, the nearest first.
+    """Return the names of a parameter and of the holders of its plugin, the nearest first.
 
     Args:
         site: place of the parameter.
 
     Returns:
-        "class.key" of the parameter, "class.slot" of what holds its plugin.
+        "class.key" of the parameter, "class.slot" of each holder.
     """
     places = [(lineage(node)[0], name) for node, name in [(site.node, site.key), *site.owners]]
     return tuple(dict.fromkeys(cls if cls in _NAMED_BY_USERS else f"{cls}.{name}" for cls, name in places))

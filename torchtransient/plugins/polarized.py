@@ -21,7 +21,7 @@ import mitsuba as mi
 
 
 def light_type():
-    """Type of what one event contributes: a spectrum, or in polarized variants a Stokes vector of spectra."""
+    """Type of the light of one event: a spectrum, or in polarized variants a Stokes vector of spectra."""
     return mi.SpectrumEntry if mi.is_polarized else mi.UnpolarizedSpectrum
 
 

@@ -250,7 +250,7 @@ def named_fields(film: FilmLayout, response: torch.Tensor) -> dict[str, Any]:
         response: tensor of the film, in torch's order.
 
     Returns:
-        Values of all fields of films, None for those of other films; ``others`` holds what has no field.
+        Values of all fields of films, None for those of other films; ``others`` holds quantities without a field.
     """
     found = {film.measures: response, **film.attributes()}
     named = {name: found.pop(name, None) for name in _OF_FILMS}

@@ -76,7 +76,7 @@ def freedom_of_halves(even: torch.Tensor, odd: torch.Tensor, passes: int, dims: 
 
 @dataclass
 class PassSums:
-    """Sums over passes, in double precision: all that an estimate is made of, and that is needed to go on.
+    """Sums over passes, in double precision: all numbers that an estimate needs, and a later call to go on.
 
     Args:
         seed, batch_spp: seed of the render, and samples per pixel of a pass.

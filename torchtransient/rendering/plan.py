@@ -384,7 +384,8 @@ def _without_roulette(given: Plan) -> Plan:
 
 
 def _other_ways(given: Plan, relative: bool, connects: bool) -> list[tuple[str, dict[str, Any], float]]:
-    """Return what may have less variance than a plan: name, changes of the plan, and most time over that of the plan.
+    """Return alternatives that may have less variance than a plan: name, changes of the plan, and most time over that
+    of the plan.
 
     Args:
         given: plan with plain paths and ordinary connections.

@@ -115,9 +115,9 @@ class TransientRenderer(CopiesParametrized):
             keeps what the scene names, except for "independent", and what a sensor without one has, which are replaced
             by "owen": points that fill each pixel's dimensions evenly. "scene" keeps those too. ``out.stats.sampler``
             has the name.
-        physics: response to what no physical system has: reflectances, albedos and other shares of the light outside of
-            [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light, and
-            depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
+        physics: response to unphysical scenes and values: reflectances, albedos and other shares of the light outside
+            of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light,
+            and depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
             scene; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
             look.
         boundary: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,

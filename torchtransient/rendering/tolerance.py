@@ -232,7 +232,7 @@ def look(sums: PassSums, request: Request) -> Look:
 
     Args:
         sums: sums of the passes.
-        request: tolerance, and what it is of.
+        request: tolerance, and the quantity that it is for.
     """
     if request.loss is not None:
         return _look_at_loss(sums, request.rtol)

@@ -505,8 +505,8 @@ def confocal_plane(
     """Compute the radiance per bin of a confocal scan point before a plane that is parallel to the wall.
 
     With K = energy wall_albedo^2 albedo / pi^3 the light at tau = 2 r is K pi depth^4 / r^7 dtau, r >= depth; a bin
-    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), the sum of all bins is pi K / (3 depth^2). Derivation: the patch of `hidden_patch`
-    integrated over the plane.
+    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), and the sum of all bins is pi K / (3 depth^2).
+    Derivation: the patch of `hidden_patch` integrated over the plane.
 
     Args:
         edges_opl: bin edges, (T + 1,), metres.

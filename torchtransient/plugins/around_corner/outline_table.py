@@ -105,8 +105,9 @@ class OutlineTable:
         edges: edges of some parts.
         viewpoints, normals: points of the wall that see the edges, and their normals, (P, 3).
 
-    The probability of an edge is the root mean square over the viewpoints of what it spans there over the square of
-    the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain length.
+    The probability of an edge is the root mean square over the viewpoints of the length that it spans there over the
+    square of the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain
+    length.
     """
 
     def __init__(self, triangles: Triangles, edges: list[Edges], viewpoints: np.ndarray, normals: np.ndarray) -> None:

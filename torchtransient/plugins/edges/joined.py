@@ -64,7 +64,7 @@ class Triangles:
 def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the places of the corners of faces, (F, 3), the same number for corners that lie at the same place.
 
-    What is not the same to the bit is the same place if it lies on rims: pieces that were put together by transforms
+    Corners that differ by some bits are the same place if they lie on rims: pieces that were put together by transforms
     are off by some roundings. No face loses an edge by it: far from the origin, edges may be as short as roundings are
     long.
 

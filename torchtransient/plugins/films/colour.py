@@ -68,7 +68,7 @@ class ChannelMatch:
             self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
 
     def to_channels(self, value) -> list:
-        """Return the channel values of what an event contributes, list of Float.
+        """Return the channel values of an event's contribution, list of Float.
 
         Args:
             value: spectrum, in polarized variants a Stokes vector.

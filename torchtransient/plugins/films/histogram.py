@@ -92,8 +92,8 @@ class TransientHDRFilm(TimeResolvedFilm):
     some, and 3 otherwise (linear sRGB in spectral variants); in polarized variants four times as many: all of S0, then
     S1, S2, S3, in the sensor's frame. There are no alpha or weight channels. Light outside the window is not stored
     but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean over channels (of S0). With
-    the sum over the stored bins they make up the steady image, whatever the temporal filter: what it spreads over the
-    rim of the window counts as outside.
+    the sum over the stored bins they make up the steady image, whatever the temporal filter: light that it spreads over
+    the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the

@@ -526,7 +526,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False):
-        """Add one event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
+        """Add one event, frequency by frequency: as :class:`EventBlock` does for many at once."""
         _add_event(self._table(self.band_array(band), exclusive), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 

@@ -232,7 +232,7 @@ class SplinedHDRFilm(TransientHDRFilm):
             dr.eval(self.bands[0][2], self.outside)
 
     def _bins_of(self, nodes):
-        """Return the array of bins, and count as outside what the line spreads over the rims of the window."""
+        """Return the array of bins, and count as outside the light that the line spreads over the window's rims."""
         *rows, bins, channels = self.cube_shape()
         row, channel = _divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
         sweep = Sweep(self, nodes, dr.empty(mi.Float, math.prod(rows) * bins * channels))

@@ -378,7 +378,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
-        """Look up, check and tabulate what a job needs, outside of recorded code.
+        """Look up, check and tabulate the data that a job needs, outside of recorded code.
 
         Other arguments and errors are those of :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
 
@@ -581,10 +581,10 @@ class TransientIntegrator(mi.CppADIntegrator):
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Render the derivative along the tangents that are set on the scene's attached parameters.
 
-        One pass over the samples for one tangent. Tangents are set on values of the scene or on what they come from,
-        and are propagated from there. A caller who does so before clears the edges (``ADFlag.ClearEdges``) and keeps
-        what lies between: Dr.Jit's default flags remove it, with a warning here, and without any flag it is counted
-        twice.
+        One pass over the samples for one tangent. Tangents are set on values of the scene or on variables that they are
+        computed from, and are propagated from there. A caller who does so before clears the edges
+        (``ADFlag.ClearEdges``) and keeps the variables between: Dr.Jit's default flags remove it, with a warning here,
+        and without any flag it is counted twice.
 
         Args:
             params: not used; parameters are found through Dr.Jit's graph.

@@ -78,7 +78,7 @@ def _pilot_size(film, pixels: int) -> tuple[int, int]:
 
 
 def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: int, roulette=True) -> PilotEvents:
-    """Trace camera paths of a transient integrator and list what arrives.
+    """Trace camera paths of a transient integrator and list the light that arrives.
 
     ``max_depth`` is :data:`PILOT_DEPTH` for the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the
     latest.
@@ -94,7 +94,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
 
     Raises:
         VariantError: in polarized variants.
-        SceneError: and what else the integrator raises for scenes that it cannot render.
+        SceneError: for scenes that the integrator cannot render; other errors of the integrator pass through.
     """
     if mi.is_polarized:
         raise VariantError(

@@ -182,7 +182,7 @@ def _is_sheared(shape: Any) -> bool:
 
 
 def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | None:
-    """Return (axes, kind, area, normal) of one shape, None for what cannot be listed."""
+    """Return (axes, kind, area, normal) of one shape, None for a shape that cannot be listed."""
     if not can_be_listed(shape):
         return None
     return _triangles(shape) if shape.is_mesh() else _analytic(shape, _KINDS[shape.class_name()])

@@ -172,7 +172,7 @@ class PrimitiveDensity:
             self._frames = packed(_frames(uncut.take(records), cuts[records]))
 
     def look_up(self, shape: Any, prim_index: Any, p: Any, active: Any, tile: Any) -> Any:
-        """Return the density (Float, per square metre), 0 for what is not in the table.
+        """Return the density (Float, per square metre), 0 for points that are not in the table.
 
         Args:
             shape, prim_index: ShapePtr and primitive, UInt32.
@@ -446,7 +446,7 @@ class HiddenElements:
         return mi.Point3f(p + offset), mi.Normal3f(n)
 
     def per_area(self, shape: Any, prim_index: Any, p: Any, active: Any = True, tile: Any = None) -> Any:
-        """Return the density of a point per square metre (Float), 0 for what is not in the table.
+        """Return the density of a point per square metre (Float), 0 for points that are not in the table.
 
         Args:
             shape, prim_index: ShapePtr and primitive, UInt32.

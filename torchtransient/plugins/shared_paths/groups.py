@@ -93,7 +93,7 @@ def _is_smooth(scene: Any) -> bool:
 
 
 def _as_they_stand(scene: Any, contents: Any) -> Cache:
-    """Return the memory of what was found of the sensor and the shapes, emptied when one of them moves."""
+    """Return the cache of results about the sensor and the shapes, emptied when one of them moves."""
     nodes = [*sensors_of(contents.sensor), *shapes_of_scene(scene)]
     return contents.memory.get("memory of sharing", 0, lambda: Cache(nodes))
 
@@ -261,7 +261,7 @@ def spread(sampler: Any, seed: Any, lanes: int, count: int) -> None:
 # Groups of a film.
 
 def pixel_order(scene: Any, contents: Any, sensor: Any, film: Any, size: int) -> tuple[Any, Any]:
-    """Return the pixels of a film in the order of their groups, by what their centres see.
+    """Return the pixels of a film in the order of their groups, by the surfaces that their centres see.
 
     Found anew when the sensor or a shape has moved.
 

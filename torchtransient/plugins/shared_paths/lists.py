@@ -53,7 +53,7 @@ class Rows:
 
 
 class LastArrival(ArrivalWindow):
-    """Window without a beginning: what comes too early for one pixel may be in time for another one of its group."""
+    """Window without a beginning: light too early for one pixel may be in time for another one of its group."""
 
     def __init__(self, last: float):
         super().__init__(-float("inf"), last)

@@ -136,7 +136,7 @@ class DampedMotion(Local):
         """Return zero with the derivative of the length, due to the vertex alone.
 
         Args:
-            n: normal of the point's surface, to add what its slide lengthens.
+            n: normal of the point's surface, to add the length that its slide brings.
         """
         if n is None:
             return -dr.dot(self.δ, self.fixed)

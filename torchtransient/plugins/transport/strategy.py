@@ -214,7 +214,7 @@ class Strategy:
     name = ""
 
     def prepare(self, context: Any) -> None:
-        """Compute what all lanes share: once a job, outside of traced code, with gradients enabled.
+        """Compute the values that all lanes share: once a job, outside of traced code, with gradients enabled.
 
         Arrays that are kept must be evaluated (``dr.eval``): launches of a job differ in width, and Dr.Jit widens
         unevaluated ones to the width of the first launch that reads them.

@@ -233,8 +233,8 @@ class DetachedHits:
         self._find_starts()
 
     def _find_starts(self) -> None:
-        """Return the place where each shape's ellipsoids or segments begin, counted from one: what is not listed has
-        none.
+        """Return the place where each shape's ellipsoids or segments begin, counted from one: a shape that is not
+        listed has none.
         """
         ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
         segments, pieces = (

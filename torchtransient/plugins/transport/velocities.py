@@ -45,7 +45,7 @@ class Movers:
         winds: (medium, volume of its velocities).
 
     Raises:
-        SceneError: for motions of what is not there, of several at once, or that has none.
+        SceneError: for motions of objects that are not there, of several at once, or that have none.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -214,7 +214,7 @@ class Velocities:
 
         Args:
             scene: scene of the job.
-            contents: :class:`.scene_contents.SceneContents`, which keeps what was looked up.
+            contents: :class:`.scene_contents.SceneContents`, which keeps the result.
             film: film of the job.
         """
         return Velocities(movers_of(scene, contents), contents.sensor) if film.knows_rates else None

@@ -16,7 +16,7 @@ class BoundaryPass:
     """
 
     def __init__(self, context):
-        """Prepare what launches share."""
+        """Prepare the data that launches share."""
 
     @staticmethod
     def exists(context, sensor):
@@ -111,7 +111,7 @@ def in_memory(context, sampler, *values):
 def is_seen_within(context, b, ray, end, medium, sampler, active, seen=True):
     """Return a mask of outlines whose inner side is seen from a point, too.
 
-    It is hidden where something in front ends in line with it: then there is one edge, that of what is in front.
+    It is hidden where something in front ends in line with it: then there is one edge, that of the shape in front.
 
     Args:
         ray: ray for time and wavelengths.
