@@ -240,8 +240,8 @@ class ErrorEstimate:
 
     `relative`: root of squared error over power, all entries together, which bright bins decide. `median_bin`: the same
     per time bin, median over the bins that hold light, which dim, late bins decide. NaN where there is no light at all.
-    `power`: mean square of the estimated quantity, which the squared error is relative to. `bias`: relative, against the
-    reference, 0 within its noise.
+    `power`: mean square of the estimated quantity, which the squared error is relative to. `bias`: relative, against
+    the reference, 0 within its noise.
     """
 
     squared: float

@@ -114,7 +114,7 @@ def _check_units(
     Args:
         renderer: the renderer.
         moving: motions, see :func:`over_time`.
-        moved: its values (K, *shape) by key.
+        moved: values (K, *shape) of the moving keys.
         time_s: times (K,), seconds.
         each: compare each time with the next one, not the first with the last; turns do not count then.
     """

@@ -118,7 +118,7 @@ class Exposure(SlowTimes):
         """Return the average of pictures (poses, ...), with the beat if they are complex.
 
         Args:
-            pictures: (poses, ...), real or complex.
+            pictures: pictures of the poses, (poses, ...), real or complex.
 
         Returns:
             (...), of the same dtype.
@@ -172,7 +172,7 @@ class RollingShutter(SlowTimes):
         """Return the pictures (poses, ..., H, W) with each row at its time.
 
         Args:
-            pictures: (poses, ..., H, W).
+            pictures: pictures of the poses, (poses, ..., H, W).
 
         Returns:
             (..., H, W).
@@ -215,7 +215,7 @@ class PhaseSteps(SlowTimes):
         """Return the pictures as they are, (number, ...).
 
         Args:
-            pictures: (number, ...).
+            pictures: pictures of the exposures, (number, ...).
 
         Returns:
             (number, ...).
@@ -250,7 +250,7 @@ class Frames(SlowTimes):
     """A video: one output for each time, along a leading dimension.
 
     Args:
-        time_s: times, (K,), seconds; of a tensor with its gradient.
+        time_s: times, (K,), seconds; a tensor keeps its gradient.
 
     Raises:
         ShapeError, UnitError: unless it is one row of finite numbers.
@@ -275,7 +275,7 @@ class Frames(SlowTimes):
         """Return the pictures as they are, (K, ...).
 
         Args:
-            pictures: (K, ...).
+            pictures: pictures of the times, (K, ...).
 
         Returns:
             (K, ...).

@@ -213,7 +213,7 @@ def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, in
 
     Args:
         edges_opl: bin edges, (T + 1,), metres.
-        height: h above the plane, metres.
+        height: height h above the plane, metres.
         reflectance: reflectance rho, 0 to 1.
         intensity: intensity I of the light, W/sr.
 
@@ -240,7 +240,7 @@ def integrating_sphere_irradiance(
         radius: radius R, metres.
         reflectance: reflectance rho, 0 to 1.
         energy: energy that leaves the wall for its first flight, J.
-        max_flights: cuts the series after that many flights.
+        max_flights: number of flights after which the series is cut, None for no limit.
 
     Returns:
         (T,), J/m^2.
@@ -325,7 +325,7 @@ def furnace(
         edges_opl: bin edges, (T + 1,), metres.
         radius: radius R, metres.
         reflectance: reflectance rho, 0 to 1.
-        radiance: Le of the wall.
+        radiance: radiance Le of the wall.
         max_bounces: reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` counts.
 
     Returns:
@@ -352,8 +352,8 @@ def parallel_plates(
         edges_opl: bin edges, (T + 1,), metres.
         separation: distance h between the plates, metres.
         reflectance: reflectance rho, 0 to 1.
-        radiance: Le of the plates.
-        first_leg: z, camera to plate, metres, h / 2 unless given.
+        radiance: radiance Le of the plates.
+        first_leg: distance z from the camera to the plate, metres, h / 2 unless given.
         max_bounces: reflections (zero for the delta).
 
     Returns:
@@ -371,7 +371,7 @@ def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[floa
     reflection (index < 1 beyond the critical angle) gives (1, 1).
 
     Args:
-        index: n, relative and real.
+        index: relative index of refraction n, real.
         incidence_deg: angle from the normal, degrees.
     """
     n = positive("index", index)
@@ -413,7 +413,7 @@ def etalon_orders(
         side: "reflected" or "transmitted".
         incidence_deg: angle from the normal, degrees.
         polarization: "s", "p" or None for the mean of both.
-        absorption_per_m: alpha, per metre of length in the glass.
+        absorption_per_m: absorption coefficient alpha, per metre of length in the glass.
 
     Raises:
         ArgumentError: for other sides and polarizations.
