@@ -29,7 +29,7 @@ class RenderStats:
         spp: samples per pixel.
         seconds: wall time, without loading and without the wait for other threads.
         samples_per_second: camera paths per second.
-        variant, integrator: names.
+        variant, integrator: names of variant and integrator.
         temporal_filter: temporal filter of the film; empty for films without one.
         seeds: one per item (entry of the batch and sensor); of a mean of passes those of all, in turn.
         energy_before, energy_after: light outside of the time axis, per item: sum over pixels of the mean over
@@ -41,7 +41,7 @@ class RenderStats:
         light_beyond: share of the light in deeper paths, where a pilot run has found ``max_depth`` for derivatives of a
             scene that states none; else None. It is that of the described values: brighter ones, given or learnt, have
             the same ``max_depth`` and more light beyond it.
-        sampler: plugin name; "owen" where the scene names ``independent``, or none.
+        sampler: plugin name of the sampler; "owen" where the scene names ``independent``, or none.
     """
 
     _: KW_ONLY
@@ -154,7 +154,7 @@ class RenderOutput(ErrorBars, TensorRecord):
         slow_times: times of slow phasors, seconds.
         others: tensors and settings of films that have no attribute here, by name.
         differences, squares, steady_differences, cells: (..., T', H', W', R), (..., T', H', W') and (..., H, W, R) of
-            renders with ``errors=``: what independent batches of samples differ by, mean over channels, for
+            renders with ``errors=``: differences between independent batches of samples, mean over channels, for
             :meth:`standard_error` and :meth:`error_map`.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. In polarized variants the

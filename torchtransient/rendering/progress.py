@@ -27,7 +27,7 @@ class Bar:
 
 
 class ForecastBar:
-    """Progress bar whose end is a forecast: its text says what is left."""
+    """Progress bar whose end is a forecast: its text says how much is left."""
 
     def __init__(self, name: str) -> None:
         from tqdm.auto import tqdm

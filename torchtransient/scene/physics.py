@@ -195,7 +195,7 @@ def outside_message(key: str, limits: PhysicalRange, low: float, high: float) ->
 
     Args:
         key: key of the parameter.
-        limits: the range.
+        limits: physical range of the parameter.
         low, high: smallest and largest number of the value.
     """
     if limits == SHARE:
