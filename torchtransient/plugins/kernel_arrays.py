@@ -38,7 +38,7 @@ def whole_numbers(values: np.ndarray) -> Any:
     """Return a copy of whole numbers as a ``mi.UInt32``.
 
     Args:
-        values: (N,), 0 to 2^32 - 1.
+        values: whole numbers, (N,), 0 to 2^32 - 1.
     """
     return mi.UInt32(_aligned(values, np.uint32))
 
@@ -47,7 +47,7 @@ def floats(values: np.ndarray) -> Any:
     """Return a copy of numbers as a ``mi.Float``.
 
     Args:
-        values: (N,).
+        values: real numbers, (N,).
     """
     return mi.Float(_aligned(values, np.float32))
 

@@ -60,8 +60,8 @@ def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
 
     Args:
         bsdf: one ``mi.BSDF``.
-        held: its parts.
-        nested: all BSDFs in it, asked themselves since a blend does not notice lobes that they get later.
+        held: parts of the blend.
+        nested: all BSDFs in the blend, asked themselves since a blend does not notice lobes that they get later.
     """
     if bsdf.class_name() != "BlendBSDF":
         return False
@@ -712,7 +712,7 @@ def is_turned_by_reflections(class_name: str, name: str) -> bool:
 
     Args:
         class_name: ``class_name()`` of the shape.
-        name: its parameter, without the path to the shape.
+        name: name of the parameter, without the path to the shape.
     """
     return (class_name, name) in _TURNED_BY_REFLECTIONS
 

@@ -78,8 +78,8 @@ class Site:
 
     Attributes:
         node, key: plugin that has it, and its name there.
-        owners: all that holds the plugin, directly or not, as (holder, name there), nearest first. A plugin that is
-            shared has several holders.
+        owners: all objects that hold the plugin, directly or not, as (holder, name there), nearest first. A plugin that
+            is shared has several holders.
     """
 
     node: Any
@@ -94,7 +94,7 @@ class Row:
     Attributes:
         effect: effect of the parameter.
         when: function of the site that says whether the row counts, None if it always does.
-        condition: the same in words.
+        condition: condition of ``when`` in words.
     """
 
     effect: ParameterEffect

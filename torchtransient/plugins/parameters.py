@@ -71,7 +71,7 @@ def loses_black(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
 
     Args:
         node, key: plugin, and name of the parameter there.
-        owners: all that holds the plugin, as in :class:`Site`.
+        owners: all objects that hold the plugin, see :class:`Site`.
     """
     return _is_in_a_map(node, owners) or _is_light(node, key, owners)
 
@@ -389,7 +389,7 @@ class PhysicalRange:
 
     Attributes:
         meaning: the quantity in words, "a roughness".
-        low, high: ends.
+        low, high: ends of the range.
         is_open: the ends are outside.
     """
 

@@ -95,7 +95,7 @@ class Vertices(Local):
         p, n, geometric_n: place, and normals of the side that light meets.
         value: weight by colour: of a head its albedo over pi times the area that it stands for, of a tail its albedo
             over pi times the light of the step before.
-        length: metres from the first vertex of the tail.
+        length: length from the first vertex of the tail, metres.
         alive: mask of vertices that exist.
         shape, primitive, uv: the material point.
     """

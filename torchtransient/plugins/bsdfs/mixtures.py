@@ -214,7 +214,7 @@ class Mixture:
         always: it is taken apart in renders, too.
         for_derivatives: it is taken apart where there are derivatives.
         parts: BSDFs or phase functions that it is taken apart into.
-        textures: weights.
+        textures: textures of the weights.
     """
 
     def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:

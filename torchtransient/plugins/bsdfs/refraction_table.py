@@ -30,7 +30,7 @@ class RefractiveBSDFs:
     index.
 
     Args:
-        entries: (BSDF, its parts that hold an index).
+        entries: pairs of a BSDF and its parts that hold an index.
     """
 
     def __init__(self, entries: list[tuple[Any, list[Any]]]) -> None:

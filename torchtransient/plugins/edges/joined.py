@@ -69,7 +69,7 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     long.
 
     Args:
-        positions: (V, 3), single precision.
+        positions: positions of the vertices, (V, 3), single precision.
         faces: numbers of vertices, (F, 3).
     """
     # Adding zero makes one of the two zeros.
@@ -97,10 +97,10 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return for each point the first of those that lie at the same place, to some roundings, (K,).
+    """Return for each point the number of the first point at the same place, up to some roundings, (K,).
 
     Args:
-        positions: (K, 3).
+        positions: positions of the points, (K, 3).
         reach: length of the longest rim at each, which a rotation may have rounded by, (K,).
     """
     p = positions.astype(np.float64)

@@ -51,7 +51,7 @@ class EdgeDensity:
 
     Args:
         weight: weight of each row, Float.
-        cumulative: its cumulative sum, Float64: of single precision, steps of long tables would be rounding.
+        cumulative: cumulative sum of the weights, Float64: steps of long tables would be rounding in single precision.
     """
 
     def __init__(self, weight: Any, cumulative: Any) -> None:

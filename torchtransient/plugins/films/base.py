@@ -175,7 +175,7 @@ class TimeResolvedFilm(mi.Film):
         """Read the adjoint of :meth:`put` at an arrival.
 
         Args:
-            adjoint: (flat array, stride of entries, stride of channels), or None.
+            adjoint: adjoint of the array as (flat array, stride of entries, stride of channels), or None.
             base: index of the pixel's first value in the array, UInt32.
             opl_from_start: ``opl - start_opl`` of the arrival, metres (Float64).
             active: mask of lanes.
@@ -286,8 +286,8 @@ class TimeResolvedFilm(mi.Film):
         """Replace the temporal filter; films without one ignore the call.
 
         Args:
-            name: filter, empty to leave it.
-            stddev: its standard deviation in bins, None to leave it.
+            name: name of the filter, empty to leave it.
+            stddev: standard deviation of the filter in bins, None to leave it.
         """
 
     def arrivals(self):
@@ -361,10 +361,11 @@ class TimeResolvedFilm(mi.Film):
         return self.cube_shape()
 
     def stored_adjoint(self, adjoint):
-        """Return the adjoint of the array that is rendered to, of that of the film.
+        """Return the adjoint of the array that is rendered to, from the adjoint of the film's array.
 
         Args:
-            adjoint: (flat array, offset, strides) of :meth:`cube_shape`; returned for :meth:`storage_shape`.
+            adjoint: adjoint in the shape :meth:`cube_shape`, as (flat array, offset, strides); the result has the
+                shape :meth:`storage_shape`.
         """
         return adjoint
 
@@ -491,7 +492,8 @@ class TimeResolvedFilm(mi.Film):
         """Let renders add to memory of the caller.
 
         Args:
-            storage: (flat array of zeros, index of the film's first entry); None for arrays of the film's own again.
+            storage: memory as (flat array of zeros, index of the film's first entry); None for arrays of the film's
+                own again.
         """
         self._lent = storage
 

@@ -246,7 +246,7 @@ class TransientHDRFilm(TimeResolvedFilm):
             cube: array of the band.
             base: index of bin 0, UInt32.
             x: arrival in bins, Float or Float64.
-            window: (first bin that is stored, the one after the last).
+            window: stored bins, as (first one, one after the last).
             value: contribution by channel, list of Float.
             active: mask of lanes.
             mode: ``dr.ReduceMode`` of the additions.

@@ -246,7 +246,7 @@ class FrequencyBlock:
         """Return a frequency, cycles per metre, Float64.
 
         Args:
-            j: its number in the block.
+            j: number of the frequency in the block.
         """
         if self.step is None:
             return self.values[j]
@@ -537,7 +537,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         """Return ``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival.
 
         Args:
-            adjoint: (flat array, frequency stride, entry stride).
+            adjoint: adjoint of the array as (flat array, frequency stride, entry stride).
             steady: always None, since the film keeps a steady image.
 
         Returns:

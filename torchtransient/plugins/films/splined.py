@@ -75,9 +75,9 @@ def spline_of(pulses, width: float, parts: int):
     """Return (nodes before the start of a bin, weights ``M`` of the nodes, error of the response in its largest value).
 
     Args:
-        pulses: all that arrivals are spread by, but for the bin.
+        pulses: pulses that spread the arrivals, without the bin itself.
         width: width of a bin, metres.
-        parts: nodes in a bin.
+        parts: number of nodes in a bin.
     """
     fine = 8 * parts
     start, values = cumulative_of_sum(pulses, width / fine)

@@ -259,7 +259,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             contents: :class:`~..transport.scene_contents.SceneContents`.
             sensor, film: sensor and its film.
             sampler: seeded sampler of the lanes.
-            pixel: (row, column) of each ray, UInt32.
+            pixel: pixel of each ray as (row, column), UInt32.
             total: samples of a pixel that are added up.
             wavelength: number that chooses the wavelengths, None to draw one.
 
@@ -311,7 +311,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Return where primary rays write to.
 
         Args:
-            job: their launch.
+            job: launch of the rays.
             rays: :class:`~..sensors.origin.PrimaryRays`.
 
         Returns:
@@ -505,9 +505,9 @@ class TransientIntegrator(mi.CppADIntegrator):
 
         Args:
             params: not used; parameters are found through Dr.Jit's graph.
-            grad_in: (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W, T, C)``, or
-                the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
-                a copy.
+            grad_in: adjoints as (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W,
+                T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any
+                layout without a copy.
             sensor, seed, spp: sensor or its index, seed, and samples per pixel (0 for those of the sampler), see
                 :meth:`render`.
 

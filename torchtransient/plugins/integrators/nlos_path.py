@@ -267,7 +267,7 @@ class TransientNLOSPath(base.TransientIntegrator):
 
         Args:
             scene: Mitsuba scene.
-            contents: its contents.
+            contents: contents of the scene.
             wanted: derivatives of the job, None in a render.
             table: :class:`ScanTable` of the job, where it is known.
 

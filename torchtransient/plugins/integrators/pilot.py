@@ -37,7 +37,7 @@ class PilotEvents:
         energy: contribution to the mean over the image of the mean over wavelengths or channels, (N,), float64.
         depth: smallest ``max_depth`` of a render that contains it, (N,).
         path: number of the camera path, (N,).
-        pixel: its pixel on the pilot's film, (N,).
+        pixel: pixel of the path on the pilot's film, (N,).
         rate: rate of the path, (N,), m/s, float64; zero for a sensor whose film measures no rates.
         paths: number of camera paths.
         size: width and height of the pilot's film.

@@ -48,7 +48,7 @@ class AreaElements:
     Attributes:
         axes: origin and three axes, (E, 4, 3).
         kind, shape, primitive, area: row of the table above, numbers of shape and primitive, square metres, (E,).
-        normal: (E, 3); of flat elements on the side that shading normals take for the front, else
+        normal: normals of flat elements, (E, 3), on the side that shading normals take for the front; else
             ``(sign / radius, 0, 0)``.
         two_sided: light scatters on the back as well, (E,).
         left_out: names of the shapes without rows: copies of groups, curves, signed distances, ellipsoids.
@@ -257,7 +257,7 @@ def morton_order(points: np.ndarray, bits: int = 10) -> np.ndarray:
     """Return the order of points along a Morton curve, which keeps neighbours together, (N,).
 
     Args:
-        points: (N, 3).
+        points: points, (N, 3).
         bits: bits of a coordinate.
     """
     if not len(points):

@@ -320,7 +320,7 @@ class HiddenElements:
         To be called before :meth:`put_first`.
 
         Args:
-            weights: (tiles, E), finite and not negative, in the order of ``elements``.
+            weights: weights of the elements, (tiles, E), finite and not negative, in the order of ``elements``.
         """
         other = copy(self)
         other.tile_count = len(weights)

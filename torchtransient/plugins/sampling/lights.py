@@ -63,7 +63,7 @@ class LightBox:
     """Box around all lights of a scene. A plain object, which Dr.Jit loops leave alone.
 
     Args:
-        low, high: its corners.
+        low, high: corners of the box.
     """
 
     def __init__(self, low, high):

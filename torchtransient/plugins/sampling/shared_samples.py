@@ -66,8 +66,8 @@ def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
     """Return the distance of the vertex that is nearest to any of some points, metres.
 
     Args:
-        vertices: (V, 3), metres.
-        points: (P, 3), metres.
+        vertices: vertices, (V, 3), metres.
+        points: points, (P, 3), metres.
     """
     nearest = np.inf
     for p in points:

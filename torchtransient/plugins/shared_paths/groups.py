@@ -172,7 +172,7 @@ class Group:
 
         Args:
             vertex: vertices of the anchors.
-            lane, point: their numbers.
+            lane, point: numbers of anchor and point.
         """
         context, sharing = self.context, self.sharing
         p, n, shading = self.place(point)
@@ -248,7 +248,7 @@ def spread(sampler: Any, seed: Any, lanes: int, count: int) -> None:
     """Seed a sampler such that its samples are evenly spread over every ``count`` lanes.
 
     Args:
-        sampler: an ``owen``.
+        sampler: sampler ``owen``.
         seed: UInt32.
         lanes: number of lanes.
         count: a power of two.

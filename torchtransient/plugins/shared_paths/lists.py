@@ -120,7 +120,7 @@ def bring(group, events, suffixes, sink, state):
         events: :class:`SuffixList`.
         suffixes: lanes of the list of each point.
         sink: sink whose lengths are counted from the anchors.
-        state: its state, which is returned as it is afterwards.
+        state: state of the sink before; the state after it is returned.
     """
     size, slots = group.size, events.slots
     lane, k = dr.arange(mi.UInt32, group.lanes), mi.UInt32(0)

@@ -245,7 +245,7 @@ class Section:
     """Ellipse in which an ellipsoid of revolution meets a plane: ``center + p cos φ + q sin φ``.
 
     Args:
-        x, e: foci, Point3f.
+        x, e: foci of the ellipsoid, Point3f.
         s: sum of the distances to the foci.
         n, o: normal and a point of the plane.
 

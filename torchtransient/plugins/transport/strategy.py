@@ -101,7 +101,7 @@ class Step(Local):
     Attributes:
         out, wo: direction in world space and in the local frame.
         weight: value over density.
-        pdf: density.
+        pdf: density of the direction.
         eta: relative index of refraction.
         delta: mask, sampled by a delta lobe.
         unconnected: mask, no connection can find what lies ahead.
@@ -609,7 +609,7 @@ class Scattering(Strategy):
         Args:
             step: :class:`Step` whose ``guided`` lanes a guide has drawn.
             ray: Ray3f of the segment.
-            leg: its leg.
+            leg: leg of the ray.
         """
 
     def look_up_attached(self, context: Any, vertex: Any, wanted: Any) -> None:

@@ -83,7 +83,7 @@ class Surface(Scattering):
         Args:
             bsdf: BSDFPtr.
             u: two uniform numbers, None without delays.
-            wavelengths: those of the segment.
+            wavelengths: wavelengths of the segment.
 
         Returns:
             :class:`~..bsdfs.delay_table.DelaySample`: the delay, the BSDF that scatters with it, and its weight.
@@ -96,7 +96,7 @@ class Surface(Scattering):
 
         Args:
             delay: :class:`~..bsdfs.delay_table.DelaySample` of the surface.
-            interactions: those at the vertex, on the sensor's side.
+            interactions: interactions at the vertex, on the sensor's side.
         """
         if delay.wavelengths is None:
             return interactions

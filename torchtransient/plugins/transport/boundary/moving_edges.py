@@ -215,7 +215,7 @@ def missing(reason: str, remedy: str, *, is_asked_for: bool = False) -> MovingEd
     """Return the gaps of an integrator without a boundary term.
 
     Args:
-        reason: why it has none, in words that go on from "since".
+        reason: reason why it has none, in words that go on from "since".
         remedy: sentence that says what to do.
         is_asked_for: it was switched off.
     """

@@ -433,7 +433,7 @@ def sees_chains(context, sensor):
 
     Args:
         context: :class:`~..context.RenderContext` of the job.
-        sensor: its sensor.
+        sensor: sensor of the job.
     """
     contents = context.contents
     return context.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)

@@ -80,7 +80,7 @@ def dragged(v_x, v_before, r, d, n, radius, active):
     """Return the displacement of a material point that is dragged along by the vertex before it.
 
     Args:
-        v_x: its displacement as a material point.
+        v_x: displacement of the point as a material point.
         v_before: displacement of the vertex before.
         r: distance of both, metres.
         d: direction of the ray between them.

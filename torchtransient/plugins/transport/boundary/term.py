@@ -68,7 +68,7 @@ class BoundaryTerm:
         names: passes to run, of ``kinds``.
 
     Attributes:
-        context: ``context``.
+        context: context of the job.
         light_context: :class:`~..context.RenderContext` of paths that start at a light and are connected to the sensor.
         edges: :class:`~...edges.table.EdgeTable` of the scene.
         places: :class:`~...sensors.seen_from.SensorPlaces`.
