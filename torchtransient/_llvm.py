@@ -133,7 +133,7 @@ def ensure_llvm() -> LLVMLibrary:
     """Return the LLVM that Dr.Jit has bound. Called before an `llvm_*` variant is set.
 
     Raises:
-        VariantError: without a usable LLVM, with what to install.
+        VariantError: without a usable LLVM; the message says which package to install.
     """
     version = _bound_version()
     if version and version[0] >= MIN_MAJOR:
@@ -248,7 +248,7 @@ def library_version(path: str) -> tuple[int, ...]:
     """Return the version of an LLVM shared library without loading it into this process; empty if unknown.
 
     Args:
-        path: of the library.
+        path: path of the library.
     """
     real = os.path.realpath(path)
     return _version_in_name(os.path.basename(real)) or _version_by_subprocess(real)

@@ -118,8 +118,8 @@ class TimeAxis:
         """Find the bins of optical path lengths.
 
         Args:
-            opl: metres, a number or a tensor of any shape on any device; compared in float64 with ``edges_opl``. An
-                edge belongs to the bin that starts there.
+            opl: optical path lengths, metres, a number or a tensor of any shape on any device; compared in float64 with
+                ``edges_opl``. An edge belongs to the bin that starts there.
 
         Returns:
             Index of the bin, int64, in the shape of ``opl``; -1 before the axis, ``num_bins`` after it.
@@ -144,7 +144,7 @@ class FrequencyAxis:
     zero its phase counts from the moment when the light leaves the emitter. Frozen, hashable and picklable.
 
     Args:
-        frequencies: cycles per metre, one number or several, zero and negative ones too.
+        frequencies: frequencies in cycles per metre, one number or several, zero and negative ones too.
         start_opl: length of phase zero, metres.
 
     Raises:
@@ -177,7 +177,7 @@ class FrequencyAxis:
         """Return an axis of equal steps, which renders faster than arbitrary frequencies.
 
         Args:
-            first, step: cycles per metre.
+            first, step: first frequency and distance to the next, cycles per metre.
             count: number of frequencies ``first + k step``.
             start_opl: length of phase zero, metres.
 
@@ -193,7 +193,7 @@ class FrequencyAxis:
         """Return an axis from modulation frequencies.
 
         Args:
-            frequencies_hz: hertz, one number or several.
+            frequencies_hz: frequencies in hertz, one number or several.
             start_opl: length of phase zero, metres.
 
         Raises:

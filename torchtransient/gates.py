@@ -260,7 +260,7 @@ def jump_in(gates: Sequence[Gate]) -> str:
     """Return a name for the first gate that opens or closes at once, for messages; empty if all have a slope.
 
     Args:
-        gates: of a film.
+        gates: gates of a film.
     """
     return next((f"{gate.kind} gate" for gate in gates if not gate.is_continuous), "")
 
@@ -269,7 +269,7 @@ def gates_to_text(gates: Sequence[Gate]) -> str:
     """Return gates in the notation of scene files.
 
     Args:
-        gates: of a film.
+        gates: gates of a film.
     """
     return "; ".join(map(str, gates))
 

@@ -70,7 +70,7 @@ def let_copy(module: nn.Module) -> None:
     """Make copies and pickles of a parametrized module as those of `CopiesParametrized`, unless its class has its own.
 
     Args:
-        module: with or without parametrizations.
+        module: module with or without parametrizations.
     """
     own: Any = parametrize.type_before_parametrizations(module)
     made: Any = type(module)

@@ -223,7 +223,7 @@ def transform(pulse: Pulse, frequencies: Any) -> NDArray[np.complex128]:
 
     Args:
         pulse: the pulse.
-        frequencies: (F,), cycles per metre.
+        frequencies: frequencies, (F,), cycles per metre.
 
     Returns:
         (F,) complex128; one at frequency zero.

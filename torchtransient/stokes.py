@@ -213,7 +213,7 @@ def rotator(angle: Tensor | float) -> Tensor:
     """Return the Mueller matrix of a change to a frame turned counter-clockwise.
 
     Args:
-        angle: radians, a number or a tensor (...).
+        angle: turn of the frame, radians, a number or a tensor (...).
 
     Returns:
         (..., 4, 4).
@@ -228,7 +228,7 @@ def linear_polarizer(angle: Tensor | float = 0.0, extinction: Tensor | float = 0
     """Return the Mueller matrix of a polarizer that passes light oscillating at an angle.
 
     Args:
-        angle: radians, a number or a tensor (...).
+        angle: angle of the axis that passes, radians, a number or a tensor (...).
         extinction: transmitted power of the light across the angle, relative to that along it, in [0, 1]: 0 is ideal,
             real sensors have 1/100 to 1/400.
 

@@ -90,15 +90,14 @@ def measure(
     runs of 16 samples (or of the smallest count) come first: where they show a heavy tail, there is no error.
 
     Args:
-        candidates: tasks by name, of each choice.
+        candidates: tasks of each choice, by name.
         spp: different sample counts, at least 1.
-        reference_spp: samples of a candidate's own reference, at least four times the largest of `spp`; None: pairs.
-        repeats: runs at each count; even without a reference.
-        seed: of the first run; no two runs share one.
-        progress: show a bar that counts the samples.
-        settings: kept in the report.
-        finest: by name of a task, the choice whose reference all choices are compared with as well, which gives the
-            total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
+        reference_spp: samples per pixel of a candidate's own reference, at least four times the largest of `spp`; None:
+        pairs. repeats: number of runs at each count, at least 2, and an even number where there is no reference. seed:
+        seed of the first run; no two runs share one. progress: show a bar that counts the samples. settings: facts to
+        keep in the report. finest: choice for each task, by its name, whose reference all choices are compared with as
+        well, which gives
+            the total error, variance and bias. That reference has `reference_spp` samples, or four times the largest of
             `spp`.
 
     Returns:
@@ -243,8 +242,8 @@ def checked_counts(spp: Sequence[int], repeats: int, reference_spp: int | None) 
 
     Args:
         spp: different counts.
-        repeats: of each count.
-        reference_spp: of the reference, or None.
+        repeats: number of runs at each count, at least 2, and an even number where there is no reference.
+        reference_spp: samples per pixel of the reference, or None for pairs of runs.
 
     Raises:
         UnitError: for other numbers.
@@ -280,7 +279,7 @@ def cosine_over_the_window(out: RenderOutput) -> torch.Tensor:
     no bias, and it changes with energy and arrival time.
 
     Args:
-        out: a render.
+        out: output of a render.
 
     Raises:
         ShapeError: for a steady image alone.
@@ -324,12 +323,12 @@ def cost_of_accuracy(
     """Measure the error of the transient, of quantities made of it, and of gradients, against seconds and samples.
 
     Every combination of samplers, filters, integrators, depths and bin widths is one curve. Its *error* is that of its
-    own noise: every curve is compared with its own expectation, and what a filter blurs does not count. Its *total
-    error* is measured where anything but samplers is compared, and of ``quantities``: the distance to a reference of
-    the finest setting (deepest paths, narrowest bins, box before tent before gaussian, the first integrator, and of
-    the samplers "owen" or else the first), so that light that a small depth leaves out, and detail that a filter or a
-    wide bin blurs, count as bias. What the finest setting itself lacks is not seen. Histograms are compared on the
-    narrowest bins, wide ones spread evenly over them.
+    own noise: every curve is compared with its own expectation, and detail that a filter blurs does not count. Its
+    *total error* is measured where anything but samplers is compared, and of ``quantities``: the distance to a
+    reference of the finest setting (deepest paths, narrowest bins, box before tent before gaussian, the first
+    integrator, and of the samplers "owen" or else the first), so that light that a small depth leaves out, and detail
+    that a filter or a wide bin blurs, count as bias. Errors of the finest setting itself are not seen. Histograms are
+    compared on the narrowest bins, wide ones spread evenly over them.
 
     Errors are squared and relative, of independent runs. Seconds are medians of wall time, with CPU seconds beside: a
     forward render for values, render and backward for gradients; the runs of all curves take turns. A loss that is not
@@ -358,11 +357,11 @@ def cost_of_accuracy(
             times the largest ``spp``, with a reference of that many samples. That of the total error has as many, with
             None four times the largest ``spp``.
         repeats: independent runs at each of ``spp``.
-        samplers: plugin names.
+        samplers: plugin names of the samplers.
         temporal_filters: "box", "tent", "gaussian"; None for the one that the renderer uses.
         integrators: plugin names; None for the renderer's.
         max_depths: longest paths, in segments, -1 for no limit; None for the renderer's.
-        bin_widths: metres of optical path; None for the renderer's.
+        bin_widths: widths of the bins, metres of optical path; None for the renderer's.
         loss: a scalar of the `RenderOutput`, for ``gradients``.
         seed: seed of the first run.
         progress: show a progress bar.
@@ -371,8 +370,8 @@ def cost_of_accuracy(
         An `AccuracyReport` with `table()`, `plot(path)`, `recommend(error=)`, `pareto()` and `to_json(path)`.
 
     Raises:
-        ArgumentError: for what is no renderer, settings that its film does not have, and ``quantities`` that are no
-            functions by name, or have a name of what is measured anyway.
+        ArgumentError: for an argument that is no renderer, settings that its film does not have, and ``quantities``
+            that are no functions by name, or have the name of a quantity that is measured anyway.
         SceneError: for a key, sampler or integrator that the renderer does not know.
         UnitError: for counts out of range, and a quantity that is not finite.
         ShapeError: for a quantity whose shape depends on the setting.
@@ -443,7 +442,7 @@ def _variations(
     max_depths: Sequence[int] | None,
     bin_widths: Numbers | None,
 ) -> dict[Choice, TransientRenderer]:
-    """A renderer for every combination; choices name what is compared beside sampler and filter."""
+    """A renderer for every combination; choices name the compared settings beside sampler and filter."""
     filters = [renderer.effective_filter or "auto"] if temporal_filters is None else list(temporal_filters)
     if not samplers or not filters:
         raise ArgumentError("expected at least one sampler and one temporal filter, got none")
@@ -482,7 +481,7 @@ def _blur(choice: Choice) -> tuple[float, float, int, bool]:
 
 
 def _checked_quantities(given: Mapping[str, Loss], own: Sequence[str]) -> dict[str, Loss]:
-    """Return functions by name. ``own``: names of what is measured in any case."""
+    """Return functions by name. ``own``: names of quantities that are measured in any case."""
     checked = {}
     for name, each in mapping("quantities", given, "{name: function of a RenderOutput}").items():
         text("quantities", name, "names, texts")
@@ -497,7 +496,7 @@ def _checked_quantities(given: Mapping[str, Loss], own: Sequence[str]) -> dict[s
 
 @dataclass
 class _Quantities:
-    """Functions of a render by name. ``shapes``: of what each returned first, and the setting of that render."""
+    """Functions of a render by name. ``shapes``: shape that each returned first, and the setting of that render."""
 
     functions: Mapping[str, Loss]
     shapes: dict[str, tuple[torch.Size, str]] = field(default_factory=dict)

@@ -154,8 +154,9 @@ class ErrorTally:
         """Return the figures of all runs so far.
 
         Args:
-            tail: of the estimate, from runs of its own: of a heavy one all figures are NaN, of others the standard
-                error comes from its spread, which a few runs do not show.
+            tail: tail of the estimate's distribution, from runs of its own: where it is heavy all figures are NaN,
+                elsewhere the standard error comes from its spread, which a few runs do not show. None: from these runs
+                alone.
 
         Raises:
             ShapeError: without any run, and of a single one without a reference.
@@ -237,9 +238,10 @@ class ErrorEstimate:
     """`squared`: expected squared error per entry, and its standard error over the runs (NaN for one run or pair),
     which contains that of the reference. `comparisons`: runs, or pairs of them, that it is the mean of.
 
-    `relative`: root of squared error over power, all entries together: what bright bins decide. `median_bin`: the same
-    per time bin, median over the bins that hold light: what dim, late bins decide. NaN where there is no light at all.
-    `power`: what the squared error is relative to. `bias`: relative, against the reference, 0 within its noise.
+    `relative`: root of squared error over power, all entries together, which bright bins decide. `median_bin`: the same
+    per time bin, median over the bins that hold light, which dim, late bins decide. NaN where there is no light at all.
+    `power`: mean square of the estimated quantity, which the squared error is relative to. `bias`: relative, against
+    the reference, 0 within its noise.
     """
 
     squared: float
@@ -259,7 +261,7 @@ def relative(squared: float, power: float) -> float:
 
     Args:
         squared: squared error, of which one below zero counts as none.
-        power: mean square of what was estimated.
+        power: mean square of the estimated quantity.
     """
     return math.sqrt(max(squared, 0.0) / power) if power > 0 else math.nan
 

@@ -28,7 +28,8 @@ class GradientEstimate:
 
     Attributes:
         value: mean over the passes, in the shape of the parameter.
-        standard_error: of ``value``, entry by entry; NaN where the tail is heavy: the runs do not tell the variance.
+        standard_error: standard error of ``value``, entry by entry; NaN where the tail is heavy: the runs do not tell
+            the variance.
         tail: distribution of short runs; None if it was not looked at.
         passes, spp: number of passes, and samples per pixel of each.
     """

@@ -50,7 +50,7 @@ class CostPoint:
 
     `quantity`: "transient", "phasor", a name of `quantities` or the key of a gradient. `spp`: samples per pixel really
     drawn. `seconds`, `cpu_seconds`: medians of wall and CPU time of one run (forward for values, forward and backward
-    for gradients). The errors are those of `ErrorEstimate`. `tail`: of a gradient, the tail of its distribution; where
+    for gradients). The errors are those of `ErrorEstimate`. `tail`: tail of a gradient's distribution; where
     it is heavy the errors are NaN. The total errors are those against the finest setting, bias included; `total_error`
     is relative, and so is `bias`, 0 within its noise. All are NaN where they were not measured.
     """
@@ -88,7 +88,7 @@ class SamplesNeeded:
     """Samples per pixel that a relative error takes, from a line through measured errors.
 
     `spp`: estimate. `low`, `high`: its 95 % interval, for errors that scatter about the line as those measured do.
-    `seconds`: time of one run of `spp`, from the last measured one in proportion. `slope`: of log squared relative
+    `seconds`: time of one run of `spp`, from the last measured one in proportion. `slope`: that of log squared relative
     error against log spp. `extrapolated`: `spp` lies outside of the samples that were measured.
     """
 
@@ -160,8 +160,8 @@ class AccuracyReport:
         """Return the points of one curve in rising spp; empty where there is none.
 
         Args:
-            quantity: its name.
-            choice: the settings.
+            quantity: name of the quantity.
+            choice: settings of the curve.
         """
         found = [p for p in self.points if (p.quantity, p.choice) == (quantity, choice)]
         return sorted(found, key=lambda p: p.spp)
@@ -173,8 +173,8 @@ class AccuracyReport:
         points the scatter is known by chance alone.
 
         Args:
-            quantity: its name.
-            choice: the settings.
+            quantity: name of the quantity.
+            choice: settings of the curve.
 
         Returns:
             The line, None with fewer than three points.
@@ -193,12 +193,12 @@ class AccuracyReport:
         """Return the 95 % interval of a point's relative error, or of its total error.
 
         Bounds are factors, the exponential of the relative standard error of the squared error times Student's t. A
-        few runs hardly know that standard error: of the noise it is pooled over the points of the curve, which have
+        few runs hardly know that standard error: that of the noise is pooled over the points of the curve, which have
         the same number of entries.
 
         Args:
-            point: of this report.
-            total: of the total error.
+            point: point of this report.
+            total: return the interval of the total error.
 
         Returns:
             (low, high), NaN where there is none.
@@ -226,7 +226,7 @@ class AccuracyReport:
         Closer by `CostPoint.error`: with the bias of a small depth, a filter and a wide bin where it was measured.
 
         Args:
-            quantity: its name, None for the first.
+            quantity: name of the quantity, None for the first.
         """
         quantity = self._quantity("pareto", quantity)
         known = [p for p in self.points if p.quantity == quantity and p.error >= 0]
@@ -322,7 +322,7 @@ class AccuracyReport:
 
         Args:
             error: relative error (`CostPoint.relative_error`), 0.05 for 5 %.
-            quantity, choice: of the curve; None: the first one of the report.
+            quantity, choice: quantity and choice of the curve; None: the first one of the report.
 
         Raises:
             UnitError: for an error that is not positive.
@@ -350,7 +350,7 @@ class AccuracyReport:
         Geometric mean over the runs with equal position in the list of samples.
 
         Args:
-            quantity: its name.
+            quantity: name of the quantity.
             choice: the other choice.
 
         Returns:
@@ -436,7 +436,7 @@ class AccuracyReport:
         """Write `to_dict()` to a file.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             StorageError: when it cannot be written.
@@ -448,7 +448,7 @@ class AccuracyReport:
         """Return the report of a file that `to_json` wrote.
 
         Args:
-            path: of the file.
+            path: path of the file.
 
         Raises:
             StorageError: for other files.
@@ -468,7 +468,7 @@ class AccuracyReport:
         and the Pareto front.
 
         Args:
-            path: of the picture.
+            path: path of the picture.
 
         Raises:
             StorageError: when it cannot be written.
@@ -502,7 +502,7 @@ def _squares(bands: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def _point(entry: dict[str, Any]) -> CostPoint:
-    """A point of its entry in a file: None is NaN, except for what has none."""
+    """Return the point of an entry in a file; None is NaN, except in choice and tail."""
     choice = Choice(**{f.name: entry.pop(f.name) for f in fields(Choice) if f.name in entry})
     tail = entry.pop("tail", None)
     tail = None if tail is None else Tail(**{name: _number(value) for name, value in tail.items()})

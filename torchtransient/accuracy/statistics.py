@@ -58,7 +58,7 @@ def standard_error(runs: ArrayLike) -> Array:
     """Return the standard error of the mean over independent runs.
 
     Args:
-        runs: (K, ...), K >= 2.
+        runs: independent runs, (K, ...), K >= 2.
 
     Returns:
         (...).
@@ -118,8 +118,8 @@ def pool_small_bins(expected: ArrayLike, minimum: float) -> NDArray[np.intp]:
     axis=-1)`. Bins left at the end join the last group.
 
     Args:
-        expected: (T,).
-        minimum: of a group.
+        expected: expected number of events in each bin, (T,).
+        minimum: smallest expected number of events in a group.
 
     Raises:
         UnitError: when all bins together hold less.
@@ -153,7 +153,7 @@ def log_log_slope(x: ArrayLike, y: ArrayLike) -> Slope:
     """Fit a line through (log x, log y) by least squares. The variance of Monte Carlo has slope -1 in spp.
 
     Args:
-        x, y: (N,), N >= 3, positive.
+        x, y: coordinates of the points, (N,), N >= 3, positive.
 
     Raises:
         ShapeError, UnitError: for other numbers.
@@ -177,7 +177,7 @@ def student_t_deviate(t: float, dof: float) -> float:
     """Return the normal deviate with the tail probability of Student's t.
 
     Args:
-        t: the deviate.
+        t: deviate of Student's t.
         dof: degrees of freedom.
     """
     if math.isinf(t):

@@ -24,7 +24,7 @@ def ray_directions(camera_matrix: Any, size: tuple[int, int], to_world: Any = No
     """Return unit vectors from the pinhole through the centres of pixels.
 
     Args:
-        camera_matrix: (..., 3, 3).
+        camera_matrix: camera matrix (..., 3, 3).
         size: (H, W) of the image.
         to_world: pose (..., 4, 4) of the sensor, for vectors of the world; None for those of kornia's camera.
 
@@ -56,7 +56,7 @@ def distance_from_z_depth(z_depth: Tensor, camera_matrix: Any) -> Tensor:
 
     Args:
         z_depth: depth along the axis (the label `z_depth`), (..., H, W), metres.
-        camera_matrix: (..., 3, 3).
+        camera_matrix: camera matrix (..., 3, 3).
     """
     cosines = _cosines(z_depth, camera_matrix, "distance_from_z_depth")
     known, depth = without_nan(z_depth)
@@ -69,7 +69,7 @@ def z_depth_from_distance(distance: Tensor, camera_matrix: Any) -> Tensor:
 
     Args:
         distance: distance along each pixel's ray (the label `depth`), (..., H, W), metres.
-        camera_matrix: (..., 3, 3).
+        camera_matrix: camera matrix (..., 3, 3).
     """
     cosines = _cosines(distance, camera_matrix, "z_depth_from_distance")
     known, along = without_nan(distance)
@@ -81,8 +81,8 @@ def points_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = N
     """Return the points at a distance along each pixel's ray.
 
     Args:
-        distance: (..., H, W), metres.
-        camera_matrix: (..., 3, 3).
+        distance: distance along the rays, (..., H, W), metres.
+        camera_matrix: camera matrix (..., 3, 3).
         to_world: pose (..., 4, 4) of the sensor, for points of the world (the label `position`); None for those of
             kornia's camera.
 
@@ -106,12 +106,12 @@ def opl_from_distance(
     the camera. There and back, `2 index distance`, of a light at the pinhole.
 
     Args:
-        distance: (..., H, W), metres.
-        camera_matrix: (..., 3, 3), for a light elsewhere.
-        to_world: pose (..., 4, 4) of the sensor, for a light elsewhere.
-        light: place in the world, (3,) or (..., 3), metres; None for the pinhole.
-        index: index of refraction between them, a number, or a tensor that broadcasts to the image and keeps its
-            gradient.
+        distance: distance along the rays, (..., H, W), metres.
+        camera_matrix: camera matrix (..., 3, 3); needed for a light that is not at the pinhole.
+        to_world: pose (..., 4, 4) of the sensor; needed for a light that is not at the pinhole.
+        light: place of the light in the world, (3,) or (..., 3), metres; None for the pinhole.
+        index: index of refraction between light, surface and camera: a number, or a tensor that broadcasts to the image
+            and keeps its gradient.
 
     Returns:
         (..., H, W), metres.
@@ -138,10 +138,11 @@ def distance_from_opl(
 
     Args:
         opl: optical path, (..., H, W), metres.
-        camera_matrix: as in `opl_from_distance`, with its errors.
-        to_world: as there.
-        light: as there.
-        index: as there.
+        camera_matrix: camera matrix (..., 3, 3); needed for a light that is not at the pinhole.
+        to_world: pose (..., 4, 4) of the sensor; needed for a light that is not at the pinhole.
+        light: place of the light in the world, (3,) or (..., 3), metres; None for the pinhole.
+        index: index of refraction between light, surface and camera: a number, or a tensor that broadcasts to the image
+            and keeps its gradient.
 
     Returns:
         (..., H, W), metres. NaN, of which nothing flows back, if the path is too short for any surface: negative, or
@@ -171,7 +172,7 @@ def image_of(image: Any, where: str) -> tuple[int, int]:
     """Return height and width of a floating image.
 
     Args:
-        image: (..., H, W).
+        image: image (..., H, W).
         where: subject of messages.
 
     Raises:
@@ -189,7 +190,7 @@ def without_nan(image: Tensor) -> tuple[Tensor, Tensor]:
     A slope of zero times NaN would be NaN, and reach cameras and lights.
 
     Args:
-        image: (..., H, W).
+        image: image (..., H, W).
     """
     known = ~torch.isnan(image)
     return known, torch.where(known, single(image), 1.0)
@@ -247,7 +248,7 @@ def normals_from_distance(distance: Tensor, camera_matrix: Any, to_world: Any = 
 
     Args:
         distance: the label `depth`, (..., H, W), metres.
-        camera_matrix: (..., 3, 3).
+        camera_matrix: camera matrix (..., 3, 3).
         to_world: pose (..., 4, 4) of the sensor, for normals of the world; None for those of kornia's camera.
 
     Returns:

@@ -42,36 +42,37 @@ def over_time(
     spp: int | None = None,
     progress: bool = False,
 ) -> RenderOutput:
-    """Render a scene that moves, as a camera sees it that looks for a while.
+    """Render a moving scene as a camera sees it during an exposure.
 
-    One batch of poses is rendered, all with the same samples, so that noise does not differ between instants; what the
-    exposure makes of it is linear. Costs as many renders as poses, and holds their pictures.
+    One batch of poses is rendered, all with the same samples, so that noise does not differ between instants; the
+    result of the exposure is linear in their pictures. Costs as many renders as poses, and holds their pictures.
 
     Args:
         renderer: a renderer whose parameters include what moves, ``parameters=["fan.to_world"]``.
-        moving: what moves, by key or by name of a body ("fan" for its pose "fan.to_world", its position or the
-            vertices of its mesh, whichever the renderer has):
+        moving: motions by key, or by name of a body ("fan" for its pose "fan.to_world", its position or the vertices of
+            its mesh, whichever the renderer has):
 
             - a :class:`tt.Motion`, from the value of the call or of the renderer, which is that of t = 0;
             - a function of times (K,), seconds, float64, that returns the values (K, *shape) of the key;
             - or, in place of the mapping, one function of times that returns values by key.
         exposure: :class:`tt.Exposure`, :class:`tt.RollingShutter`, :class:`tt.PhaseSteps` or :class:`tt.Frames`.
-        values: by key in place of the renderer's own, without a batch.
+        values: values by key in place of the renderer's own, without a batch.
         seed: one seed for all poses; None draws one from torch's generator.
         spp: samples per pixel of each pose, None for the renderer's.
         progress: show a progress bar.
 
     Returns:
-        A :class:`RenderOutput` as of the renderer, with one leading dimension more for ``PhaseSteps`` and ``Frames``.
-        Its tensors carry gradients to velocities, to what functions are made of, and to all values.
+        A :class:`RenderOutput` as a call of the renderer returns it, with one leading dimension more for
+        ``PhaseSteps`` and ``Frames``. Its tensors carry gradients to velocities, to tensors that the functions use, and
+        to all values.
 
     Raises:
         ArgumentError: for a renderer with a whole number as ``grad_seed``, whose poses would differ in noise; for films
-            without what the exposure needs; for a motion of what has no place, and for none.
+            that do not measure what the exposure needs; for a motion of a value that is no place, and without motions.
         UnknownKeyError: for keys and names that the renderer does not have.
         ShapeError: for batches, and functions that return other than one value for each time.
-        PhysicsError: with ``physics="error"`` of the renderer, for what moves further than the scene is large, or turns
-            around, while the camera looks (of ``Frames``: what moves so far from one to the next). Otherwise that is a
+        PhysicsError: with ``physics="error"`` of the renderer, for a body that moves further than the scene is large,
+            or turns around, while the camera looks (of ``Frames``: from one frame to the next). Otherwise that is a
             ``PhysicsWarning``, as is a motion that slow phasors follow already, by the velocity of the same body.
         SceneError, UnitError, DeviceError, StorageError, GradientError: as the renderer raises them.
 
@@ -108,14 +109,14 @@ def over_time(
 def _check_units(
     renderer: TransientRenderer, moving: Moving, moved: Mapping[str, Tensor], time_s: Tensor, each: bool
 ) -> None:
-    """Warn of what moves further than the scene is large, or turns around, as what was given milliseconds does.
+    """Warn of bodies that move further than the scene is large, or turn around, as they do for times in milliseconds.
 
     Args:
         renderer: the renderer.
-        moving: what moves.
-        moved: its values (K, *shape) by key.
+        moving: motions, see :func:`over_time`.
+        moved: values (K, *shape) of the moving keys.
         time_s: times (K,), seconds.
-        each: from one time to the next, not from the first to the last; turns do not count then.
+        each: compare each time with the next one, not the first with the last; turns do not count then.
     """
     size, watch = scene_size(renderer), watch_of(renderer)
     for key, value in moved.items():
@@ -149,7 +150,7 @@ def _check_once(renderer: TransientRenderer, moved: Iterable[str]) -> None:
 
 
 def _values_at(moving: Moving, time_s: Tensor, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the values (K, *shape) of what moves; ``own``: values of all keys at t = 0."""
+    """Return the values (K, *shape) of all moving keys; ``own``: values of all keys at t = 0."""
     if isinstance(moving, Mapping):
         at = {name: how if isinstance(how, Motion) else _called(name, how, time_s) for name, how in moving.items()}
     else:

@@ -39,7 +39,7 @@ class Motion:
         self.center = _three("center", center)
 
     def matrices(self, time_s: Tensor) -> Tensor:
-        """Return what takes points of t = 0 to their places at other times.
+        """Return the transforms that take points of t = 0 to their places at other times.
 
         Args:
             time_s: times, (K,), seconds.

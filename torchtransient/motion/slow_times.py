@@ -34,7 +34,7 @@ _MOST_BEATS = 1000
 
 
 class SlowTimes(abc.ABC):
-    """Base of what `tt.over_time` takes: times of poses, and a map from their pictures to the result.
+    """Base class of exposures for `tt.over_time`: times of poses, and a map from their pictures to the result.
 
     Attributes:
         needs_phasors: only phasor films have a result.
@@ -111,14 +111,14 @@ class Exposure(SlowTimes):
         return float(self.duration_s) / 2 * torch.tensor(_nodes(int(self.poses)))
 
     def weights(self) -> Tensor:
-        """Return what each pose counts with, complex128 (poses,); their sum is the beat's average."""
+        """Return the weight of each pose, complex128 (poses,); their sum is the beat's average."""
         return torch.tensor(_beat_weights(int(self.poses), float(self.beat_hz) * float(self.duration_s)))
 
     def combine(self, pictures: Tensor) -> Tensor:
         """Return the average of pictures (poses, ...), with the beat if they are complex.
 
         Args:
-            pictures: (poses, ...), real or complex.
+            pictures: pictures of the poses, (poses, ...), real or complex.
 
         Returns:
             (...), of the same dtype.
@@ -138,7 +138,7 @@ class RollingShutter(SlowTimes):
     negative where a body crosses bins between them. Each row sees one instant.
 
     Args:
-        row_s: from one row to the next, seconds; negative from the bottom to the top.
+        row_s: time from one row to the next, seconds; negative from the bottom to the top.
         poses: number of renders.
 
     Raises:
@@ -172,7 +172,7 @@ class RollingShutter(SlowTimes):
         """Return the pictures (poses, ..., H, W) with each row at its time.
 
         Args:
-            pictures: (poses, ..., H, W).
+            pictures: pictures of the poses, (poses, ..., H, W).
 
         Returns:
             (..., H, W).
@@ -186,11 +186,11 @@ class RollingShutter(SlowTimes):
 class PhaseSteps(SlowTimes):
     """Exposures of an iToF camera one after another, a render each; the middle of them is t = 0.
 
-    The output has a leading dimension of exposures. `taps` puts together what each of them sees.
+    The output has a leading dimension of exposures. `taps` puts together the taps of each of them.
 
     Args:
         number: exposures: phase steps times frequencies, in the order of the sensor's taps.
-        period_s: from one exposure to the next, seconds.
+        period_s: time from one exposure to the next, seconds.
 
     Raises:
         UnitError: for other numbers.
@@ -215,7 +215,7 @@ class PhaseSteps(SlowTimes):
         """Return the pictures as they are, (number, ...).
 
         Args:
-            pictures: (number, ...).
+            pictures: pictures of the exposures, (number, ...).
 
         Returns:
             (number, ...).
@@ -250,7 +250,7 @@ class Frames(SlowTimes):
     """A video: one output for each time, along a leading dimension.
 
     Args:
-        time_s: times, (K,), seconds; of a tensor with its gradient.
+        time_s: times, (K,), seconds; a tensor keeps its gradient.
 
     Raises:
         ShapeError, UnitError: unless it is one row of finite numbers.
@@ -275,7 +275,7 @@ class Frames(SlowTimes):
         """Return the pictures as they are, (K, ...).
 
         Args:
-            pictures: (K, ...).
+            pictures: pictures of the times, (K, ...).
 
         Returns:
             (K, ...).

@@ -143,7 +143,7 @@ KINDS = (
 
 @dataclass(frozen=True)
 class PluginModule:
-    """A module of plugins, and what it registers as pairs `(kind, name)`.
+    """A module of plugins, and the plugins that it registers as pairs `(kind, name)`.
 
     A module without plugins is listed when others inherit from its classes: it has to be executed again before them.
     """
@@ -276,8 +276,8 @@ def register_module(module: str, plugins: tuple[tuple[str, str], ...] = ()) -> N
 
     Args:
         module: dotted name that Python can import.
-        plugins: what it registers, as (kind, name). Listed names answer with a clear VariantError in scalar variants,
-            and a listed name that the module fails to register is an error.
+        plugins: plugins that the module registers, as (kind, name). Listed names answer with a clear VariantError in
+            scalar variants, and a listed name that the module fails to register is an error.
 
     Raises:
         PluginRegistrationError: for a module that cannot be found or executed.
@@ -387,8 +387,8 @@ def attach() -> None:
 
 @contextlib.contextmanager
 def plugin_errors() -> Iterator[None]:
-    """Raise the typed error of a plugin's constructor, or what has interrupted it, instead of the RuntimeError that
-    Mitsuba makes of it.
+    """Raise the typed error of a plugin's constructor, or the interrupt that ended it, instead of the RuntimeError
+    that Mitsuba turns either into.
 
     Use it around `mi.load_dict` and `mi.load_file`.
     """
@@ -428,8 +428,8 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
 
 def _check_nothing_was_raised() -> None:
     """Mitsuba (3.9) goes on with its callbacks when one was interrupted, and calls them with the exception still set.
-    What C functions return then is taken for an error: a lock, once taken, would never be let go of. Raises what was
-    raised before; a lock that nobody else has finds it.
+    The results of C functions are then taken for errors: a lock, once taken, would never be let go of. Raises the
+    exception that was set; taking a lock that nobody else has brings it out.
     """
     try:
         with threading.RLock():

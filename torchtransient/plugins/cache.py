@@ -51,7 +51,7 @@ class Cache:
 
         Args:
             kind: name of the computation.
-            key: all that the result depends on, beside the numbers of plugins.
+            key: data that the result depends on, beside the numbers of plugins.
             compute: function that computes it.
         """
         if self._has_plugins:

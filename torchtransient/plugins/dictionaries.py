@@ -154,7 +154,7 @@ def _array(value: np.ndarray, key: str) -> Any:
 def parsed(config: Any, tree: Mapping[str, Any]) -> Any:
     """Return Mitsuba's parser state of a dictionary.
 
-    Tensors enter with one row and get their own once the parser keeps them: what has three rows Mitsuba tries as a
+    Tensors enter with one row and get their own once the parser keeps them: an array of three rows Mitsuba tries as a
     point and as two kinds of colours first, and nanobind prints a line on stderr for each.
 
     Args:
@@ -215,8 +215,8 @@ def _mesh_rows(value: Any, key: str) -> Any:
 
 
 def take_arrays() -> None:
-    """Let ``mi.load_dict`` take the dictionaries of this library. What it took before it takes as it did; repeating
-    this has no effect.
+    """Let ``mi.load_dict`` take the dictionaries of this library. Other dictionaries are taken as before;
+    repeating this has no effect.
     """
     if not hasattr(mi.load_dict, "takes_arrays"):
         mi.load_dict = _taking_arrays(mi.load_dict)

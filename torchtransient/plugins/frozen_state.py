@@ -83,7 +83,7 @@ def state_below(value: Any) -> tuple[tuple[Any, ...], list[Any]]:
 
     Returns:
         (structure: all that is no array, with the places and types of arrays, hashable; Mitsuba's objects count by
-        their address. Arrays: as of :func:`arrays_below`).
+        their address. Arrays: see :func:`arrays_below`).
 
     Raises:
         NotComparableError: for objects of an unknown type.

@@ -40,7 +40,7 @@ def interrupt_behind(error: BaseException, handled: BaseException | None = None)
     """Return the interrupt, or other exception that is no ``Exception``, that caused an error; None without one.
 
     Args:
-        error, handled: as of :func:`chain_of`.
+        error, handled: the exception, and the one that was handled at the call or None, see :func:`chain_of`.
     """
     chain = chain_of(error, handled)
     own = next((cause for cause in reversed(chain) if not isinstance(cause, Exception)), None)

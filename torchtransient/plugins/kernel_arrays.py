@@ -21,8 +21,8 @@ _ALIGNMENT = 64
 def host_numbers(value: Any, dtype: DTypeLike = np.float64) -> np.ndarray:
     """Return a copy of an array's numbers in the memory of the host.
 
-    Of a detached handle: Dr.Jit evaluates what it reads in place, and a literal that a scene shows to recordings would
-    be another array afterwards.
+    They are read through a detached handle: Dr.Jit evaluates an array in place to read it, and a literal that a scene
+    shows to recordings would be another array afterwards.
 
     Args:
         value: Dr.Jit array, attached or not.
@@ -38,7 +38,7 @@ def whole_numbers(values: np.ndarray) -> Any:
     """Return a copy of whole numbers as a ``mi.UInt32``.
 
     Args:
-        values: (N,), 0 to 2^32 - 1.
+        values: whole numbers, (N,), 0 to 2^32 - 1.
     """
     return mi.UInt32(_aligned(values, np.uint32))
 
@@ -47,7 +47,7 @@ def floats(values: np.ndarray) -> Any:
     """Return a copy of numbers as a ``mi.Float``.
 
     Args:
-        values: (N,).
+        values: real numbers, (N,).
     """
     return mi.Float(_aligned(values, np.float32))
 
@@ -95,7 +95,7 @@ def registry_number(plugin: Any) -> int:
         plugin: BSDF, emitter, shape, medium or other plugin of which Mitsuba has arrays of pointers.
 
     Raises:
-        SceneError: for what kernels cannot point to.
+        SceneError: for plugins that kernels cannot point to.
     """
     for kind, pointer in _POINTERS.items():
         if isinstance(plugin, getattr(mi, kind)):

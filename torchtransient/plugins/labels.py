@@ -158,7 +158,7 @@ class LabelJob:
 
     @no_collection()
     def prepare(self) -> LabelJob:
-        """Look up what is not part of what is recorded."""
+        """Look up all data that is not part of the recorded code."""
         _check_sensor(self.sensor, self.names)
         self.tables.seen.follow_derivatives(self.scene, False)
         self.plugins = self.tables.seen.python_plugins(self.scene)
@@ -199,7 +199,7 @@ class LabelJob:
 
     @staticmethod
     def state_of(jobs: list[LabelJob]) -> tuple[tuple[Any, ...], list[Any]]:
-        """Return (structure, arrays), as of :func:`torchtransient.plugins.integrators.job.state_of`."""
+        """Return (structure, arrays), see :func:`torchtransient.plugins.integrators.job.state_of`."""
         held: list[Any] = []
         for job in jobs:
             held += [job.kind, job.names, job.samples, job._size, job._passes, job._hides_emitters, job.sensor]

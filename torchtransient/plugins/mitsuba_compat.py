@@ -37,7 +37,7 @@ def cancels_lobe_probability(bsdf: Any) -> bool:
 
 
 def weight_slot(bsdf: Any) -> str | None:
-    """Return the name of the texture or volume that mixes what a BSDF or phase function holds.
+    """Return the name of the texture or volume that mixes the parts of a BSDF or phase function.
 
     Args:
         bsdf: one ``mi.BSDF`` or ``mi.PhaseFunction``.
@@ -55,13 +55,13 @@ def adds_up_wrongly(bsdf: Any, held: list[Any], nested: list[Any]) -> bool:
     So it is where a part has a delta lobe or lets light through, or works on a side of the surface where another does
     nothing. Mitsuba divides the sum of both parts' values by the sum of their densities. The density of a delta lobe is
     a probability instead. Other parts draw directions that they throw away, on the other side of the surface: a diffuse
-    one that is seen from behind, a rough one whose facet mirrors or refracts there. What lets light through has a value
-    there, which counts once too often (rough glass and paint, from behind: 10 %).
+    one that is seen from behind, a rough one whose facet mirrors or refracts there. A part that lets light through has
+    a value there, which counts once too often (rough glass and paint, from behind: 10 %).
 
     Args:
         bsdf: one ``mi.BSDF``.
-        held: its parts.
-        nested: all BSDFs in it, asked themselves since a blend does not notice lobes that they get later.
+        held: parts of the blend.
+        nested: all BSDFs in the blend, asked themselves since a blend does not notice lobes that they get later.
     """
     if bsdf.class_name() != "BlendBSDF":
         return False
@@ -107,8 +107,8 @@ def normal_texture(bsdf: Any) -> str | None:
 def forgets_black_samples(bsdf: Any) -> bool:
     """Return True if a BSDF drops samples of weight zero of the one that it holds.
 
-    The derivative of what is black, by the light that comes from elsewhere, is lost then. A normal map reports no
-    density for them, and paths end there; a bump map masks the weight, of which a delta lobe has no other value.
+    The derivative of a reflectance of zero, by the light that comes from elsewhere, is lost then. A normal map reports
+    no density for them, and paths end there; a bump map masks the weight, of which a delta lobe has no other value.
 
     Args:
         bsdf: one ``mi.BSDF``.
@@ -330,8 +330,8 @@ def flat_array(value: Any) -> Any:
     """Return the numbers of an array of a mesh in a row.
 
     Args:
-        value: what ``mi.traverse`` shows of the mesh: a tensor with a row for each vertex in newer versions of Mitsuba,
-            a flat array in others.
+        value: array of the mesh as ``mi.traverse`` shows it: a tensor with a row for each vertex in newer versions of
+            Mitsuba, a flat array in others.
     """
     return value.array if dr.is_tensor_v(value) else value
 
@@ -712,7 +712,7 @@ def is_turned_by_reflections(class_name: str, name: str) -> bool:
 
     Args:
         class_name: ``class_name()`` of the shape.
-        name: its parameter, without the path to the shape.
+        name: name of the parameter, without the path to the shape.
     """
     return (class_name, name) in _TURNED_BY_REFLECTIONS
 

@@ -152,7 +152,7 @@ def _places_delta_slopes(site: Site) -> bool:
 
 
 def _places_light(site: Site) -> bool:
-    """Return True if the texture coordinates of a mesh place what it emits."""
+    """Return True if the texture coordinates of a mesh place its emission."""
     emitter = site.node.emitter()
     return emitter is not None and any(t.is_spatially_varying() for t in objects_below(emitter, mi.Texture))
 
@@ -188,7 +188,7 @@ def _is_extinction(site: Site) -> bool:
 
 
 def _attenuates(medium: Any, name: str) -> bool:
-    """Return True if what a medium holds under ``name`` changes how far light gets. The albedo does not; a phase
+    """Return True if the part of a medium under ``name`` changes how far light gets. The albedo does not; a phase
     function does where it is one of flakes, whose projected area is a factor of the extinction.
     """
     if name == "phase_function":

@@ -51,7 +51,8 @@ def unshared(value: Any) -> Any:
 
 @functools.cache
 def _collector(base: type) -> type:
-    """Return a callback class that collects what one plugin shows, made once for each variant."""
+    """Return a callback class that collects the values and objects that one plugin shows, made once for each variant.
+    """
 
     class Collector(base):  # type: ignore[misc, valid-type]
         def __init__(self) -> None:
@@ -73,7 +74,7 @@ def _collector(base: type) -> type:
 
 
 def shown_by(node: Any) -> tuple[list[ShownValue], list[tuple[str, Any, int]]]:
-    """Return what one plugin shows to ``mi.TraversalCallback``, without what is below it.
+    """Return the values and objects that one plugin shows to ``mi.TraversalCallback``, without those below it.
 
     Args:
         node: Mitsuba object.
@@ -133,7 +134,7 @@ def has_mean(texture: Any) -> bool:
 
 
 def carries_derivatives(node: Any) -> bool:
-    """Return True if a number of a plugin, or of what it holds, is attached. Call with gradients enabled.
+    """Return True if a number of a plugin, or of an object in it, is attached. Call with gradients enabled.
 
     Also for textures that read an attribute of their shapes, which may be attached.
 
@@ -208,7 +209,7 @@ def owners_of(node: Any, holders: dict[int, list[tuple[Any, str]]]) -> Iterator[
         holders: direct holders by address of the object held, as (holder, name there).
 
     Returns:
-        Iterator of (holder, the name that it has for what leads to ``node``).
+        Iterator of (holder, its name for the object that leads to ``node``).
     """
     waiting: list[Any] = [node]
     seen: set[int] = set()

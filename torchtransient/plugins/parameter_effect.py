@@ -43,8 +43,8 @@ class ParameterEffect:
             rays; "index": an index of refraction; "delay": a lifetime; "medium": an extinction;
             "velocity": how fast it moves, which films of rates alone measure; "value": none.
         supported: it has a derivative.
-        biased: that derivative is wrong in some scenes, beside what it lacks of moving edges, which integrators answer
-            (``silhouettes``).
+        biased: the derivative is wrong in some scenes, apart from the missing part of moving edges, for which
+            integrators answer (``silhouettes``).
         reason: the state in words.
         trusted: the derivative is right although Mitsuba marks the parameter as not differentiable.
         stand_in: name of the plugin that is built in place of Mitsuba's when the derivative is asked for; for a
@@ -78,8 +78,8 @@ class Site:
 
     Attributes:
         node, key: plugin that has it, and its name there.
-        owners: all that holds the plugin, directly or not, as (holder, name there), nearest first. A plugin that is
-            shared has several holders.
+        owners: all objects that hold the plugin, directly or not, as (holder, name there), nearest first. A plugin that
+            is shared has several holders.
     """
 
     node: Any
@@ -94,7 +94,7 @@ class Row:
     Attributes:
         effect: effect of the parameter.
         when: function of the site that says whether the row counts, None if it always does.
-        condition: the same in words.
+        condition: condition of ``when`` in words.
     """
 
     effect: ParameterEffect
@@ -113,7 +113,7 @@ def declare_effects(plugin: type | str, effects: Mapping[str, ParameterEffect | 
 
     Args:
         plugin: the class, or the name by which Mitsuba calls it.
-        effects: by key (the last name of the parameter, "*" for all others), an effect, or rows with conditions.
+        effects: an effect, or rows with conditions, by key (the last name of the parameter, "*" for all others).
 
     Raises:
         PluginRegistrationError: for an unknown role.
@@ -187,13 +187,13 @@ _NAMED_BY_USERS = ("ShapeGroupPlugin", "BatchSensor")
 
 
 def location_of(site: Site) -> tuple[str, ...]:
-    """Return the names of a parameter and of what its plugin is in, the nearest first.
+    """Return the names of a parameter and of the holders of its plugin, the nearest first.
 
     Args:
         site: place of the parameter.
 
     Returns:
-        "class.key" of the parameter, "class.slot" of what holds its plugin.
+        "class.key" of the parameter, "class.slot" of each holder.
     """
     places = [(lineage(node)[0], name) for node, name in [(site.node, site.key), *site.owners]]
     return tuple(dict.fromkeys(cls if cls in _NAMED_BY_USERS else f"{cls}.{name}" for cls, name in places))

@@ -53,8 +53,8 @@ class Attached(NamedTuple):
     Attributes:
         node, key: plugin, and its name there.
         value: the attached number.
-        owners: all that holds the plugin, directly or not, as (holder, name there).
-        holders: what holds it directly.
+        owners: all objects that hold the plugin, directly or not, as (holder, name there).
+        holders: objects that hold it directly.
     """
 
     node: Any
@@ -71,7 +71,7 @@ def loses_black(node: Any, key: str, owners: Sequence[tuple[Any, str]]) -> bool:
 
     Args:
         node, key: plugin, and name of the parameter there.
-        owners: all that holds the plugin, as in :class:`Site`.
+        owners: all objects that hold the plugin, see :class:`Site`.
     """
     return _is_in_a_map(node, owners) or _is_light(node, key, owners)
 
@@ -220,7 +220,7 @@ class ParameterTracker:
             self._note_reader(reader, str(attribute_name(reader)))
 
     def _note_reader(self, reader: Any, name: str) -> None:
-        """Record a texture as the holder of what it reads off its shapes: a mesh attribute, or a texture."""
+        """Record a texture as the holder of the values that it reads off its shapes: a mesh attribute, or a texture."""
         shapes = {holder.ptr: holder for holder, _ in self._owners_of(reader) if isinstance(holder, mi.Shape)}
         for shape in shapes.values():
             self._readers.setdefault((shape.ptr, name), []).append(reader)
@@ -263,7 +263,7 @@ class ParameterTracker:
             node, key: plugin, and name of the parameter there, which has a ``stand_in``.
 
         Returns:
-            The plugin itself, or the BSDFs that hold a texture, as (plugin, name of what it holds).
+            The plugin itself, or the BSDFs that hold a texture, as (plugin, name of the held object).
         """
         if isinstance(node, mi.BSDF):
             return [(node, "")]
@@ -389,7 +389,7 @@ class PhysicalRange:
 
     Attributes:
         meaning: the quantity in words, "a roughness".
-        low, high: ends.
+        low, high: ends of the range.
         is_open: the ends are outside.
     """
 
@@ -445,8 +445,8 @@ _SENSOR_RANGES = {"x_fov": ANGLE, "aperture_radius": LENGTH, "focus_distance": L
 def ranges_of(params: Any) -> dict[str, PhysicalRange]:
     """Return the physical ranges of the parameters that have one.
 
-    The numbers of textures, volumes and attributes of meshes have the range of what they supply, through whatever
-    textures they are read. Coefficients of spectral models have none.
+    The numbers of textures, volumes and attributes of meshes have the range of the parameter that they supply, through
+    whatever textures they are read. Coefficients of spectral models have none.
 
     Args:
         params: ``mi.traverse`` of a scene.

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 
 def light_type():
-    """Type of what one event contributes: a spectrum, or in polarized variants a Stokes vector of spectra."""
+    """Type of the light of one event: a spectrum, or in polarized variants a Stokes vector of spectra."""
     return mi.SpectrumEntry if mi.is_polarized else mi.UnpolarizedSpectrum
 
 
@@ -77,7 +77,7 @@ def rotation_tangent(t_rotation):
     """Return the tangent of a throughput of one whose frame turns, in polarized variants.
 
     Args:
-        t_rotation: tangent of twice the angle, radians, as of :meth:`FrameRotation.angle`.
+        t_rotation: tangent of twice the angle, radians, see :meth:`FrameRotation.angle`.
     """
     zero, t = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(t_rotation)
     return mi.Spectrum(*[zero] * 6, t, *[zero] * 2, -t, *[zero] * 6)
@@ -152,7 +152,7 @@ def rotation_from_light(si, wo, out=None, d=None):
     Args:
         si: SurfaceInteraction3f of the vertex.
         wo: direction in which the path goes on, unit Vector3f in the local frame of ``si``.
-        out: that direction in the world, attached where ``wo`` is; None computes it as that of the next ray.
+        out: direction of ``wo`` in the world, attached where ``wo`` is; None computes it as that of the next ray.
         d: direction of the next ray to the bit; None takes ``out``.
 
     Returns:
@@ -182,7 +182,7 @@ def scatter_unpolarized(value, rotation):
 
     Args:
         value: BSDF times cosine, in polarized variants a Mueller matrix between implicit frames.
-        rotation: that of :func:`rotation_to_sensor`.
+        rotation: rotation from :func:`rotation_to_sensor`.
     """
     if not mi.is_polarized:
         return mi.unpolarized_spectrum(value)

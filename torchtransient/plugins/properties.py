@@ -142,7 +142,7 @@ def count_bad(bad: dict[str, str], key: str, array: np.ndarray) -> None:
 
 
 def refuse(bad: Mapping[str, str]) -> None:
-    """Raise for what :func:`count_bad` has noted, if there is something.
+    """Raise for the bad numbers that :func:`count_bad` has noted, if there are any.
 
     Args:
         bad: notes by key.
@@ -165,7 +165,7 @@ def numbers_of(value: Any) -> np.ndarray | None:
         value: property or parameter: number, transform, spectrum, bitmap, grid or Dr.Jit array.
 
     Returns:
-        Numpy array of the value's shape, None for what has no real numbers (text, whole numbers, objects).
+        Numpy array of the value's shape, None for values without real numbers (text, whole numbers, objects).
     """
     if isinstance(value, (bool, int, str)) or value is None:
         return None

@@ -70,7 +70,7 @@ def as_colours(coefficients: np.ndarray, where: str) -> np.ndarray:
     """Return the colours whose spectra have given coefficients.
 
     Args:
-        coefficients: (..., 3).
+        coefficients: coefficients of spectra, (..., 3).
         where: key of the parameter, for messages.
 
     Returns:

@@ -29,8 +29,8 @@ class Request:
     """Derivatives that are requested of a call.
 
     Args:
-        needs: for each input tensor, whether there is a derivative by it.
-        has_cotangent: for each real output, whether it has a cotangent.
+        needs: truth value of each input tensor, whether there is a derivative by it.
+        has_cotangent: truth value of each real output, whether it has a cotangent.
     """
 
     needs: tuple[bool, ...]

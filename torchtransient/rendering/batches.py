@@ -56,7 +56,7 @@ def run_in_batches(job: RenderJob, values: Sequence[torch.Tensor]) -> tuple[torc
 
 
 def with_differences(output: RenderOutput, request: BatchErrors, leading: tuple[int, ...]) -> RenderOutput:
-    """Return an output with what its batches differ by.
+    """Return an output with the differences between its batches.
 
     Args:
         output: mean of the batches.

@@ -20,7 +20,7 @@ def broken_entries(tensor: torch.Tensor, count: int) -> list[bool]:
     """Return for each entry along the first dimension of size ``count`` whether it has numbers that are not finite.
 
     Args:
-        tensor: (count, ...).
+        tensor: tensor (count, ...).
         count: number of entries.
     """
     return [False] * count if all_finite(tensor) else [not all_finite(tensor[n]) for n in range(count)]

@@ -23,7 +23,7 @@ class Camera:
     """A pinhole camera, for the functions of ``tt.geometry``, with gradients to values of the call.
 
     Attributes:
-        intrinsics: (3, 3), in pixels of the image.
+        intrinsics: camera matrix (3, 3), in pixels of the image.
         to_world: pose of the sensor, (4, 4).
         size: height and width of the image.
     """

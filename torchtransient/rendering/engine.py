@@ -49,8 +49,8 @@ def run(
         job: settings of the call.
         kind: ``RENDER``, ``BACKWARD`` or ``FORWARD`` of :mod:`torchtransient.interfaces`.
         values: one tensor per key of the job, with a leading dimension of entries where ``job.batched`` says so.
-        vectors: for ``BACKWARD`` the adjoints of steady and response, None for zero; for ``FORWARD`` the tangents of
-            the values that need a derivative.
+        vectors: adjoints of steady and response for ``BACKWARD``, None for zero; tangents of the values that need a
+            derivative for ``FORWARD``.
 
     Returns:
         Of ``RENDER`` steady and response, of ``FORWARD`` their derivatives, of ``BACKWARD`` the gradients of the values
@@ -125,7 +125,7 @@ class Session:
         Args:
             item: item, whose entry counts.
             values: one tensor for each key, of all entries where they are batched.
-            needs: for each value, whether its leaf carries gradients.
+            needs: truth value of each key, whether its leaf carries gradients.
 
         Returns:
             Leaves of Dr.Jit's graph that the scene's parameters were computed from, flat, one for each key.

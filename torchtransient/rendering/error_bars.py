@@ -44,7 +44,7 @@ class ErrorCells(NamedTuple):
 
 @dataclass
 class BatchErrors:
-    """Request for the error bars of a call, and what its batches differ by.
+    """Request for the error bars of a call, and the differences between its batches.
 
     Args:
         cells: layout of the differences.
@@ -53,10 +53,10 @@ class BatchErrors:
         rows: the film has several histograms a pixel, which come before H.
 
     Attributes:
-        differences: for each run of the job (R, items, [4,] [rows,] H, W, T), summed over cells; R is 1 for two
-            batches.
-        squares: likewise (items, [4,] [rows,] H, W, T), their squares, summed over R and cells.
-        steady: likewise (R, items, [4,] H, W), pixel by pixel.
+        differences: differences of the batches for each run of the job (R, items, [4,] [rows,] H, W, T), summed over
+            cells; R is 1 for two batches.
+        squares: squares of the differences (items, [4,] [rows,] H, W, T), summed over R and cells.
+        steady: differences of the steady images (R, items, [4,] H, W), pixel by pixel.
     """
 
     cells: ErrorCells
@@ -76,9 +76,9 @@ class BatchErrors:
         """Return the mean over channels.
 
         Args:
-            array: (H, W, ..., channels) of ``dims + 1`` dimensions, with or without one of items.
+            array: array (H, W, ..., channels) of ``dims + 1`` dimensions, with or without one of items.
             dims: number of dimensions of a film without channels.
-            is_complex: as in :func:`channel_mean`.
+            is_complex: channels have real and imaginary parts in turn, and the mean is complex.
 
         Returns:
             (items, [4,] H, W, ...), of several histograms a pixel (items, [4,] rows, H, W, T).
@@ -92,7 +92,7 @@ def channel_mean(array: torch.Tensor, components: int, is_complex: bool = False)
     """Return the mean over the channels of a film's array, in its own order of dimensions.
 
     Args:
-        array: (..., channels), of Stokes components one after the other; real and imaginary parts in turn if
+        array: array (..., channels), of Stokes components one after the other; real and imaginary parts in turn if
             ``is_complex``.
         components: number of Stokes components.
         is_complex: return complex numbers.
@@ -114,7 +114,7 @@ def in_cells(values: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     """Sum over cells.
 
     Args:
-        values: (..., H, W, T).
+        values: array (..., H, W, T).
         cells: layout; those at the ends of a dimension may hold fewer entries.
 
     Returns:
@@ -160,7 +160,7 @@ def differences_of(sums: Sequence[torch.Tensor], numbers: Sequence[int]) -> torc
 
     Args:
         sums: mean of each batch.
-        numbers: its samples.
+        numbers: number of samples of each batch.
     """
     total = sum(numbers)
     if len(sums) == 2:
@@ -176,7 +176,7 @@ def cell_weights(weights: torch.Tensor, cells: ErrorCells) -> torch.Tensor:
     Within a cell, bins are taken as independent: one that is covered in part counts with the root of its mean square.
 
     Args:
-        weights: (..., H, W, T).
+        weights: weights of bins, (..., H, W, T).
 
     Returns:
         (..., H, W, ceil(T / bins)).
@@ -193,8 +193,8 @@ def variance(
     """Return the variance of a weighted sum.
 
     Args:
-        differences: (..., T', H', W', R) in cells.
-        weights: (..., T, H, W), real.
+        differences: differences in cells, (..., T', H', W', R).
+        weights: real weights of bins, (..., T, H, W).
         cells: layout of the differences.
         rows: the last of the leading dimensions has the histograms of a pixel, which the sum is over, too.
 
@@ -220,7 +220,7 @@ def local_mean(values: torch.Tensor, dims: tuple[int, ...]) -> torch.Tensor:
     """Return the mean over each entry and its neighbours along ``dims``; at rims over those that exist.
 
     Args:
-        values: any shape.
+        values: tensor of any shape.
         dims: dimensions, each with its neighbours on both sides.
 
     Returns:
@@ -247,9 +247,9 @@ def local_errors(
     """Return the standard error of every bin: of its cell, or where cells hold one pixel of those around it, too.
 
     Args:
-        squares: (..., T', H', W') in cells.
-        cells: layout.
-        shape: (T, H, W).
+        squares: squared differences in cells, (..., T', H', W').
+        cells: layout of the cells.
+        shape: sizes (T, H, W) of the film.
         near: dimensions along which neighbours are alike.
 
     Returns:
@@ -283,7 +283,7 @@ class ErrorBars:
     cells: ErrorCells | None
 
     def standard_error(self, weights: Any = None, *, steady: bool = False) -> torch.Tensor:
-        """Return the standard error of a weighted sum of what was measured, mean over channels.
+        """Return the standard error of a weighted sum of the measurement, mean over channels.
 
         It is right on average, and known as well as many cells of light were added up: that of one cell of 4 x 4 pixels
         and 8 bins rests on one number (of one pixel with ``errors="bins"``). See ``docs/accuracy.md``.
@@ -337,7 +337,7 @@ class ErrorBars:
         return found.squeeze(-3) if steady else found
 
     def relative_error(self) -> float | None:
-        """Return the largest relative standard error of the sum over all that was measured; None without light.
+        """Return the largest relative standard error of the sum over the whole measurement; None without light.
 
         Raises:
             ArgumentError: for a render without ``errors=``.

@@ -171,7 +171,7 @@ class FilmLayout(abc.ABC):
         """Return the array of a film in the order of torch.
 
         Args:
-            cube: (H, W, ..., C) of a film, with or without one dimension of items.
+            cube: array (H, W, ..., C) of a film, with or without one dimension of items.
             leading: sizes of the dimensions of items.
             components: Stokes components that the film's channels are made of; more than one come before C.
 
@@ -240,7 +240,7 @@ def measured(output: Any, name: str) -> Any:
 
     Args:
         output: `RenderOutput` or `Result`.
-        name: what the film measures, such as "transient".
+        name: name of the quantity that the film measures, such as "transient".
     """
     found = getattr(output, name, None)
     return getattr(output, "others", {}).get(name) if found is None else found
@@ -256,7 +256,7 @@ def steady_channels_first(steady: torch.Tensor, leading: tuple[int, ...], compon
     """Return a steady image in the order of torch.
 
     Args:
-        steady: (H, W, C) of a film, with or without one dimension of items.
+        steady: steady image (H, W, C) of a film, with or without one dimension of items.
         leading: sizes of the dimensions of items.
         components: Stokes components that the film's channels are made of; more than one come before C.
 
@@ -271,7 +271,8 @@ def cube_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components
     """Return an array over time in the order of torch.
 
     Args:
-        cube: (H, W, T, C) of a film, (H, W, Lh, Lw, T, C) of an exhaustive scan, with or without a dimension of items.
+        cube: array (H, W, T, C) of a film, or (H, W, Lh, Lw, T, C) of an exhaustive scan, with or without a dimension
+            of items.
         leading: sizes of the dimensions of items.
         components: Stokes components that the film's channels are made of; more than one come before C.
 
@@ -289,7 +290,7 @@ def phasor_channels_first(cube: torch.Tensor, leading: tuple[int, ...], componen
     """Return phasors in the order of torch, as :func:`cube_channels_first`.
 
     Args:
-        cube: (H, W, F, 2 C) of real and imaginary parts in turn.
+        cube: array (H, W, F, 2 C) of real and imaginary parts in turn.
         leading: sizes of the dimensions of items.
         components: Stokes components that the film's channels are made of; more than one come before C.
 
@@ -304,7 +305,7 @@ def rows_channels_first(cube: torch.Tensor, leading: tuple[int, ...], components
     """Return several arrays a pixel in the order of torch, as :func:`cube_channels_first`.
 
     Args:
-        cube: (H, W, rows, entries, C).
+        cube: array (H, W, rows, entries, C) of a film.
         leading: sizes of the dimensions of items.
         components: Stokes components that the film's channels are made of; more than one come before C.
 

@@ -438,7 +438,7 @@ class SlowPhasors(FilmLayout):
 
     Args:
         slow_times: times of the pulses, seconds; poses are those of 0.
-        frequencies: as of :class:`Phasors`.
+        frequencies: a :class:`~torchtransient.axes.FrequencyAxis`, or numbers in cycles per metre.
 
     Raises:
         ArgumentError: without frequencies.

@@ -28,7 +28,7 @@ def render(
     """Render a scene with values for some of its parameters: :class:`TransientRenderer` as a function.
 
     The result is that of the module with the same keys and seed. For a loop, keep the scene of
-    :func:`torchtransient.load`: it holds what was built.
+    :func:`torchtransient.load`: it keeps the built scene and its recordings.
 
     Args:
         scene: anything that :func:`torchtransient.load` takes.

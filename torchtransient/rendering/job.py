@@ -95,7 +95,7 @@ class RunLog:
         energy_before, energy_after: light before and after the window.
         energy_total: all light.
         recorded: how each call was made: launched, recorded, or the reason why it was traced.
-        max_depth: of the integrator, -1 for no limit, None for one without.
+        max_depth: bound on the depth of the integrator's paths, -1 for no limit, None for an integrator without one.
         sampler: plugin name.
     """
 
@@ -118,12 +118,12 @@ class RenderJob:
     Args:
         scene, options, keys: the scene, options of its build, and keys of the values.
         items: films to fill, empty where the seed is known later; ``seeding`` makes them then.
-        batched: for each value, whether it has a leading batch dimension.
+        batched: truth value of each key, whether its tensor has a leading batch dimension.
         spp, spp_grad: samples per pixel of the render and of its derivatives.
-        temporal_filter: of the films; None for the scene's.
+        temporal_filter: temporal filter of the films; None for the scene's.
         watch: warns of unphysical values.
-        needs: for each value, whether it wants a derivative.
-        bound: on the depth; None for the scene's.
+        needs: truth value of each key, whether a derivative by its tensor is wanted.
+        bound: bound on the depth; None for the scene's.
         boundary, spp_boundary: whether derivatives have the boundary term, and its samples per pixel; None for the
             integrator's.
         sampler: plugin name, "scene" or "auto"; None for the integrator's, or "auto".

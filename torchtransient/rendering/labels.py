@@ -70,10 +70,10 @@ def scene_labels(
     material        (H, W) int32    index into :func:`material_names`
     =============== =============== ====================================================================================
 
-    Where a pixel meets nothing, floats are NaN and numbers are -1. A pixel looks through what lets more than half of
-    the light pass unbent (BSDF ``null``, a ``mask`` of an opacity below one half, a thin pane), 64 such surfaces at
-    most, and through area lights under an integrator that hides emitters; a
-    glass that bends light is a surface, and so is a mirror. ``camera_unwarp`` changes nothing.
+    Where a pixel meets nothing, floats are NaN and numbers are -1. A pixel looks through surfaces that let more than
+    half of the light pass unbent (BSDF ``null``, a ``mask`` of an opacity below one half, a thin pane), 64 of them at
+    most, and through area lights under an integrator that hides emitters; a glass that bends light is a surface, and so
+    is a mirror. ``camera_unwarp`` changes nothing.
 
     Calls are recorded as renders are, unless the renderer was made with ``freeze=False``. Not supported:
     ``torch.func.vmap``.
@@ -140,8 +140,8 @@ def first_return(
     Filters wider than a bin bring light to the bins before. Not supported: exhaustive scans.
 
     Args:
-        transient: (..., C, T, H, W), or (..., 4, C, T, H, W) with ``polarized``.
-        axis: its time axis, of T bins.
+        transient: transient (..., C, T, H, W), or (..., 4, C, T, H, W) with ``polarized``.
+        axis: time axis of the transient, of T bins.
         polarized: the transient has Stokes components, of which S0 counts.
         threshold: largest value of a dark bin, in units of the transient.
 

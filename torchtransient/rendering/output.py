@@ -29,19 +29,19 @@ class RenderStats:
         spp: samples per pixel.
         seconds: wall time, without loading and without the wait for other threads.
         samples_per_second: camera paths per second.
-        variant, integrator: names.
-        temporal_filter: of the film; empty for films without one.
+        variant, integrator: names of variant and integrator.
+        temporal_filter: temporal filter of the film; empty for films without one.
         seeds: one per item (entry of the batch and sensor); of a mean of passes those of all, in turn.
         energy_before, energy_after: light outside of the time axis, per item: sum over pixels of the mean over
             channels; zero for films without a window (phasors, gates). ``RenderOutput.outside`` has the shares.
-        energy_total: likewise, all light of ``steady``.
+        energy_total: all light of ``steady``, per item, summed in the same way.
         recorded: per item "launched", "recorded", or "traced: " and the reason.
         derivatives_recorded: the same of the derivatives since.
-        max_depth: of the paths, -1 for no limit, None for integrators without one.
+        max_depth: bound on the depth of the paths, -1 for no limit, None for integrators without one.
         light_beyond: share of the light in deeper paths, where a pilot run has found ``max_depth`` for derivatives of a
             scene that states none; else None. It is that of the described values: brighter ones, given or learnt, have
             the same ``max_depth`` and more light beyond it.
-        sampler: plugin name; "owen" where the scene names ``independent``, or none.
+        sampler: plugin name of the sampler; "owen" where the scene names ``independent``, or none.
     """
 
     _: KW_ONLY
@@ -154,7 +154,7 @@ class RenderOutput(ErrorBars, TensorRecord):
         slow_times: times of slow phasors, seconds.
         others: tensors and settings of films that have no attribute here, by name.
         differences, squares, steady_differences, cells: (..., T', H', W', R), (..., T', H', W') and (..., H, W, R) of
-            renders with ``errors=``: what independent batches of samples differ by, mean over channels, for
+            renders with ``errors=``: differences between independent batches of samples, mean over channels, for
             :meth:`standard_error` and :meth:`error_map`.
 
     Leading dimensions come in the order (batch, sensor), each present only when asked for. In polarized variants the
@@ -250,7 +250,7 @@ def named_fields(film: FilmLayout, response: torch.Tensor) -> dict[str, Any]:
         response: tensor of the film, in torch's order.
 
     Returns:
-        Values of all fields of films, None for those of other films; ``others`` holds what has no field.
+        Values of all fields of films, None for those of other films; ``others`` holds quantities without a field.
     """
     found = {film.measures: response, **film.attributes()}
     named = {name: found.pop(name, None) for name in _OF_FILMS}

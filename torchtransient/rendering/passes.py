@@ -76,7 +76,7 @@ def freedom_of_halves(even: torch.Tensor, odd: torch.Tensor, passes: int, dims: 
 
 @dataclass
 class PassSums:
-    """Sums over passes, in double precision: all that an estimate is made of, and that is needed to go on.
+    """Sums over passes, in double precision: all numbers that an estimate needs, and a later call to go on.
 
     Args:
         seed, batch_spp: seed of the render, and samples per pixel of a pass.
@@ -84,7 +84,7 @@ class PassSums:
         settings: variant, sampler and others by name, which all passes have in common.
         values: tensors that were rendered, by key.
         passes, seconds: number of passes, and their wall time.
-        measured, steady: sums of what the film measures, and of steady images.
+        measured, steady: sums of the film's measurements, and of steady images.
         odd: sum over passes of odd number in bins (..., T, H, W), channels averaged.
         squares: sums of squared magnitudes in bins, of passes of even and of odd number.
         stats, channels: statistics of all passes together, and names of the channels.
@@ -190,7 +190,7 @@ _Filled = TypeVar("_Filled")
 
 
 def _filled(value: _Filled | None) -> _Filled:
-    """Return what the first pass has made."""
+    """Return a value that the first pass has made."""
     assert value is not None
     return value
 

@@ -141,8 +141,8 @@ class Plan(Effects):
         parameters: keys of the parameters that will have gradients.
         reasons: one line per decision.
         pilot: results of the pilot run, None without one.
-        scene, variant, integrator, temporal_filter: as the renderer uses them; the filter is empty for phasor and
-            gated films.
+        scene, variant, integrator, temporal_filter: scene, and names of variant, integrator and filter, as the renderer
+            uses them; the filter is empty for phasor and gated films.
         max_depth: bound on the depth, None for the scene's.
         sensor: sensor of the plan, which the renderer takes; another one is refused.
     """
@@ -265,8 +265,8 @@ def plan(
 
     Args:
         scene: scene, as for :func:`load`. The variant that it was loaded with only sets the device.
-        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for what
-            the settings of a film that are given call for, or else "transient".
+        outputs: some of "transient", "steady", "phasor", "stokes", "gates", "rates", "beats", "bands"; None for
+            those that the given settings of a film call for, or else "transient".
         parameters: keys of the parameters that will have gradients.
         time_axis: axis of the film, "scene" for the scene's own, None to find one.
         frequencies, gates: settings of a phasor or gated film.
@@ -279,7 +279,7 @@ def plan(
         tail: largest share of the image's light that may be left to deeper paths; no block of the image (an 8 x 8
             grid) may lose more than ten times that. A bound on the light of the pilot run, with two standard errors to
             spare.
-        missed: the same for light outside of the time window.
+        missed: largest share of the light that may lie outside of the time window, bounded in the same way.
         strict: carry polarization also where it only changes the light between smooth surfaces. Without it such a
             scene is planned unpolarized, as is usual, with a line in ``reasons``.
         pilot: False for no pilot run: the depth then follows from the albedos where they bound it, and the time axis
@@ -384,7 +384,8 @@ def _without_roulette(given: Plan) -> Plan:
 
 
 def _other_ways(given: Plan, relative: bool, connects: bool) -> list[tuple[str, dict[str, Any], float]]:
-    """Return what may have less variance than a plan: name, changes of the plan, and most time over that of the plan.
+    """Return alternatives that may have less variance than a plan: name, changes of the plan, and most time over that
+    of the plan.
 
     Args:
         given: plan with plain paths and ordinary connections.

@@ -20,7 +20,7 @@ def pose_of(renderer: TransientRenderer, values: Mapping[str, Any] | None, name:
 
     Args:
         renderer: the renderer.
-        values: as of a call.
+        values: values by key, see the call of the renderer.
         name: name of the function, for messages.
 
     Raises:
@@ -43,7 +43,7 @@ def film_rows(renderer: TransientRenderer) -> int:
 
 
 def watch_of(renderer: TransientRenderer) -> PhysicsWatch:
-    """Return what warns of what no physical system has, as ``physics`` of the renderer says.
+    """Return the renderer's checks for unphysical values, which warn or raise as its ``physics`` says.
 
     Args:
         renderer: the renderer.

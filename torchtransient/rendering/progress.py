@@ -27,7 +27,7 @@ class Bar:
 
 
 class ForecastBar:
-    """Progress bar whose end is a forecast: its text says what is left."""
+    """Progress bar whose end is a forecast: its text says how much is left."""
 
     def __init__(self, name: str) -> None:
         from tqdm.auto import tqdm
@@ -50,7 +50,7 @@ def with_bar(things: Sequence[_T], name: str, progress: bool) -> Iterator[_T]:
     """Yield the entries of a sequence; show a bar called ``name`` if ``progress``.
 
     Args:
-        things: what is iterated over.
+        things: sequence to iterate over.
         name: text before the bar.
         progress: show the bar.
     """

@@ -89,7 +89,8 @@ class TransientRenderer(CopiesParametrized):
         chirps: :class:`Chirps` of a frequency-modulated lidar; the films become beat films with ``out.beats``.
         slow_times: times in seconds, beside ``frequencies``: phasors at each of them, as a radar's pulses see things
             that move, ``out.slow_phasor``.
-        film: the same as an object of ``torchtransient.rendering.films``; films of one's own are asked for so.
+        film: film as an object of ``torchtransient.rendering.films``, in place of these settings; films of one's own
+            are asked for so.
         max_depth: replaces the integrator's. Where that is no limit, calls whose values can be differentiated by use a
             bound that a pilot run finds, for value and derivative: ``out.stats.max_depth``, beyond which
             ``out.stats.light_beyond`` of the light lies.
@@ -112,18 +113,19 @@ class TransientRenderer(CopiesParametrized):
             time axis or frequencies, and temporal filter, where the arguments beside it do not say otherwise; it speaks
             of one sensor.
         sampler: plugin name of a sampler that replaces those of the sensors, with the same number of samples. None
-            keeps what the scene names, except for "independent", and what a sensor without one has, which are replaced
-            by "owen": points that fill each pixel's dimensions evenly. "scene" keeps those too. ``out.stats.sampler``
+            keeps the scene's samplers, except for "independent" and where a sensor names none: these are replaced by
+            "owen", whose points fill each pixel's dimensions evenly. "scene" keeps those too. ``out.stats.sampler``
             has the name.
-        physics: response to what no physical system has: reflectances, albedos and other shares of the light outside of
-            [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light, and
-            depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
+        physics: response to unphysical scenes and values: reflectances, albedos and other shares of the light outside
+            of [0, 1], described or given, transforms without an inverse, windows that miss more than 5 % of the light,
+            and depths that had to be bounded. "warn" gives a ``PhysicsWarning`` with the key and the number, once for a
             scene; "error" raises ``PhysicsError``, of bounds for those that leave out more than 5 %; "ignore" does not
             look.
-        boundary: derivatives by keys that move silhouettes hold what moving edges hide and uncover (the boundary term,
-            see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out. Where a
-            derivative lacks a part, the first call with values that can be differentiated by warns with the keys
-            (``GradientWarning``), and with ``physics="error"`` raises ``GradientError``, unless the part was left out.
+        boundary: derivatives by keys that move silhouettes hold the light that moving edges hide and uncover (the
+            boundary term, see ``docs/gradients.md``), unless the scene's integrator leaves it out; False leaves it out.
+            Where a derivative lacks a part, the first call with values that can be differentiated by warns with the
+            keys (``GradientWarning``), and with ``physics="error"`` raises ``GradientError``, unless the part was left
+            out.
         spp_boundary: samples per pixel of each pass of the boundary term, None for half of those of the derivative.
         freeze: True records the kernels of a call, so that later calls need no tracing, with the same values, gradients
             and noise; ``out.stats.recorded`` says whether, ``docs/speed.md`` when a recording is made anew.
@@ -375,7 +377,7 @@ class TransientRenderer(CopiesParametrized):
 
     @opaque
     def _rebuild(self, changes: Mapping[str, Any]) -> None:
-        """Change options of the build, in a scene of its own: others keep what they have built and recorded."""
+        """Change options of the build, in a scene of its own: others keep their built scenes and recordings."""
         self._options = replace(self._options, **changes)
         self.scene = self.scene.apart()
         with active_variant(self.scene.variant):
@@ -430,15 +432,15 @@ class TransientRenderer(CopiesParametrized):
         """Render the scene with the module's parameters, or with ``values`` in their place.
 
         Args:
-            values: by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of the
-                shapes that ``scene.parameters()`` lists, or with one leading batch dimension B more; values without it
-                are used for every entry. Any real dtype is taken and computed in float32.
+            values: values by key of ``parameters``, in place of the module's own: tensors, arrays, lists or numbers of
+                the shapes that ``scene.parameters()`` lists, or with one leading batch dimension B more; values without
+                it are used for every entry. Any real dtype is taken and computed in float32.
             seed: same seed, same tensor. None draws one from torch's generator (``torch.manual_seed``). In a batch
                 every entry has its own seed, derived from this one, the first entry the seed itself; or give one seed
                 per entry.
             spp: samples per pixel, None for the renderer's.
             errors: True renders in independent batches of samples (two, or eight where pixels share light) and keeps
-                what they differ by in cells of 4 x 4 pixels x 8 bins, so that ``out.standard_error`` knows the error of
+                their differences in cells of 4 x 4 pixels x 8 bins, so that ``out.standard_error`` knows the error of
                 sums; "bins" keeps it bin by bin.
             progress: show a progress bar.
 
@@ -540,10 +542,10 @@ class TransientRenderer(CopiesParametrized):
         The error of a bin is the standard error of the mean over passes, channels averaged, relative to the mean of the
         bin and its neighbours (3 x 3 pixels, and 3 bins of time). The seed of a pass follows from ``seed`` and its
         number: the mean depends on the number of passes alone, not on interruptions. Without ``max_seconds`` and
-        ``max_spp`` the render may take arbitrarily long; Ctrl-C ends it with what there is.
+        ``max_spp`` the render may take arbitrarily long; Ctrl-C ends it with the passes so far.
 
         Args:
-            values: as of a call.
+            values: values by key of ``parameters``, in place of the module's own, see :meth:`forward`.
             rtol: relative error, 0.05 for 5 %.
             quantile: share of the bins with light whose error is to be at most that.
             on: None for bins whose local mean is at least 2 % of the mean over all bins; a mask of truth values that
@@ -551,9 +553,9 @@ class TransientRenderer(CopiesParametrized):
                 and gates in place of bins (those without any light never count); or a loss, a function of a
                 ``RenderOutput`` that returns one number, whose relative error is meant then. It must be linear in the
                 render: the mean of another loss over passes is not the loss of their mean.
-            max_seconds: wall time of this call, after which it ends with what there is; a pass is made in any case.
-            max_spp: samples per pixel, those of ``resume`` included.
-            seed: seed of the passes; of ``resume`` the same.
+            max_seconds: wall time of this call, after which it ends with the passes so far, at least one.
+            max_spp: largest number of samples per pixel, those of ``resume`` included.
+            seed: seed of the passes; the same as that of ``resume``.
             batch_spp: samples per pixel of a pass. None for at least 16 with the sampler ``owen``, 8 with others, and
                 up to 256 of small films, to make 2^16 paths.
             resume: result of an earlier call with the same values, to go on from: its passes count.
@@ -566,7 +568,7 @@ class TransientRenderer(CopiesParametrized):
 
         Raises:
             UnitError, ArgumentError, ShapeError: for other arguments, and a ``resume`` of another render.
-            SceneError, DeviceError, StorageError: as of a call.
+            SceneError, DeviceError, StorageError: as :meth:`forward` raises them.
         """
         request = Request(rtol, quantile, on, max_seconds, max_spp)
         number = whole_number(seed)
@@ -626,7 +628,7 @@ class TransientRenderer(CopiesParametrized):
             check_slope(moving, *self._response)
 
     def _check_edges(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Warn once for each key of what derivatives of this call lack at moving edges."""
+        """Warn once for each key of the gaps of this call's derivatives at moving edges."""
         graph = torch.is_grad_enabled()
         new = [
             key

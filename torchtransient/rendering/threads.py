@@ -53,8 +53,8 @@ def threads(n: int | None = None) -> Threads:
     on the count through the order of sums alone.
 
     Args:
-        n: 1 to 1024, the calling thread included; 1 leaves no other thread at work. More threads than cores take turns,
-            which is slower. None changes nothing.
+        n: number of threads, 1 to 1024, the calling one included; 1 leaves no other thread at work. More threads than
+            cores take turns, which is slower. None changes nothing.
 
     Returns:
         The counts in use.
@@ -64,13 +64,13 @@ def threads(n: int | None = None) -> Threads:
         DeviceError: if the system or torch refuses so many threads; the counts stay as they were.
         VariantError: in a process that was forked from one whose threads of Dr.Jit were at work.
 
-    Dr.Jit's count is the process's. Torch's is that of the calling thread, and what threads begin with that compute
-    for the first time later; those that have computed before keep theirs. Neither reaches spawned processes: call it
-    there. Only CPU variants compute with Dr.Jit's threads. No variant is needed, and none is activated.
+    Dr.Jit's count is the process's. Torch's is that of the calling thread, and the one that threads begin with which
+    compute for the first time later; those that have computed before keep theirs. Neither reaches spawned processes:
+    call it there. Only CPU variants compute with Dr.Jit's threads. No variant is needed, and none is activated.
 
-    Mitsuba hands OpenEXR files to Dr.Jit's threads and waits for them, for ever where there is but one. What this
-    library loads gets a second one meanwhile; for Mitsuba's own calls on such files (``mi.Bitmap``, ``mi.load_dict``)
-    write ``with tt.threads(2):`` around them.
+    Mitsuba hands OpenEXR files to Dr.Jit's threads and waits for them, for ever where there is but one. Files that
+    this library loads get a second thread meanwhile; for Mitsuba's own calls on such files (``mi.Bitmap``,
+    ``mi.load_dict``) write ``with tt.threads(2):`` around them.
     """
     n = _checked(n)
     # What an interrupted call has left may be a number of threads.

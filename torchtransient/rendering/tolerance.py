@@ -56,8 +56,8 @@ def quantile_of(values: torch.Tensor, quantile: float) -> float:
     """Return the smallest of the values that a share ``quantile`` of them does not exceed, NaN without any.
 
     Args:
-        values: any shape.
-        quantile: in (0, 1].
+        values: tensor of any shape.
+        quantile: share of the values, in (0, 1].
     """
     number = values.numel()
     if number == 0:
@@ -82,8 +82,8 @@ def share_to_aim_at(freedom: float) -> float:
     Args:
         freedom: degrees of freedom of the variance.
 
-    5 % less than the tolerance, and less than what chance hides in one of 20 estimates: the root of the 5 % quantile of
-    chi squared over its mean (Wilson and Hilferty 1931).
+    5 % less than the tolerance, and less by as much as chance hides in one of 20 estimates: the root of the 5 %
+    quantile of chi squared over its mean (Wilson and Hilferty 1931).
     """
     if not freedom > 0:
         return 0.05
@@ -207,7 +207,7 @@ class Look:
 
     @property
     def aim(self) -> float:
-        """Error to reach: below the tolerance by what chance can hide."""
+        """Error to reach: below the tolerance by as much as chance can hide."""
         return self.rtol * share_to_aim_at(self.freedom)
 
     @property
@@ -232,7 +232,7 @@ def look(sums: PassSums, request: Request) -> Look:
 
     Args:
         sums: sums of the passes.
-        request: tolerance, and what it is of.
+        request: tolerance, and the quantity that it is for.
     """
     if request.loss is not None:
         return _look_at_loss(sums, request.rtol)
@@ -307,7 +307,7 @@ def counted_bins(mean: torch.Tensor, on: Any, sums: PassSums) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class ToleranceState:
-    """All that ``renderer.to_tolerance(resume=...)`` goes on from.
+    """State from which ``renderer.to_tolerance(resume=...)`` goes on.
 
     Args:
         sums: sums over passes.
@@ -330,16 +330,17 @@ class ToleranceResult:
 
     Attributes:
         output: the mean, as a render; ``output.stats`` has samples, seconds and seeds of all passes.
-        error: relative error of what was asked for: the quantile over bins that was reached, or that of the loss.
+        error: relative error that was asked for: the quantile over bins that was reached, or that of the loss.
             Infinite after a single pass, NaN without light.
         reached: the error is below the tolerance, and passes do not tell of one that is larger.
         reason: why the render has ended, in words.
         passes, spp: number of passes, and their samples per pixel together.
         seconds: wall time, of all calls together.
-        rtol, quantile: as asked.
+        rtol, quantile: relative error and share of the bins that were asked for.
         heavy_tailed: few passes hold most of the deviations: the error may be larger than it looks.
-        standard_error: of the mean in each bin (..., T, H, W), float32: channels averaged (S0 of polarized light),
-            drawn to that of the neighbours; of phasors the root of the summed variances of real and imaginary parts.
+        standard_error: standard error of the mean in each bin (..., T, H, W), float32: channels averaged (S0 of
+            polarized light), drawn to that of the neighbours; of phasors the root of the summed variances of real and
+            imaginary parts.
         looks: estimates on the way, one after the other.
         state: sums of the passes, for ``resume``.
     """

@@ -90,7 +90,7 @@ def wrap(
 
     A derivative is a replay: it calls the function once more with the arguments that were saved and the scene as it
     was at the call, attached, and keeps nothing. So the function has to do the same for the same arguments. Seeds are
-    the same in both, since what follows the light in the function, a loss for instance, needs the image that was
+    the same in both, since the code after the render in the function, a loss for instance, needs the image that was
     returned; ``mi.render`` itself takes another seed for its adjoint.
 
     Every scene that the function reaches is put back after each call and derivative: ``mitsuba.SceneParameters`` and

@@ -83,7 +83,7 @@ class SceneInventory:
         albedo: largest share of the light that a surface or medium scatters, 1 if unknown.
         brightest: label of the node with that share.
         integrator, max_depth: plugin name, and its bound on the depth, -1 for no limit.
-        connections: what the integrator says of connections, None if nothing.
+        connections: property ``connections`` of the integrator, None without it.
         film, film_props: plugin name and properties of the film of the sensor.
         temporal_filter: described temporal filter, of the integrator or else of the film.
         sampler: sampler that integrator or sensor name, None if neither does.
@@ -149,7 +149,7 @@ def _parsed(scene: Scene, what: str, read: Callable[[Any], _Found]) -> _Found:
 
 
 def described_samplers(scene: Scene) -> list[str | None]:
-    """Return what names the sampler of each sensor of a scene, None for a sensor without one.
+    """Return the plugin name of the sampler of each sensor of a scene, None for a sensor without one.
 
     Args:
         scene: the scene.
@@ -268,7 +268,8 @@ def _sensors(state: Any) -> list[Any]:
 
 
 def _samplers_of(state: Any) -> list[str | None]:
-    """Return what names the sampler of each sensor of a parsed scene: the integrator, or the sensor; None for neither.
+    """Return the plugin name of each sensor's sampler in a parsed scene, that of the integrator first; None without
+    one.
     """
     of_integrator = _sampler_of_integrator(state)
     if of_integrator not in ("", "auto"):

@@ -81,7 +81,7 @@ class LoadedObject:
 
     Args:
         value: the object.
-        where: its path.
+        where: path of its keys.
     """
 
     value: Any

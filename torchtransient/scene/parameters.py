@@ -181,7 +181,7 @@ def parameter_table(built: BuiltScene) -> ParameterTable:
 
 
 def _moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
-    """Return what derivatives lack at moving edges that some sensors see, by the scene's integrator.
+    """Return the gaps of derivatives at moving edges that some sensors see, by the scene's integrator.
 
     Args:
         scene: built scene.
@@ -195,7 +195,7 @@ def _moving_edges_of(scene: Any, sensors: Sequence[Any]) -> MovingEdges:
 
 
 def missing_edges(built: BuiltScene, keys: Iterable[str], sensors: Iterable[int]) -> dict[Gap, list[str]]:
-    """Return what derivatives lack at moving edges.
+    """Return the gaps of derivatives at moving edges.
 
     Args:
         built: built scene.

@@ -146,7 +146,7 @@ class PhysicsWatch:
         Args:
             total: all light, in units of the steady image.
             before, after: light before and after the window, in the same units.
-            rates: what lies outside of the axis of rates counts as after the window.
+            rates: light outside of the axis of rates counts as after the window.
         """
         if not self.window_name or before + after <= 0 or (self.mode != "error" and self.window_name in self._warned):
             return
@@ -195,7 +195,7 @@ def outside_message(key: str, limits: PhysicalRange, low: float, high: float) ->
 
     Args:
         key: key of the parameter.
-        limits: the range.
+        limits: physical range of the parameter.
         low, high: smallest and largest number of the value.
     """
     if limits == SHARE:

@@ -224,7 +224,7 @@ class Arrivals:
 
         Args:
             depth: paths of more vertices are left out; none are for -1.
-            missed: largest share of the light after the window, as of :meth:`negligible`.
+            missed: largest share of the light after the window, see :meth:`negligible`.
 
         Returns:
             Earliest arrival, and the arrival after which light is negligible, metres.

@@ -52,9 +52,9 @@ class Effects(abc.ABC):
 
     Attributes:
         scene: the scene, in the variant of the plan.
-        variant, integrator: names.
-        film_choice, max_depth, rr_depth, connections, pulse, irf: None keeps the scene's.
-        temporal_filter: empty for films without one.
+        variant, integrator: names of variant and integrator.
+        film_choice, max_depth, rr_depth, connections, pulse, irf: settings of the render; None keeps the scene's.
+        temporal_filter: name of the temporal filter, empty for films without one.
         filter_is_given: the filter was an argument of the plan, which no other filter replaces.
         sensor: index of the sensor whose light the decisions are about.
     """
@@ -128,7 +128,7 @@ class Choice:
 
     Args:
         value: the decision.
-        reason: the line.
+        reason: line that explains it.
     """
 
     value: str
@@ -272,7 +272,7 @@ class Draft:
         film_choice: settings of the film that were asked for, None to keep or find them.
         described_film: settings of the scene's own film, None where they are not known before it is built.
         described_axis: time axis of the scene's own film, None without one.
-        scene, variant, integrator, pulse, irf, parameters, sensor: as in the plan.
+        scene, variant, integrator, pulse, irf, parameters, sensor: attributes of the plan of the same names.
     """
 
     scene: Scene
@@ -312,7 +312,7 @@ class Finder:
 
     Args:
         draft: decisions that are made already.
-        reasons: their lines.
+        reasons: lines that explain them.
         inventory: contents of the scene.
         tail: largest share of the light in deeper paths.
         missed: largest share of the light outside of the window.

@@ -90,7 +90,7 @@ def write_scene(
         All numbers of the scene with these values, by key.
 
     Raises:
-        SceneError: for what XML cannot hold.
+        SceneError: for values that XML cannot hold.
         ShapeError, UnitError, DeviceError: for values, as a renderer raises them.
     """
     import mitsuba as mi

@@ -62,7 +62,7 @@ def sphere_chord(radius: float) -> FlightLaw:
     Mean 4R/3, variance 2R^2/9. Source: Fry et al., Applied Optics 45 (2006), integrating-cavity theory.
 
     Args:
-        radius: R, metres.
+        radius: radius R, metres.
     """
     return FlightLaw(2.0 * _length("radius", radius), lambda x: 2.0 * x, 0, 1)
 
@@ -73,7 +73,7 @@ def plate_gap(separation: float) -> FlightLaw:
     Mean 2h, infinite variance.
 
     Args:
-        separation: h, metres.
+        separation: distance h between the plates, metres.
     """
     return FlightLaw(_length("separation", separation), lambda x: 2.0 / x**3, 1, None)
 
@@ -82,7 +82,7 @@ def checked_edges(edges_opl: ArrayLike) -> Array:
     """Return bin edges as a float64 array.
 
     Args:
-        edges_opl: (T + 1,), metres, increasing.
+        edges_opl: bin edges, (T + 1,), metres, increasing.
 
     Raises:
         ShapeError, UnitError: for other edges.
@@ -99,8 +99,8 @@ def delta_mass(edges_opl: ArrayLike, opl: float) -> Array:
     """Return the bins of one unit of energy that arrives at one time; bins are half-open [start, end).
 
     Args:
-        edges_opl: (T + 1,), metres.
-        opl: of the arrival, metres.
+        edges_opl: bin edges, (T + 1,), metres.
+        opl: optical path length of the arrival, metres.
 
     Returns:
         (T,).
@@ -120,9 +120,9 @@ def flight_masses(law: FlightLaw, edges_opl: ArrayLike, start_opl: float = 0.0) 
     edge is not in any bin. Endless: the caller stops.
 
     Args:
-        law: of a flight.
-        edges_opl: (T + 1,), metres.
-        start_opl: metres.
+        law: law of one flight.
+        edges_opl: bin edges, (T + 1,), metres.
+        start_opl: optical path length of the start, metres.
 
     Yields:
         (T,).
@@ -212,10 +212,10 @@ def light_over_plane(edges_opl: ArrayLike, height: float, reflectance: float, in
     the plane, integrated against the meter's cosine.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        height: h above the plane, metres.
-        reflectance: rho, 0 to 1.
-        intensity: I, W/sr.
+        edges_opl: bin edges, (T + 1,), metres.
+        height: height h above the plane, metres.
+        reflectance: reflectance rho, 0 to 1.
+        intensity: intensity I of the light, W/sr.
 
     Returns:
         (T,), W/m^2.
@@ -236,11 +236,11 @@ def integrating_sphere_irradiance(
     sum is energy / (4 pi R^2 (1 - rho)). Source: Fry et al. 2006; Labsphere integrating sphere guide.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        radius: R, metres.
-        reflectance: rho, 0 to 1.
-        energy: that leaves the wall for its first flight, J.
-        max_flights: cuts the series after that many flights.
+        edges_opl: bin edges, (T + 1,), metres.
+        radius: radius R, metres.
+        reflectance: reflectance rho, 0 to 1.
+        energy: energy that leaves the wall for its first flight, J.
+        max_flights: number of flights after which the series is cut, None for no limit.
 
     Returns:
         (T,), J/m^2.
@@ -259,10 +259,10 @@ def integrating_sphere_radiance(
     rho)). The scene is `tt.scenes.integrating_sphere`.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        radius: R, metres.
-        reflectance: rho, 0 to 1.
-        intensity: I, W/sr.
+        edges_opl: bin edges, (T + 1,), metres.
+        radius: radius R, metres.
+        reflectance: reflectance rho, 0 to 1.
+        intensity: intensity I of the light, W/sr.
         max_bounces: reflections at the wall (one for the delta), as a renderer with `max_depth = max_bounces + 1`
             counts.
 
@@ -282,8 +282,8 @@ def integrating_sphere_decay(radius: float, reflectance: float) -> float:
     R^2). At reflectance 0.5 it is 2R exactly.
 
     Args:
-        radius: R, metres.
-        reflectance: between 0 and 1, both excluded.
+        radius: radius R, metres.
+        reflectance: reflectance rho, between 0 and 1, both excluded.
 
     Returns:
         Metres.
@@ -322,10 +322,10 @@ def furnace(
     `tt.scenes.furnace`; the late decay is `integrating_sphere_decay`.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        radius: R, metres.
-        reflectance: rho, 0 to 1.
-        radiance: Le of the wall.
+        edges_opl: bin edges, (T + 1,), metres.
+        radius: radius R, metres.
+        reflectance: reflectance rho, 0 to 1.
+        radiance: radiance Le of the wall.
         max_bounces: reflections (zero for the delta), as a renderer with `max_depth = max_bounces + 1` counts.
 
     Returns:
@@ -349,11 +349,11 @@ def parallel_plates(
     rho). Source: the view factor of parallel planes. The scene is `tt.scenes.parallel_plates`.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        separation: h, metres.
-        reflectance: rho, 0 to 1.
-        radiance: Le of the plates.
-        first_leg: z, camera to plate, metres, h / 2 unless given.
+        edges_opl: bin edges, (T + 1,), metres.
+        separation: distance h between the plates, metres.
+        reflectance: reflectance rho, 0 to 1.
+        radiance: radiance Le of the plates.
+        first_leg: distance z from the camera to the plate, metres, h / 2 unless given.
         max_bounces: reflections (zero for the delta).
 
     Returns:
@@ -371,7 +371,7 @@ def fresnel_reflectances(index: float, incidence_deg: float = 0.0) -> tuple[floa
     reflection (index < 1 beyond the critical angle) gives (1, 1).
 
     Args:
-        index: n, relative and real.
+        index: relative index of refraction n, real.
         incidence_deg: angle from the normal, degrees.
     """
     n = positive("index", index)
@@ -408,12 +408,12 @@ def etalon_orders(
     delay of a wavefront, 2 n d cos_t; dispersion (group index) is not covered.
 
     Args:
-        thickness: metres.
-        index: of refraction.
+        thickness: thickness of the slab, metres.
+        index: index of refraction of the slab.
         side: "reflected" or "transmitted".
         incidence_deg: angle from the normal, degrees.
         polarization: "s", "p" or None for the mean of both.
-        absorption_per_m: alpha, per metre of length in the glass.
+        absorption_per_m: absorption coefficient alpha, per metre of length in the glass.
 
     Raises:
         ArgumentError: for other sides and polarizations.
@@ -449,10 +449,10 @@ def etalon_slab(
     The orders of `etalon_orders` shifted by the path in air.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        thickness: metres.
-        index: of refraction.
-        radiance: of the light.
+        edges_opl: bin edges, (T + 1,), metres.
+        thickness: thickness of the slab, metres.
+        index: index of refraction of the slab.
+        radiance: radiance of the light.
         air_opl: path in air, metres: 2 for `tt.scenes.etalon_slab(light="behind")` with side="transmitted", 3 for
             light="front" with side="reflected".
         side: "transmitted" or "reflected".
@@ -505,16 +505,16 @@ def confocal_plane(
     """Compute the radiance per bin of a confocal scan point before a plane that is parallel to the wall.
 
     With K = energy wall_albedo^2 albedo / pi^3 the light at tau = 2 r is K pi depth^4 / r^7 dtau, r >= depth; a bin
-    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), all of it pi K / (3 depth^2). Derivation: the patch of `hidden_patch`
-    integrated over the plane.
+    holds (K pi depth^4 / 3) (r_a^-6 - r_b^-6), and the sum of all bins is pi K / (3 depth^2).
+    Derivation: the patch of `hidden_patch` integrated over the plane.
 
     Args:
-        edges_opl: (T + 1,), metres.
-        depth: of the plane before the scan point, metres.
-        albedo, wall_albedo: 0 to 1.
-        energy: of the laser, J.
-        radius: of a disk around the point before which the scan point stands, which ends at r = hypot(depth, radius);
-            infinite for the plane.
+        edges_opl: bin edges, (T + 1,), metres.
+        depth: distance of the plane from the scan point, metres.
+        albedo, wall_albedo: albedo of the hidden surface and of the wall, 0 to 1.
+        energy: energy of the laser, J.
+        radius: radius in metres of a disk in place of the plane, centred before the scan point, whose rim is at r =
+            hypot(depth, radius); infinite for the plane.
 
     Returns:
         (T,).
@@ -547,12 +547,12 @@ def hidden_patch(
     distances of the patch from the spot and the scan point, whose wall has one normal. Zero where a side faces away.
 
     Args:
-        spot, scan_point, patch: (3,), metres.
-        normal: of the patch, (3,).
-        area: m^2.
-        albedo, wall_albedo: 0 to 1.
-        wall_normal: (3,).
-        energy: of the laser, J.
+        spot, scan_point, patch: points on the wall and the middle of the patch, (3,), metres.
+        normal: normal of the patch, (3,).
+        area: area of the patch, m^2.
+        albedo, wall_albedo: albedo of the hidden surface and of the wall, 0 to 1.
+        wall_normal: normal of the wall, (3,).
+        energy: energy of the laser, J.
 
     Returns:
         (metres, radiance).

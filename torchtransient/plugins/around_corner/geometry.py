@@ -73,9 +73,9 @@ def sees(scene: Any, start: Any, end: Any, n: Any, active: Any) -> Any:
 def occluded(scene: Any, sample: Any, line: Any, p: Any, n: Any, active: Any) -> Any:
     """Return a mask of samples and wall points with something in between.
 
-    Both ends are moved off their surfaces along the geometric normals, by what single precision leaves of the largest
-    coordinate on the way: on curved meshes neighbouring triangles are not met, whatever the scale of the scene. What
-    lies nearer to a surface than that does not hide it.
+    Both ends are moved off their surfaces along the geometric normals, by the rounding error of single precision at
+    the largest coordinate on the way: on curved meshes neighbouring triangles are not met, whatever the scale of the
+    scene. Surfaces that lie nearer to another one than that do not hide it.
 
     Args:
         scene: built scene.
@@ -154,7 +154,7 @@ def gather_one_or_each(array: Any, index: Any, active: Any = True) -> Any:
     """Gather entries of an array that has one entry for all, or one each.
 
     Args:
-        array: of any type, of width one or of one entry each.
+        array: array of any type, of width one or of one entry each.
         index: numbers of the entries (UInt32).
         active: mask.
     """

@@ -93,9 +93,9 @@ class Vertices(Local):
 
     Attributes:
         p, n, geometric_n: place, and normals of the side that light meets.
-        value: by colour, of a head its albedo over pi times the area that it stands for, of a tail its albedo over pi
-            times the light of the step before.
-        length: metres from the first vertex of the tail.
+        value: weight by colour: of a head its albedo over pi times the area that it stands for, of a tail its albedo
+            over pi times the light of the step before.
+        length: length from the first vertex of the tail, metres.
         alive: mask of vertices that exist.
         shape, primitive, uv: the material point.
     """
@@ -493,8 +493,8 @@ class GroupBlock:
         links: the :class:`Links` of the groups.
         seen: ``[g, r]`` of heads from scan points, by row of a tile and point: cosines over the squared distance, and
             distance (metres).
-        lit: likewise of each vertex of tails from laser spots, by chain and spot, in confocal captures by row of a tile
-            and point.
+        lit: the same two numbers of tails from laser spots, a list with an array for each vertex of a tail, by chain
+            and spot, in confocal captures by row of a tile and point.
     """
 
     def __init__(self, light: LateLight, first: int, groups: int) -> None:

@@ -84,7 +84,7 @@ def launches_of(film: Any, samples: int) -> list[Launch]:
     """Return the launches of ``samples`` samples for each pixel of a film.
 
     Args:
-        film: of the capture.
+        film: film of the capture.
         samples: number for each pixel.
     """
     width = int(film.crop_size()[0])
@@ -129,7 +129,7 @@ def _with_events(band: int, band_first: int, rows: int, width: int, samples: int
 
 
 class ScanJob:
-    """Render of a scan onto a film, whose light is added to.
+    """Render of a scan, which adds light to a film.
 
     Args:
         scene: everything that can stand in the way, the wall too.

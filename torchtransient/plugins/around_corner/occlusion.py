@@ -388,7 +388,8 @@ class LateOutlines(BoundaryTerm):
     """Boundary term of a job of derivatives in light of ``FIRST`` and more bounces.
 
     Args:
-        integrator, context, sensor, film, seed, samples: as of :class:`BoundaryTerm`; ``context`` is that of the job.
+        integrator, context, sensor, film, seed: integrator and context of the job, its sensor, film and seed.
+        samples: edge samples per pixel of each pass.
     """
 
     can_be_recorded = False
@@ -549,7 +550,9 @@ def late_outlines(integrator: Any, context: Any, sensor: Any, film: Any, seed: A
     itself.
 
     Args:
-        integrator, context, sensor, film, seed, spp: as of :func:`mutual_occlusion`.
+        integrator, context, sensor, film: integrator and context of the job, its sensor and film.
+        seed: seed of the job.
+        spp: samples per pixel of the job, 0 for the sampler's own, see :func:`mutual_occlusion`.
     """
     wanted = context.wanted
     if not (wanted.geometry and follows_outlines(type(context.segment), context.contents)) or mi.is_polarized:

@@ -105,8 +105,9 @@ class OutlineTable:
         edges: edges of some parts.
         viewpoints, normals: points of the wall that see the edges, and their normals, (P, 3).
 
-    The probability of an edge is the root mean square over the viewpoints of what it spans there over the square of
-    the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain length.
+    The probability of an edge is the root mean square over the viewpoints of the length that it spans there over the
+    square of the distance, times the cosine at the viewpoint, zero from where it is no outline; mixed with plain
+    length.
     """
 
     def __init__(self, triangles: Triangles, edges: list[Edges], viewpoints: np.ndarray, normals: np.ndarray) -> None:
@@ -215,7 +216,7 @@ def parts_of(shapes: list[Any]) -> tuple[list[Part], Triangles]:
     With more than ``MOST_PARTS`` pieces each mesh is one part.
 
     Args:
-        shapes: of the scene.
+        shapes: shapes of the scene.
     """
     numbers = [k for k, shape in enumerate(shapes) if shape.is_mesh()]
     triangles = Triangles.from_meshes([shapes[k] for k in numbers])
@@ -271,7 +272,7 @@ def hiding_pairs(parts: list[Part], viewpoints: np.ndarray, is_requested: Any) -
     """Find pairs of parts of which one may hide the other, or points of its own, from a viewpoint.
 
     Args:
-        parts: of the scene.
+        parts: parts of the scene, see :func:`parts_of`.
         viewpoints: points of the wall, (P, 3), metres.
         is_requested: predicate of (hider, hidden) for the pairs that count.
 

@@ -350,7 +350,7 @@ def origin_of(scene: Any, sensor: Any) -> Any:
 
     Args:
         scene: built scene.
-        sensor: of the capture, which may say it.
+        sensor: sensor of the capture, whose ``laser_origin`` counts if it has one.
     """
     given = getattr(sensor, "laser_origin", None)
     return mi.Point3f(laser_of(scene).world_transform().translation()) if given is None else given
@@ -362,8 +362,8 @@ def aims_of(scene: Any, sensor: Any, capture: CaptureType, fov: float | None) ->
 
     Args:
         scene: built scene.
-        sensor: of the capture.
-        capture: its type.
+        sensor: sensor of the capture.
+        capture: type of the capture.
         fov: horizontal field of view in degrees of a grid of laser positions around the emitter's axis, None for the
             laser positions of the sensor.
 
@@ -414,7 +414,7 @@ def scan_rays(sensor: Any) -> Any:
     Attached where the sensor is.
 
     Args:
-        sensor: of the capture.
+        sensor: sensor of the capture.
     """
     if hasattr(sensor, "scanned"):
         origin = mi.Point3f(sensor.origin)
@@ -432,7 +432,7 @@ def scanned_points(scene: Any, sensor: Any) -> Any:
 
     Args:
         scene: built scene.
-        sensor: of the capture.
+        sensor: sensor of the capture.
     """
     if hasattr(sensor, "scanned"):
         return sensor.scanned()
@@ -449,8 +449,8 @@ def check_count(aims: Any, sensor: Any, capture: CaptureType) -> None:
 
     Args:
         aims: directions of the laser.
-        sensor: of the capture.
-        capture: its type.
+        sensor: sensor of the capture.
+        capture: type of the capture.
 
     Raises:
         SceneError: for another number.

@@ -211,7 +211,7 @@ def moves_scan(context: Any, hidden: list[Any]) -> bool:
     """Return whether derivatives are requested by wall, sensor or laser.
 
     Args:
-        context: of the job.
+        context: context of the job.
         hidden: shapes that do not count, with the plugins inside them.
     """
     others = [shape for shape in context.scene.shapes() if shape.ptr not in {one.ptr for one in hidden}]

@@ -37,7 +37,7 @@ class SampleTable:
 
     Args:
         samples: the samples.
-        front, n, delay: for samples that are lit by one laser spot, else None: scattered light in place of ``f``,
+        front, n, delay: arrays of samples that are lit by one laser spot, else None: scattered light in place of ``f``,
             normals of the sides that are lit, and lengths of the ways to the spot (metres) in place of ``b0``.
     """
 
@@ -79,7 +79,8 @@ class ThirdBounce(ScanJob):
     Not supported: spectral and polarized variants; derivatives.
 
     Args:
-        scene, film, sensors, energy, progress: as of :class:`.launches.ScanJob`.
+        scene, film, sensors, energy, progress: scene, film, scan points, energy of the laser (J) and function of the
+            fraction that is done, see :class:`.launches.ScanJob`.
         samples: hidden samples.
         tile: tile whose samples each scan point takes (UInt32), None for samples without tiles.
 

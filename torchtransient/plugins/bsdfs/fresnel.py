@@ -104,7 +104,8 @@ def refract(wi: Any, normal: Any, cos_theta_t: Any, eta_ti: Any) -> Any:
     Args:
         wi: direction away from the surface, towards the light's origin, unit vector.
         normal: unit normal of the facet.
-        cos_theta_t, eta_ti: of :class:`FresnelTerms`.
+        cos_theta_t, eta_ti: signed cosine of the refracted direction and reciprocal relative index, see
+            :class:`FresnelTerms`.
     """
     return normal * (dr.dot(wi, normal) * eta_ti + cos_theta_t) - wi * eta_ti
 

@@ -58,7 +58,7 @@ def specular_share(specular: Any | None, diffuse: Any, followed: bool) -> Any:
     Args:
         specular: texture of the specular lobe, None for a factor of one.
         diffuse: texture of the diffuse lobe.
-        followed: for derivatives by one of the textures, which need samples of both lobes.
+        followed: there are derivatives by one of the textures, which need samples of both lobes.
     """
     with dr.suspend_grad():
         d = mi.Float(diffuse.mean() if has_mean(diffuse) else 0.5)

@@ -60,8 +60,8 @@ def hides_lobe_probability(bsdf: Any) -> bool:
 def mirrors_matrices(bsdf: Any) -> bool:
     """Return True if a BSDF is ``twosided`` or holds one (in a mask, in a blend).
 
-    From behind, Mitsuba's ``twosided`` evaluates what it holds for the mirror images of the directions, and returns its
-    Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
+    From behind, Mitsuba's ``twosided`` evaluates its nested BSDF for the mirror images of the directions, and returns
+    its Mueller matrix as if it belonged to the directions themselves: turned, and with the hands of circular light
     exchanged.
 
     Args:
@@ -106,8 +106,8 @@ def _rebuild_wrapper(wrapper: Any, nested: Any, flags: dict[str, bool]) -> Any:
 def _flags_of(wrapper: Any) -> dict[str, bool]:
     """Properties of a bump or normal map that a built one does not show.
 
-    They are told by what it samples, with values of textures by which all choices differ: not with those of now, since
-    a map that is flat or a surface that is black now may be changed.
+    They are found out from its samples, with values of textures for which all choices differ: not with the present
+    ones, since a map that is flat or a surface that is black now may be changed.
     """
     if normal_texture(wrapper) is None:
         return {}
@@ -213,8 +213,8 @@ class Mixture:
     Attributes:
         always: it is taken apart in renders, too.
         for_derivatives: it is taken apart where there are derivatives.
-        parts: what it is taken apart into.
-        textures: weights.
+        parts: BSDFs or phase functions that it is taken apart into.
+        textures: textures of the weights.
     """
 
     def __init__(self, node: Any, kind: type, shapes: Sequence[Any]) -> None:
@@ -328,8 +328,8 @@ def _needs_choice(node: Any) -> bool:
 
 
 def _is_mixture(node: Any) -> bool:
-    """Return True if a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of what it
-    holds.
+    """Return True if a BSDF or phase function is a mixture, or one that can be rebuilt around the parts of a
+    nested one.
     """
     if weight_slot(node) is not None:
         return True
@@ -394,7 +394,8 @@ class MixtureChoice:
 
     Args:
         mixtures: mixtures of the scene.
-        chosen: by address of a mixture, (it is taken apart everywhere, it is where a weight is about 0 or 1).
+        chosen: how each mixture is taken apart, by its address: a pair of truth values, everywhere and where a weight
+            is about 0 or 1.
 
     Not a dataclass on purpose: Dr.Jit loops would take it apart as loop state.
     """

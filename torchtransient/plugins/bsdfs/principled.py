@@ -47,9 +47,9 @@ class Weight(mi.Texture):
 
     Args:
         slot: name under which the surface holds it.
-        texture: its texture.
+        texture: texture of the weight.
         ends: the values at which Mitsuba skips that lobe or another one.
-        reading: how it is read now.
+        reading: rule for reading the weights of the surface.
     """
 
     def __init__(self, slot: str, texture: Any, ends: tuple[float, ...], reading: Reading) -> None:

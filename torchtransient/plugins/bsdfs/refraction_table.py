@@ -21,7 +21,7 @@ from torchtransient.plugins.parameter_effect import class_of
 
 
 class RefractiveBSDFs:
-    """The BSDFs of one scene that refract without being a delta function, each with what holds its index.
+    """The BSDFs of one scene that refract without being a delta function, each with the object that holds its index.
 
     Covers every BSDF with a glossy non-symmetric transmission lobe: ``diff_rough_dielectric``, ``roughdielectric``,
     ``principled`` with ``spec_trans`` and plugins of others that expose ``eta``, also inside ``mask``,
@@ -30,7 +30,7 @@ class RefractiveBSDFs:
     index.
 
     Args:
-        entries: (BSDF, its parts that hold an index).
+        entries: pairs of a BSDF and its parts that hold an index.
     """
 
     def __init__(self, entries: list[tuple[Any, list[Any]]]) -> None:
@@ -103,7 +103,7 @@ class RefractionTable:
 
 
 def boundaries_of(bsdfs: list[Any]) -> list[tuple[Any, Any]]:
-    """Return (BSDF, what holds its relative index) of those that light enters another medium through.
+    """Return (BSDF, object that holds its relative index) of those that light enters another medium through.
 
     By a smooth or a rough lobe. Of parts with different indices, the first counts: see :class:`..sensors.surroundings`.
 

@@ -54,7 +54,9 @@ def internal_reflectance(alpha: Any, eta: Any, ggx: bool) -> Any:
     """Return the fraction of diffuse light from inside that a rough interface throws back.
 
     Args:
-        alpha, eta, ggx: as of :func:`external_transmittance`.
+        alpha: roughness, Float, attached or not.
+        eta: index inside over outside, Float, attached or not.
+        ggx: GGX, else Beckmann.
     """
 
     def number(alpha: Any, eta: Any) -> Any:

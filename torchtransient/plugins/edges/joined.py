@@ -25,7 +25,7 @@ class Triangles:
     Faces without area are left out.
 
     Attributes:
-        vertices: of all meshes in their order, (V, 3).
+        vertices: vertices of all meshes in their order, (V, 3).
         first: number of the first vertex of each mesh, (M,).
         faces: numbers of vertices, (F, 3).
         joined: numbers of places, (F, 3).
@@ -64,12 +64,12 @@ class Triangles:
 def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the places of the corners of faces, (F, 3), the same number for corners that lie at the same place.
 
-    What is not the same to the bit is the same place if it lies on rims: pieces that were put together by transforms
+    Corners that differ by some bits are the same place if they lie on rims: pieces that were put together by transforms
     are off by some roundings. No face loses an edge by it: far from the origin, edges may be as short as roundings are
     long.
 
     Args:
-        positions: (V, 3), single precision.
+        positions: positions of the vertices, (V, 3), single precision.
         faces: numbers of vertices, (F, 3).
     """
     # Adding zero makes one of the two zeros.
@@ -97,10 +97,10 @@ def joined_places(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def near_places(positions: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return for each point the first of those that lie at the same place, to some roundings, (K,).
+    """Return for each point the number of the first point at the same place, up to some roundings, (K,).
 
     Args:
-        positions: (K, 3).
+        positions: positions of the points, (K, 3).
         reach: length of the longest rim at each, which a rotation may have rounded by, (K,).
     """
     p = positions.astype(np.float64)

@@ -51,7 +51,7 @@ class EdgeDensity:
 
     Args:
         weight: weight of each row, Float.
-        cumulative: its cumulative sum, Float64: of single precision, steps of long tables would be rounding.
+        cumulative: cumulative sum of the weights, Float64: steps of long tables would be rounding in single precision.
     """
 
     def __init__(self, weight: Any, cumulative: Any) -> None:
@@ -71,7 +71,7 @@ class EdgeTable:
     """Edges and limbs of a scene for one job, with their numbers as they are now.
 
     Args:
-        topology: of the scene.
+        topology: topology of the scene.
         moving: addresses of the shapes that move.
 
     Attributes:
@@ -282,12 +282,12 @@ class EdgeTable:
             V: viewer, Point3f.
 
         Returns:
-            ``p, d, dist``: the point, direction and distance of it; ``n``: out of what hides, across edge and line of
-            sight; ``sin`` between these two; ``inv_pdf``: one over the density by length; ``crease``: a face begins
-            where another one ends; ``valid``: there is an outline or a crease; ``beside``: where to look past the edge
-            from, a little before it; ``within``: the same on the inside, along what hides; ``inner``: the face that
-            hides, as intersection of the ray along ``d_in``; ``facing``: the other face of a crease, along ``d``;
-            ``limb``: the place in the space of a limb.
+            ``p, d, dist``: the point, direction and distance of it; ``n``: out of the hiding shape, across edge and
+            line of sight; ``sin`` between these two; ``inv_pdf``: one over the density by length; ``crease``: a face
+            begins where another one ends; ``valid``: there is an outline or a crease; ``beside``: where to look past
+            the edge from, a little before it; ``within``: the same on the inside, along the hiding shape; ``inner``:
+            the face that hides, as intersection of the ray along ``d_in``; ``facing``: the other face of a crease,
+            along ``d``; ``limb``: the place in the space of a limb.
         """
         t, p, length, outside = self._tangent(k), k.near, k.length, mi.Bool(True)
         local, limb_n = mi.Point3f(0), mi.Vector3f(0)

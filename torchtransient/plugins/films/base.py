@@ -164,7 +164,8 @@ class TimeResolvedFilm(mi.Film):
         """Add the derivative of an event, ``k df + f k' dtau`` with the film's response ``k``, in forward mode.
 
         Args:
-            band, base, opl_from_start, active: as of :meth:`put`.
+            band, base, opl_from_start, active: number of the band, index of the pixel's first value there, optical path
+                length of the arrival (metres) and mask of lanes, see :meth:`put`.
             d_value: ``df`` by channel.
             value_d_opl: ``f dtau`` by channel.
         """
@@ -174,7 +175,7 @@ class TimeResolvedFilm(mi.Film):
         """Read the adjoint of :meth:`put` at an arrival.
 
         Args:
-            adjoint: (flat array, stride of entries, stride of channels), or None.
+            adjoint: adjoint of the array as (flat array, stride of entries, stride of channels), or None.
             base: index of the pixel's first value in the array, UInt32.
             opl_from_start: ``opl - start_opl`` of the arrival, metres (Float64).
             active: mask of lanes.
@@ -285,8 +286,8 @@ class TimeResolvedFilm(mi.Film):
         """Replace the temporal filter; films without one ignore the call.
 
         Args:
-            name: filter, empty to leave it.
-            stddev: its standard deviation in bins, None to leave it.
+            name: name of the filter, empty to leave it.
+            stddev: standard deviation of the filter in bins, None to leave it.
         """
 
     def arrivals(self):
@@ -360,10 +361,11 @@ class TimeResolvedFilm(mi.Film):
         return self.cube_shape()
 
     def stored_adjoint(self, adjoint):
-        """Return the adjoint of the array that is rendered to, of that of the film.
+        """Return the adjoint of the array that is rendered to, from the adjoint of the film's array.
 
         Args:
-            adjoint: (flat array, offset, strides) of :meth:`cube_shape`; returned for :meth:`storage_shape`.
+            adjoint: adjoint in the shape :meth:`cube_shape`, as (flat array, offset, strides); the result has the
+                shape :meth:`storage_shape`.
         """
         return adjoint
 
@@ -490,7 +492,8 @@ class TimeResolvedFilm(mi.Film):
         """Let renders add to memory of the caller.
 
         Args:
-            storage: (flat array of zeros, index of the film's first entry); None for arrays of the film's own again.
+            storage: memory as (flat array of zeros, index of the film's first entry); None for arrays of the film's
+                own again.
         """
         self._lent = storage
 

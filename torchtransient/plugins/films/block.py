@@ -134,7 +134,7 @@ class AdjointBlock:
 
         Args:
             A: adjoint of the transient, by channel.
-            slope: its slope by channel, or None.
+            slope: slope by channel, or None.
 
         Returns:
             (adjoint, slope or None).
@@ -216,7 +216,7 @@ class BinLayout:
         flat: array of the film.
         base: index of the histogram's first value in it, UInt32.
         bin_stride, channel_stride: strides in the array.
-        bins, channels: their numbers.
+        bins, channels: numbers of bins and channels.
         exclusive: every lane has a histogram of its own.
     """
 

@@ -36,7 +36,7 @@ class StandardObserver:
         """Return for each wavelength of a ray the share of each channel.
 
         Args:
-            wavelengths: nanometres.
+            wavelengths: wavelengths, nanometres.
         """
         return [self._shares(wavelengths[k]) for k in range(len(wavelengths))]
 
@@ -68,7 +68,7 @@ class ChannelMatch:
             self.matrix = [[r * self.weight[k] for r in row] for k, row in enumerate(response.matrix(wavelengths))]
 
     def to_channels(self, value) -> list:
-        """Return the channel values of what an event contributes, list of Float.
+        """Return the channel values of an event's contribution, list of Float.
 
         Args:
             value: spectrum, in polarized variants a Stokes vector.
@@ -174,7 +174,7 @@ class SensorResponse:
         """Return the values of the curves at wavelengths, (C, N).
 
         Args:
-            wavelengths: (N,), nanometres.
+            wavelengths: wavelengths, (N,), nanometres.
         """
         values = self._evaluate(mi.UnpolarizedSpectrum(mi.Float(wavelengths)))
         return np.array([np.broadcast_to(np.array(value[0], dtype=float), len(wavelengths)) for value in values])
@@ -218,7 +218,7 @@ class SensorResponse:
         """Return for each wavelength of a ray the share of each channel, of which the mean is taken.
 
         Args:
-            wavelengths: nanometres.
+            wavelengths: wavelengths, nanometres.
         """
         values = self._evaluate(wavelengths)
         count = len(wavelengths)
@@ -229,7 +229,7 @@ class SensorResponse:
 
         Args:
             sensor: the sensor.
-            ray: its ray, which is changed.
+            ray: ray of the sensor, which is changed.
             weight: weight of the ray.
             u: the number that its wavelengths were drawn from, Float.
 

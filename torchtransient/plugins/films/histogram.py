@@ -92,8 +92,8 @@ class TransientHDRFilm(TimeResolvedFilm):
     some, and 3 otherwise (linear sRGB in spectral variants); in polarized variants four times as many: all of S0, then
     S1, S2, S3, in the sensor's frame. There are no alpha or weight channels. Light outside the window is not stored
     but counted: ``energy_before`` and ``energy_after`` are sums over pixels of the mean over channels (of S0). With
-    the sum over the stored bins they make up the steady image, whatever the temporal filter: what it spreads over the
-    rim of the window counts as outside.
+    the sum over the stored bins they make up the steady image, whatever the temporal filter: light that it spreads over
+    the rim of the window counts as outside.
 
     The spatial reconstruction filter is applied by sampling it (each sample is moved by an offset drawn from the filter
     and weighted by its sign), so every filter works, negative lobes too, at the price of a box. It converges to the
@@ -223,7 +223,7 @@ class TransientHDRFilm(TimeResolvedFilm):
         return reduce_mode(exclusive, crowded and looks and self.temporal_bins >= MANY_BINS)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False, crowded=False, laser=None):
-        """Add a contribution, as of :meth:`~.base.TimeResolvedFilm.put`.
+        """Add a contribution, see :meth:`~.base.TimeResolvedFilm.put`.
 
         Args:
             laser: index ``row * laser_scan_width + column`` of the laser position in an exhaustive scan, None
@@ -246,7 +246,7 @@ class TransientHDRFilm(TimeResolvedFilm):
             cube: array of the band.
             base: index of bin 0, UInt32.
             x: arrival in bins, Float or Float64.
-            window: (first bin that is stored, the one after the last).
+            window: stored bins, as (first one, one after the last).
             value: contribution by channel, list of Float.
             active: mask of lanes.
             mode: ``dr.ReduceMode`` of the additions.

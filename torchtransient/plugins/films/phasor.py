@@ -246,7 +246,7 @@ class FrequencyBlock:
         """Return a frequency, cycles per metre, Float64.
 
         Args:
-            j: its number in the block.
+            j: number of the frequency in the block.
         """
         if self.step is None:
             return self.values[j]
@@ -526,7 +526,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         return Table(flat, self.frequency_array, self.frequency_total, self.channel_count(), exclusive)
 
     def put(self, band, base, opl_from_start, value, active, exclusive=False):
-        """Add one event, frequency by frequency: the plain form of what :class:`EventBlock` does for many at once."""
+        """Add one event, frequency by frequency: as :class:`EventBlock` does for many at once."""
         _add_event(self._table(self.band_array(band), exclusive), base, opl_from_start, value, None, active)
         return mi.Float(0), mi.Float(0)
 
@@ -537,7 +537,7 @@ class PhasorHDRFilm(TimeResolvedFilm):
         """Return ``A = sum over nu of a_re cos - a_im sin`` and its slope ``dA / d opl`` for an arrival.
 
         Args:
-            adjoint: (flat array, frequency stride, entry stride).
+            adjoint: adjoint of the array as (flat array, frequency stride, entry stride).
             steady: always None, since the film keeps a steady image.
 
         Returns:

@@ -24,7 +24,7 @@ class Row:
     Attributes:
         number: number of the array, UInt32.
         inside: mask, the array exists.
-        shift: what is added to the arrival's length, metres (Float64).
+        shift: length that is added to the arrival's, metres (Float64).
         k: derivative of ``shift`` by the rate, seconds.
         weight, slope: share of the arrival, and its derivative by the rate.
     """
@@ -130,8 +130,8 @@ class RateHDRFilm(film_of_rows(TransientHDRFilm)):
     r"""Film over optical path length and rate (:monosp:`rate_hdr_film`): a histogram for each bin of the rate.
 
     The rate ``d opl / dt`` (m/s, positive where paths get longer) is that of material points, see
-    :mod:`~..transport.velocities`: what waves feel whose phase the scatterers carry. Their Doppler shift is ``- rate /
-    wavelength``.
+    :mod:`~..transport.velocities`: the rate for waves whose phase the scatterers carry. Their Doppler shift is ``- rate
+    / wavelength``.
 
     Parameters beside those of ``transient_hdr_film``: ``rate_start``, ``rate_width`` (m/s), ``rate_bins`` (int): bins
     ``[rate_start + k rate_width, rate_start + (k + 1) rate_width)``, over which the temporal filter spreads arrivals as

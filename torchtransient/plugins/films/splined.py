@@ -75,9 +75,9 @@ def spline_of(pulses, width: float, parts: int):
     """Return (nodes before the start of a bin, weights ``M`` of the nodes, error of the response in its largest value).
 
     Args:
-        pulses: all that arrivals are spread by, but for the bin.
+        pulses: pulses that spread the arrivals, without the bin itself.
         width: width of a bin, metres.
-        parts: nodes in a bin.
+        parts: number of nodes in a bin.
     """
     fine = 8 * parts
     start, values = cumulative_of_sum(pulses, width / fine)
@@ -232,7 +232,7 @@ class SplinedHDRFilm(TransientHDRFilm):
             dr.eval(self.bands[0][2], self.outside)
 
     def _bins_of(self, nodes):
-        """Return the array of bins, and count as outside what the line spreads over the rims of the window."""
+        """Return the array of bins, and count as outside the light that the line spreads over the window's rims."""
         *rows, bins, channels = self.cube_shape()
         row, channel = _divided(dr.arange(mi.UInt32, math.prod(rows) * channels), channels)
         sweep = Sweep(self, nodes, dr.empty(mi.Float, math.prod(rows) * bins * channels))
@@ -317,7 +317,7 @@ def swept(sweep, at, to):
     Args:
         sweep: :class:`Sweep`.
         at: index of each row's first node and channel.
-        to: that of the first bin.
+        to: index of each row's first bin and channel.
 
     Returns:
         (sum of bins before the first one, list of those behind the last one and a zero).
@@ -342,7 +342,7 @@ def swept_back(sweep, at, stride, to):
     Args:
         sweep: :class:`Sweep` with the adjoint of the bins.
         at: index of each row's first bin and channel.
-        stride: from one bin to the next.
+        stride: step of the index from one bin to the next.
         to: index of the first node and channel.
     """
     values, number = [mi.Float(0) for _ in range(sweep.most)], mi.UInt32(0)

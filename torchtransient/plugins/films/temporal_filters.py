@@ -205,7 +205,7 @@ class PulsedFilter:
         """Return the cumulative distribution at an edge, and its slope per bin.
 
         Args:
-            node, share: place of the edge in the table, as of :meth:`begin`.
+            node, share: place of the edge in the table, see :meth:`begin`.
         """
         low, high = dr.gather(mi.Float, self._table, node), dr.gather(mi.Float, self._table, node + 1)
         return dr.fma(high - low, share, low), (high - low) * self.nodes_per_bin
@@ -245,7 +245,7 @@ def pulse_of(props, prefix: str, plugin: str) -> Pulse | None:
 
     Args:
         props: properties of the film.
-        prefix: of their names.
+        prefix: first part of the names of these properties.
         plugin: name of the film, for messages.
 
     Raises:

@@ -169,7 +169,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Return a copy of the sampler that draws for a sensor, with the sensor's number of samples.
 
         Args:
-            plugin: in place of the integrator's ``sampler``.
+            plugin: name of a sampler plugin in place of the integrator's ``sampler``, which None takes.
         """
         return self._seen_scene(scene).sampler(sensor, self.sampler if plugin is None else plugin).clone()
 
@@ -259,7 +259,7 @@ class TransientIntegrator(mi.CppADIntegrator):
             contents: :class:`~..transport.scene_contents.SceneContents`.
             sensor, film: sensor and its film.
             sampler: seeded sampler of the lanes.
-            pixel: (row, column) of each ray, UInt32.
+            pixel: pixel of each ray as (row, column), UInt32.
             total: samples of a pixel that are added up.
             wavelength: number that chooses the wavelengths, None to draw one.
 
@@ -311,7 +311,7 @@ class TransientIntegrator(mi.CppADIntegrator):
         """Return where primary rays write to.
 
         Args:
-            job: their launch.
+            job: launch of the rays.
             rays: :class:`~..sensors.origin.PrimaryRays`.
 
         Returns:
@@ -378,7 +378,7 @@ class TransientIntegrator(mi.CppADIntegrator):
 
     @no_collection()
     def prepared(self, scene, sensor=0, seed=0, spp=0, kind=RENDER, grad_in=(None, None)):
-        """Look up, check and tabulate what a job needs, outside of recorded code.
+        """Look up, check and tabulate the data that a job needs, outside of recorded code.
 
         Other arguments and errors are those of :meth:`render`, :meth:`render_backward` and :meth:`render_forward`.
 
@@ -505,10 +505,11 @@ class TransientIntegrator(mi.CppADIntegrator):
 
         Args:
             params: not used; parameters are found through Dr.Jit's graph.
-            grad_in: (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W, T, C)``, or
-                the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any layout without
-                a copy.
-            sensor, seed, spp: as of :meth:`render`.
+            grad_in: adjoints as (steady ``(H, W, C)`` or None, transient or None). The transient is a TensorXf ``(H, W,
+                T, C)``, or the tuple ``(flat array, offset, (row, column, bin, channel) strides)``, which reads any
+                layout without a copy.
+            sensor, seed, spp: sensor or its index, seed, and samples per pixel (0 for those of the sampler), see
+                :meth:`render`.
 
         Raises:
             GradientError: if a path length can change and the temporal filter has no slope, or without a bound on the
@@ -580,20 +581,21 @@ class TransientIntegrator(mi.CppADIntegrator):
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0, develop=True):
         """Render the derivative along the tangents that are set on the scene's attached parameters.
 
-        One pass over the samples for one tangent. Tangents are set on values of the scene or on what they come from,
-        and are propagated from there. A caller who does so before clears the edges (``ADFlag.ClearEdges``) and keeps
-        what lies between: Dr.Jit's default flags remove it, with a warning here, and without any flag it is counted
-        twice.
+        One pass over the samples for one tangent. Tangents are set on values of the scene or on variables that they are
+        computed from, and are propagated from there. A caller who does so before clears the edges
+        (``ADFlag.ClearEdges``) and keeps the variables between: Dr.Jit's default flags remove it, with a warning here,
+        and without any flag it is counted twice.
 
         Args:
             params: not used; parameters are found through Dr.Jit's graph.
-            sensor, seed, spp, develop: as of :meth:`render`.
+            sensor, seed, spp, develop: sensor or its index, seed, samples per pixel (0 for those of the sampler), and
+                whether images are returned, see :meth:`render`.
 
         Returns:
             Steady ``(H, W, C)`` and transient ``(H, W, T, C)`` TensorXf, or None.
 
         Raises:
-            GradientError: as of :meth:`render_backward`.
+            GradientError: as :meth:`render_backward` raises it.
         """
         with dr.suspend_grad():
             job = self.prepared(scene, sensor, seed, spp, FORWARD)

@@ -155,7 +155,7 @@ def _whole(seed: Any) -> int:
 def _launch_counts(sampler: Any, spp: int, most: int) -> list[int]:
     """Return the samples per pixel of the launches that make up ``spp``, at most ``most`` each.
 
-    Samplers such as multijitter or ldsampler round a number up; a pixel is divided by what they draw.
+    Samplers such as multijitter or ldsampler round a number up; a pixel is divided by the number that they draw.
     """
 
     def drawn(count):
@@ -236,7 +236,7 @@ class Prepared:
 
 
 def state_of(jobs: list[Prepared]) -> tuple[tuple[Any, ...], list[Any]]:
-    """Return what the kernels of jobs depend on, beside the scene's parameters.
+    """Return all data that the kernels of jobs depend on, beside the scene's parameters.
 
     Args:
         jobs: jobs of one scene.

@@ -129,7 +129,7 @@ class TransientNLOSPath(base.TransientIntegrator):
         (:mod:`..around_corner.late_light`), or from paths, as light of more bounces is. ``auto`` chooses as for
         ``third_bounce``; both have the same mean, and derivatives come from paths. So does late light of pairs.
     ``boundary`` (bool, true)
-        False leaves the boundary term of what hides other hidden things out of derivatives. Samples of edges are a
+        False leaves the boundary term of hidden shapes that hide one another out of derivatives. Samples of edges are a
         quarter of the paths, for light of three bounces and twice for that of more.
     ``force_equal_illumination_scanning`` (bool, true), ``illumination_scan_fov`` (degrees, 20)
         Whether the laser positions of an exhaustive capture are the scanned points; if not, they lie on a grid of this
@@ -267,7 +267,7 @@ class TransientNLOSPath(base.TransientIntegrator):
 
         Args:
             scene: Mitsuba scene.
-            contents: its contents.
+            contents: contents of the scene.
             wanted: derivatives of the job, None in a render.
             table: :class:`ScanTable` of the job, where it is known.
 

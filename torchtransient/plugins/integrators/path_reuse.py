@@ -75,7 +75,7 @@ class TransientPathReuse(path.TransientPath):
         return sensor, film
 
     def _why_not(self, scene, sensor, film):
-        """Return why light cannot be shared and what to do, None if it can."""
+        """Return the reason why light cannot be shared, with a remedy; None if it can."""
         delays = self.contents(scene, sensor).delays
         if self.connections != "ordinary":
             return f"expected connections='ordinary', got {self.connections!r}, which is of one pixel"

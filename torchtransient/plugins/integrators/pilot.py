@@ -37,7 +37,7 @@ class PilotEvents:
         energy: contribution to the mean over the image of the mean over wavelengths or channels, (N,), float64.
         depth: smallest ``max_depth`` of a render that contains it, (N,).
         path: number of the camera path, (N,).
-        pixel: its pixel on the pilot's film, (N,).
+        pixel: pixel of the path on the pilot's film, (N,).
         rate: rate of the path, (N,), m/s, float64; zero for a sensor whose film measures no rates.
         paths: number of camera paths.
         size: width and height of the pilot's film.
@@ -78,7 +78,7 @@ def _pilot_size(film, pixels: int) -> tuple[int, int]:
 
 
 def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: int, roulette=True) -> PilotEvents:
-    """Trace camera paths of a transient integrator and list what arrives.
+    """Trace camera paths of a transient integrator and list the light that arrives.
 
     ``max_depth`` is :data:`PILOT_DEPTH` for the run, and Russian roulette starts at :data:`PILOT_RR_DEPTH` at the
     latest.
@@ -94,7 +94,7 @@ def pilot_events(scene, integrator, sensor, *, seed: int, pixels: int, paths: in
 
     Raises:
         VariantError: in polarized variants.
-        SceneError: and what else the integrator raises for scenes that it cannot render.
+        SceneError: for scenes that the integrator cannot render; other errors of the integrator pass through.
     """
     if mi.is_polarized:
         raise VariantError(

@@ -48,7 +48,7 @@ class AreaElements:
     Attributes:
         axes: origin and three axes, (E, 4, 3).
         kind, shape, primitive, area: row of the table above, numbers of shape and primitive, square metres, (E,).
-        normal: (E, 3); of flat elements on the side that shading normals take for the front, else
+        normal: normals of flat elements, (E, 3), on the side that shading normals take for the front; else
             ``(sign / radius, 0, 0)``.
         two_sided: light scatters on the back as well, (E,).
         left_out: names of the shapes without rows: copies of groups, curves, signed distances, ellipsoids.
@@ -182,7 +182,7 @@ def _is_sheared(shape: Any) -> bool:
 
 
 def _rows_of(shape: Any) -> tuple[np.ndarray, int, np.ndarray, np.ndarray] | None:
-    """Return (axes, kind, area, normal) of one shape, None for what cannot be listed."""
+    """Return (axes, kind, area, normal) of one shape, None for a shape that cannot be listed."""
     if not can_be_listed(shape):
         return None
     return _triangles(shape) if shape.is_mesh() else _analytic(shape, _KINDS[shape.class_name()])
@@ -257,7 +257,7 @@ def morton_order(points: np.ndarray, bits: int = 10) -> np.ndarray:
     """Return the order of points along a Morton curve, which keeps neighbours together, (N,).
 
     Args:
-        points: (N, 3).
+        points: points, (N, 3).
         bits: bits of a coordinate.
     """
     if not len(points):
@@ -279,7 +279,7 @@ def facing_weight(elements: AreaElements, points: np.ndarray, normals: np.ndarra
 
     Args:
         elements: elements of hidden shapes.
-        points, normals: of the wall, (P, 3), metres.
+        points, normals: points (metres) and normals of the wall, (P, 3).
         chunk: number of elements that are computed at once.
     """
     weight = np.zeros(len(elements))

@@ -163,7 +163,7 @@ class LightFaces:
         count: number of faces.
         holds_all: the scene has no other lights.
         share: probability that a scene chooses one of these lights.
-        area: square metres.
+        area: area of each face, square metres.
     """
 
     def __init__(self, scene, emits_by_place):

@@ -137,9 +137,9 @@ class PrimitiveDensity:
     Args:
         shapes: shapes of the elements.
         uncut: elements before they are cut.
-        cuts: parts of each triangle's edges.
-        place, cell: for each part the element that it belongs to, and its cell there, (M,).
-        density: (tiles, M).
+        cuts: number of parts that each triangle's edges are cut into.
+        place, cell: number of the element that each part belongs to, and of its cell there, (M,).
+        density: density of each part per square metre, (tiles, M).
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class PrimitiveDensity:
             self._frames = packed(_frames(uncut.take(records), cuts[records]))
 
     def look_up(self, shape: Any, prim_index: Any, p: Any, active: Any, tile: Any) -> Any:
-        """Return the density (Float, per square metre), 0 for what is not in the table.
+        """Return the density (Float, per square metre), 0 for points that are not in the table.
 
         Args:
             shape, prim_index: ShapePtr and primitive, UInt32.
@@ -298,7 +298,7 @@ class HiddenElements:
         Args:
             memory: cache of the scene.
             shapes: hidden shapes.
-            points, normals: as of the class.
+            points, normals: wall points and their normals, see the class.
             beside: other shapes of the scene.
         """
         every, others = AreaElements.from_shapes(shapes), AreaElements.from_shapes(list(beside))
@@ -320,7 +320,7 @@ class HiddenElements:
         To be called before :meth:`put_first`.
 
         Args:
-            weights: (tiles, E), finite and not negative, in the order of ``elements``.
+            weights: weights of the elements, (tiles, E), finite and not negative, in the order of ``elements``.
         """
         other = copy(self)
         other.tile_count = len(weights)
@@ -395,7 +395,7 @@ class HiddenElements:
             x, y: uniform numbers in [0, 1), Float64 and Float.
 
         Returns:
-            (Point3f, geometric Normal3f, place on the primitive as of :meth:`coordinates`, ShapePtr, primitive).
+            (Point3f, geometric Normal3f, place on the primitive, see :meth:`coordinates`, ShapePtr, primitive).
         """
         element, a = self.select_element(x, active)
         point, n = self.point(element, a, y, active)
@@ -446,7 +446,7 @@ class HiddenElements:
         return mi.Point3f(p + offset), mi.Normal3f(n)
 
     def per_area(self, shape: Any, prim_index: Any, p: Any, active: Any = True, tile: Any = None) -> Any:
-        """Return the density of a point per square metre (Float), 0 for what is not in the table.
+        """Return the density of a point per square metre (Float), 0 for points that are not in the table.
 
         Args:
             shape, prim_index: ShapePtr and primitive, UInt32.
@@ -462,7 +462,7 @@ class HiddenElements:
 
         Args:
             element: number in the table, UInt32.
-            a, y: numbers in [0, 1), as of :meth:`point`.
+            a, y: numbers in [0, 1), see :meth:`point`.
         """
         row, kind = self._row(element, 3, active), self.kind(element, active)
         x = mi.Point2f(*local_point(kind, a, y, dr, self.kinds)[:2])

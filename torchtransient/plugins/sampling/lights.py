@@ -20,7 +20,7 @@ class DistantReference:
     """Sphere whose tangent planes distant light leaves at t = 0.
 
     Args:
-        center, radius: of the sphere around the scene, metres.
+        center, radius: center and radius of the sphere around the scene, metres.
     """
 
     def __init__(self, center: tuple[float, float, float], radius: float):
@@ -63,7 +63,7 @@ class LightBox:
     """Box around all lights of a scene. A plain object, which Dr.Jit loops leave alone.
 
     Args:
-        low, high: its corners.
+        low, high: corners of the box.
     """
 
     def __init__(self, low, high):

@@ -96,9 +96,9 @@ def plane_points(count: int, seed: Any, sets: int = 1) -> tuple[Any, Any]:
 
     Hammersley's set, the second coordinate scrambled, and both shifted by the same random part of ``1 / count`` (of the
     next power of two) for all points: every point is uniform by itself, so that means are unbiased, and with a power of
-    two the points are a (0, m, 2)-net as those of Sobol's sequence are. What is sorted by the first coordinate needs no
-    sorting afterwards. A common shift leaves half of the variance that shifts of their own would, where a bin of time
-    is an interval of one coordinate.
+    two the points are a (0, m, 2)-net as those of Sobol's sequence are. The points are sorted by the
+    first coordinate already. A common shift leaves half of the variance that shifts of their own would, where a bin of
+    time is an interval of one coordinate.
     """
     j = dr.arange(mi.UInt32, sets * count)
     number = j // dr.opaque(mi.UInt32, count)
@@ -163,7 +163,7 @@ def sobol(index: Any, dimension: int, seed: Any) -> Any:
 
     Args:
         index: numbers of the points, UInt32.
-        dimension: of the coordinate, 0 to ``DIMENSIONS - 1``.
+        dimension: number of the coordinate, 0 to ``DIMENSIONS - 1``.
         seed: UInt32 of width one, in memory, which scrambles every dimension in its own way.
     """
     if dimension == 0:

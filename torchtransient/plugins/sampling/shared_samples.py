@@ -32,8 +32,8 @@ class ScanTiles:
     """Tiles of a scan, one where the scan is not wider than twice the distance of the hidden geometry.
 
     Args:
-        points, normals: of the scan, (P, 3).
-        distance: of the nearest hidden geometry, metres.
+        points, normals: points (metres) and normals of the scan, (P, 3).
+        distance: distance of the nearest hidden geometry, metres.
 
     Attributes:
         count: number of tiles.
@@ -66,8 +66,8 @@ def distance_to(vertices: np.ndarray, points: np.ndarray) -> float:
     """Return the distance of the vertex that is nearest to any of some points, metres.
 
     Args:
-        vertices: (V, 3), metres.
-        points: (P, 3), metres.
+        vertices: vertices, (V, 3), metres.
+        points: points, (P, 3), metres.
     """
     nearest = np.inf
     for p in points:

@@ -58,11 +58,11 @@ class PrimaryRays:
         sampler: seeded sampler of the lanes.
         ray, weight: Ray3f and spectrum, attached to the sensor.
         scale: weight of a sample in its pixel, Float; None for rays that weigh nothing.
-        row, column: pixel, UInt32.
+        row, column: row and column of the pixel, UInt32.
         seen: :class:`View` of every sensor.
         η: index of refraction where the rays start, attached to the glass that they start in.
         laser: number of the laser position in an exhaustive scan, else None.
-        strata: (number of the sample in its pixel, number of samples), None for rays that are in no order.
+        strata: stratum as (number of the sample in its pixel, number of samples), None for rays that are in no order.
         clip: distance from ``ray.o`` at which the first surface can be, None for 0.
         leg: PreliminaryIntersection3f of the first segment, None if unknown.
         meter_normal: normal of an irradiance meter at rest where each ray starts, None for other sensors.

@@ -69,8 +69,8 @@ class SensorPlaces:
 
     Args:
         sensor: projective camera, irradiance meter, or a ``batch`` of cameras.
-        film: of the sensor.
-        radius: of the scene.
+        film: film of the sensor.
+        radius: radius of the scene.
 
     Cameras are known by three rays each: on a plane across the axis, places of the film are an affine grid. This holds
     beyond the film, from where reconstruction filters bring light to its pixels.

@@ -93,7 +93,7 @@ def _is_smooth(scene: Any) -> bool:
 
 
 def _as_they_stand(scene: Any, contents: Any) -> Cache:
-    """Return the memory of what was found of the sensor and the shapes, emptied when one of them moves."""
+    """Return the cache of results about the sensor and the shapes, emptied when one of them moves."""
     nodes = [*sensors_of(contents.sensor), *shapes_of_scene(scene)]
     return contents.memory.get("memory of sharing", 0, lambda: Cache(nodes))
 
@@ -111,7 +111,7 @@ class Group:
         seed: UInt32, of all that these groups draw.
 
     Attributes:
-        rows: for each anchor and point of its group ``r`` and ``F``.
+        rows: ``r`` and ``F`` for each anchor and point of its group.
         inverse: one over the density of each point in its group.
         first: path length up to each anchor, minus the film's start (Float64).
         earliest: length at which the first anchor of a group sees each point, minus the film's start (Float64).
@@ -172,7 +172,7 @@ class Group:
 
         Args:
             vertex: vertices of the anchors.
-            lane, point: their numbers.
+            lane, point: numbers of anchor and point.
         """
         context, sharing = self.context, self.sharing
         p, n, shading = self.place(point)
@@ -248,7 +248,7 @@ def spread(sampler: Any, seed: Any, lanes: int, count: int) -> None:
     """Seed a sampler such that its samples are evenly spread over every ``count`` lanes.
 
     Args:
-        sampler: an ``owen``.
+        sampler: sampler ``owen``.
         seed: UInt32.
         lanes: number of lanes.
         count: a power of two.
@@ -261,7 +261,7 @@ def spread(sampler: Any, seed: Any, lanes: int, count: int) -> None:
 # Groups of a film.
 
 def pixel_order(scene: Any, contents: Any, sensor: Any, film: Any, size: int) -> tuple[Any, Any]:
-    """Return the pixels of a film in the order of their groups, by what their centres see.
+    """Return the pixels of a film in the order of their groups, by the surfaces that their centres see.
 
     Found anew when the sensor or a shape has moved.
 

@@ -53,7 +53,7 @@ class Rows:
 
 
 class LastArrival(ArrivalWindow):
-    """Window without a beginning: what comes too early for one pixel may be in time for another one of its group."""
+    """Window without a beginning: light too early for one pixel may be in time for another one of its group."""
 
     def __init__(self, last: float):
         super().__init__(-float("inf"), last)
@@ -120,7 +120,7 @@ def bring(group, events, suffixes, sink, state):
         events: :class:`SuffixList`.
         suffixes: lanes of the list of each point.
         sink: sink whose lengths are counted from the anchors.
-        state: its state, which is returned as it is afterwards.
+        state: state of the sink before; the state after it is returned.
     """
     size, slots = group.size, events.slots
     lane, k = dr.arange(mi.UInt32, group.lanes), mi.UInt32(0)

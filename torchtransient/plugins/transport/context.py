@@ -40,7 +40,7 @@ class PathSettings:
 
 
 class RenderContext:
-    """Context of a job, a render or a derivative: what every strategy receives.
+    """Context of a job, a render or a derivative, which every strategy receives.
 
     Built outside of traced code, not changed afterwards. A plain class: Dr.Jit loops would take a dataclass apart as
     loop state.
@@ -151,7 +151,7 @@ class RenderContext:
         Args:
             active: mask of lanes.
             τ: optical path length up to ``p``, minus the film's start, metres (Float64).
-            p: last vertex, Point3f; the way to the nearest light is a lower bound of what remains.
+            p: last vertex, Point3f; the way to the nearest light is a lower bound of the remaining length.
         """
         if self.window is None:
             return active

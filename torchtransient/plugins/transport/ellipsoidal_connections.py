@@ -49,7 +49,7 @@ _BEHIND = 1e-3
 
 
 def why_not(contents, film):
-    """Return why ellipsoidal connections cannot be made in a scene and what to do, None if they can.
+    """Return the reason why a scene admits no ellipsoidal connections, with a remedy; None if it does.
 
     Args:
         contents: :class:`~.scene_contents.SceneContents` of the scene.
@@ -207,8 +207,8 @@ class Ellipsoidal(Connection):
         return 1 + dr.inv_two_pi * self.lights.faces.area / (self.width * dr.norm(w - e))
 
     def last_segment(self, context, at, e, value, pdf, active):
-        """Return what a point of a light brings over its density, by the share that connections have beside light that
-        is run into.
+        """Return the light from a point of a light over its density, by the share that connections have beside light
+        that is run into.
 
         Args:
             at: interaction at the vertex between.
@@ -226,7 +226,7 @@ class Ellipsoidal(Connection):
         """Return (mask of segments that nothing is in the way of, transmittance).
 
         Args:
-            ray: Ray3f that ends before what it leads to.
+            ray: Ray3f that ends before the point that it leads to.
             length: length that attenuates, metres.
             medium: medium at its start, None in vacuum.
             u: uniform numbers that were drawn for the segment.
@@ -245,7 +245,7 @@ class Section:
     """Ellipse in which an ellipsoid of revolution meets a plane: ``center + p cos φ + q sin φ``.
 
     Args:
-        x, e: foci, Point3f.
+        x, e: foci of the ellipsoid, Point3f.
         s: sum of the distances to the foci.
         n, o: normal and a point of the plane.
 
@@ -519,5 +519,5 @@ class EllipsoidalMedium(Ellipsoidal):
 
 
 def _collision_density(mei, active):
-    """Return the density of collisions that weights go by: that of the majorant, without what was attenuated before."""
+    """Return the density of collisions that weights go by: that of the majorant, without the attenuation before."""
     return dr.mean(mi.unpolarized_spectrum(mei.medium.get_majorant(mei, active)))

@@ -30,7 +30,7 @@ class FreeFlight:
         scatter: mask of flights that end in a medium; others end at ``pi``, or nowhere if that is not valid.
         t: distance of the end from the ray's origin, metres.
         medium: MediumPtr that the walk ended in.
-        weight: transmittance over the probability density of what was sampled, without the scattering coefficient.
+        weight: transmittance over the probability density of the sample, without the scattering coefficient.
         entry: the last boundary that was passed, if ``media.keeps_entry``.
     """
 
@@ -280,7 +280,7 @@ def transmittance(scene, media, ray, length, medium, numbers, lanes, active, hid
     Args:
         scene: Mitsuba scene.
         media: :class:`.scene_contents.FlightSettings`.
-        ray: Ray3f; what lies before its ``maxt`` is in the way.
+        ray: Ray3f; surfaces before its ``maxt`` are in the way.
         length: length that counts, metres. Open boundaries count up to the end.
         medium: MediumPtr at its start.
         numbers: uniform numbers of the sampler, from which those of ratio tracking follow.

@@ -32,7 +32,7 @@ def material_point(pi, ray, active, meshes=None, surfaces=None):
         active: mask of lanes.
         meshes: PointerTable of the meshes that may be met, or None. Their derivatives by texture coordinates change
             with these, or are made up where there are none: the area is that of the triangle.
-        surfaces: as of :func:`~.surface_interactions.surface_interaction`.
+        surfaces: attached surfaces of the job's context, None where Mitsuba's own derivatives are right.
 
     Returns:
         (SurfaceInteraction3f; area element, Float, up to a constant).
@@ -57,7 +57,7 @@ def point_of_light(context, ref, ds, active):
     Args:
         context: :class:`~.context.RenderContext` of the job.
         ref: Interaction3f that the light is seen from.
-        ds: the point, with ``p`` and ``emitter`` as of a DirectionSample3f.
+        ds: the point, with ``p`` and ``emitter`` of a DirectionSample3f.
         active: mask of lanes.
 
     Returns:
@@ -136,7 +136,7 @@ class DampedMotion(Local):
         """Return zero with the derivative of the length, due to the vertex alone.
 
         Args:
-            n: normal of the point's surface, to add what its slide lengthens.
+            n: normal of the point's surface, to add the length that its slide brings.
         """
         if n is None:
             return -dr.dot(self.δ, self.fixed)

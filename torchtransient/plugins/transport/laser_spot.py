@@ -174,7 +174,7 @@ class GeneralSpot:
 
 class DiffuseSpot:
     """The same on a flat diffuse wall: ``n`` points to the side that is lit, and is zero where the beam meets nothing,
-    ``value`` is what leaves along it.
+    ``value`` is the light that leaves along it.
     """
 
     def __init__(self, p, n, value, leg):

@@ -17,7 +17,7 @@ def _finite(value, otherwise=0):
 
 
 def _unpolarizing(value):
-    """Scattering by ``value`` that leaves nothing of the polarization: what a scalar phase function says."""
+    """Scattering by ``value`` that removes all polarization, as a scalar phase function does."""
     if not mi.is_polarized:
         return value
     matrix = dr.zeros(mi.Spectrum)

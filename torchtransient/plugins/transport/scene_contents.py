@@ -304,8 +304,8 @@ class SceneCache:
     """Look-ups that need to be made once a scene: the ``reference`` sphere of distant light, the contents by sensor,
     the parameters, the BSDFs with all that they hold.
 
-    The reference is that of the scene as described, see :mod:`..described_scene`: neither moving a shape nor what was
-    rendered before may shift the clock. The scene itself is not kept, since it owns the integrator and would never be
+    The reference is that of the scene as described, see :mod:`..described_scene`: neither moving a shape nor an earlier
+    render may shift the clock. The scene itself is not kept, since it owns the integrator and would never be
     freed.
     """
 
@@ -341,7 +341,7 @@ class SceneCache:
     def follow_derivatives(self, scene: Any, asked: bool) -> None:
         """Let the BSDFs that sample otherwise for derivatives look up which parameters carry some now.
 
-        What they build for it belongs to the scene's contents.
+        The tables that they build for it belong to the scene's contents.
 
         Args:
             scene: scene of the job.

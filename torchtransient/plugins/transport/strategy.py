@@ -101,7 +101,7 @@ class Step(Local):
     Attributes:
         out, wo: direction in world space and in the local frame.
         weight: value over density.
-        pdf: density.
+        pdf: density of the direction.
         eta: relative index of refraction.
         delta: mask, sampled by a delta lobe.
         unconnected: mask, no connection can find what lies ahead.
@@ -195,7 +195,7 @@ class AttachedVertex(Local):
         velocity: attached velocity, of films that measure rates (segment).
         rate_slope: Float, zero with the derivative of the rate up to the vertex, where ``wanted.rate`` (segment).
         damping_radius: distance below which points are dragged along, with moving geometry (segment).
-        bsdf, delay: as of :class:`Vertex` (scattering).
+        bsdf, delay: BSDF and delay of the scattering, see :class:`Vertex` (scattering).
         scattered_si: ``si`` with the wavelengths behind the surface (scattering).
         scattered_slope, scattered_opl: slope and optical path length behind the delay (scattering).
         rotation: rotation of Stokes vectors to the frame of the segment (scattering).
@@ -214,7 +214,7 @@ class Strategy:
     name = ""
 
     def prepare(self, context: Any) -> None:
-        """Compute what all lanes share: once a job, outside of traced code, with gradients enabled.
+        """Compute the values that all lanes share: once a job, outside of traced code, with gradients enabled.
 
         Arrays that are kept must be evaluated (``dr.eval``): launches of a job differ in width, and Dr.Jit widens
         unevaluated ones to the width of the first launch that reads them.
@@ -328,7 +328,7 @@ class Segment(Strategy):
 
         Args:
             pi: PreliminaryIntersection3f of the surface.
-            medium: MediumPtr in front of it, as of :meth:`medium_towards`; None in vacuum.
+            medium: MediumPtr in front of it, see :meth:`medium_towards`; None in vacuum.
         """
         raise NotImplementedError
 
@@ -365,9 +365,9 @@ class Segment(Strategy):
         """Trace a shadow ray from a vertex.
 
         Args:
-            ds: point of the light, ``p, d, dist`` as of a DirectionSample3f.
+            ds: point of the light, with ``p``, ``d`` and ``dist`` of a DirectionSample3f.
             u: two uniform numbers, drawn for this vertex, which seed a generator.
-            seen: as of :meth:`depart`.
+            seen: the ray is part of a primary ray, which passes lights where ``context.hide_emitters``.
 
         Returns:
             (mask of points that are visible, transmittance per colour).
@@ -609,7 +609,7 @@ class Scattering(Strategy):
         Args:
             step: :class:`Step` whose ``guided`` lanes a guide has drawn.
             ray: Ray3f of the segment.
-            leg: its leg.
+            leg: leg of the ray.
         """
 
     def look_up_attached(self, context: Any, vertex: Any, wanted: Any) -> None:

@@ -160,7 +160,7 @@ def surface_interaction(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, fl
     Its values are those of ``pi.compute_surface_interaction(ray, flags, active)``.
 
     Args:
-        surfaces: those of the job's context, None where Mitsuba's own derivatives are right.
+        surfaces: attached surfaces of the job's context, None where Mitsuba's own derivatives are right.
         pi: PreliminaryIntersection3f.
         ray: Ray3f.
         flags: ``mi.RayFlags``.
@@ -175,7 +175,7 @@ def distance_to(surfaces: AttachedSurfaces | None, pi: Any, ray: Any, active: An
     """Return the distance of a surface along an attached ray, metres.
 
     Args:
-        surfaces: as of :func:`surface_interaction`.
+        surfaces: attached surfaces of the job's context, None where Mitsuba's own derivatives are right.
         pi: PreliminaryIntersection3f of the surface.
         ray: Ray3f.
         active: mask of lanes.
@@ -233,8 +233,8 @@ class DetachedHits:
         self._find_starts()
 
     def _find_starts(self) -> None:
-        """Return the place where each shape's ellipsoids or segments begin, counted from one: what is not listed has
-        none.
+        """Return the place where each shape's ellipsoids or segments begin, counted from one: a shape that is not
+        listed has none.
         """
         ellipsoids = _starts([_floats(values["data"].read(shape)) for shape, values in self._ellipsoids], _ELLIPSOID)
         segments, pieces = (

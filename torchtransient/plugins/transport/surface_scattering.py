@@ -83,7 +83,7 @@ class Surface(Scattering):
         Args:
             bsdf: BSDFPtr.
             u: two uniform numbers, None without delays.
-            wavelengths: those of the segment.
+            wavelengths: wavelengths of the segment.
 
         Returns:
             :class:`~..bsdfs.delay_table.DelaySample`: the delay, the BSDF that scatters with it, and its weight.
@@ -96,7 +96,7 @@ class Surface(Scattering):
 
         Args:
             delay: :class:`~..bsdfs.delay_table.DelaySample` of the surface.
-            interactions: those at the vertex, on the sensor's side.
+            interactions: interactions at the vertex, on the sensor's side.
         """
         if delay.wavelengths is None:
             return interactions
@@ -164,7 +164,8 @@ class Surface(Scattering):
         """Replace answers and step at vertices in a medium; a surface leaves them.
 
         Args:
-            proposals, answers, step: as of :meth:`~.strategy.Scattering.scatter`.
+            proposals, answers, step: proposals of the connections, their answers and the next step, see
+                :meth:`~.strategy.Scattering.scatter`.
         """
 
     # ------------------------------------------------------------------------------------------------- guides
@@ -220,8 +221,8 @@ class Surface(Scattering):
         """Return the density per solid angle with which guides draw a point, shares included (Float).
 
         Args:
-            depth: number of the vertex that it is drawn from, UInt32.
-            p: that vertex, Point3f.
+            depth: number of the vertex that the point is drawn from, UInt32.
+            p: position of that vertex, Point3f.
             to: point, with ``p`` and ``n``.
             shape: ShapePtr of the point.
             primitive: number of its triangle, None if unknown.
@@ -442,7 +443,7 @@ class Lambertian(Surface):
     """Scattering where every surface is Lambertian (:meth:`fits`): cosines instead of virtual calls.
 
     Args:
-        guides: as of :class:`Surface`.
+        guides: list of :class:`~.strategy.Guide`, whose shares sum to less than one.
         draws_lobe: draw the number that chooses a lobe, so that a seed gives the same paths as :class:`Surface`.
     """
 

@@ -42,10 +42,10 @@ class Movers:
         shapes, emitters, media: bodies of that kind and the numbers of their motions.
         sensors: number of the motion by the sensor's pointer.
         meshes: meshes with velocities at their vertices.
-        winds: (medium, volume of its velocities).
+        winds: media that move, as (medium, volume of its velocities).
 
     Raises:
-        SceneError: for motions of what is not there, of several at once, or that has none.
+        SceneError: for motions of objects that are not there, of several at once, or that have none.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -173,8 +173,8 @@ def _inside(moving: list[tuple[Any, int]], shapes: list[Any]) -> list[tuple[Any,
     """Return the media inside of shapes that move, with the numbers of their motions, but for those that others bound.
 
     Args:
-        moving: (shape, number) of those that move.
-        shapes: all shapes.
+        moving: shapes that move, as (shape, number of its motion).
+        shapes: all shapes of the scene.
     """
     bounding: dict[int, set[int]] = {}
     for shape in shapes:
@@ -214,7 +214,7 @@ class Velocities:
 
         Args:
             scene: scene of the job.
-            contents: :class:`.scene_contents.SceneContents`, which keeps what was looked up.
+            contents: :class:`.scene_contents.SceneContents`, which keeps the result.
             film: film of the job.
         """
         return Velocities(movers_of(scene, contents), contents.sensor) if film.knows_rates else None

@@ -93,9 +93,9 @@ class MovingEdges:
 
     Args:
         always: gaps of every parameter that moves edges.
-        bent: gaps of what bends light alone.
-        scene: scene that is searched for textures with steps, for bodies that run into each other, for what clip planes
-            cut and for normals that turn away, or None.
+        bent: gaps of parameters that bend light alone.
+        scene: scene that is searched for textures with steps, for bodies that run into each other, for shapes that clip
+            planes cut and for normals that turn away, or None.
         words: gaps that only the table of parameters names, whatever the scene.
         has_term: there is a boundary term.
         sensors: sensors of the scene that see the edges.
@@ -145,7 +145,7 @@ class MovingEdges:
         return tuple(dict.fromkeys(found))
 
     def reason(self, node: Any, key: str, effect: ParameterEffect) -> str:
-        """Return the reason of an effect, with what the derivative lacks; arguments as of :meth:`lacking`."""
+        """Return the reason of an effect, with the gaps of the derivative; arguments as in :meth:`lacking`."""
         words = list(self.words) if effect.supported and moves_edges(key, effect) else []
         words += [gap.where for gap in self.lacking(node, key, effect)]
         if not words:
@@ -215,7 +215,7 @@ def missing(reason: str, remedy: str, *, is_asked_for: bool = False) -> MovingEd
     """Return the gaps of an integrator without a boundary term.
 
     Args:
-        reason: why it has none, in words that go on from "since".
+        reason: reason why it has none, in words that go on from "since".
         remedy: sentence that says what to do.
         is_asked_for: it was switched off.
     """
@@ -230,7 +230,7 @@ def switched_off() -> MovingEdges:
 
 
 def moving_edges(scene: Any, sensors: Sequence[Any], max_depth: int | None = None) -> MovingEdges:
-    """Return what the passes of the boundary term (:mod:`.term`) leave out in a scene.
+    """Return the gaps that the passes of the boundary term (:mod:`.term`) leave in a scene.
 
     Args:
         scene: scene.

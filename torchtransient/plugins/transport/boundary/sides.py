@@ -16,7 +16,7 @@ class BoundaryPass:
     """
 
     def __init__(self, context):
-        """Prepare what launches share."""
+        """Prepare the data that launches share."""
 
     @staticmethod
     def exists(context, sensor):
@@ -54,9 +54,9 @@ def both_sides(context, mode, sampler, view, b, past, first, factor, speeds, nee
     """Trace the two sides of outlines.
 
     Args:
-        view: film block or adjoint block of the samples, as of ``mode.view``.
+        view: film block or adjoint block of the samples, see ``mode.view``.
         b: outlines seen from x.
-        past: ray past them and its leg, as of :func:`past_edge`.
+        past: ray past them and its leg, see :func:`past_edge`.
         first: fields of the paths at x: ``ray``, ``medium`` and those of :class:`~..walk.Path`.
         factor: detached weight of a sample.
         speeds: attached (inner, outer).
@@ -111,7 +111,7 @@ def in_memory(context, sampler, *values):
 def is_seen_within(context, b, ray, end, medium, sampler, active, seen=True):
     """Return a mask of outlines whose inner side is seen from a point, too.
 
-    It is hidden where something in front ends in line with it: then there is one edge, that of what is in front.
+    It is hidden where something in front ends in line with it: then there is one edge, that of the shape in front.
 
     Args:
         ray: ray for time and wavelengths.

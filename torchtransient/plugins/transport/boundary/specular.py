@@ -68,7 +68,7 @@ class Chains:
     """Chains of planes that a sensor sees, see the module.
 
     Args:
-        integrator, context: of the job.
+        integrator, context: integrator and context of the job.
         places: :class:`~torchtransient.plugins.sensors.seen_from.SensorPlaces`.
         sampler: seeded, with ``RAYS`` lanes.
 
@@ -138,7 +138,7 @@ class Chains:
             context: context of the walk.
             rays: :class:`~...sensors.origin.PrimaryRays`.
             count: largest number of vertices, UInt32.
-            mirrors: by vertex, the lobes that :class:`KnownLobes` takes; None for the sampled ones.
+            mirrors: lobes by vertex, as :class:`KnownLobes` takes them (reflection or not); None for the sampled ones.
 
         Returns:
             ``path``, behind the last one, active where all were delta vertices; by vertex ``reached`` (mask),
@@ -296,7 +296,7 @@ def attached_ray(context, ray, ratios, count, active):
 
     Args:
         ray: attached primary ray.
-        ratios: by plane, ratio of the index behind it to that before, 0 for a mirror.
+        ratios: index of refraction behind each plane over that before it, 0 for a mirror.
         count: number of planes, UInt32.
     """
     carried = mi.Ray3f(ray)
@@ -342,8 +342,8 @@ def bent(d, n, ratio):
     """Return (direction behind a plane, derivative of its part along ``n`` by that of ``d``).
 
     Args:
-        d, n: direction before it, normal of the plane.
-        ratio: of the index behind it to that before, 0 for a mirror.
+        d, n: direction before the plane, and its normal.
+        ratio: index of refraction behind the plane over that before it, 0 for a mirror.
     """
     cos = dr.dot(n, d)
     mirrors = ratio == 0
@@ -433,7 +433,7 @@ def sees_chains(context, sensor):
 
     Args:
         context: :class:`~..context.RenderContext` of the job.
-        sensor: its sensor.
+        sensor: sensor of the job.
     """
     contents = context.contents
     return context.max_depth > 1 and contents.delta and contents.media is None and has_eye(sensor)

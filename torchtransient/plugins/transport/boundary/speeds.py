@@ -38,7 +38,7 @@ def sides_from(context, b, edges, v_x, y, radius, active):
     Args:
         b: outlines seen from x.
         v_x: attached displacement of x.
-        y: point behind: ``dist`` from x (infinite for none) and attached displacement ``v``, as of :func:`behind`.
+        y: point behind: ``dist`` from x (infinite for none) and attached displacement ``v``, see :func:`behind`.
         radius: damping radius, metres.
     """
     n_x, n_p = dr.dot(b.n, v_x), dr.dot(b.n, edges.moving(b))
@@ -67,7 +67,7 @@ def behind(context, b, ray, leg, active):
 
     Args:
         b: outlines seen from x.
-        ray, leg: ray past them, and its leg, as of :func:`.sides.past_edge`.
+        ray, leg: ray past them, and its leg, see :func:`.sides.past_edge`.
     """
     t, found = context.segment.length_of(leg)
     pi, on_surface = context.segment.surface_of(leg)
@@ -80,7 +80,7 @@ def dragged(v_x, v_before, r, d, n, radius, active):
     """Return the displacement of a material point that is dragged along by the vertex before it.
 
     Args:
-        v_x: its displacement as a material point.
+        v_x: displacement of the point as a material point.
         v_before: displacement of the vertex before.
         r: distance of both, metres.
         d: direction of the ray between them.

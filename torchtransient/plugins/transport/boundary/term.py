@@ -63,12 +63,12 @@ class BoundaryTerm:
     """Boundary term of one job of derivatives.
 
     Args:
-        integrator, context, sensor, film, seed: of the job.
+        integrator, context, sensor, film, seed: integrator and context of the job, its sensor, film and seed.
         samples: edge samples per pixel of each pass.
         names: passes to run, of ``kinds``.
 
     Attributes:
-        context: ``context``.
+        context: context of the job.
         light_context: :class:`~..context.RenderContext` of paths that start at a light and are connected to the sensor.
         edges: :class:`~...edges.table.EdgeTable` of the scene.
         places: :class:`~...sensors.seen_from.SensorPlaces`.
@@ -262,7 +262,7 @@ class PixelSums(Sink):
 
     Args:
         mode: :class:`Reverse`.
-        middle, u: as of :meth:`Reverse.sink_of_pixels`.
+        middle, u: primary rays of the middle of the film, and two uniform numbers, see :meth:`Reverse.sink_of_pixels`.
         count: number of sums.
     """
 

@@ -35,8 +35,8 @@ class VertexPass(BoundaryPass):
     It traces a path to a vertex x, chosen uniformly of those that may have one after them. An edge point seen from
     there is chosen of several candidates in proportion to its span over the squared distance (resampling, Talbot et al.
     2005). Vertices behind the edge are points of their shapes, so that only outlines matter, and of them the outer
-    side, but for what is near x and dragged along, lights included. Lights past edges are found by the pass of the
-    lights, or here where paths of lights do not find the sensor.
+    side, but for surfaces near x that are dragged along, lights included. Lights past edges are found by the pass of
+    the lights, or here where paths of lights do not find the sensor.
     """
 
     @staticmethod
