@@ -32,8 +32,6 @@ _LMS_TO_RGB = np.array([
 
 # Hues that run from red over yellow and green to violet: those of a rainbow, without the purple that would close it.
 _FIRST_HUE, _LAST_HUE = 25.0, 305.0
-# Kinds of cyclic maps.
-CYCLES = ("even", "hsv")
 
 
 def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:

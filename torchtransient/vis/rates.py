@@ -96,7 +96,7 @@ def _rates_of(
     axis = getattr(source, "axis", None) if axis is None else axis
     rate_axis = getattr(source, "rate_axis", None) if rate_axis is None else rate_axis
     if axis is None or rate_axis is None:
-        raise ShapeError(f"{who}: expected light with axes, got none: give axis=TimeAxis(...), rate_axis=RateAxis(...).")
+        raise ShapeError(f"{who}: light without its own axes needs axis=TimeAxis(...) and rate_axis=RateAxis(...).")
     light = as_tensor(held, who)
     if light.ndim != 5 or tuple(light.shape[1:3]) != (rate_axis.num_bins, axis.num_bins):
         raise ShapeError(

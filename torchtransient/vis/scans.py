@@ -28,7 +28,7 @@ _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
 # Mitsuba's square and cube.
 _SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 _CUBE = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-_CUBE_FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+_CUBE_FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 # Sides of a circle, and rows of a sphere.
 _SIDES, _ROWS = 32, 16
 
@@ -280,6 +280,6 @@ def _cells(grid: Array) -> list[Array]:
 
 # Shapes that are drawn, by Mitsuba's name.
 DRAWN: dict[str, Callable[[Mapping[str, Any]], list[Array]]] = {
-    "mesh_arrays": _mesh, "rectangle": lambda shape: [_SQUARE], "cube": lambda shape: list(_CUBE[np.array(_CUBE_FACES)]),
+    "mesh_arrays": _mesh, "rectangle": lambda shape: [_SQUARE], "cube": lambda shape: list(_CUBE[_CUBE_FACES]),
     "disk": lambda shape: [_circle(_SIDES + 1)[:-1]], "sphere": _sphere, "cylinder": _cylinder,
 }  # fmt: skip
