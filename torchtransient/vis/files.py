@@ -92,18 +92,16 @@ def check_picture(path: str | Path, who: str = "picture") -> None:
 
 
 @contextmanager
-def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
+def _place_of(path: str | Path, who: str) -> Iterator[tuple[Path, str]]:
     """Yield a name to write to, which takes the place of `path` once it is whole, and the ending of `path`."""
-    try:
-        target = check_folder(path, who)
-        with replacing(target, who) as unfinished:
+    target = check_folder(path, who)
+    with replacing(target, who) as unfinished:
+        try:
             yield unfinished, target.suffix.lstrip(".").lower()
-    except StorageError as error:
-        said = str(error).removeprefix(f"{who}: ").removeprefix(f"'{path}' could not be written: ")
-        raise StorageError(f"{who}: cannot write '{path}': {said}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # of an unknown ending, too
-        said = short_message(error)
-        raise StorageError(f"{who}: cannot write '{path}': {said}. Choose a writable .png.") from error
+        except (OSError, ValueError, KeyError) as error:  # of an unknown ending, too
+            raise StorageError(
+                f"{who}: '{path}' could not be written: {short_message(error)}. Choose a writable .png."
+            ) from error
 
 
 def to_palette(path: str | Path) -> None:
