@@ -28,14 +28,13 @@ from torchtransient.vis.pages.content import (
 )  # fmt: skip
 from torchtransient.vis.sources import as_tensor, frequencies_of, read_any
 
-# Samples of a data set on a page.
-_SAMPLES = 8
+# What films measure, by the names of results.
+_FILMS = ("rates", "beats", "slow_phasor", "phasor", "gated", "transient")
 
 
 def content_of(
-    x: Any, who: str, *, axis: TimeAxis | None = None, rate_axis: RateAxis | None = None,
-    frequencies: Any = None, samples: int = _SAMPLES,
-) -> Content:  # fmt: skip
+    x: Any, who: str, *, axis: TimeAxis | None, rate_axis: RateAxis | None, frequencies: Any, samples: int
+) -> Content:
     """Return the content of a page.
 
     Args:
@@ -50,21 +49,17 @@ def content_of(
     known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
     if isinstance(x, tuple) and len(x) == 2:
         return _together([_single(part, who, **known) for part in x], ("A", "B"), who)
-    if not isinstance(x, Tensor | np.ndarray | Mapping | str | Path) and _is_sequence(x):
+    sequence = hasattr(x, "__getitem__") or hasattr(x, "__iter__")
+    if sequence and not isinstance(x, Tensor | np.ndarray | Mapping | str | Path):
         known["axis"] = getattr(x, "axis", None) if axis is None else axis
         parts = list(islice(_each(x), samples))
         if not parts:
             raise ShapeError(f"{who}: expected at least one sample, got an empty {type(x).__name__}.")
-        found = _together(
-            [_single(part, who, **known) for part in parts], [f"sample {n}" for n in range(len(parts))], who
-        )
+        names = [f"sample {n}" for n in range(len(parts))]
+        found = _together([_single(part, who, **known) for part in parts], names, who)
         left = len(x) - len(parts) if hasattr(x, "__len__") else 0
         return replace(found, notes=(*found.notes, f"The first {len(parts)} of {len(x)} samples.")) if left else found
     return _single(x, who, **known)
-
-
-def _is_sequence(x: Any) -> bool:
-    return hasattr(x, "__getitem__") or hasattr(x, "__iter__")
 
 
 def _each(x: Any) -> Iterator[Any]:
@@ -82,17 +77,12 @@ def _together(parts: list[Content], names: Sequence[str], who: str) -> Content:
         if not same:
             raise ShapeError(
                 f"{who}: expected results of one kind and shape to compare, got {first.kind} {first.shape} and "
-                f"{part.kind} {part.shape}. Show each on a page of its own, or crop and resample them to one shape."
+                f"{part.kind} {part.shape}."
             )
         if not np.allclose(part.slider.centers, first.slider.centers):
-            ends = [
-                f"{each.slider.centers[0]:.6g} to {each.slider.centers[-1]:.6g} {each.slider.unit}".strip()
-                for each in (first, part)
-            ]
             raise ShapeError(
-                f"{who}: expected results over one {first.slider.name} to compare, got centres of {ends[0]} and of "
-                f"{ends[1]}. Render both with one axis, show each on a page of its own, or give the tensors alone to "
-                "compare them bin by bin."
+                f"{who}: expected results over one {first.slider.name} to compare, got others. Render both with one "
+                "axis, or give the tensors alone to compare them bin by bin."
             )
     return replace(first, items=tuple(names), planes=tuple(planes for part in parts for planes in part.planes))
 
@@ -107,25 +97,24 @@ def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Co
     if hasattr(x, "grid") and hasattr(x, "picture"):
         return _volume(x)
     axis = getattr(x, "axis", None) if axis is None else axis
-    for name, make in (("rates", _rates), ("beats", _beats)):
-        if getattr(x, name, None) is not None:
-            given = getattr(x, "rate_axis", None) if rate_axis is None else rate_axis
-            return make(as_tensor(getattr(x, name), who), axis, given, who)
-    if getattr(x, "slow_phasor", None) is not None:
-        known = getattr(x, "frequencies", None) if frequencies is None else frequencies
-        return _slow_phasors(as_tensor(x.slow_phasor, who), known, getattr(x, "slow_times", None), who)
-    if getattr(x, "phasor", None) is not None:
-        known = getattr(x, "frequencies", None) if frequencies is None else frequencies
-        return _phasors(as_tensor(x.phasor, who), known, who)
-    if getattr(x, "gated", None) is not None:
-        slider = gate_slider(x.gated.shape[-3], getattr(x, "gates", None))
-        return light_content(as_tensor(x.gated, who), slider, "gates", _errors(x), who)
-    if getattr(x, "transient", None) is not None:
-        cube = as_tensor(x.transient, who)
-        return light_content(
-            cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who
-        )
-    return _plain(as_tensor(x, who), who, axis, rate_axis, frequencies)
+    rate_axis = getattr(x, "rate_axis", None) if rate_axis is None else rate_axis
+    frequencies = getattr(x, "frequencies", None) if frequencies is None else frequencies
+    name = next((name for name in _FILMS if getattr(x, name, None) is not None), "")
+    cube = as_tensor(getattr(x, name) if name else x, who)
+    match name:
+        case "rates":
+            return _rates(cube, axis, rate_axis, who)
+        case "beats":
+            return _beats(cube, axis, who)
+        case "slow_phasor":
+            return _slow_phasors(cube, frequencies, getattr(x, "slow_times", None), who)
+        case "phasor":
+            return _phasors(cube, frequencies, who)
+        case "gated":
+            return _light(cube, gate_slider(cube.shape[-3], getattr(x, "gates", None)), who, "gates", _errors(x))
+        case "transient":
+            return _light(cube, _slider_of(cube, axis, who), who, error=_errors(x))
+    return _plain(cube, who, axis, rate_axis, frequencies)
 
 
 def _plain(cube: Tensor, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
@@ -148,7 +137,7 @@ def _plain(cube: Tensor, who: str, axis: Any, rate_axis: Any, frequencies: Any) 
             f"{tuple(cube.shape)} without either. Light over rates (C, R, T, H, W) needs rate_axis=tt.RateAxis(...); "
             "polarized light of other channels is shown of its result, or with one channel chosen."
         )
-    return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
+    return _light(cube, _slider_of(cube, axis, who), who)
 
 
 def _may_be_stokes(cube: Tensor) -> bool:
@@ -162,7 +151,7 @@ class _Named:
 
     def __init__(self, entries: Mapping[str, Any], axis: Any) -> None:
         self.__dict__.update({"axis": axis, **entries})
-        if not {"transient", "phasor", "slow_phasor", "gated", "rates", "beats"} & set(entries):
+        if not {*_FILMS} & {*entries}:
             self.__dict__["transient"] = entries.get("measurement")
 
 
@@ -173,22 +162,11 @@ def _errors(x: Any) -> Tensor | None:
     return found[0] if found.ndim == 4 else found
 
 
-def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
-    """Return the slider of bins of time, which count without an axis.
-
-    Args:
-        bins: number of bins.
-        axis: time axis.
-        who: beginning of messages.
-
-    Raises:
-        ArgumentError: for another object.
-        ShapeError: for another number of bins.
-    """
+def _slider_of(cube: Tensor, axis: TimeAxis | None, who: str) -> Slider:
+    """Return the slider of bins of time of light (..., T, H, W), which count without an axis."""
+    bins = cube.shape[-3] if cube.ndim > 2 else 0
     if axis is None:
         return bin_slider(bins)
-    if not isinstance(axis, TimeAxis):
-        raise ArgumentError(f"{who}: expected axis as a TimeAxis, got {shown(axis)}.")
     if axis.num_bins != bins:
         raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the light {bins}.")
     return time_slider(axis.centers_opl.numpy())
@@ -202,21 +180,10 @@ def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     return mean[None], notes
 
 
-def light_content(
-    cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None, who: str = "view"
+def _light(
+    cube: Tensor, slider: Slider, who: str, kind: str = "transient", error: Tensor | None = None
 ) -> Content:
-    """Return the content of light over time.
-
-    Args:
-        cube: (C, T, H, W), or polarized (4, C, T, H, W). Other numbers of channels than 1 and 3 are averaged.
-        slider: positions of T.
-        kind: "transient" or "gates".
-        error: standard errors (T, H, W).
-        who: beginning of messages.
-
-    Raises:
-        ShapeError: for other shapes.
-    """
+    """Return the content of light (C, T, H, W), or polarized (4, C, T, H, W), with standard errors (T, H, W)."""
     if cube.ndim == 5 and cube.shape[0] == 4:
         mean, notes = _over_channels(cube.transpose(0, 1))
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
@@ -234,7 +201,7 @@ def light_content(
 
 def _phasors(cube: Tensor, known: Any, who: str) -> Content:
     cube = cube[0] if cube.ndim == 5 and cube.shape[0] == 4 else cube
-    if cube.ndim != 4 or not cube.is_complex() or not cube.numel():
+    if cube.ndim != 4 or not cube.is_complex():
         raise ShapeError(
             f"{who}: expected complex phasors (C, F, H, W), got {cube.dtype} {tuple(cube.shape)}. Phasors at several "
             "slow times (C, S, F, H, W) are shown of a result that has them, or of {'slow_phasor': tensor}."
@@ -248,7 +215,7 @@ def _phasors(cube: Tensor, known: Any, who: str) -> Content:
 def _slow_phasors(cube: Tensor, known: Any, slow_times: Any, who: str) -> Content:
     """Phasors (C, S, F, H, W): the slider is the slow time, and frequencies are layers."""
     cube = cube[0] if cube.ndim == 6 and cube.shape[0] == 4 else cube
-    if cube.ndim != 5 or not cube.is_complex() or not cube.numel():
+    if cube.ndim != 5 or not cube.is_complex():
         raise ShapeError(
             f"{who}: expected complex phasors (C, S, F, H, W) at S slow times, got {cube.dtype} {tuple(cube.shape)}."
         )
@@ -280,7 +247,7 @@ def _over_channels(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
 
 
 def _rows(cube: Tensor, who: str, what: str) -> tuple[Tensor, tuple[str, ...]]:
-    if cube.ndim != 5 or cube.is_complex() or not cube.numel():
+    if cube.ndim != 5 or cube.is_complex():
         raise ShapeError(f"{who}: expected {what}, got {tuple(cube.shape)}; of a batch, choose one entry.")
     return _over_channels(cube)
 
@@ -291,22 +258,21 @@ def _rates(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
         raise ShapeError(f"{who}: light over {len(mean)} rates needs rate_axis=RateAxis(...), got {shown(rate_axis)}.")
     centers = tuple(rate_axis.centers.tolist())
     return Content(
-        "rates", slider_of(mean.shape[1], axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
+        "rates", _slider_of(mean, axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
         tuple(Planes(part[None]) for part in mean), layer_name="rate", layer_numbers=centers, notes=notes,
     )  # fmt: skip
 
 
-def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
+def _beats(cube: Tensor, axis: Any, who: str) -> Content:
     mean, notes = _rows(cube, who, "beats (C, 2, T, H, W)")
     planes = tuple(Planes(part[None]) for part in mean)
-    slider = slider_of(mean.shape[1], axis, who)
+    slider = _slider_of(mean, axis, who)
     names = ("up chirp", "down chirp")
     return Content("beats", slider, ("",), names, planes, quantity="beat power", layer_name="chirp", notes=notes)
 
 
 def _capture(capture: Capture, who: str) -> Content:
     tensor = capture.transient if capture.transient is not None else capture.phasor
-    assert tensor is not None  # a capture has one
     cube = as_tensor(tensor, who)
     scan, rank = capture.scan, len(capture.scan.shape)
     if capture.polarized:
@@ -329,7 +295,7 @@ def _capture(capture: Capture, who: str) -> Content:
         parts = [_phasors(cube[:, :, n], capture.frequencies, who) for n in range(cube.shape[2])]
         return replace(parts[0], planes=tuple(part.planes[0] for part in parts), **common)
     light = [_grey(cube[:, :, n]) for n in range(cube.shape[2])]
-    slider = slider_of(cube.shape[1], capture.axis, who)
+    slider = _slider_of(light[0][0], capture.axis, who)
     return Content("capture", slider, planes=tuple(Planes(part) for part, _ in light), notes=light[0][1], **common)
 
 
