@@ -540,7 +540,7 @@ def gradient_picture(
         raise ShapeError(f"gradient_picture: expected real (C, H, W) or (H, W), got {tuple(values.shape)}.")
     image = values.double().sum(0).numpy()
     limit = colour_maps.symmetric_limit(image)
-    figure, (panel,) = picture_figure(*image.shape, side=4.4)
+    figure, (panel,) = picture_figure(image.shape[0], image.shape[1], side=4.4)
     import matplotlib
 
     colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="limegreen")
