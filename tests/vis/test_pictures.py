@@ -276,7 +276,7 @@ def test_gradient_picture(tmp_path):
     (lambda v: v.plot_overview(sweep(), sweep(), AXIS, path="a.png"), ShapeError),
     (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", pixel=(6, 0)), ShapeError),
     (lambda v: v.rainbow(sweep(), style="prism"), ArgumentError),
-    (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError),
+    (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError), (lambda v: v.streak(sweep(), row=6), ShapeError),
     (lambda v: v.streak(sweep(), row=1, column=1), ArgumentError),
     (lambda v: v.frame_grid(sweep(), bins=[-1]), ShapeError),
     (lambda v: v.gradient_picture(sweep()), ShapeError),

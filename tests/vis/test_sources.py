@@ -14,7 +14,7 @@ from support.cubes import AXIS, sweep
 from torchtransient.errors import ShapeError, StorageError
 from torchtransient.files import read_result, write_result
 from torchtransient.files.result_file import Result
-from torchtransient.vis.sources import images_of, phasor_of, steady_of, stokes_of, transient_of
+from torchtransient.vis.sources import images_of, phasor_of, stokes_of, transient_of
 
 
 @dataclass
@@ -39,7 +39,6 @@ def test_files_hold_what_was_rendered(tmp_path):
         cube, axis = transient_of(source)
         assert torch.equal(cube, output.transient)
         assert axis == output.axis
-        assert torch.equal(steady_of(source), output.steady)
 
 
 def test_arrays(tmp_path):
@@ -49,8 +48,6 @@ def test_arrays(tmp_path):
         got, axis = transient_of(source, AXIS)
         assert torch.equal(got.float(), cube)
         assert axis == AXIS and not got.requires_grad
-    assert torch.equal(steady_of(cube), cube.sum(1))
-    assert torch.equal(steady_of(cube.sum(1)), cube.sum(1))
 
 
 def test_polarized_sources():
@@ -61,7 +58,6 @@ def test_polarized_sources():
     output = Output(stokes, stokes.sum(2), axis=AXIS, polarized=True)
     assert torch.equal(stokes_of(output), stokes.sum(2))
     assert torch.equal(stokes_of(output, 9), stokes[:, :, 9])
-    assert torch.equal(steady_of(output), stokes.sum(2)[0])
     with pytest.raises(ShapeError, match="expected Stokes vectors"):
         stokes_of(sweep())
 
@@ -105,9 +101,6 @@ def test_which_shapes_are_what():
     with pytest.raises(ShapeError, match=r"got \(4, 5, 2, 3\)"):
         transient_of(four)
     assert torch.equal(transient_of(four, any_channels=True)[0], four)
-    with pytest.raises(ShapeError, match="expected an image"):
-        steady_of(Output(steady=torch.ones(2, 1, 4, 5)))
-    assert torch.equal(steady_of(four[:, :3]), four[0, :3]) and torch.equal(steady_of(four[:3]), four[:3].sum(1))
     turned = torch.complex(torch.rand(4, 3, 2, 5, 6), torch.rand(4, 3, 2, 5, 6))
     assert torch.equal(phasor_of(turned)[0], turned[0])
     with pytest.raises(ShapeError, match="expected complex"):
@@ -125,4 +118,3 @@ def test_films_in_files(tmp_path):
     assert torch.equal(found, cube) and axis is None and word == "gate"
     found, known = phasor_of(tmp_path / "b.npz")
     assert torch.equal(found, cube * 1j) and known == (1.5, 2.5)
-    assert torch.equal(steady_of(tmp_path / "a.npz"), steady)

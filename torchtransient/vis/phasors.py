@@ -24,7 +24,6 @@ from torchtransient.vis.videos import Frames, check_video, with_strip, write_vid
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_UNITS = (("THz", 1e12), ("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0))
 SHOWS = ("real", "imaginary", "amplitude", "phase", "domain")
 
 
@@ -173,6 +172,7 @@ def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
     nu = frequencies[index]
     if nu == 0:
         return f"{name}, steady light"
-    hertz = abs(nu) * SPEED_OF_LIGHT
-    unit, size = next(pair for pair in _UNITS if hertz >= pair[1] or pair[1] == 1)
-    return f"{name}, wavelength {1 / nu:.3g} m ({hertz / size:.3g} {unit})"
+    from matplotlib.ticker import EngFormatter
+
+    hertz = float(f"{abs(nu) * SPEED_OF_LIGHT:.3g}")
+    return f"{name}, wavelength {1 / nu:.3g} m ({EngFormatter('Hz')(hertz)})"

@@ -368,18 +368,18 @@ def streak(
 
     Raises:
         ArgumentError: for a row and a column.
-        ShapeError: for other shapes.
-        IndexError: for a line outside of the image.
+        ShapeError: for other shapes and a line outside of the image.
         StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "streak")
     if row is not None and column is not None:
         raise ArgumentError("streak: expected row or column, got both.")
-    if column is not None:
-        what, number, line = "column", column % cube.shape[3], cube[..., column]
-    else:
-        row = cube.shape[2] // 2 if row is None else row
-        what, number, line = "row", row % cube.shape[2], cube[:, :, row]
+    what, given, dim = ("row", row, 2) if column is None else ("column", column, 3)
+    number = cube.shape[dim] // 2 if given is None else given
+    if not -cube.shape[dim] <= number < cube.shape[dim]:
+        raise ShapeError(f"streak: {what} {number} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}.")
+    number %= cube.shape[dim]
+    line = cube.select(dim, number)
     picture = tone_map(line, exposure_of(line, 0.999) if exposure is None else exposure, curve).numpy()
     figure = figure_type()(figsize=(6.2, 5.2), layout="constrained")
     panel = figure.subplots()

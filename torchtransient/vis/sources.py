@@ -108,28 +108,6 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
     return cube, axis
 
 
-def steady_of(source: Source, who: str = "picture") -> Tensor:
-    """Return an intensity (C, H, W), C = 1 or 3.
-
-    Args:
-        source: a tensor (C, H, W) or (4, C, H, W), the ``steady`` of a result or file, or a transient, which is added
-            up over time.
-        who: beginning of messages.
-
-    Raises:
-        ShapeError, StorageError: as of :func:`transient_of`.
-    """
-    loaded = _load(source, "")
-    image = loaded.steady
-    if image is None:
-        image = images_of(loaded, None, who)[0].sum(1)
-    if image.ndim == 4 and image.shape[0] == 4:
-        image = image[0]
-    if image.ndim != 3 or image.shape[0] not in (1, 3):
-        raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
-    return image
-
-
 def stokes_of(source: Source, frame: int | None = None, who: str = "picture") -> Tensor:
     """Return Stokes vectors (4, C, H, W).
 

@@ -97,7 +97,7 @@ def view(
         raise UnitError(f"view: expected max_megabytes of at least 2, as an empty page takes, got {max_megabytes!r}.")
     target = None if path is None else check_folder(path, "view")
     heading = title or (Path(x).name if isinstance(x, str | Path) else "torchtransient")
-    content = content_of(x, "view", axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
+    content = content_of(x, axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
     page = _page_of(content, heading, int(max_megabytes * 1e6))
     if target is None:
         return page
