@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from torchtransient.axes import TimeAxis
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.vis.colour_maps import symmetric_limit
-from torchtransient.vis.files import figure_type, save_figure, to_bytes
+from torchtransient.vis.files import figure_type, needed, save_figure, to_bytes
 from torchtransient.vis.fit_page import Curve, Moment, Panel, Picture, write_page
 from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
@@ -184,7 +184,9 @@ class FitMonitor:
         self._now: _Light | None = None
         self._looks, self._between = 0, 1
         self._live = _in_notebook()
-        self._writer = None if log_dir is None else _writer(log_dir)
+        self._writer: Any = None
+        if log_dir is not None:
+            self._writer = needed("torch.utils.tensorboard", "tensorboard", "tensorboard").SummaryWriter(log_dir)
         if self._live or self._writer is not None:
             figure_type()  # whose import is no cost of a step
         self._handle: Any = None
@@ -370,16 +372,9 @@ class FitMonitor:
         are those that Lightning holds then: over batches that it accumulates, sums. Raises MissingPackageError without
         Lightning (extra ``lightning``).
         """
-        try:
-            from lightning.pytorch.callbacks import Callback
-        except ImportError as error:
-            raise MissingPackageError(
-                "FitMonitor.callback needs the package lightning. Install it with pip install "
-                "'torchtransient[lightning]'."
-            ) from error
-        monitor = self
+        monitor, callbacks = self, needed("lightning.pytorch.callbacks", "lightning", "lightning")
 
-        class MonitorCallback(Callback):
+        class MonitorCallback(callbacks.Callback):  # type: ignore[misc, name-defined]  # found when it is called
             def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
                 result = outputs if isinstance(outputs, Mapping) else {"loss": outputs}
                 monitor.step(result["loss"], result.get("output"))
@@ -536,14 +531,3 @@ def _display(figure: Figure, handle: Any) -> Any:
 def _in_notebook() -> bool:
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
-
-
-def _writer(folder: str | Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingPackageError(
-            "FitMonitor: log_dir needs the package tensorboard. Install it with pip install "
-            "'torchtransient[tensorboard]'."
-        ) from error
-    return SummaryWriter(folder)

@@ -16,9 +16,9 @@ from torch import Tensor
 from torchtransient.array_files.part_files import replacing
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import check_folder, path_of, positive, short_message, shown
-from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.units import opl_to_seconds
-from torchtransient.vis.files import Image, enlarge, pillow, to_bytes
+from torchtransient.vis.files import Image, enlarge, needed, pillow, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
 
@@ -296,14 +296,7 @@ def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) 
 
 
 def _ffmpeg() -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingPackageError(
-            "video: an .mp4 needs the package imageio-ffmpeg, which brings ffmpeg along. Install it with pip install "
-            "'torchtransient[vis]', or choose a name that ends in .gif."
-        ) from error
-    return imageio_ffmpeg
+    return needed("imageio_ffmpeg", "imageio-ffmpeg")
 
 
 # ------------------------------------------------------------------------------------------- the strip with the time
