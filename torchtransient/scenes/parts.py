@@ -39,9 +39,7 @@ def transient_film(
     }
 
 
-def perspective(
-    to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent"
-) -> SceneDict:
+def perspective(to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent") -> SceneDict:
     """Return a pinhole camera.
 
     Args:

@@ -155,9 +155,7 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any]) -> None:
         bar.set_ticks([-1, -0.5, 0, 0.5, 1], labels=["$-\\pi$", "$-\\pi/2$", "0", "$\\pi/2$", "$\\pi$"])
 
 
-def _images(
-    source: Source, given: FrequencyAxis | Numbers | None, who: str
-) -> tuple[Tensor, tuple[float, ...] | None]:
+def _images(source: Source, given: FrequencyAxis | Numbers | None, who: str) -> tuple[Tensor, tuple[float, ...] | None]:
     """Return images (F, H, W), summed over channels, and their frequencies, given or those of the source."""
     phasor, known = phasor_of(source, who)
     known = known if given is None else frequencies_of(given)

@@ -85,8 +85,7 @@ def _moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5
 
 
 def _median_pixel(steady: Tensor) -> tuple[int, int]:
-    """Return (row, column) of the pixel of median brightness among those that see light: neither the lamp nor darkness.
-    """
+    """Return (row, column) of the pixel of median brightness among the lit ones: neither the lamp nor darkness."""
     brightness = steady.sum(0).flatten()
     order = brightness.argsort(stable=True)
     order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
@@ -513,9 +512,7 @@ def _to_metres(time_ns: Any) -> Any:
 # -------------------------------------------------------------------------------------------------------- gradients
 
 
-def gradient_picture(
-    gradient: Source, path: str | Path | None = None, *, label: str = "", title: str = ""
-) -> Figure:
+def gradient_picture(gradient: Source, path: str | Path | None = None, *, label: str = "", title: str = "") -> Figure:
     """Draw a gradient, summed over channels: blue is negative, white zero, red positive.
 
     The symmetric scale ends where 99 % of the pixels are, so that some noisy ones do not hide the others.

@@ -255,9 +255,7 @@ def _load(source: Source, name: str) -> Loaded:
     return Loaded(steady=tensor)
 
 
-def of_one_spot(
-    capture: Capture, laser: int | tuple[int, ...] | None, who: str
-) -> tuple[Tensor, TimeAxis, Scan]:
+def of_one_spot(capture: Capture, laser: int | tuple[int, ...] | None, who: str) -> tuple[Tensor, TimeAxis, Scan]:
     """Return the light of a capture under one laser spot.
 
     Args:

@@ -33,9 +33,7 @@ from torchtransient.vis.sources import as_tensor, frequencies_of, read_any
 _FILMS = ("rates", "beats", "slow_phasor", "phasor", "gated", "transient")
 
 
-def content_of(
-    x: Any, *, axis: TimeAxis | None, rate_axis: RateAxis | None, frequencies: Any, samples: int
-) -> Content:
+def content_of(x: Any, *, axis: TimeAxis | None, rate_axis: RateAxis | None, frequencies: Any, samples: int) -> Content:
     """Return the content of a page.
 
     Args:
@@ -173,9 +171,7 @@ def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     return mean[None], notes
 
 
-def _light(
-    cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None
-) -> Content:
+def _light(cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None) -> Content:
     """Return the content of light (C, T, H, W), or polarized (4, C, T, H, W), with standard errors (T, H, W)."""
     if cube.ndim == 5 and cube.shape[0] == 4:
         mean, notes = _over_channels(cube.transpose(0, 1))
