@@ -139,9 +139,7 @@ def test_ctrl_c_and_on_again(made, tmp_path):
 
 
 def test_a_misspelt_command(tmp_path):
-    result = run(tmp_path, "inf", "rooms")
-    assert result.exit_code == 2 and "No such command or recipe 'inf'. Did you mean 'info'?" in result.output
+    assert "'inf' cannot be read" in run(tmp_path, "inf", "--out", "set").output
     (tmp_path / "inf").write_text("scene: {}")  # a recipe by that name is a recipe
     assert "Missing option" in run(tmp_path, "inf").output
-    assert "'zzz' cannot be read" in run(tmp_path, "zzz", "--out", "set").output
     assert "holds no shard" in run(tmp_path, "verify", str(tmp_path)).output

@@ -197,7 +197,7 @@ def test_what_a_file_leaves_open_is_asked_for(folder):
 
 
 @together("arguments, word", [
-    (("missing.h5",), "missing.h5"), (("a.h5", "--method", "midpoint-fk"), "--method"),
+    (("missing.h5",), "missing.h5"), (("a.h5", "--method", "midpoint-fk"), "method 'midpoint-fk'"),
     (("a.h5", "--method", "fk", "--snr", 3), "--snr"), (("a.h5", "--method", "fk", "--voxels", 8), "--voxels"),
     (("a.h5", "--method", "fbp", "--filter", "laplacian", "--cycles", 3), "--cycles"),
     (("a.h5", "--method", "bp", "--voxels", "4,x"), "X,Y[,Z]"),

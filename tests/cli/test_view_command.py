@@ -9,7 +9,6 @@ import sys
 import urllib.error
 import urllib.request
 
-import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -18,16 +17,15 @@ from support import view_cases as cases
 from support.sweeps import together
 from torchtransient.__main__ import main
 from torchtransient.cli import view
+from torchtransient.files.result_file import Result, write_result
 
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, seed in (("a", 0), ("b", 1)):
-        with h5py.File(f"{name}.h5", "w") as file:
-            file["transient"] = cases.front(3, seed=seed).numpy()
-            axis = cases.AXIS
-            file.attrs.update(start_opl=axis.start_opl, bin_width_opl=axis.bin_width_opl, num_bins=axis.num_bins)
+        light = cases.front(3, seed=seed)
+        write_result(f"{name}.h5", Result(light, light.sum(1), cases.AXIS))
     return tmp_path
 
 

@@ -9,7 +9,7 @@ from support.sweeps import together
 from torchtransient import scenes
 from torchtransient.capture import Wall
 from torchtransient.capture.wall import first_hits
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, SceneError, UnitError
 from torchtransient.scenes import rotate, scale, translate
 
 ALL = {
@@ -134,9 +134,6 @@ def test_plates_and_corners():
     (lambda: scenes.nlos_z(albedo=1.2), UnitError), (lambda: scenes.relay_wall(-1.0), UnitError),
     (lambda: scenes.nlos_room(width=2.4 - 1e-6, level=0), UnitError),
     (lambda: scenes.bounds({}), SceneError), (lambda: scenes.bounds({"a": {"type": "obj"}}), SceneError),
-    (lambda: scenes.bounds([{"type": "sphere"}]), SceneError),
-    *((lambda shape=shape: scenes.bounds({"it": shape}), ShapeError) for shape in (
-        {"type": "mesh_arrays", "vertices": np.zeros((0, 3))}, {"type": "sphere", "center": [1.0, 2.0]})),
 ])  # fmt: skip
 def test_what_is_refused(make, error):
     with pytest.raises(error):

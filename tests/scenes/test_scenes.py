@@ -87,7 +87,7 @@ def test_moving_wall_direct_light():
 def _dictionaries():
     """Every dictionary that this room makes without a file."""
     shapes = {"a": scenes.triangle_mesh(np.eye(3), [[0, 1, 2]], reflectance=0.4)}
-    others = ("bounds", "triangle_mesh", "milk_bottle", "identity", "look_at", "rotate", "scale", "translate")
+    others = ("bounds", "triangle_mesh", "milk_bottle", "look_at", "rotate", "scale", "translate")
     made = {name: make() for name, make in vars(scenes).items() if callable(make) and name not in others}
     return {**made, "triangle_mesh": shapes}
 

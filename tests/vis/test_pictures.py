@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
@@ -98,9 +99,9 @@ def test_white_of_an_image():
 def test_curves():
     ramp = torch.tensor([0.0, 2.0**-10, 2.0**-5, 0.25, 1.0, 4.0, -1.0]).reshape(1, 1, 7).requires_grad_()
     assert tt.vis.tone_map(ramp, 1.0, "linear")[0, :, 0].tolist() == [0, 2**-10, 2**-5, 0.25, 1, 1, 0]
-    gamma = tt.vis.tone_map(ramp, 1.0, "gamma", gamma=2.0)[0, :, 1]
-    np.testing.assert_allclose(gamma, [0, 2**-5, 2**-2.5, 0.5, 1, 1, 0], atol=1e-12)
-    log = tt.vis.tone_map(ramp, 1.0, "log", stops=10.0)[0, :, 2]
+    gamma = tt.vis.tone_map(ramp, 1.0, "gamma")[0, :, 1]
+    np.testing.assert_allclose(gamma, [*np.array([0, 2**-10, 2**-5, 0.25, 1, 1]) ** (1 / 2.2), 0], atol=1e-12)
+    log = tt.vis.tone_map(ramp, 1.0, "log")[0, :, 2]
     np.testing.assert_allclose(log, [0, 0, 0.5, 0.8, 1, 1, 0], atol=1e-12)
     srgb = tt.vis.tone_map(torch.tensor([0.0, 0.0031308, 0.2140411, 1.0]).reshape(1, 1, 4), 1.0)
     np.testing.assert_allclose(srgb[0, :, 0], [0.0, 0.04045, 0.5, 1.0], atol=2e-6)
@@ -194,14 +195,15 @@ def test_overview(tmp_path):
     cube[:, 20:81] = 1.0
     cube[:, :, :2] = cube[:, :, 5] = 0.0
     cube[:, 30, 5] = 1e6
-    told = tt.vis.plot_overview(cube, cube.sum(1), tt.TimeAxis(2.0, 0.1, 100), path=tmp_path / "a.png", title="pulse")
-    assert 2 <= told.pixel[0] <= 4
-    assert told.frames == (28, 40, 72)  # a tenth, half and nine tenths of the light
+    figure = tt.vis.plot_overview(cube, cube.sum(1), tt.TimeAxis(2.0, 0.1, 100), path=tmp_path / "a.png", title="pulse")
+    titles = " ".join(panel.get_title() for panel in figure.axes)
+    assert re.search("pixel at row [234],", titles)
+    assert re.findall(r"bin (\d+)", titles) == ["28", "40", "72"]  # a tenth, half and nine tenths of the light
     assert read_png(tmp_path / "a.png").std() > 10
     flash = torch.zeros(1, 100, 2, 2)
     flash[:, 98] = 1.0
-    told = tt.vis.plot_overview(flash, flash.sum(1), tt.TimeAxis(2.0, 0.1, 100), path=tmp_path / "a.png")
-    assert told.frames == (98, 99, 99)
+    figure = tt.vis.plot_overview(flash, flash.sum(1), tt.TimeAxis(2.0, 0.1, 100), path=tmp_path / "a.png")
+    assert re.findall(r"bin (\d+)", " ".join(panel.get_title() for panel in figure.axes)) == ["98", "99", "99"]
 
 
 def test_a_streak():
@@ -250,17 +252,16 @@ def test_captures_stand_as_the_wall():
 def test_gradient_picture(tmp_path):
     values = torch.linspace(-1, 2, 3000).reshape(3, 25, 40)
     values[0, 0, 0] = NAN
-    figure = tt.vis.gradient_picture(values, tmp_path / "g.png", percentile=100)
+    figure = tt.vis.gradient_picture(values, tmp_path / "g.png")
     image = figure.axes[0].images[0]
     low, high = image.get_clim()
     assert low == -high
-    assert high == pytest.approx(float(values[:, 1:].sum(0).abs().max()), rel=1e-6)
+    sums = values.double().sum(0).numpy()
+    assert high == pytest.approx(np.nanpercentile(np.abs(sums), 99), rel=1e-9)
+    np.testing.assert_array_equal(np.ma.filled(image.get_array(), NAN), sums)
     np.testing.assert_allclose(image.cmap(0.5)[:3], [0.97, 0.97, 0.97], atol=0.02)  # zero is white
     red, blue = image.cmap(1.0), image.cmap(0.0)
     assert red[0] > red[2] and blue[2] > blue[0]
-    figure = tt.vis.gradient_picture(values, per_channel=True, limit=0.5)
-    assert [figure.axes[k].images[0].get_clim() for k in range(3)] == [(-0.5, 0.5)] * 3
-    np.testing.assert_allclose(shown(figure, 2), values[2].numpy())
     assert tt.vis.gradient_picture(torch.zeros(4, 4)).axes[0].images[0].get_clim() == (-1.0, 1.0)
 
 
@@ -270,16 +271,15 @@ def test_gradient_picture(tmp_path):
 @together("call, error", [
     (lambda v: v.peak_time_picture(sweep()), ShapeError),  # without an axis
     (lambda v: v.peak_time_picture(sweep(), axis=tt.TimeAxis(0, 1, 9)), ShapeError),
-    (lambda v: v.peak_time_picture(sweep(), axis=AXIS, limits=(3, 3)), UnitError),
+    (lambda v: v.rainbow(sweep(), axis=AXIS, limits=(3, 3)), UnitError),
     (lambda v: v.peak_time(sweep()[None], AXIS), ShapeError),
     (lambda v: v.plot_overview(sweep(), sweep(), AXIS, path="a.png"), ShapeError),
     (lambda v: v.plot_overview(sweep(), sweep().sum(1), AXIS, path="a.png", pixel=(6, 0)), ShapeError),
     (lambda v: v.rainbow(sweep(), style="prism"), ArgumentError),
     (lambda v: v.rainbow(sweep(), period_opl=0.0), UnitError), (lambda v: v.streak(sweep(), row=6), ShapeError),
     (lambda v: v.streak(sweep(), row=1, column=1), ArgumentError),
-    (lambda v: v.frame_grid(sweep(), bins=[-1]), ShapeError), (lambda v: v.histogram(sweep(), pixels=[]), ShapeError),
+    (lambda v: v.frame_grid(sweep(), bins=[-1]), ShapeError),
     (lambda v: v.gradient_picture(sweep()), ShapeError),
-    (lambda v: v.gradient_picture(torch.ones(2, 2), limit=0), UnitError),
     (lambda v: v.tone_map(torch.ones(2, 2, 3)), ShapeError),
     (lambda v: v.tone_map(torch.ones(1, 2, 3), INF), UnitError),
     (lambda v: v.exposure_of(torch.ones(1, 2, 3), 1.01), UnitError),

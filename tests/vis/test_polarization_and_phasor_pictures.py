@@ -111,7 +111,7 @@ def wave():
 def test_domain_colours():
     """Hue by phase, brightness by amplitude; what is not finite is grey."""
     values = torch.tensor([1, 0.25, 0, 1j, NAN * 1j]).reshape(1, 1, 1, 5).to(torch.complex128)
-    image = np.asarray(shown(tt.vis.phasor_picture(values, show=("domain",), percentile=100)))[0]
+    image = np.asarray(shown(tt.vis.phasor_picture(values, show=("domain",))))[0]
     np.testing.assert_allclose(image[0], colour_maps.cyclic(0.0, 1.0))
     np.testing.assert_allclose(image[1], colour_maps.cyclic(0.0, 0.5))
     np.testing.assert_allclose(image[3], colour_maps.cyclic(0.25, 1.0))
@@ -138,7 +138,7 @@ def test_colours_of_what_is_dark_or_broken():
     """Phases are those of pixels above a ten-thousandth of the brightest; what is not finite is grey everywhere."""
     values = torch.tensor([[1.0, 1.2e-4, 0.9e-4j, NAN * 1j]]).to(torch.complex128)[None, None]
     shows = ("phase", "domain", "real", "amplitude")
-    panels = tt.vis.phasor_picture(values, show=shows, percentile=100).axes[:4]
+    panels = tt.vis.phasor_picture(values, show=shows).axes[:4]
     phase, domain = (np.asarray(panel.images[0].get_array())[0] for panel in panels[:2])
     assert (np.ptp(phase, axis=-1) > 0.1).tolist() == [True, True, False, False]
     assert phase[2].tolist() == phase[3].tolist() == domain[3].tolist() == [0.5] * 3
@@ -150,9 +150,8 @@ def test_colours_of_what_is_dark_or_broken():
 @together("draw, arguments, error", [
     (tt.vis.polarization_picture, {"quantities": ("dolp", "colour")}, ArgumentError),
     (tt.vis.polarization_picture, {"angle_map": "jet"}, ArgumentError),
-    (tt.vis.polarization_picture, {"floor": -1.0}, UnitError),
     (tt.vis.polarization_picture, {"source": torch.ones(3, 4, 4)}, ShapeError),
-    (tt.vis.phasor_picture, {"which": (1,)}, ShapeError), (tt.vis.phasor_picture, {"which": ()}, ShapeError),
+    (tt.vis.phasor_picture, {"which": (1,)}, IndexError),
     (tt.vis.phasor_picture, {"frequencies": (1.0, 2.0)}, ShapeError),
     (tt.vis.phasor_picture, {"show": ("colour",)}, UnitError),
     (tt.vis.phasor_picture, {"source": torch.ones(1, 1, 2, 2)}, ShapeError),

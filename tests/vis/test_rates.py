@@ -10,7 +10,8 @@ import torch
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.errors import ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.files.result_file import Result, write_result
 
 AXIS, RATES = tt.TimeAxis(2.0, 0.5, 6), tt.RateAxis(-2.0, 0.5, 8)
 
@@ -49,10 +50,7 @@ def test_map_of_all_pixels():
 
 def test_other_pictures_show_the_sum_over_rates(tmp_path):
     cube, file = light(), tmp_path / "out.npz"
-    np.savez(
-        file, rates=cube.numpy(), start_opl=2.0, bin_width_opl=0.5, num_bins=6, rates_start=-2.0, rates_bin_width=0.5,
-        rates_num_bins=8,
-    )  # fmt: skip
+    write_result(file, Result(None, cube.sum((1, 2)), AXIS, rates=cube, rate_axis=RATES))
     whole = tt.vis.range_doppler(cube, axis=AXIS, rate_axis=RATES)
     np.testing.assert_array_equal(image_of(tt.vis.range_doppler(file)), image_of(whole))
     expected = image_of(tt.vis.peak_time_picture(cube.sum(1), axis=AXIS))
@@ -76,11 +74,11 @@ def test_beats_and_batches_are_no_times_of_arrival(tmp_path):
     with pytest.raises(ShapeError, match="beats"):
         tt.vis.rainbow(beats)
     beats.rates = None
-    with pytest.raises(ShapeError, match=r"without, whose beats tt\.sensing\.range_and_speed reads"):
+    with pytest.raises(ShapeError, match=r"without.*Beats are read by tt\.sensing\.range_and_speed"):
         tt.vis.range_doppler(beats)
     batch = SimpleNamespace(rates=torch.stack([light()] * 4), transient=None, polarized=False, axis=AXIS)
     with pytest.raises(ShapeError, match="batch"):
         tt.vis.rainbow(batch)
-    np.savez(tmp_path / "out.npz", transient=light().sum(1).numpy(), start_opl=2.0, bin_width_opl=0.5, num_bins=6)
-    with pytest.raises(StorageError, match="no light by rates"):
+    write_result(tmp_path / "out.npz", Result(light().sum(1), light().sum((1, 2)), AXIS))
+    with pytest.raises(ShapeError, match="expected light by rates"):
         tt.vis.range_doppler(tmp_path / "out.npz")

@@ -146,7 +146,7 @@ FRAME = np.zeros((4, 6, 3), np.uint8)
 @together("arguments, error", [
     ({"path": "a.avi"}, StorageError), ({"path": "missing/a.gif"}, StorageError), ({"fps": 0}, UnitError),
     ({"fps": 100}, UnitError),  # which GIF players do not know
-    ({"exposure": -1}, UnitError), ({"curve": "sepia"}, ArgumentError), ({"every": 0}, ShapeError),
+    ({"exposure": -1}, UnitError), ({"curve": "sepia"}, ArgumentError),
     ({"source": torch.zeros(3, 0, 4, 4)}, ShapeError), ({"source": torch.zeros(2, 5, 4, 4)}, ShapeError),
     ({"source": torch.zeros(5, 3, 5, 4, 4)}, ShapeError), ({"source": "cube"}, StorageError),
     ({"source": [1.0]}, ArgumentError), ({"axis": tt.TimeAxis(0, 1, 3)}, ShapeError),
@@ -159,11 +159,10 @@ def test_refused(tmp_path, arguments, error):
 
 
 @together("frames, count", [
-    ([FRAME], 0), ([], 1), (iter([FRAME]), 1), ([FRAME, FRAME[1:]], 2), ([[5]], 1), ([FRAME[..., :2]], 1),
-    ([FRAME + 0.5], 1),
+    ([], 1), (iter([FRAME]), 1), ([FRAME, FRAME[1:]], 2), ([FRAME[..., :2]], 1), ([FRAME + 0.5], 1),
 ])  # fmt: skip
 def test_what_is_no_row_of_frames(tmp_path, frames, count):
-    """None, others than were announced, of several sizes, and of other numbers; a GIF looks at them twice."""
+    """None, of several sizes, and of other numbers; a GIF looks at them twice."""
     with pytest.raises(ShapeError):
         tt.vis.write_video(tmp_path / "a.gif", frames, count)
     assert not list(tmp_path.iterdir())

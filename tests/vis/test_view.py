@@ -131,7 +131,6 @@ REFUSED = {
     "a batch": (lambda: tt.vis.view(torch.ones(2, 3, 5, 4, 4)), ShapeError, "expected light"),
     "nothing": (lambda: tt.vis.view([]), ShapeError, "at least one sample"),
     "another axis": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), axis=cases.AXIS), ShapeError, "24 bins"),
-    "no axis": (lambda: tt.vis.view(torch.ones(1, 5, 4, 4), axis=3), ArgumentError, "TimeAxis"),
     "rates": (lambda: tt.vis.view(cases.result(rates=cases.rates()[0])), ShapeError, "rate_axis"),
     "two kinds": (lambda: tt.vis.view((cases.front(1), cases.capture())), ShapeError, "one kind"),
     "two sizes": (lambda: tt.vis.view((cases.front(1), cases.front(1, 4, 4))), ShapeError, "one kind"),

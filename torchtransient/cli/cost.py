@@ -39,6 +39,7 @@ def command(scene: Path, **options: Any) -> None:
     setting.
     """
     from torchtransient.checks import check_folder
+    from torchtransient.errors import ArgumentError
     from torchtransient.vis.files import check_picture
 
     film = film_of_options(options)
@@ -46,15 +47,17 @@ def command(scene: Path, **options: Any) -> None:
         check_picture(options["plot"])
     if options["json_path"]:
         check_folder(options["json_path"], "--json")
-    described = load_scene(scene, options["variant"], options["params"])
-    report = _measure(described, film, options)
+    report = _measure(load_scene(scene, options["variant"], options["params"]), film, options)
     click.echo(report.table())
     reached = True
     if options["error"]:
         for quantity in report.quantities():
-            found, said = _recommended(report, quantity, options["error"])
-            click.echo(said)
-            reached = reached and found
+            try:
+                best = report.recommend(options["error"], quantity=quantity)
+                click.echo(f"recommended for {options['error']:.2%}: {best}")
+            except ArgumentError as none:
+                click.echo(none)
+                reached = False
     if options["plot"]:
         report.plot(options["plot"])
         click.echo(f"{options['plot']}: the curves")
@@ -65,33 +68,15 @@ def command(scene: Path, **options: Any) -> None:
         sys.exit(NOT_REACHED)
 
 
-def _recommended(report: Any, quantity: str, error: float) -> tuple[bool, str]:
-    """Return True and the setting for an error in words, or False and why there is none."""
-    from torchtransient.errors import ArgumentError
-
-    try:
-        return True, f"recommended for {error:.2%}: {report.recommend(error, quantity=quantity)}"
-    except ArgumentError as none:
-        return False, str(none)
-
-
 def _measure(described: Any, film: Any, options: dict[str, Any]) -> Any:
     import torchtransient as tt
 
-    renderer = tt.TransientRenderer(
-        described, parameters=list(options["gradients"]), film=film, max_depth=options["max_depth"]
-    )
+    gradients = list(options["gradients"])
+    renderer = tt.TransientRenderer(described, parameters=gradients, film=film, max_depth=options["max_depth"])
     return tt.cost_of_accuracy(
-        renderer,
-        spp=options["spp"],
-        gradients=list(options["gradients"]),
-        reference_spp=options["reference_spp"],
-        repeats=options["repeats"],
-        samplers=list(options["samplers"]),
-        temporal_filters=list(options["filters"]) or None,
-        integrators=list(options["integrators"]) or None,
-        max_depths=list(options["depths"]) or None,
-        bin_widths=list(options["widths"]) or None,
-        seed=options["seed"],
+        renderer, spp=options["spp"], gradients=gradients, reference_spp=options["reference_spp"],
+        repeats=options["repeats"], samplers=list(options["samplers"]),
+        temporal_filters=list(options["filters"]) or None, integrators=list(options["integrators"]) or None,
+        max_depths=list(options["depths"]) or None, bin_widths=list(options["widths"]) or None, seed=options["seed"],
         progress=not options["quiet"],
-    )
+    )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,6 @@ class GeneratesByDefault(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read `FILE --out DIR` as `generate FILE --out DIR`."""
         if args and args[0] not in {*self.commands, *ctx.help_option_names}:
-            near = difflib.get_close_matches(args[0], self.commands, 1, 0.7)
-            if near and not Path(args[0]).exists():
-                raise click.UsageError(f"No such command or recipe '{args[0]}'. Did you mean '{near[0]}'?", ctx)
             args = ["generate", *args]
         return super().parse_args(ctx, args)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,22 +19,9 @@ _TITLE = (
 )
 
 
-@dataclass
-class Fit:
-    """Course of a fit: one loss and one colour for each step, and the last colour."""
-
-    losses: list[float] = field(default_factory=list)
-    colours: list[list[float]] = field(default_factory=list)
-    found: list[float] = field(default_factory=list)
-
-
 def fit_colour(
-    renderer: Any,
-    target: torch.Tensor,
-    steps: int,
-    learning_rate: float = 0.06,
-    look: Callable[[torch.Tensor, Any], None] = lambda loss, output: None,
-) -> Fit:
+    renderer: Any, target: torch.Tensor, steps: int, look: Callable[[torch.Tensor, Any], None]
+) -> list[float]:
     """Fit the colour of the wall with Adam, from the transient alone.
 
     Few samples per pixel make single bins noisy, so averages over 8 x 8 pixels and 2 bins are compared, each relative
@@ -45,22 +31,20 @@ def fit_colour(
         renderer: a TransientRenderer whose only parameter is KEY, at its start value.
         target: (C, T, H, W).
         steps: of Adam.
-        learning_rate: of Adam, at the start.
         look: called with loss and output of every step.
 
     Returns:
-        The course of the fit.
+        The colour that was found.
     """
     import torch
     from tqdm import tqdm
 
     # Little momentum: with the usual 0.9, thirty steps are spent on overshooting.
-    optimizer = torch.optim.Adam(renderer.parameters(), lr=learning_rate, betas=(0.5, 0.9))
+    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.06, betas=(0.5, 0.9))
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     colour = renderer.values[KEY]
     wanted = _averages(target)
     weight = 1 / (wanted + wanted.mean()).square()
-    fit = Fit()
     with tqdm(range(steps), desc="fit", unit="step") as bar:
         for step in bar:
             optimizer.zero_grad()
@@ -68,15 +52,13 @@ def fit_colour(
             loss = (weight * (_averages(out.transient) - wanted).square()).mean()
             loss.backward()  # type: ignore[no-untyped-call]
             look(loss, out)
-            fit.losses.append(loss.item())
-            fit.colours.append(colour.tolist())
             optimizer.step()
             schedule.step()
             with torch.no_grad():
                 colour.clamp_(0.0, 1.0)
-            bar.set_postfix(loss=f"{fit.losses[-1]:.2e}")
-    fit.found = colour.tolist()
-    return fit
+            bar.set_postfix(loss=f"{loss.item():.2e}")
+    found: list[float] = colour.tolist()
+    return found
 
 
 def _averages(transient: torch.Tensor) -> torch.Tensor:
@@ -130,12 +112,12 @@ def command(output: Path, resolution: int, spp: int, steps: int) -> None:
     monitor = FitMonitor(
         renderer, target=truth, pixels=[(place, place // 4), (place, place)], truth={KEY: truth_colour}, every=1
     )
-    fit = fit_colour(renderer, truth.transient, steps, look=monitor.step)
+    found = fit_colour(renderer, truth.transient, steps, monitor.step)
     for name in ("fit.png", "fit.html"):
         monitor.save(output / name)
     click.echo(f"{'':>8}  {'start':>7} {'found':>7} {'truth':>7}")
     for n, name in enumerate(CHANNELS):
-        click.echo(f"{name:>8}  {grey[n]:7.4f} {fit.found[n]:7.4f} {float(truth_colour[n]):7.4f}")
+        click.echo(f"{name:>8}  {grey[n]:7.4f} {found[n]:7.4f} {float(truth_colour[n]):7.4f}")
     click.echo(f"\nWritten to {output.resolve()}:")
     for name, meaning in (
         ("light_in_flight.html", "light in flight, for the browser"),

@@ -47,9 +47,7 @@ def versions() -> list[Finding]:
     found = [Finding("ok" if good else "problem", "python", python if good else f"{python}; 3.11 or newer is needed")]
     for name in ("torchtransient", "torch", "mitsuba", "drjit", "numpy", "kornia", "click", "tqdm"):
         version = _version(name)
-        found.append(
-            _judged(name, version) if version else Finding("problem", name, f"missing: pip install {name}")
-        )
+        found.append(_judged(name, version) if version else Finding("problem", name, f"missing: pip install {name}"))
     optional = (("matplotlib", "vis", "pictures"), ("bokeh", "view", "pages"), ("h5py", "data", "HDF5 files"))
     for name, extra, purpose in optional:
         version = _version(name)
@@ -96,14 +94,11 @@ def llvm() -> list[Finding]:
     major = int(out.split(".")[0]) if code == 0 and out.split(".")[0].lstrip("-").isdigit() else -1
     if major < _llvm.MIN_MAJOR:
         gets = f"LLVM {out}" if major > 0 else "no LLVM"
-        found.append(
-            Finding(
-                "note",
-                "LLVM",
-                f"a program that imports drjit or mitsuba before torchtransient gets {gets}. Import torchtransient "
-                f"first, or set {_llvm.VARIABLE}={library.path}",
-            )
+        said = (
+            f"a program that imports drjit or mitsuba before torchtransient gets {gets}. Import torchtransient first, "
+            f"or set {_llvm.VARIABLE}={library.path}"
         )
+        found.append(Finding("note", "LLVM", said))
     return found
 
 

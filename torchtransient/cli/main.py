@@ -33,11 +33,8 @@ COMMANDS = {
     "demo": "Render the Cornell box, fit a colour to it, write pictures.",
 }
 
-
+# Letters of a fault that are shown.
 _FAULT = 300
-_FAULTS = (
-    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, TypeError, ValueError, RuntimeError,
-)  # fmt: skip
 
 
 class Commands(click.Group):
@@ -67,25 +64,21 @@ class Commands(click.Group):
                 show = warnings.showwarning
                 warnings.showwarning = functools.partial(_show_warning, show)
                 return super().invoke(ctx)
-        except TorchTransientError as error:
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise  # which click handles
+        except Exception as error:
             if ctx.params.get("debug"):
                 raise
-            click.echo(f"error: {' '.join(_in_options(error).split())}", err=True)
-            sys.exit(2)
-        except BrokenPipeError:
-            raise  # the reader of the output has left, which click handles
-        except OSError as error:
-            if ctx.params.get("debug"):
-                raise
-            click.echo(f"error: {' '.join(str(error).split())}.", err=True)
-            sys.exit(2)
-        except _FAULTS as error:
-            # What click itself ends commands with is a RuntimeError too.
-            if ctx.params.get("debug") or isinstance(error, click.exceptions.Exit | click.exceptions.Abort):
-                raise
-            said = " ".join(f"{type(error).__name__}: {error}".split())[:_FAULT]
-            click.echo(f"error: a fault of torchtransient, not of yours: {said} (--debug shows where).", err=True)
-            sys.exit(70)
+            match error:
+                case TorchTransientError():
+                    said, status = _in_options(error), 2
+                case OSError():
+                    said, status = f"{error}.", 2
+                case _:
+                    fault = " ".join(f"{type(error).__name__}: {error}".split())[:_FAULT]
+                    said, status = f"a fault of torchtransient, not of yours: {fault} (--debug shows where).", 70
+            click.echo(f"error: {' '.join(said.split())}", err=True)
+            sys.exit(status)
 
 
 def _in_options(message: Any) -> str:

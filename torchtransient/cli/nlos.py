@@ -53,6 +53,7 @@ def command(scene: Path, **options: Any) -> None:
 
     import torchtransient as tt
     from torchtransient.array_files.array_file import check_target
+    from torchtransient.nlos.part_file import delete_part_file
     from torchtransient.nlos.renderer import checked_seed
 
     # What is wrong with the places to write to is said before the simulation, not after it.
@@ -67,7 +68,7 @@ def command(scene: Path, **options: Any) -> None:
         click.echo(tt.nlos.forecast(**setup, part=part, **parts))
         return
     if options["restart"] and part is not None:
-        _delete(part)
+        delete_part_file(part)
     generator = torch.Generator().manual_seed(checked_seed(scene.name, setup.get("seed") or 0))
     try:
         capture = tt.nlos.simulate(
@@ -79,7 +80,7 @@ def command(scene: Path, **options: Any) -> None:
         sys.exit(INTERRUPTED)
     tt.nlos.write_capture(target, capture, {"scene": scene.name, "parameters": list(options["params"])})
     if part is not None:
-        _delete(part)
+        delete_part_file(part)
     click.echo(f"{target}: {_summary(capture)}")
     _write_pictures(capture, setup, options)
 
@@ -91,12 +92,6 @@ def _part(options: dict[str, Any], target: Path) -> Path | None:
     if given:
         raise click.UsageError(f"--whole keeps no part file; leave out {' and '.join(given)}, or --whole.")
     return None
-
-
-def _delete(part: Path) -> None:
-    from torchtransient.nlos.part_file import delete_part_file
-
-    delete_part_file(part)
 
 
 def _summary(capture: Any) -> str:

@@ -35,27 +35,13 @@ _PICTURES = ("overview", "peak_time", "rainbow", "video")
 _WORDS = {
     "print(scene.parameters()) lists all keys": "`torchtransient render SCENE --list-parameters` lists all keys",
     "tt.plan(scene) finds a window": "`torchtransient plan SCENE` finds a window",
-    " RenderOutput.stats has the energies.": "",
     ", by a sigmoid or, after each step, by torch.no_grad() and x.clamp_(0, 1)": "",
     "tt.plan: outputs are some of": "--outputs takes some of",
-    "error='relative'": "--error relative",
-    "tt.plan: ": "",
-    "tt.load: ": "",
+    "tt.plan: error='relative'": "--error relative",
     "temporal_filter: ": "--temporal-filter: ",
     "sensors: the scene has": "--sensor: the scene has",
-    "neither the film nor the call has": "neither the film of the scene nor the command line has",
-}
-# Calls and classes of reconstruction, after arguments have become options.
-_RECONSTRUCTION = {
     " to read_capture": "",
-    "reconstruct: ": "",
-    "DiffusionDeconvolution: ": "--slab: ",
-    "method '": "--method '",
-    "VoxelGrid.before: ": "",
     "Give extent=(width, height) in metres": "Give --extent WIDTH,HEIGHT in metres",
-    "Use Backprojection, which takes any points.": "Take --method bp or fbp.",
-    "expected size= for a list of points": "expected --voxels for a list of points",
-    "Crop the capture.": "Give --record.",
 }
 
 
@@ -158,66 +144,47 @@ def film_of_options(options: Mapping[str, Any]) -> FilmLayout | None:
         ArgumentError: for options of two films, and for a part of an axis.
         UnitError: for frequencies, rates and chirps that are no numbers.
     """
-    histogram = _histogram(options)
-    axis = None if histogram is None else histogram.axis
-    rows = [film for film in (_rates(options, axis), _chirps(options, axis)) if film is not None]
-    every = (None if rows else histogram, _phasors(options), _gates(options), *rows)
-    found = [film for film in every if film is not None]
-    if len(found) > 1:
-        flags = " and ".join(OPTIONS[type(film)][0] for film in found)
-        raise ArgumentError(f"{flags} ask for different films: leave out one of them.")
-    return found[0] if found else None
+    names = ("frequencies", "gates", "rates", "chirps")
+    given = {name: options[name] for name in names if options.get(name) is not None}
+    axis = _axis_of(options)
+    if len(given) > 1 or (axis is not None and not given.keys().isdisjoint(("frequencies", "gates"))):
+        flags = [f"--{name}" for name in given] + ["--start-opl"] * (axis is not None)
+        raise ArgumentError(f"{' and '.join(flags)} ask for different films: leave out one of them.")
+    for name, text in given.items():
+        match name:
+            case "frequencies":
+                return Phasors(FrequencyAxis(tuple(_numbers(name, text.split(","), "numbers with commas"))))
+            case "gates":
+                return Gates(gates_from_text(text))
+            case "rates":
+                start, width, bins = _numbers(name, text.split(":"), "START:WIDTH:BINS in m/s, as -10.25:0.5:41", 3)
+                return Rates(RateAxis(start, width, bins), axis)
+            case "chirps":
+                parts, form = text.split(":"), "BANDWIDTH:DURATION:WAVELENGTH in Hz, s and m, as 1e9:1e-5:1550e-9"
+                numbers = _numbers(name, parts[:3], form, 3)
+                window: dict[str, Any] = {"window": ":".join(parts[3:])} if parts[3:] else {}
+                return Beats(Chirps(*numbers, **window), axis)
+    return None if axis is None else Histogram(axis)
 
 
-def _histogram(options: Mapping[str, Any]) -> Histogram | None:
+def _axis_of(options: Mapping[str, Any]) -> TimeAxis | None:
     start, width, bins = (options.get(name) for name in ("start_opl", "bin_width_opl", "num_bins"))
     if start is None and width is None and bins is None:
         return None
     if start is None or width is None or bins is None:
         raise ArgumentError("--start-opl, --bin-width-opl and --num-bins replace the scene's axis together: give all.")
-    return Histogram(TimeAxis(start, width, bins))
+    return TimeAxis(start, width, bins)
 
 
-def _phasors(options: Mapping[str, Any]) -> FilmLayout | None:
-    given = options.get("frequencies")
-    if given is None:
-        return None
+def _numbers(name: str, parts: Sequence[str], form: str, count: int | None = None) -> list[Any]:
+    """Return the numbers of a text, whole ones as int."""
     try:
-        return Phasors(FrequencyAxis(tuple(float(text) for text in given.split(","))))
+        found = [int(part) if part.strip().isdigit() else float(part) for part in parts]
     except ValueError:
-        raise UnitError(f"--frequencies: expected numbers with commas, got '{given}'.") from None
-
-
-def _gates(options: Mapping[str, Any]) -> FilmLayout | None:
-    given = options.get("gates")
-    return None if given is None else Gates(gates_from_text(given))
-
-
-def _rates(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | None:
-    given = options.get("rates")
-    if given is None:
-        return None
-    try:
-        start, width, bins = given.split(":")
-        numbers = float(start), float(width), int(bins)
-    except ValueError:
-        raise UnitError(f"--rates: expected START:WIDTH:BINS in m/s, such as -10.25:0.5:41, got '{given}'.") from None
-    return Rates(RateAxis(*numbers), axis)
-
-
-def _chirps(options: Mapping[str, Any], axis: TimeAxis | None) -> FilmLayout | None:
-    given = options.get("chirps")
-    if given is None:
-        return None
-    numbers, window = given.split(":")[:3], given.split(":")[3:]
-    try:
-        bandwidth, duration, wavelength = map(float, numbers)
-    except ValueError:
-        raise UnitError(
-            f"--chirps: expected BANDWIDTH:DURATION:WAVELENGTH in Hz, s and m, such as 1e9:1e-5:1550e-9, got '{given}'."
-        ) from None
-    chirps = Chirps(bandwidth, duration, wavelength, **({"window": ":".join(window)} if window else {}))
-    return Beats(chirps, axis)
+        found = []
+    if not found or count not in (None, len(found)):
+        raise UnitError(f"--{name}: expected {form}, got '{':'.join(parts)}'.")
+    return found
 
 
 def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
@@ -240,18 +207,6 @@ def _pictures_of(film: FilmLayout) -> tuple[str, ...]:
     if isinstance(film, Histogram | Rates):
         return _PICTURES
     return ("video",) if isinstance(film, Phasors | Gates) else ()
-
-
-def _write_film_video(film: FilmLayout, output: Any, path: Any, progress: bool) -> str:
-    """Write a video of a render and return its contents in words; other films were refused by `check_pictures`."""
-    from torchtransient.vis.phasors import phasor_video
-    from torchtransient.vis.videos import video
-
-    if isinstance(film, Phasors):
-        phasor_video(output, path, progress=progress)
-        return "the wave of the first frequency"
-    video(output, path, progress=progress)
-    return f"{film.count} frames" + (", one for each gate" if isinstance(film, Gates) else "")
 
 
 # ------------------------------------------------------------------------------------------------------------- pictures
@@ -327,8 +282,10 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
         tt.vis.rainbow(output, options["rainbow"])
         click.echo(f"{options['rainbow']}: hue by arrival")
     if options["video"]:
-        shown = _write_film_video(film, output, options["video"], progress=not options["quiet"])
-        click.echo(f"{options['video']}: {shown}")
+        write = tt.vis.phasor_video if isinstance(film, Phasors) else tt.vis.video
+        write(output, options["video"], progress=not options["quiet"])
+        shows = "the wave of the first frequency" if isinstance(film, Phasors) else f"{film.count} frames"
+        click.echo(f"{options['video']}: {shows}")
 
 
 # ------------------------------------------------------------------------------------------------------------- messages
@@ -344,11 +301,11 @@ def in_options(message: str) -> str:
         message = message.replace(f"Give {kind.example}", f"Give {', '.join(flags)}")
     for python, option in _WORDS.items():
         message = message.replace(python, option)
-    return message
+    return re.sub(r"^(tt\.\w+|reconstruct): ", "", message)
 
 
 def arguments_as_options(message: str, names: Sequence[str]) -> str:
-    """Return a message with ``name=`` as ``--name``, and without calls of reconstruction.
+    """Return a message with ``name=`` as ``--name``.
 
     Args:
         message: of an error.
@@ -359,6 +316,4 @@ def arguments_as_options(message: str, names: Sequence[str]) -> str:
         # With a value behind it, or as a name alone.
         message = re.sub(rf"\b{name}=(?=['\"\w])", f"{option} ", message)
         message = re.sub(rf"\b{name}=", option, message)
-    for python, option in _RECONSTRUCTION.items():
-        message = message.replace(python, option)
     return message

@@ -43,15 +43,16 @@ def _draw(kind: str, result: Path, target: Path, options: dict[str, Any]) -> Non
     from torchtransient.rendering.films import layout_of_output
 
     def overview() -> None:
-        from torchtransient.vis.sources import steady_of, transient_of
+        from torchtransient.vis.sources import transient_of
 
         held = read_result(result)
         film = layout_of_output(held)
         if held.axis is None:
             what = "something else" if film is None else film.plural
             raise click.UsageError(f"--kind overview shows a histogram over time, and this file holds {what}.")
-        cube, _ = transient_of(result)
-        tt.vis.plot_overview(cube, steady_of(result), held.axis, path=target, pixel=options["pixel"], title=result.name)
+        cube, _ = transient_of(held)
+        steady = held.steady[0] if held.steady.ndim == 4 else held.steady
+        tt.vis.plot_overview(cube, steady, held.axis, path=target, pixel=options["pixel"], title=result.name)
 
     draw: dict[str, Callable[[], Any]] = {
         "overview": overview,

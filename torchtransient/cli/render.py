@@ -84,17 +84,14 @@ def command(scene: Path, **options: Any) -> None:
     else:
         names = ("max_depth", "temporal_filter")
         settings = {"film": film, "sensors": options["sensor"], **{name: options[name] for name in names}}
-    if options["rtol"] is None:
-        output = _render(described, values, settings, options)
-    else:
-        found = _render_to_tolerance(described, values, settings, options)
-        output, said = found.output, "reached" if found.reached else "not reached"
+    output, found = _rendered(described, values, settings, options)
+    if found is not None:
         error = found.error if math.isfinite(found.error) else None  # JSON has no infinity
         metadata["tolerance"] = {
             "rtol": found.rtol, "quantile": found.quantile, "error": error, "reached": found.reached,
         }  # fmt: skip
-        click.echo(f"relative error {found.error:.3g} of {found.quantile:.0%} of the bins with light, {said}: "
-                   f"{found.reason}")  # fmt: skip
+        said = f"{'reached' if found.reached else 'not reached'}: {found.reason}"
+        click.echo(f"relative error {found.error:.3g} of {found.quantile:.0%} of the bins with light, {said}")
     write_result(target, output, metadata)
     stats, film = output.stats, layout_of_output(output)
     assert film is not None  # a steady film was refused before the render
@@ -108,23 +105,25 @@ def command(scene: Path, **options: Any) -> None:
     write_pictures(output, film, options, scene.name)
 
 
-def _render(described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]) -> Any:
+def _rendered(
+    described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]
+) -> tuple[Any, Any]:
+    """Return a render, and with --rtol what was reached of it."""
     import torch
 
     import torchtransient as tt
 
-    with torch.no_grad(), warnings.catch_warnings():
+    common = {"seed": options["seed"], "progress": not options["quiet"]}
+    with warnings.catch_warnings():
         # What the axis misses is said in the words of the command line, by `_report_energy`.
         warnings.filterwarnings("ignore", "the window misses", PhysicsWarning)
-        return tt.render(
-            described,
-            values,
-            spp=options["spp"],
-            seed=options["seed"],
-            progress=not options["quiet"],
-            errors=options["errors"],
-            **settings,
-        )
+        if options["rtol"] is None:
+            with torch.no_grad():
+                errors = options["errors"]
+                return tt.render(described, values, spp=options["spp"], errors=errors, **common, **settings), None
+        renderer = tt.TransientRenderer(described, list(values), **settings)
+        found = renderer.to_tolerance(values, rtol=options["rtol"], max_seconds=options["max_seconds"], **common)
+        return found.output, found
 
 
 def _check_tolerance(options: dict[str, Any]) -> None:
@@ -134,23 +133,6 @@ def _check_tolerance(options: dict[str, Any]) -> None:
         raise click.UsageError("--rtol, --errors: give one of them; --rtol says the error that it reached.")
     if options["rtol"] is not None and options["spp"] is not None:
         raise click.UsageError("--rtol, --spp: give one of them; --rtol finds the samples, --max-seconds bounds them.")
-
-
-def _render_to_tolerance(
-    described: Any, values: dict[str, Any], settings: dict[str, Any], options: dict[str, Any]
-) -> Any:
-    import torchtransient as tt
-
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "the window misses", PhysicsWarning)
-        renderer = tt.TransientRenderer(described, list(values), **settings)
-        return renderer.to_tolerance(
-            values,
-            rtol=options["rtol"],
-            max_seconds=options["max_seconds"],
-            seed=options["seed"],
-            progress=not options["quiet"],
-        )
 
 
 def _report_energy(output: Any) -> None:

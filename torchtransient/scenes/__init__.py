@@ -15,7 +15,6 @@ from torchtransient.scenes.nlos import nlos_plates as nlos_plates
 from torchtransient.scenes.nlos import nlos_room as nlos_room
 from torchtransient.scenes.nlos import nlos_z as nlos_z
 from torchtransient.scenes.nlos import relay_wall as relay_wall
-from torchtransient.scenes.transforms import identity as identity
 from torchtransient.scenes.transforms import look_at as look_at
 from torchtransient.scenes.transforms import rotate as rotate
 from torchtransient.scenes.transforms import scale as scale

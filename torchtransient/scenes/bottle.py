@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchtransient.checks import finite, positive
-from torchtransient.errors import SceneError, UnitError
+from torchtransient.errors import UnitError
 from torchtransient.scenes.parts import SceneDict, checked_depth, diffuse, perspective, transient_film
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
@@ -35,30 +35,11 @@ def lathe(profile: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float
 
     Returns:
         Vertices (V, 3) and triangles (F, 3).
-
-    Raises:
-        SceneError: for an outline that does not start and end on the axis or has fewer than three points, and for too
-            few segments.
     """
-    profile = np.asarray(profile, dtype=np.float64)
-    if profile.ndim != 2 or profile.shape[1] != 2 or len(profile) < 3 or np.any(profile[[0, -1], 0] != 0):
-        raise SceneError(
-            "lathe: expected an outline (N, 2) of radius and height, N >= 3, that starts and ends at r = 0"
-        )
-    if np.any(profile[1:-1, 0] <= 0):
-        raise SceneError("lathe: expected positive radii between the two ends of the outline")
-    if segments < 3:
-        raise SceneError(f"lathe: expected at least 3 segments, got {segments}")
     angle = 2 * math.pi * np.arange(segments) / segments
     rings = profile[1:-1]
-    ring_points = np.stack(
-        [
-            rings[:, :1] * np.cos(angle),
-            np.repeat(rings[:, 1:], segments, axis=1),
-            rings[:, :1] * np.sin(angle),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    across, up = rings[:, :1], np.repeat(rings[:, 1:], segments, axis=1)
+    ring_points = np.stack([across * np.cos(angle), up, across * np.sin(angle)], axis=-1).reshape(-1, 3)
     low, high = len(ring_points), len(ring_points) + 1
     vertices = np.concatenate([ring_points, [[0.0, profile[0, 1], 0.0], [0.0, profile[-1, 1], 0.0]]])
     here, there = np.arange(segments), (np.arange(segments) + 1) % segments

@@ -9,6 +9,9 @@ from torchtransient.checks import finite, positive
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
 
+# Of all scenes with a closed form: beyond their depths.
+_NO_ROULETTE = 1000
+
 
 def _camera(resolution: int, num_bins: int, start_opl: float, bin_width_opl: float, spp: int, fov: float) -> SceneDict:
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
@@ -26,13 +29,11 @@ def furnace(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int | None = 1000,
-    emitter_sampling: bool = False,
 ) -> SceneDict:
     """Return a diffuse sphere that emits from its whole inner side, seen from its centre.
 
-    Every pixel sees the same light. By default a dark point light at the centre takes the emitter samples, and emission
-    is found by BSDF sampling alone, which leaves no noise in the image.
+    Every pixel sees the same light. A dark point light at the centre takes the emitter samples, and emission is found
+    by BSDF sampling alone, which leaves no noise in the image.
 
     Args:
         radius: metres.
@@ -45,32 +46,24 @@ def furnace(
         spp: samples per pixel.
         max_depth: segments of the longest path. The truncation leaves out the energy ``radiance *
             reflectance**max_depth / (1 - reflectance)``.
-        rr_depth: start of Russian roulette, by default beyond `max_depth`.
-        emitter_sampling: sample the wall itself, too. Rays start a little off the wall (1.8e-4 of the radius), where
-            the two strategies meet other points of it, which makes the furnace 0.03 % too dark. Mitsuba's own
-            integrators are 0.17 % too bright there (3.9.1): its sphere light gives some points of its own surface the
-            density of a sphere seen from outside.
 
     Closed form: `closed_forms.furnace`.
     """
-    scene: SceneDict = {
+    return {
         "type": "scene",
-        "integrator": transient_path(max_depth, rr_depth),
+        "integrator": transient_path(max_depth, _NO_ROULETTE),
         "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 45.0),
         "wall": {
             "type": "sphere",
             "radius": positive("radius", radius),
             "flip_normals": True,
             "bsdf": diffuse(reflectance),
-            "emitter": {"type": "area", "radiance": finite("radiance", radiance)},
+            "emitter": {"type": "area", "radiance": finite("radiance", radiance), "sampling_weight": 0.0},
         },
-    }
-    if not emitter_sampling:
-        scene["wall"]["emitter"]["sampling_weight"] = 0.0
         # Not zero: spectral variants refuse a light without any energy. Added to anything in float32 it changes
         # nothing.
-        scene["dark"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1e-30}
-    return scene
+        "dark": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 1e-30},
+    }
 
 
 def integrating_sphere(
@@ -84,7 +77,6 @@ def integrating_sphere(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """Return a diffuse sphere lit by a point source at its centre and seen from there.
 
@@ -101,11 +93,10 @@ def integrating_sphere(
         bin_width_opl: width of a bin, metres of optical path.
         spp: samples per pixel.
         max_depth: segments of the longest path.
-        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     return {
         "type": "scene",
-        "integrator": transient_path(max_depth, rr_depth),
+        "integrator": transient_path(max_depth, _NO_ROULETTE),
         "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 45.0),
         "light": {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": finite("intensity", intensity)},
         "wall": {
@@ -129,7 +120,6 @@ def parallel_plates(
     bin_width_opl: float = 0.05,
     spp: int = 256,
     max_depth: int = 64,
-    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """Return two emitting diffuse squares that face each other, the camera half-way between them.
 
@@ -148,7 +138,6 @@ def parallel_plates(
         bin_width_opl: width of a bin, metres of optical path.
         spp: samples per pixel.
         max_depth: segments of the longest path.
-        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     gap = positive("separation", separation)
     size = scale(positive("half_extent", half_extent))
@@ -163,7 +152,7 @@ def parallel_plates(
 
     return {
         "type": "scene",
-        "integrator": transient_path(max_depth, rr_depth),
+        "integrator": transient_path(max_depth, _NO_ROULETTE),
         "sensor": _camera(resolution, num_bins, start_opl, bin_width_opl, spp, 0.5),
         "back": plate(translate([0.0, 0.0, -gap / 2]) @ size),
         "front": plate(translate([0.0, 0.0, gap / 2]) @ rotate([0, 1, 0], 180) @ size),

@@ -8,13 +8,12 @@ a scan, x runs to the right and y up, so that letters read as usual.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import finite, flag, positive, real_array, shown, transform
-from torchtransient.errors import ArgumentError, SceneError, ShapeError
+from torchtransient.checks import finite, flag, positive, transform
+from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.scenes.meshes import Albedo, Mesh, ellipsoid, joined, plate, sheet, solid, subdivided, triangle_mesh
 from torchtransient.scenes.parts import SceneDict, diffuse
 from torchtransient.scenes.transforms import rotate, scale, translate
@@ -120,8 +119,8 @@ def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
     Raises:
         ArgumentError: for other letters.
     """
-    if not isinstance(letter, str) or letter not in OUTLINES:
-        raise ArgumentError(f"letter: expected one of {', '.join(OUTLINES)}, got {shown(letter)}")
+    if letter not in OUTLINES:
+        raise ArgumentError(f"letter: expected one of {', '.join(OUTLINES)}, got {letter!r}")
     return (np.array(OUTLINES[letter], dtype=np.float64) - 0.5) * size
 
 
@@ -232,8 +231,6 @@ def bounds(shapes: SceneDict) -> NDArray[np.float64]:
     Raises:
         SceneError: for other shapes, and for a dictionary without any.
     """
-    if not isinstance(shapes, dict):
-        raise SceneError(f"bounds: expected a dictionary of shapes, got {shown(shapes)}")
     boxes = [_bounds_of(name, shape) for name, shape in shapes.items() if isinstance(shape, dict)]
     if not boxes:
         raise SceneError("bounds: expected a dictionary of shapes, got one without any")
@@ -241,16 +238,16 @@ def bounds(shapes: SceneDict) -> NDArray[np.float64]:
 
 
 def _bounds_of(name: str, shape: SceneDict) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    kind, matrix = shape.get("type"), transform(f"{name}: to_world", shape.get("to_world", np.eye(4)))
+    kind, matrix = shape["type"], transform(f"{name}: to_world", shape.get("to_world", np.eye(4)))
     if kind == "sphere":
-        center = matrix[:3, :3] @ _rows(name, "center", shape.get("center", [0.0, 0.0, 0.0])) + matrix[:3, 3]
+        center = matrix[:3, :3] @ np.asarray(shape.get("center", [0.0, 0.0, 0.0])) + matrix[:3, 3]
         reach = positive(f"{name}: radius", shape.get("radius", 1.0)) * np.linalg.norm(matrix[:3, :3], axis=1)
         return center - reach, center + reach
     if kind == "disk":
         reach = np.linalg.norm(matrix[:3, :2], axis=1)
         return matrix[:3, 3] - reach, matrix[:3, 3] + reach
     if kind == "mesh_arrays":
-        points = _rows(name, "vertices", shape.get("vertices"))
+        points = np.asarray(shape["vertices"], dtype=np.float64)
     elif kind in ("rectangle", "cube"):
         depths = (0.0,) if kind == "rectangle" else (-1.0, 1.0)
         points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in depths], dtype=np.float64)
@@ -258,13 +255,6 @@ def _bounds_of(name: str, shape: SceneDict) -> tuple[NDArray[np.float64], NDArra
         raise SceneError(f"bounds: expected rectangles, disks, cubes, spheres or mesh_arrays, got {kind!r} at {name}")
     placed = points @ matrix[:3, :3].T + matrix[:3, 3]
     return placed.min(0), placed.max(0)
-
-
-def _rows(name: str, entry: str, values: Any) -> NDArray[np.float64]:
-    rows = real_array(values)
-    if rows is None or not rows.size or rows.shape[-1] != 3:
-        raise ShapeError(f"bounds: expected {entry} of {name} as rows of three numbers, got {shown(values)}")
-    return rows
 
 
 # --------------------------------------------------------------------------------------------------------------- a room

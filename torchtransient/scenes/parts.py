@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
-from torchtransient.checks import Numbers, count, finite, positive, shares, shown, text
+from torchtransient.checks import Numbers, count, finite, positive, shares
 from torchtransient.errors import ArgumentError, SceneError
 from torchtransient.scenes.transforms import Matrix
 
@@ -26,17 +25,13 @@ def transient_film(
     Raises:
         SceneError, UnitError: for sizes below one, a width of zero or a start that is not finite.
     """
-    given: Any = resolution
-    array = getattr(given, "ndim", None)
-    several = array != 0 and isinstance(given, Iterable) and not isinstance(given, (str, bytes))
-    sides = list(given) if several else [given, given]
+    sides = resolution if isinstance(resolution, tuple | list) else (resolution, resolution)
     if len(sides) != 2:
-        raise SceneError(f"resolution: expected one side in pixels or (width, height), got {shown(resolution)}.")
-    width, height = sides
+        raise SceneError(f"resolution: expected one side in pixels or (width, height), got {resolution!r}.")
     return {
         "type": "transient_hdr_film",
-        "width": count("resolution", width),
-        "height": count("resolution", height),
+        "width": count("resolution", sides[0]),
+        "height": count("resolution", sides[1]),
         "rfilter": {"type": "box"},
         "temporal_bins": count("num_bins", num_bins),
         "start_opl": finite("start_opl", start_opl),
@@ -44,9 +39,7 @@ def transient_film(
     }
 
 
-def perspective(
-    to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent", near_clip: float = 1e-3
-) -> SceneDict:
+def perspective(to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler: str = "independent") -> SceneDict:
     """Return a pinhole camera.
 
     Args:
@@ -55,19 +48,15 @@ def perspective(
         film: dictionary of the film.
         spp: samples per pixel.
         sampler: plugin name of the sampler.
-        near_clip: metres.
     """
     return {
         "type": "perspective",
         "fov_axis": "smaller",
         "fov": positive("fov", fov),
-        "near_clip": positive("near_clip", near_clip),
+        "near_clip": 1e-3,
         "far_clip": 100.0,
         "to_world": to_world,
-        "sampler": {
-            "type": text("sampler", sampler, "the plugin name of a sampler"),
-            "sample_count": count("spp", spp),
-        },
+        "sampler": {"type": sampler, "sample_count": count("spp", spp)},
         "film": film,
     }
 

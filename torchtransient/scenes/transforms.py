@@ -27,11 +27,6 @@ def _triple(name: str, values: Triple) -> NDArray[np.float64]:
     return array
 
 
-def identity() -> Matrix:
-    """Return the transform (4, 4) that moves nothing."""
-    return np.eye(4)
-
-
 def translate(offset: Triple) -> Matrix:
     """Return a shift (4, 4).
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchtransient.checks import count, finite, is_one_of, positive, shown
+from torchtransient.checks import count, finite, positive
 from torchtransient.errors import ArgumentError
 from torchtransient.scenes.parts import SceneDict, diffuse, perspective, transient_film, transient_path
 from torchtransient.scenes.transforms import look_at, rotate, scale, translate
@@ -124,7 +124,6 @@ def etalon_slab(
     bin_width_opl: float = 0.05,
     spp: int = 1024,
     max_depth: int = 32,
-    rr_depth: int | None = 1000,
 ) -> SceneDict:
     """Return a smooth glass slab met head-on by the camera, with an area light behind or in front of it.
 
@@ -143,22 +142,21 @@ def etalon_slab(
         bin_width_opl: width of a bin, metres of optical path.
         spp: samples per pixel.
         max_depth: segments of the longest path.
-        rr_depth: start of Russian roulette, None for the plugin's own.
     """
     d = positive("thickness", thickness)
-    if not is_one_of(light, ("behind", "front")):
-        raise ArgumentError(f"etalon_slab: expected light='behind' or light='front', got {shown(light)}")
     if light == "behind":
         emitter_to_world = translate([0.0, 0.0, -1.0])
-    else:
+    elif light == "front":
         emitter_to_world = translate([0.0, 0.0, d + 2.0]) @ rotate([0, 1, 0], 180)
+    else:
+        raise ArgumentError(f"etalon_slab: expected light='behind' or light='front', got {light!r}")
     film = transient_film(resolution, num_bins, start_opl, bin_width_opl)
     # The cube's faces are pairs of triangles; one ray in 1e4 would slip through the diagonal if the camera looked along
     # it.
     slab_to_world = translate([3.0, 0.0, d / 2]) @ scale([10.0, 10.0, d / 2])
     return {
         "type": "scene",
-        "integrator": transient_path(max_depth, rr_depth),
+        "integrator": transient_path(max_depth, 1000),
         "sensor": perspective(look_at([0.0, 0.0, d + 1.0], [0.0, 0.0, 0.0]), 0.1, film, spp),
         "slab": {
             "type": "cube",

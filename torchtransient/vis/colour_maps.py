@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import as_number, shown
-from torchtransient.errors import UnitError
 from torchtransient.vis.files import figure_type
 
 if TYPE_CHECKING:
@@ -34,8 +32,6 @@ _LMS_TO_RGB = np.array([
 
 # Hues that run from red over yellow and green to violet: those of a rainbow, without the purple that would close it.
 _FIRST_HUE, _LAST_HUE = 25.0, 305.0
-# Kinds of cyclic maps.
-CYCLES = ("even", "hsv")
 
 
 def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
@@ -106,16 +102,10 @@ def symmetric_limit(values: Any, percentile: float = 99.0) -> float:
 
     Returns:
         The percentile; the maximum where that is zero, 1 where all are.
-
-    Raises:
-        UnitError: for a percentile outside of 0 to 100.
     """
-    share = as_number(percentile)
-    if share is None or not 0 <= share <= 100:
-        raise UnitError(f"percentile: expected a number from 0 to 100, got {shown(percentile)}.")
     size = np.abs(np.asarray(values, dtype=np.float64)).ravel()
     size = size[np.isfinite(size)]
     if not size.size or size.max() == 0:
         return 1.0
-    limit = float(np.percentile(size, share))
+    limit = float(np.percentile(size, percentile))
     return limit if limit > 0 and math.isfinite(1 / limit) else float(size.max())

@@ -54,18 +54,12 @@ def contact_sheet(
         The matplotlib figure.
 
     Raises:
-        ShapeError: without samples, and for different images.
+        ShapeError: without samples.
         StorageError: when the figure cannot be written.
     """
     if not cells:
         raise ShapeError("contact_sheet: expected at least one sample, got none.")
     names = list(cells[0].images)
-    for each in cells:
-        if set(each.images) != set(names):
-            raise ShapeError(
-                f"contact_sheet: expected the images {', '.join(names) or 'none'} of every sample, as the first has "
-                f"them, got {', '.join(each.images) or 'none'}."
-            )
     curves = any(cell.curve is not None for cell in cells)
     cell = (len(names) * _PICTURE + 0.15, _PICTURE + _TITLE + (_CURVE if curves else 0.0))
     across = max(1, min(len(cells), round(math.sqrt(len(cells) * cell[1] / cell[0]))))

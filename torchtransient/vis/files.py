@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -92,18 +93,16 @@ def check_picture(path: str | Path, who: str = "picture") -> None:
 
 
 @contextmanager
-def _place_of(path: Any, who: str) -> Iterator[tuple[Path, str]]:
+def _place_of(path: str | Path, who: str) -> Iterator[tuple[Path, str]]:
     """Yield a name to write to, which takes the place of `path` once it is whole, and the ending of `path`."""
-    try:
-        target = check_folder(path, who)
-        with replacing(target, who) as unfinished:
+    target = check_folder(path, who)
+    with replacing(target, who) as unfinished:
+        try:
             yield unfinished, target.suffix.lstrip(".").lower()
-    except StorageError as error:
-        said = str(error).removeprefix(f"{who}: ").removeprefix(f"'{path}' could not be written: ")
-        raise StorageError(f"{who}: cannot write '{path}': {said}") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # of an unknown ending, too
-        said = short_message(error)
-        raise StorageError(f"{who}: cannot write '{path}': {said}. Choose a writable .png.") from error
+        except (OSError, ValueError, KeyError) as error:  # of an unknown ending, too
+            raise StorageError(
+                f"{who}: '{path}' could not be written: {short_message(error)}. Choose a writable .png."
+            ) from error
 
 
 def to_palette(path: str | Path) -> None:
@@ -120,13 +119,30 @@ def to_palette(path: str | Path) -> None:
     few.save(path, optimize=True)
 
 
+def needed(module: str, package: str, extra: str = "vis") -> Any:
+    """Return a module of a package that may be missing.
+
+    Args:
+        module: its full name.
+        package: package that has it.
+        extra: extra of this library that brings the package.
+
+    Raises:
+        MissingPackageError: without the package.
+    """
+    try:
+        importlib.import_module(module.partition(".")[0])
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingPackageError(
+            f"this needs the package {package}. Install it with pip install 'torchtransient[{extra}]'."
+        ) from error
+
+
 def figure_type() -> type[Figure]:
     """Return matplotlib's Figure, which draws without a window. Raises MissingPackageError without matplotlib."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing("matplotlib") from error
-    return Figure
+    found: type[Figure] = needed("matplotlib.figure", "matplotlib").Figure
+    return found
 
 
 def picture_figure(height: int, width: int, panels: int = 1, side: float = 4.2, columns: int = 4) -> tuple[Figure, Any]:
@@ -162,11 +178,7 @@ def enlarge(image: Image, factor: int) -> Image:
 
 def pillow() -> Any:
     """Return the module PIL.Image. Raises MissingPackageError without Pillow."""
-    try:
-        import PIL.Image
-    except ImportError as error:
-        raise missing("pillow") from error
-    return PIL.Image
+    return needed("PIL.Image", "pillow")
 
 
 def grey_where_broken(name: str) -> Any:
@@ -178,18 +190,4 @@ def grey_where_broken(name: str) -> Any:
     Raises:
         MissingPackageError: without matplotlib.
     """
-    figure_type()
-    import matplotlib
-
-    return matplotlib.colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))
-
-
-def missing(package: str) -> MissingPackageError:
-    """Return the error of pictures without a package.
-
-    Args:
-        package: to install.
-    """
-    return MissingPackageError(
-        f"pictures need the package {package}. Install it with pip install 'torchtransient[vis]'."
-    )
+    return needed("matplotlib", "matplotlib").colormaps[name].with_extremes(bad=(0.5, 0.5, 0.5))

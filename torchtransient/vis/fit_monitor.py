@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import math
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +19,11 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_number, count, mapping, numbers, path_of, several, shown, some_of
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError
+from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.vis.colour_maps import symmetric_limit
-from torchtransient.vis.files import figure_type, save_figure, to_bytes
+from torchtransient.vis.files import figure_type, needed, save_figure, to_bytes
 from torchtransient.vis.fit_page import Curve, Moment, Panel, Picture, write_page
-from torchtransient.vis.sources import Source, given_tensor, images_of, pixel_of, real_tensor
+from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of
 from torchtransient.vis.tone_mapping import exposure_of, tone_map
 
 if TYPE_CHECKING:
@@ -146,11 +144,10 @@ class FitMonitor:
             of the time. Losses have all points. A page has 120 moments at most, evenly spread.
         log_dir: folder of a TensorBoard log: scalars ``loss/NAME``, ``parameter/NAME``, ``gradient_noise/NAME``, and
             the picture ``fit``, all of them at looks. Needs the package tensorboard (extra ``tensorboard``).
-        live: True shows the figure with IPython; None does so in notebooks.
 
     Raises:
-        ArgumentError: for parameters of another kind, truth of names that are not shown.
-        ShapeError: for a target that is neither a transient nor an image, pixels outside of it, ``every`` < 1.
+        ArgumentError: for truth of names that are not shown.
+        ShapeError: for a target that is neither a transient nor an image, pixels outside of it.
         MissingPackageError: without matplotlib or tensorboard, where they are needed.
     """
 
@@ -164,19 +161,17 @@ class FitMonitor:
         axis: TimeAxis | None = None,
         every: int | None = None,
         log_dir: str | Path | None = None,
-        live: bool | None = None,
     ) -> None:
-        if not isinstance(parameters, nn.Module):
-            given = mapping("FitMonitor: parameters", parameters, "{name: tensor}, or a module")
-            parameters = {name: given_tensor(value, f"FitMonitor: {name!r}") for name, value in given.items()}
         self._parameters = parameters
-        self._turns = _Turns(None if every is None else count("FitMonitor: every", every, error=ShapeError))
+        self._turns = _Turns(every)
         self._axis = axis if axis is not None else getattr(parameters, "axis", None)
-        self._pixels: list[Any] = list(several("FitMonitor: pixels", pixels, "pixels (row, column)"))
+        self._pixels = list(pixels)
         self._target = None if target is None else self._light(0, target)
-        aims = mapping("FitMonitor: truth", truth or {}, "{name: numbers}")
-        self._truth = {name: numbers(f"FitMonitor: truth of {name!r}", v).ravel().tolist() for name, v in aims.items()}
-        self._check_names(self._truth)
+        self._truth = {name: _numbers(aim) for name, aim in (truth or {}).items()}
+        known = [key for key, _ in self._shown_values()]
+        unknown = [name for name in self._truth if name not in known]
+        if unknown:
+            raise ArgumentError(f"FitMonitor: expected truth of some of {', '.join(known)}, got {', '.join(unknown)}.")
         self._next = 0
         self._pending: list[tuple[int, dict[str, Any]]] = []
         self._losses: dict[str, _Track] = {}
@@ -188,9 +183,10 @@ class FitMonitor:
         self._lights: list[_Light] = []
         self._now: _Light | None = None
         self._looks, self._between = 0, 1
-        self._seen_output = False
-        self._live = _in_notebook() if live is None else live
-        self._writer = None if log_dir is None else _writer(path_of(log_dir, "FitMonitor: log_dir"))
+        self._live = _in_notebook()
+        self._writer: Any = None
+        if log_dir is not None:
+            self._writer = needed("torch.utils.tensorboard", "tensorboard", "tensorboard").SummaryWriter(log_dir)
         if self._live or self._writer is not None:
             figure_type()  # whose import is no cost of a step
         self._handle: Any = None
@@ -199,52 +195,34 @@ class FitMonitor:
     # -------------------------------------------------------------------------------------------------- in the loop
 
     @torch.no_grad()
-    def step(
-        self, loss: Tensor | float | Mapping[str, Any], output: Source | None = None, step: int | None = None
-    ) -> None:
+    def step(self, loss: Tensor | float | Mapping[str, Any], output: Source | None = None) -> None:
         """Take in a step of the loop, after ``backward`` and before the gradients are set to zero.
 
         Args:
             loss: a number, or several by name.
-            output: light of the step, in the form and unit of ``target``; read in steps that are looked at.
-            step: number of the step; None counts on.
+            output: light of the step, in the form and unit of ``target``; read in steps that are looked at. Without
+                it a fit is watched without its light.
 
         Raises:
-            ArgumentError: for a loss that is no number.
-            ShapeError: for a loss of several, an output that is no light, or not over the target's channels, bins and
-                pixels; of outputs at the first one already.
+            ShapeError: for an output that is no light, or not over the target's channels, bins and pixels.
         """
-        number = self._next if step is None else count("FitMonitor.step: step", step, 0, ArgumentError)
+        number = self._next
         self._next = number + 1
         begin = time.perf_counter()
         look, taken = self._turns.begin(number, begin)
         losses = loss if isinstance(loss, Mapping) else {"loss": loss}
-        self._pending.append((number, {name: _number(name, value) for name, value in losses.items()}))
+        # Tensors stay on their device until they are looked at.
+        self._pending.append((number, {n: v.detach() if isinstance(v, Tensor) else v for n, v in losses.items()}))
         for key, leaf in self._differentiated if taken else ():
             if leaf.grad is not None:
                 self._gradients[key].add(number, leaf.grad)
-        if output is not None and (look or not self._seen_output):
-            light = self._light_of_step(number, output)
-            self._seen_output = True
-        else:
-            light = None
         if look:
-            self._look(number, light)
+            self._look(number, output)
         self._turns.end(begin, look)
         if look and (self._live or self._writer is not None) and time.perf_counter() >= self._draw_again:
             self._show()
 
-    def _light_of_step(self, number: int, output: Source) -> _Light:
-        """Return the light of a step, checked against the target: the first output is, whichever steps are looked at.
-        """
-        try:
-            light = self._light(number, output)
-            self._check_like_target(light)
-        except ShapeError as error:
-            raise ShapeError(f"{error} monitor.step(loss), without the output, watches a fit without light.") from None
-        return light
-
-    def _look(self, number: int, light: _Light | None) -> None:
+    def _look(self, number: int, output: Source | None) -> None:
         self._take_losses()
         for name, gradient in self._gradients.items():
             share = gradient.share()
@@ -252,8 +230,8 @@ class FitMonitor:
                 self._noise.setdefault(name, _Track()).add(number, [share])
         for name, value in self._shown_values():
             self._values.setdefault(name, _Track()).add(number, _row(value))
-        if light is not None:
-            self._take_light(light)
+        if output is not None:
+            self._take_light(self._light(number, output))
         if self._writer is not None:
             for name, track in self._losses.items():
                 if track.steps[-1] == number:
@@ -280,17 +258,6 @@ class FitMonitor:
         else:
             yield from self._leaves()
 
-    def _check_names(self, names: Iterable[str]) -> None:
-        known = [key for key, _ in self._shown_values()]
-        for name in names:
-            if name not in known:
-                parts = [key for key in known if f".{name}." in f".{key}."]
-                near = some_of(map(repr, parts or difflib.get_close_matches(str(name), known, 3, 0.5)))
-                raise ArgumentError(
-                    f"FitMonitor: expected names of parameters in truth, got {name!r}. "
-                    f"{f'Did you mean {near}? ' if near else ''}There are: {some_of(known) or 'none'}."
-                )
-
     def _is_many(self, name: str) -> bool:
         return any(value.numel() > MOST_CURVES for key, value in self._shown_values() if key == name)
 
@@ -303,7 +270,7 @@ class FitMonitor:
     def _light(self, number: int, source: Source) -> _Light:
         who, axis, bins = "FitMonitor: light", None, "bin"
         if getattr(source, "ndim", None) == 3:
-            image = real_tensor(source, who).detach().cpu()
+            image = as_tensor(source, who)
             cube = image[:, None]
         else:
             cube, axis, bins = images_of(source, None, who)
@@ -321,25 +288,20 @@ class FitMonitor:
         # Images of a film's memory are written again by the next step.
         return _Light(number, image.clone(), np.stack(curves) if curves else np.empty((0, 0)), places, label)
 
-    def _check_like_target(self, light: _Light) -> None:
-        target = self._target
-        if target is None:
-            return
-        if light.image.shape != target.image.shape:
-            raise ShapeError(
-                "FitMonitor.step: expected light of the target's channels and pixels, "
-                f"{tuple(target.image.shape)}, got {tuple(light.image.shape)}."
-            )
+    def _check_like_target(self, light: _Light, target: _Light) -> None:
         bins, got = len(target.places), len(light.places)
         # Images have no bins; without an axis places are numbers.
         same = got == bins and (light.x_label != target.x_label or np.allclose(light.places, target.places))
-        if not same and 1 not in (bins, got):
+        if light.image.shape != target.image.shape or not (same or 1 in (bins, got)):
             raise ShapeError(
-                f"FitMonitor.step: expected light over the target's {bins} bins, around {target.places[0]:g} to "
-                f"{target.places[-1]:g}, got {got}, around {light.places[0]:g} to {light.places[-1]:g}."
+                f"FitMonitor.step: expected light as the target's, (C, H, W) = {tuple(target.image.shape)} over {bins} "
+                f"bins from {target.places[0]:g} to {target.places[-1]:g}, got {tuple(light.image.shape)} over {got} "
+                f"from {light.places[0]:g} to {light.places[-1]:g}."
             )
 
     def _take_light(self, light: _Light) -> None:
+        if self._target is not None:
+            self._check_like_target(light, self._target)
         self._now = light
         self._looks += 1
         if (self._looks - 1) % self._between:
@@ -385,12 +347,8 @@ class FitMonitor:
         Args:
             path: file to write.
         """
-        ending = path_of(path, "FitMonitor.save: path").suffix.lower()
-        if ending not in (".html", ".htm"):
-            figure = self.figure()
-            if ending and ending[1:] not in figure.canvas.get_supported_filetypes():
-                raise StorageError(f"FitMonitor.save: expected a name that ends in .html or .png, got '{path}'.")
-            save_figure(figure, path, "FitMonitor.save")
+        if Path(path).suffix.lower() not in (".html", ".htm"):
+            save_figure(self.figure(), path, "FitMonitor.save")
             return
         self._take_losses()
         lights = list(self._lights)
@@ -414,16 +372,9 @@ class FitMonitor:
         are those that Lightning holds then: over batches that it accumulates, sums. Raises MissingPackageError without
         Lightning (extra ``lightning``).
         """
-        try:
-            from lightning.pytorch.callbacks import Callback
-        except ImportError as error:
-            raise MissingPackageError(
-                "FitMonitor.callback needs the package lightning. Install it with pip install "
-                "'torchtransient[lightning]'."
-            ) from error
-        monitor = self
+        monitor, callbacks = self, needed("lightning.pytorch.callbacks", "lightning", "lightning")
 
-        class MonitorCallback(Callback):
+        class MonitorCallback(callbacks.Callback):  # type: ignore[misc, name-defined]  # found when it is called
             def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
                 result = outputs if isinstance(outputs, Mapping) else {"loss": outputs}
                 monitor.step(result["loss"], result.get("output"))
@@ -502,16 +453,9 @@ class FitMonitor:
         return exposure_of((self._target or self._lights[0]).image)
 
 
-def _number(name: str, loss: Any) -> Tensor | float:
-    """A loss as it is; tensors stay on their device until they are looked at."""
-    if isinstance(loss, Tensor):
-        if loss.numel() != 1:
-            raise ShapeError(f"FitMonitor.step: expected {name!r} as one number, got {shown(loss)}.")
-        return loss.detach()
-    number = as_number(loss)
-    if number is None:
-        raise ArgumentError(f"FitMonitor.step: expected {name!r} as one number, got {shown(loss)}.")
-    return number
+def _numbers(values: Any) -> list[float]:
+    numbers: list[float] = torch.as_tensor(values, dtype=torch.float64).flatten().tolist()
+    return numbers
 
 
 def _curves(tracks: Mapping[str, _Track]) -> list[Curve]:
@@ -587,14 +531,3 @@ def _display(figure: Figure, handle: Any) -> Any:
 def _in_notebook() -> bool:
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
-
-
-def _writer(folder: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise MissingPackageError(
-            "FitMonitor: log_dir needs the package tensorboard. Install it with pip install "
-            "'torchtransient[tensorboard]'."
-        ) from error
-    return SummaryWriter(folder)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient.axes import FrequencyAxis
-from torchtransient.checks import Numbers, as_whole, count, several, shown
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.units import SPEED_OF_LIGHT
 from torchtransient.vis import colour_maps
@@ -24,7 +24,6 @@ from torchtransient.vis.videos import Frames, check_video, with_strip, write_vid
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_UNITS = (("THz", 1e12), ("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0))
 SHOWS = ("real", "imaginary", "amplitude", "phase", "domain")
 
 
@@ -35,10 +34,8 @@ def phasor_picture(
     show: Sequence[str] = ("real", "domain"),
     which: Sequence[int] = (0,),
     frequencies: FrequencyAxis | Numbers | None = None,
-    percentile: float = 99.0,
-    title: str = "",
 ) -> Figure:
-    """Draw phasor images, a row for each frequency and a panel for each quantity.
+    """Draw phasor images, a row for each frequency and a panel for each quantity; scales hold 99 % of the pixels.
 
     Args:
         source: complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
@@ -47,32 +44,26 @@ def phasor_picture(
             cyclic hue, grey where dark; "domain", hue by phase and brightness by amplitude.
         which: indices of the frequencies.
         frequencies: cycles per metre of optical path, for titles; None takes those of the source.
-        percentile: percentile of the pixels that scales hold.
-        title: text above the figure.
 
     Returns:
         The matplotlib figure. Pixels that are not finite are grey.
 
     Raises:
-        ShapeError: for another shape, an index outside, other numbers of frequencies.
+        ShapeError: for another shape, other numbers of frequencies.
+        IndexError: for an index outside.
         UnitError: for an unknown panel.
         StorageError: when the figure cannot be written.
     """
-    show = several("phasor_picture: show", show, "names of panels", str, UnitError)
-    if not show or any(name not in SHOWS for name in show):
+    if any(name not in SHOWS for name in show):
         raise UnitError(f"phasor_picture: expected panels out of {', '.join(SHOWS)}, got {tuple(show)}.")
-    images, known = _images(source, "phasor_picture")
-    frequencies = known if frequencies is None else frequencies_of(frequencies)
-    which = _indices(which, images, frequencies)
+    images, known = _images(source, frequencies, "phasor_picture")
     height, width = images.shape[1:]
     figure, panels = picture_figure(height, width, panels=len(show) * len(which), side=3.6, columns=len(show))
     for row, index in enumerate(which):
         values = images[index].numpy()
         for panel, name in zip(panels[row * len(show) :], show, strict=False):
-            panel.set_title(_label(index, frequencies, name), fontsize=9)
-            _draw(figure, panel, name, values, percentile)
-    if title:
-        figure.suptitle(title, fontsize=11)
+            panel.set_title(_label(index, known, name), fontsize=9)
+            _draw(figure, panel, name, values)
     return save_figure(figure, path, "phasor_picture")
 
 
@@ -106,20 +97,17 @@ def phasor_video(
         The path.
 
     Raises:
-        ShapeError: for another shape or an index outside.
+        ShapeError: for another shape, other numbers of frequencies.
+        IndexError: for an index outside.
         StorageError: as of ``video``.
     """
     check_video(path)
-    images, known = _images(source, "phasor_video")
-    frequencies = known if frequencies is None else frequencies_of(frequencies)
-    (chosen,) = _indices((which,), images, frequencies)
-    steps = count("phasor_video: steps", steps, 1, ShapeError)
-    values = np.nan_to_num(images[chosen].numpy(), posinf=0.0, neginf=0.0)
+    images, known = _images(source, frequencies, "phasor_video")
+    values = np.nan_to_num(images[which].numpy(), posinf=0.0, neginf=0.0)
     limit = colour_maps.symmetric_limit(np.abs(values))
     colours = grey_where_broken("RdBu_r")
     factor = max(1, round(320 / max(values.shape))) if scale is None else scale
-    factor = count("phasor_video: scale", factor, 1, ShapeError)
-    label = _label(chosen, frequencies, "real")
+    label = _label(which, known, "real")
 
     def make(index: int) -> Any:
         turned = np.real(values * np.exp(2j * math.pi * index / steps))
@@ -129,28 +117,28 @@ def phasor_video(
     return write_video(path, Frames(steps, make), steps, fps=fps, progress=progress)
 
 
-def _domain_colours(values: NDArray[Any], percentile: float) -> NDArray[np.float64]:
+def _domain_colours(values: NDArray[Any]) -> NDArray[np.float64]:
     """Return RGB (..., 3) in [0, 1]: hue by phase, red at 0, brightness by the root of the amplitude."""
     finite = np.isfinite(values)
     safe = np.where(finite, values, 0)
     amplitude = np.abs(safe)
-    level = np.sqrt(amplitude / colour_maps.symmetric_limit(amplitude, percentile))
+    level = np.sqrt(amplitude / colour_maps.symmetric_limit(amplitude))
     image = colour_maps.cyclic(np.angle(safe) / (2 * math.pi), level)
     image[~finite] = 0.5
     return image
 
 
-def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: float) -> None:
+def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any]) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     if name in ("real", "imaginary"):
         part = np.real(values) if name == "real" else np.imag(values)
-        limit = colour_maps.symmetric_limit(part, percentile)
+        limit = colour_maps.symmetric_limit(part)
         image = panel.imshow(part, cmap=grey_where_broken("RdBu_r"), vmin=-limit, vmax=limit, interpolation="nearest")
         figure.colorbar(image, ax=panel, shrink=0.8)
     elif name == "amplitude":
-        top = colour_maps.symmetric_limit(np.abs(values), percentile)
+        top = colour_maps.symmetric_limit(np.abs(values))
         colours = grey_where_broken("inferno")
         image = panel.imshow(np.abs(values), cmap=colours, vmin=0, vmax=top, interpolation="nearest")
         figure.colorbar(image, ax=panel, shrink=0.8)
@@ -159,27 +147,21 @@ def _draw(figure: Any, panel: Any, name: str, values: NDArray[Any], percentile: 
         if name == "phase":
             # What is as good as dark has no phase.
             amplitude = np.where(np.isfinite(values), np.abs(values), 0)
-            level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude, percentile)] = 0.5
-        panel.imshow(level if name == "phase" else _domain_colours(values, percentile), interpolation="nearest")
+            level[amplitude <= 1e-4 * colour_maps.symmetric_limit(amplitude)] = 0.5
+        panel.imshow(level if name == "phase" else _domain_colours(values), interpolation="nearest")
         bar = figure.colorbar(
             ScalarMappable(Normalize(-1, 1), colour_maps.cyclic_map()), ax=panel, shrink=0.8, label="phase"
         )
         bar.set_ticks([-1, -0.5, 0, 0.5, 1], labels=["$-\\pi$", "$-\\pi/2$", "0", "$\\pi/2$", "$\\pi$"])
 
 
-def _images(source: Source, who: str) -> tuple[Tensor, tuple[float, ...] | None]:
-    phasor, frequencies = phasor_of(source, who)
-    return phasor.to(torch.complex128).sum(0), frequencies
-
-
-def _indices(which: Sequence[int], images: Tensor, frequencies: Sequence[float] | None) -> list[int]:
-    many, which = images.shape[0], several("phasor picture: which", which, "numbers of frequencies")
-    found = [place for one in which if (place := as_whole(one)) is not None and 0 <= place < many]
-    if not found or len(found) < len(which):
-        raise ShapeError(f"phasor picture: expected indices out of {many} frequencies, got {shown(which)}.")
-    if frequencies is not None and len(frequencies) != many:
-        raise ShapeError(f"phasor picture: expected {many} frequencies, got {len(frequencies)}.")
-    return found
+def _images(source: Source, given: FrequencyAxis | Numbers | None, who: str) -> tuple[Tensor, tuple[float, ...] | None]:
+    """Return images (F, H, W), summed over channels, and their frequencies, given or those of the source."""
+    phasor, known = phasor_of(source, who)
+    known = known if given is None else frequencies_of(given)
+    if known is not None and len(known) != phasor.shape[1]:
+        raise ShapeError(f"{who}: expected {phasor.shape[1]} frequencies, as the phasors have, got {len(known)}.")
+    return phasor.to(torch.complex128).sum(0), known
 
 
 def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
@@ -188,6 +170,7 @@ def _label(index: int, frequencies: Sequence[float] | None, name: str) -> str:
     nu = frequencies[index]
     if nu == 0:
         return f"{name}, steady light"
-    hertz = abs(nu) * SPEED_OF_LIGHT
-    unit, size = next(pair for pair in _UNITS if hertz >= pair[1] or pair[1] == 1)
-    return f"{name}, wavelength {1 / nu:.3g} m ({hertz / size:.3g} {unit})"
+    from matplotlib.ticker import EngFormatter
+
+    hertz = float(f"{abs(nu) * SPEED_OF_LIGHT:.3g}")
+    return f"{name}, wavelength {1 / nu:.3g} m ({EngFormatter('Hz')(hertz)})"

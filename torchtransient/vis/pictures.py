@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +11,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient import checks
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_number, is_one_of, of_class, positive, several, shown
+from torchtransient.checks import positive
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.units import opl_to_seconds
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import Image, figure_type, picture_figure, save_figure, save_image, to_bytes
-from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of, real_tensor, transient_of
+from torchtransient.vis.sources import Source, as_tensor, images_of, pixel_of, transient_of
 from torchtransient.vis.tone_mapping import BROKEN, exposure_of, tone_map
 from torchtransient.vis.videos import moment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STYLES = ("peak", "fusion")
 _ROWS_AT_ONCE = 32
 
 # ------------------------------------------------------------------------------------------- when light arrives
@@ -88,8 +85,7 @@ def _moments_of_arrival(transient: Tensor, shares: tuple[float, ...] = (0.1, 0.5
 
 
 def _median_pixel(steady: Tensor) -> tuple[int, int]:
-    """Return (row, column) of the pixel of median brightness among those that see light: neither the lamp nor darkness.
-    """
+    """Return (row, column) of the pixel of median brightness among the lit ones: neither the lamp nor darkness."""
     brightness = steady.sum(0).flatten()
     order = brightness.argsort(stable=True)
     order = order[brightness[order] > 0] if bool((brightness > 0).any()) else order
@@ -103,29 +99,17 @@ def _row_bands(transient: Tensor) -> Iterator[Tensor]:
         yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
 
 
-def _on_axis(given: Any, axis: Any, who: str) -> Tensor:
-    transient = real_tensor(given, who)
-    if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.numel() == 0:
+def _on_axis(given: Any, axis: TimeAxis, who: str) -> Tensor:
+    transient = torch.as_tensor(given)
+    if transient.ndim != 4 or transient.shape[0] not in (1, 3) or transient.shape[1] != axis.num_bins:
         raise ShapeError(
-            f"{who}: expected a transient (C, T, H, W) with C = 1 or 3, got {tuple(transient.shape)}; of a batch, "
-            "choose one."
-        )
-    if transient.shape[1] != of_class(f"{who}: axis", axis, TimeAxis).num_bins:
-        raise ShapeError(
-            f"{who}: expected a transient with T = {axis.num_bins} bins as its axis has, got {transient.shape[1]}."
+            f"{who}: expected a transient (C, {axis.num_bins}, H, W) with C = 1 or 3 and the bins of the axis, got "
+            f"{tuple(transient.shape)}; of a batch, choose one."
         )
     return transient
 
 
 # -------------------------------------------------------------------------------------------------- one page of all
-
-
-@dataclass(frozen=True)
-class Overview:
-    """Moments (bins) and pixel (row, column) that `plot_overview` has drawn."""
-
-    frames: tuple[int, ...]
-    pixel: tuple[int, int]
 
 
 def plot_overview(
@@ -137,7 +121,7 @@ def plot_overview(
     pixel: tuple[int, int] | None = None,
     title: str = "",
     errors: Tensor | None = None,
-) -> Overview:
+) -> Figure:
     """Draw a render on one page: steady image, time of the peak, three moments, the histogram of a pixel.
 
     Args:
@@ -151,41 +135,30 @@ def plot_overview(
             over channels in the histogram.
 
     Returns:
-        The moments and the pixel that are shown.
+        The matplotlib figure.
 
     Raises:
         ShapeError: for other shapes or a pixel outside.
         StorageError: when the file cannot be written.
         MissingPackageError: without matplotlib (extra ``vis``).
     """
-    transient, steady = _on_axis(transient, axis, "plot_overview"), real_tensor(steady, "plot_overview: steady")
-    height, width = transient.shape[-2:]
-    if tuple(steady.shape) != (transient.shape[0], height, width):
-        expected = (transient.shape[0], height, width)
-        raise ShapeError(f"plot_overview: expected steady of shape {expected}, got {tuple(steady.shape)}.")
-    if errors is not None:
-        errors = real_tensor(errors, "plot_overview: errors")
-        if errors.shape != transient.shape[1:]:
-            raise ShapeError(
-                f"plot_overview: expected errors of shape {tuple(transient.shape[1:])}, got {tuple(errors.shape)}."
-            )
-    row, column = pixel_of(_median_pixel(steady) if pixel is None else pixel, (height, width), "plot_overview")
-    overview = Overview(tuple(_moments_of_arrival(transient)), (row, column))
+    transient, steady = _on_axis(transient, axis, "plot_overview"), torch.as_tensor(steady)
+    size = (transient.shape[-2], transient.shape[-1])
+    pixel = pixel_of(_median_pixel(steady) if pixel is None else pixel, size, "plot_overview")
     figure = figure_type()(figsize=(12.0, 7.4), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False).flat
     panels = upper.subplots(1, 3)
-    _draw_steady(panels[0], steady, overview.pixel)
+    _draw_steady(panels[0], steady, pixel)
     _draw_peak_time(upper, panels[1], transient, axis)
-    _draw_histogram(panels[2], transient, axis, overview.pixel, errors)
-    for panel, index in zip(lower.subplots(1, 3), overview.frames, strict=True):
+    _draw_histogram(panels[2], transient, axis, pixel, errors)
+    for panel, index in zip(lower.subplots(1, 3), _moments_of_arrival(transient), strict=True):
         panel.imshow(tone_map(transient[:, index].cpu()).numpy(), interpolation="nearest")
         opl, time_s = float(axis.centers_opl[index]), float(axis.centers_s[index])
         panel.set_title(f"{opl:.3f} m = {time_s * 1e9:.3f} ns (bin {index})", fontsize=10)
         panel.set_axis_off()
     if title:
         figure.suptitle(title, fontsize=11)
-    save_figure(figure, path, "plot_overview")
-    return overview
+    return save_figure(figure, path, "plot_overview")
 
 
 def _draw_steady(panel: Any, steady: Tensor, pixel: tuple[int, int]) -> None:
@@ -203,18 +176,17 @@ def _draw_peak_time(figure: Any, panel: Any, transient: Tensor, axis: TimeAxis) 
 
 
 def _draw_histogram(
-    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None = None
+    panel: Any, transient: Tensor, axis: TimeAxis, pixel: tuple[int, int], errors: Tensor | None
 ) -> None:
     values = transient[:, :, pixel[0], pixel[1]].detach().cpu().numpy()
     if errors is not None:
-        band, mean = 2 * errors[:, pixel[0], pixel[1]].detach().cpu().numpy(), values.mean(0)
+        band, mean = 2 * torch.as_tensor(errors)[:, pixel[0], pixel[1]].detach().cpu().numpy(), values.mean(0)
         edges = axis.edges_opl.numpy()
         panel.stairs(mean + band, edges, baseline=mean - band, fill=True, color="0.85")
         label = "mean over channels, 2 standard errors of its cell"
         panel.stairs(mean, edges, color="0.4", linewidth=0.8, label=label)
         panel.legend(fontsize=8, frameon=False)
-    colours = ("tab:red", "tab:green", "tab:blue") if len(values) == 3 else ("black",)
-    for curve, colour in zip(values, colours, strict=True):
+    for curve, colour in zip(values, _line_colours(len(values)), strict=True):
         panel.stairs(curve, axis.edges_opl.numpy(), color=colour, linewidth=1.0)
     panel.set_xlabel("optical path length (m)")
     panel.set_ylabel("radiance in a bin")
@@ -230,15 +202,15 @@ def peak_time_picture(
     path: str | Path | None = None,
     *,
     axis: TimeAxis | None = None,
-    limits: tuple[float, float] | None = None,
     title: str = "",
 ) -> Figure:
     """Draw the :func:`peak_time` of every pixel, with a colour bar in metres and in nanoseconds.
 
+    The scale holds 98 % of the pixels.
+
     Args:
         source, axis: as in ``frames``.
         path: file to write the figure to.
-        limits: ends of the scale, metres; None for where 1 % and 99 % of the pixels are.
         title: text above the picture.
 
     Returns:
@@ -246,7 +218,6 @@ def peak_time_picture(
 
     Raises:
         ShapeError: for other shapes, and without an axis.
-        UnitError: for limits that do not rise.
         StorageError: when the figure cannot be written.
     """
     cube, axis = transient_of(source, axis, "peak_time_picture")
@@ -256,7 +227,7 @@ def peak_time_picture(
             "axis=TimeAxis(...), or a RenderOutput, which knows its own."
         )
     peaks = peak_time(torch.nan_to_num(cube, posinf=0.0, neginf=0.0), axis).numpy()
-    low, high = _limits(peaks, axis, limits)
+    low, high = _limits(peaks, axis)
     figure, (panel,) = picture_figure(peaks.shape[0], peaks.shape[1], side=5.0)
     panel.set_facecolor("0.6")
     panel.set_axis_on()
@@ -298,8 +269,6 @@ def rainbow(
         UnitError: for limits that do not rise, and a period or an exposure that is not positive.
         StorageError: when the image cannot be written.
     """
-    if not is_one_of(style, STYLES):
-        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {shown(style)}.")
     cube, axis = transient_of(source, axis, "rainbow")
     axis = axis or TimeAxis(0.0, 1.0, cube.shape[1])
     steady = cube.sum((0, 1))
@@ -307,11 +276,15 @@ def rainbow(
     cube = torch.nan_to_num(cube, posinf=0.0, neginf=0.0)
     image = torch.nan_to_num(steady, nan=0.0, posinf=0.0, neginf=0.0)[None]
     level = tone_map(image, exposure_of(image, 0.95) if exposure is None else exposure)[..., 0].numpy()
-    low, high = _arrival_limits(cube, axis) if limits is None else checked_limits(limits)
+    low, high = _arrival_limits(cube, axis) if limits is None else limits
+    if not low < high:
+        raise UnitError(f"rainbow: expected limits in metres, the first below the second, got {limits!r}.")
     if style == "peak":
         colours = colour_maps.rainbow(_hue(peak_time(cube, axis).numpy(), low, high, period_opl), level)
-    else:
+    elif style == "fusion":
         colours = _fused(cube, _hue(axis.centers_opl.numpy(), low, high, period_opl), level)
+    else:
+        raise ArgumentError(f"rainbow: expected style 'peak' or 'fusion', got {style!r}.")
     colours[broken] = BROKEN
     return save_image(to_bytes(colours), path, "rainbow")
 
@@ -351,9 +324,7 @@ def _to_linear(shown: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4))
 
 
-def _limits(peaks: NDArray[np.float64], axis: TimeAxis, limits: tuple[float, float] | None) -> tuple[float, float]:
-    if limits is not None:
-        return checked_limits(limits)
+def _limits(peaks: NDArray[np.float64], axis: TimeAxis) -> tuple[float, float]:
     known = peaks[np.isfinite(peaks)]
     if not known.size:
         return axis.start_opl, axis.end_opl
@@ -368,25 +339,6 @@ def _arrival_limits(cube: Tensor, axis: TimeAxis) -> tuple[float, float]:
     edges = torch.searchsorted(arrived / arrived[-1], torch.tensor([0.01, 0.99], dtype=torch.float64))
     first, last = (axis.start_opl + float(k) * axis.bin_width_opl for k in edges)
     return first, last + axis.bin_width_opl
-
-
-def checked_limits(limits: tuple[float, float]) -> tuple[float, float]:
-    """Return two lengths in metres.
-
-    Args:
-        limits: the pair.
-
-    Raises:
-        ShapeError: for anything else than two numbers.
-        UnitError: for lengths that do not rise.
-    """
-    pair = checks.real_array(limits)
-    if pair is None or pair.shape != (2,):
-        raise ShapeError(f"limits: expected two lengths in metres, got {shown(limits)}.")
-    low, high = pair.tolist()
-    if not (np.isfinite(pair).all() and low < high):
-        raise UnitError(f"limits: expected two lengths in metres, the first below the second, got {limits!r}.")
-    return low, high
 
 
 # ------------------------------------------------------------------------------------ cuts, moments and histograms
@@ -421,16 +373,12 @@ def streak(
     cube, axis = transient_of(source, axis, "streak")
     if row is not None and column is not None:
         raise ArgumentError("streak: expected row or column, got both.")
-    number, what = (column, "column") if column is not None else (row, "row")
-    count = cube.shape[3] if what == "column" else cube.shape[2]
-    number = count // 2 if number is None else number
-    place = checks.as_whole(number)
-    if place is None or not -count <= place < count:
-        raise ShapeError(
-            f"streak: {what} {shown(number)} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}."
-        )
-    number = place % count
-    line: Tensor = cube[:, :, :, number] if what == "column" else cube[:, :, number]
+    what, given, dim = ("row", row, 2) if column is None else ("column", column, 3)
+    number = cube.shape[dim] // 2 if given is None else given
+    if not -cube.shape[dim] <= number < cube.shape[dim]:
+        raise ShapeError(f"streak: {what} {number} lies outside of an image of {cube.shape[2]} x {cube.shape[3]}.")
+    number %= cube.shape[dim]
+    line = cube.select(dim, number)
     picture = tone_map(line, exposure_of(line, 0.999) if exposure is None else exposure, curve).numpy()
     figure = figure_type()(figsize=(6.2, 5.2), layout="constrained")
     panel = figure.subplots()
@@ -475,25 +423,16 @@ def frame_grid(
         The matplotlib figure.
 
     Raises:
-        ShapeError: for other shapes, no bins, and bins outside of the axis.
+        ShapeError: for other shapes, and bins outside of the axis.
         StorageError: when the figure cannot be written.
     """
     cube, axis, word = images_of(source, axis, "frame_grid")
     total = cube.shape[1]
-    columns, number = (
-        checks.count(f"frame_grid: {name}", value, 1, ShapeError)
-        for name, value in (("columns", columns), ("count", count))
-    )
     if bins is None:
-        shares = tuple(float(s) for s in (np.arange(number) + 0.5) / number)
+        shares = tuple(float(s) for s in (np.arange(count) + 0.5) / count)
         bins = _moments_of_arrival(cube.nan_to_num(posinf=0.0, neginf=0.0), shares)
-    bins = several("frame_grid: bins", bins, "numbers of bins")
-    if not bins:
-        raise ShapeError("frame_grid: expected some bins, got none.")
-    for index in bins:
-        if (place := checks.as_whole(index)) is None or not 0 <= place < total:
-            raise ShapeError(f"frame_grid: bin {shown(index)} lies outside of {total} bins.")
-    bins = [int(index) for index in bins]
+    if not all(0 <= index < total for index in bins):
+        raise ShapeError(f"frame_grid: expected bins from 0 to {total - 1}, got {list(bins)}.")
     figure, panels = picture_figure(cube.shape[2], cube.shape[3], panels=len(bins), side=2.4, columns=columns)
     for panel, index in zip(panels, bins, strict=False):
         panel.imshow(tone_map(cube[:, index], exposure, curve).numpy(), interpolation="nearest")
@@ -510,7 +449,6 @@ def histogram(
     pixels: Sequence[tuple[int, int]],
     axis: TimeAxis | None = None,
     log: bool = False,
-    title: str = "",
 ) -> Figure:
     """Draw light over time of some pixels, a panel each.
 
@@ -520,20 +458,16 @@ def histogram(
         path: file to write the figure to.
         pixels: (row, column) of each.
         log: take a logarithmic scale.
-        title: text above the figure.
 
     Returns:
         The matplotlib figure.
 
     Raises:
-        ShapeError: without pixels, and for one outside of the image.
+        ShapeError: for a pixel outside of the image.
         StorageError: when the figure cannot be written.
     """
     cube, axis, word = images_of(source, axis, "histogram", any_channels=True)
     height, width = cube.shape[2:]
-    pixels = several("histogram", pixels, "pixels (row, column)")
-    if not pixels:
-        raise ShapeError("histogram: expected at least one pixel (row, column), got none.")
     pixels = [pixel_of(pixel, (height, width), "histogram") for pixel in pixels]
     figure = figure_type()(figsize=(7.0, 0.5 + 2.1 * len(pixels)), layout="constrained")
     panels = figure.subplots(len(pixels), 1, sharex=True, squeeze=False)[:, 0]
@@ -556,8 +490,6 @@ def histogram(
         top = panels[0].secondary_xaxis("top", functions=(_to_nanoseconds, _to_metres))
         top.set_xlabel("time (ns)")
         panels[0].set_title(f"row {pixels[0][0]}, column {pixels[0][1]}", fontsize=9, loc="left", pad=6)
-    if title:
-        figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, "histogram")
 
 
@@ -580,25 +512,14 @@ def _to_metres(time_ns: Any) -> Any:
 # -------------------------------------------------------------------------------------------------------- gradients
 
 
-def gradient_picture(
-    gradient: Source,
-    path: str | Path | None = None,
-    *,
-    percentile: float = 99.0,
-    limit: float | None = None,
-    per_channel: bool = False,
-    label: str = "",
-    title: str = "",
-) -> Figure:
-    """Draw a gradient: blue is negative, white zero, red positive.
+def gradient_picture(gradient: Source, path: str | Path | None = None, *, label: str = "", title: str = "") -> Figure:
+    """Draw a gradient, summed over channels: blue is negative, white zero, red positive.
+
+    The symmetric scale ends where 99 % of the pixels are, so that some noisy ones do not hide the others.
 
     Args:
         gradient: (C, H, W) or (H, W), numbers themselves, not a tensor that has them as ``.grad``.
         path: file to write the figure to.
-        percentile: percentile of the sizes at which the symmetric scale ends, so that some noisy pixels do not hide the
-            others.
-        limit: end of the scale in place of the percentile.
-        per_channel: a panel for each channel on one scale, in place of their sum.
         label: text at the colour bar.
         title: text above the figure.
 
@@ -607,34 +528,21 @@ def gradient_picture(
 
     Raises:
         ShapeError: for other shapes.
-        UnitError: for a percentile outside of (0, 100] or a limit that is not positive.
         StorageError: when the figure cannot be written.
     """
     values = as_tensor(gradient, "gradient_picture")
     if values.ndim == 2:
         values = values[None]
-    if values.ndim != 3 or values.numel() == 0 or values.is_complex():
-        raise ShapeError(f"gradient_picture: expected (C, H, W) or (H, W), got {tuple(values.shape)}.")
-    share = as_number(percentile)
-    if share is None or not 0 < share <= 100:
-        raise UnitError(f"gradient_picture: expected 0 < percentile <= 100, got {shown(percentile)}.")
-    images = values.double().numpy() if per_channel else values.double().sum(0, keepdim=True).numpy()
-    if limit is None:
-        limit = colour_maps.symmetric_limit(images, percentile)
-    else:
-        limit = positive("gradient_picture: limit", limit)
-    figure, panels = picture_figure(images.shape[1], images.shape[2], panels=len(images), side=4.4)
+    if values.ndim != 3 or values.is_complex():
+        raise ShapeError(f"gradient_picture: expected real (C, H, W) or (H, W), got {tuple(values.shape)}.")
+    image = values.double().sum(0).numpy()
+    limit = colour_maps.symmetric_limit(image)
+    figure, (panel,) = picture_figure(image.shape[0], image.shape[1], side=4.4)
     import matplotlib
 
     colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="limegreen")
-    names = ("red", "green", "blue") if len(images) == 3 else tuple(f"channel {n}" for n in range(len(images)))
-    drawn: list[Any] = []
-    for panel, image, name in zip(panels, images, names, strict=False):
-        drawn.append(panel.imshow(image, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest"))
-        panel.set_title(name if per_channel else title, fontsize=10)
-    outside = np.abs(images[np.isfinite(images)]) > limit
-    extend = "both" if outside.any() else "neither"
-    figure.colorbar(drawn[-1], ax=panels[: len(images)], shrink=0.85, label=label, extend=extend)
-    if title and per_channel:
-        figure.suptitle(title, fontsize=11)
+    drawn = panel.imshow(image, cmap=colours, vmin=-limit, vmax=limit, interpolation="nearest")
+    panel.set_title(title, fontsize=10)
+    extend = "both" if (np.abs(image[np.isfinite(image)]) > limit).any() else "neither"
+    figure.colorbar(drawn, ax=[panel], shrink=0.85, label=label, extend=extend)
     return save_figure(figure, path, "gradient_picture")

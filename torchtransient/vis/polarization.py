@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchtransient import stokes as st
-from torchtransient.checks import finite, is_one_of, several, shown
-from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.errors import ArgumentError
 from torchtransient.vis import colour_maps
 from torchtransient.vis.files import picture_figure, save_figure
 from torchtransient.vis.sources import Source, stokes_of
@@ -23,7 +22,6 @@ from torchtransient.vis.tone_mapping import tone_map
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-QUANTITIES = ("intensity", "dop", "dolp", "aolp", "docp", "s1", "s2", "s3")
 _TITLES = {
     "intensity": "intensity $S_0$",
     "dop": "degree of polarization",
@@ -45,7 +43,6 @@ def polarization_picture(
     frame: int | None = None,
     floor: float | None = None,
     angle_map: str = "even",
-    title: str = "",
 ) -> Figure:
     """Draw polarization, a panel for each quantity.
 
@@ -58,25 +55,21 @@ def polarization_picture(
         frame: bin; None for the light of all times.
         floor: intensity below which pixels are grey; None for a hundredth of the median of lit pixels.
         angle_map: "even" for hues of equal lightness, "hsv" for the hue circle of many papers.
-        title: text above the figure.
 
     Returns:
         The matplotlib figure.
 
     Raises:
-        ShapeError: for unpolarized sources and bins outside.
+        ShapeError: for unpolarized sources.
+        IndexError: for bins outside.
         ArgumentError: for unknown names.
-        UnitError: for a negative ``floor``.
         StorageError: when the figure cannot be written.
     """
-    quantities = several("polarization_picture: quantities", quantities, "names", str, ArgumentError)
-    unknown = [q for q in quantities if q not in QUANTITIES]
-    if unknown or not quantities:
+    if any(name not in _TITLES for name in quantities) or angle_map not in ("even", "hsv"):
         raise ArgumentError(
-            f"polarization_picture: expected quantities out of {', '.join(QUANTITIES)}, got {tuple(quantities)}."
+            f"polarization_picture: expected quantities out of {', '.join(_TITLES)} and angle_map 'even' or 'hsv', got "
+            f"{tuple(quantities)} and {angle_map!r}."
         )
-    if not is_one_of(angle_map, colour_maps.CYCLES):
-        raise ArgumentError(f"polarization_picture: expected angle_map 'even' or 'hsv', got {shown(angle_map)}.")
     vectors = stokes_of(source, frame, "polarization_picture").to(torch.float64)
     broken = ~torch.isfinite(vectors).all(0).all(0)
     vectors = torch.nan_to_num(vectors, posinf=0.0, neginf=0.0)
@@ -85,8 +78,6 @@ def polarization_picture(
         # Of the median, which lamps in the picture do not decide.
         lit = total[0][total[0] > 0]
         floor = 0.01 * lit.median().item() if lit.numel() else 0.0
-    elif (floor := finite("polarization_picture: floor", floor)) < 0:
-        raise UnitError(f"polarization_picture: expected floor >= 0, got {floor!r}.")
     dark = ((total[0] <= floor) | broken).numpy()
     figure, panels = picture_figure(total.shape[1], total.shape[2], panels=len(quantities), side=3.4)
     for panel, name in zip(panels, quantities, strict=False):
@@ -97,8 +88,6 @@ def polarization_picture(
             _draw_angle(figure, panel, total, dark, angle_map)
         else:
             _draw_scalar(figure, panel, name, total, dark)
-    if title:
-        figure.suptitle(title, fontsize=11)
     return save_figure(figure, path, "polarization_picture")
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from torchtransient.axes import RateAxis, TimeAxis
-from torchtransient.checks import of_class, positive
+from torchtransient.checks import positive
 from torchtransient.errors import ShapeError
 from torchtransient.vis.files import figure_type, grey_where_broken, save_figure
-from torchtransient.vis.sources import Source, as_tensor, pixel_of, read_rates
+from torchtransient.vis.sources import Source, as_tensor, pixel_of, read_any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,8 +52,6 @@ def range_doppler(
     me = "range_doppler"
     light, axis, rate_axis = _rates_of(source, axis, rate_axis, me)
     decades = positive(f"{me}: decades", decades)
-    if axis is None:
-        raise ShapeError(f"{me}: light over {light.shape[1]} bins of length needs axis=TimeAxis(...) to be drawn.")
     if pixel is None:
         shared = light.mean((-2, -1)).numpy()
     else:
@@ -85,35 +83,24 @@ def range_doppler(
 
 def _rates_of(
     source: Source, axis: TimeAxis | None, rate_axis: RateAxis | None, who: str
-) -> tuple[Tensor, TimeAxis | None, RateAxis]:
+) -> tuple[Tensor, TimeAxis, RateAxis]:
     """Return light (R, T, H, W), float64, channels added up, and its axes."""
     if isinstance(source, str | Path):
-        source = read_rates(Path(source))
-    held = getattr(source, "rates", None)
-    if held is not None:
-        axis = getattr(source, "axis", None) if axis is None else axis
-        rate_axis = getattr(source, "rate_axis", None) if rate_axis is None else rate_axis
-    elif hasattr(source, "rates"):
-        has_beats = getattr(source, "beats", None) is not None
-        other = ", whose beats tt.sensing.range_and_speed reads" if has_beats else ""
+        source = read_any(Path(source))
+    held = getattr(source, "rates", source)
+    if held is None:
         raise ShapeError(
-            f"{who}: expected light by rates, got a result without{other}. Render with rates=tt.RateAxis(...)."
+            f"{who}: expected light by rates, got a result without; render with rates=tt.RateAxis(...). Beats are read "
+            "by tt.sensing.range_and_speed."
         )
-    light = as_tensor(source if held is None else held, who)
-    if light.ndim != 5 or light.is_complex() or not light.numel():
+    axis = getattr(source, "axis", None) if axis is None else axis
+    rate_axis = getattr(source, "rate_axis", None) if rate_axis is None else rate_axis
+    if axis is None or rate_axis is None:
+        raise ShapeError(f"{who}: light without its own axes needs axis=TimeAxis(...) and rate_axis=RateAxis(...).")
+    light = as_tensor(held, who)
+    if light.ndim != 5 or tuple(light.shape[1:3]) != (rate_axis.num_bins, axis.num_bins):
         raise ShapeError(
-            f"{who}: expected light over rates and lengths (C, R, T, H, W), got {tuple(light.shape)}; of a batch, "
-            "choose one entry."
-        )
-    if rate_axis is None:
-        raise ShapeError(f"{who}: light over {light.shape[1]} rates needs rate_axis=RateAxis(...) to have speeds.")
-    of_class(f"{who}: rate_axis", rate_axis, RateAxis)
-    if axis is not None:
-        of_class(f"{who}: axis", axis, TimeAxis)
-    bins = light.shape[2] if axis is None else axis.num_bins
-    if tuple(light.shape[1:3]) != (rate_axis.num_bins, bins):
-        raise ShapeError(
-            f"{who}: expected light (C, {rate_axis.num_bins}, {bins}, H, W) as the axes have it, got "
-            f"{tuple(light.shape)}."
+            f"{who}: expected light (C, {rate_axis.num_bins}, {axis.num_bins}, H, W) as the axes have it, got "
+            f"{tuple(light.shape)}; of a batch, choose one entry."
         )
     return light.double().sum(0), axis, rate_axis

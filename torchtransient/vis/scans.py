@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient import checks
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
-from torchtransient.capture.wall import triple
-from torchtransient.checks import checked_mesh, is_one_of, positive, shown, transform
+from torchtransient.checks import checked_mesh, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError
 from torchtransient.vis.files import figure_type, save_figure
-from torchtransient.vis.pictures import checked_limits
 from torchtransient.vis.sources import middle_spot, of_one_spot
 
 if TYPE_CHECKING:
@@ -27,12 +24,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-STYLES = ("curves", "image")
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
 # Mitsuba's square and cube.
-SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+_SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 _CUBE = np.array([[x, y, z] for z in (-1.0, 1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-_CUBE_FACES = ((0, 1, 2, 3), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+_CUBE_FACES = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 # Sides of a circle, and rows of a sphere.
 _SIDES, _ROWS = 32, 16
 
@@ -45,8 +41,6 @@ def transients_grid(
     rows: int = 5,
     columns: int = 5,
     laser: int | tuple[int, ...] | None = None,
-    limits: tuple[float, float] | None = None,
-    title: str = "",
 ) -> Figure:
     """Draw the transients of a capture, point by point.
 
@@ -58,49 +52,33 @@ def transients_grid(
             of a grid, an image of a list.
         rows, columns: most histograms beside each other.
         laser: index of the spot of an exhaustive capture; None for the middle one.
-        limits: ends of the time axis, metres.
-        title: text above the figure.
 
     Returns:
         The matplotlib figure.
 
     Raises:
-        ArgumentError: for another object or style.
+        ArgumentError: for another style.
         ShapeError: for a batch, other numbers of channels, no transient.
-        UnitError: for limits without a bin.
         StorageError: when the figure cannot be written.
     """
     cube, axis, scan = of_one_spot(capture, laser, "transients_grid")
-    if limits is not None:
-        part = Capture(cube, axis, scan).crop(*checked_limits(limits))
-        cube, axis, _ = of_one_spot(part, None, "transients_grid")
     style = ("curves" if cube.ndim == 4 else "image") if style is None else style
-    if not is_one_of(style, STYLES):
-        raise ArgumentError(f"transients_grid: expected style 'curves' or 'image', got {shown(style)}.")
-    if style == "curves" and cube.ndim != 4:
+    if style == "image":
+        figure = _image(cube, axis)
+    elif style != "curves":
+        raise ArgumentError(f"transients_grid: expected style 'curves' or 'image', got {style!r}.")
+    elif cube.ndim != 4:
         raise ShapeError(
             f"transients_grid: expected a grid of sensor points for curves, got a list of {scan.pairs}; style='image' "
             "draws lists."
         )
-    if style == "image":
-        figure = _image(cube, axis)
     else:
-        try:
-            rows, columns = checks.count("rows", rows), checks.count("columns", columns)
-        except SceneError:
-            raise ShapeError(
-                f"transients_grid: expected at least one row and column, got {shown(rows)} and {shown(columns)}."
-            ) from None
         figure = _curves(cube, axis, _chosen(cube.shape[2], rows), _chosen(cube.shape[3], columns))
-    figure.suptitle(title or _title(capture, laser), fontsize=10)
-    return save_figure(figure, path, "transients_grid")
-
-
-def _title(capture: Capture, laser: Any) -> str:
     spot = ""
     if capture.scan.kind == "exhaustive":
         spot = f", spot {middle_spot(capture.scan) if laser is None else laser}"
-    return f"{capture.scan.kind} scan{spot}"
+    figure.suptitle(f"{capture.scan.kind} scan{spot}", fontsize=10)
+    return save_figure(figure, path, "transients_grid")
 
 
 def _chosen(available: int, wanted: int) -> list[int]:
@@ -165,21 +143,19 @@ def scan_layout(
         The matplotlib figure.
 
     Raises:
-        ShapeError: for anything that is no scan.
         SceneError: for other shapes and mesh files.
+        ShapeError, UnitError: for meshes and transforms that are none.
         StorageError: when the figure cannot be written.
     """
     scan = scan.scan if isinstance(scan, Capture) else scan
-    if not isinstance(scan, Scan):
-        raise ShapeError(f"scan_layout: expected a Scan or a Capture, got {shown(scan)}; Scan.grid makes one.")
-    shapes = hidden_polygons(hidden, "scan_layout")
+    shapes = _hidden_polygons(hidden)
     figure = figure_type()(figsize=(7.0, 6.0), layout="constrained")
     panel = figure.add_subplot(projection="3d")
     drawn = [scan.sensor_points, scan.laser_points, scan.sensor_origin, scan.laser_origin]
     corners = [tensor.detach().cpu().numpy().reshape(-1, 3) for tensor in drawn]
     if scan.wall is not None:
         surface = Wall.of(scan.wall)
-        faces = SQUARE[:, :1] * surface.half_u + SQUARE[:, 1:2] * surface.half_v + surface.center
+        faces = _SQUARE[:, :1] * surface.half_u + _SQUARE[:, 1:2] * surface.half_v + surface.center
         polygons = [faces] if surface.vertices is None else list(surface.vertices[surface.faces])
         corners.append(np.concatenate(polygons))
         _draw_faces(panel, polygons, "0.5", 0.2)
@@ -231,51 +207,34 @@ def _equal_box(panel: Any, points: NDArray[np.float64]) -> None:
 # ---------------------------------------------------------------------------------------- hidden shapes as polygons
 
 
-def hidden_polygons(hidden: Any, who: str) -> list[list[Array]]:
+def _hidden_polygons(hidden: Any) -> list[list[Array]]:
     """Return the corners (N, 3) of the faces of each hidden shape, metres.
 
-    Args:
-        hidden: shapes of Mitsuba by name, a single one, (vertices (V, 3), faces (F, 3)), an object with both, or None.
-            Nodes that a shape refers to are left out.
-        who: beginning of messages.
-
-    Raises:
-        SceneError: for other shapes than :data:`DRAWN`, mesh files among them.
-        ShapeError, UnitError: for meshes and transforms that are none.
+    Nodes that a shape refers to are left out.
     """
     if hidden is None:
         return []
     if isinstance(hidden, Mapping):
-        if "type" in hidden and hidden["type"] != "scene":
-            return [_of_shape("hidden", hidden, who)]
-        shapes = {name: node for name, node in hidden.items() if name != "type"}
+        shapes = {"hidden": hidden} if hidden.get("type", "scene") != "scene" else hidden
         used = set(_references(shapes))
-        return [_of_shape(name, node, who) for name, node in shapes.items() if name not in used]
-    if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
-        vertices, faces = hidden
-        return [_of_mesh(vertices, faces, f"{who}: hidden")]
-    if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
-        return [_of_mesh(hidden.vertices, hidden.faces, f"{who}: hidden")]
-    if isinstance(hidden, (str, PathLike)):
-        raise SceneError(f"{who}: mesh files are not drawn, got {str(hidden)!r}. Give its (vertices, faces).")
-    raise SceneError(
-        f"{who}: expected hidden as shapes by name, a shape, (vertices, faces) or an object with both, got "
-        f"{shown(hidden)}."
-    )
+        return [_of_shape(name, node) for name, node in shapes.items() if name not in {"type", *used}]
+    if isinstance(hidden, str | PathLike):
+        raise SceneError(f"scan_layout: mesh files are not drawn, got {str(hidden)!r}. Give its (vertices, faces).")
+    vertices, faces = hidden if isinstance(hidden, tuple | list) else (hidden.vertices, hidden.faces)
+    return [_mesh({"vertices": vertices, "faces": faces})]
 
 
-def _of_shape(name: str, shape: Any, who: str) -> list[Array]:
-    where = f"{who}: hidden {name!r}"
-    if not isinstance(shape, Mapping) or "type" not in shape:
-        raise SceneError(f"{where}: expected a dictionary with a type, got {shown(shape)}.")
-    kind = shape["type"]
-    if kind not in DRAWN:
-        raise SceneError(f"{where}: shapes that are drawn are {', '.join(DRAWN)}, got {kind!r}. Leave it out.")
-    matrix = transform(f"{where}: to_world", shape.get("to_world", np.eye(4)))
-    return [points @ matrix[:3, :3].T + matrix[:3, 3] for points in DRAWN[kind](shape, where)]
+def _of_shape(name: str, shape: Mapping[str, Any]) -> list[Array]:
+    if shape["type"] not in DRAWN:
+        raise SceneError(
+            f"scan_layout: hidden {name!r}: shapes that are drawn are {', '.join(DRAWN)}, got {shape['type']!r}. "
+            "Leave it out."
+        )
+    matrix = transform(f"scan_layout: hidden {name!r}: to_world", shape.get("to_world", np.eye(4)))
+    return [points @ matrix[:3, :3].T + matrix[:3, 3] for points in DRAWN[shape["type"]](shape)]
 
 
-def _references(nodes: Any) -> Iterator[str]:
+def _references(nodes: Mapping[str, Any]) -> Iterator[str]:
     """Yield names that nodes refer to."""
     for node in nodes.values():
         if isinstance(node, Mapping):
@@ -287,46 +246,29 @@ def _references(nodes: Any) -> Iterator[str]:
 # -------------------------------------------------------------------------------------- faces of each shape, unplaced
 
 
-def _of_mesh(vertices: Any, faces: Any, where: str) -> list[Array]:
-    points, triangles = checked_mesh(where, vertices, faces)
+def _mesh(shape: Mapping[str, Any]) -> list[Array]:
+    points, triangles = checked_mesh("scan_layout: hidden", shape["vertices"], shape["faces"])
     return list(points[triangles])
 
 
-def _mesh(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    return _of_mesh(shape.get("vertices"), shape.get("faces"), where)
+def _circle(points: int) -> Array:
+    angle = np.linspace(0, 2 * np.pi, points)
+    return np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
 
 
-def _square(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    return [SQUARE]
+def _sphere(shape: Mapping[str, Any]) -> list[Array]:
+    up = np.linspace(0, np.pi, _ROWS + 1)[:, None, None]
+    around = np.sin(up) * _circle(_SIDES + 1) + np.cos(up) * np.array([0.0, 0.0, 1.0])
+    return _cells(np.asarray(shape.get("center", (0.0, 0.0, 0.0))) + shape.get("radius", 1.0) * around)
 
 
-def _cube(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    return list(_CUBE[np.array(_CUBE_FACES)])
-
-
-def _circle(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    angle = np.arange(_SIDES) * 2 * np.pi / _SIDES
-    return [np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)]
-
-
-def _sphere(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    center = triple(f"{where}: center", shape.get("center", (0.0, 0.0, 0.0)))
-    radius = positive(f"{where}: radius", shape.get("radius", 1.0))
-    up, around = np.linspace(0, np.pi, _ROWS + 1)[:, None], np.linspace(0, 2 * np.pi, _SIDES + 1)[None]
-    x, y, z = np.sin(up) * np.cos(around), np.sin(up) * np.sin(around), np.cos(up) + 0 * around
-    return _cells(center + radius * np.stack([x, y, z], -1))
-
-
-def _cylinder(shape: Mapping[str, Any], where: str) -> Sequence[Array]:
-    begin = triple(f"{where}: p0", shape.get("p0", (0.0, 0.0, 0.0)))
-    end = triple(f"{where}: p1", shape.get("p1", (0.0, 0.0, 1.0)))
-    radius = positive(f"{where}: radius", shape.get("radius", 1.0))
+def _cylinder(shape: Mapping[str, Any]) -> list[Array]:
+    begin, end = (np.array(shape.get(*place), float) for place in (("p0", (0, 0, 0)), ("p1", (0, 0, 1))))
     axis = end - begin
     aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    aside /= np.linalg.norm(aside) or 1.0
-    other = np.cross(axis, aside) / (np.linalg.norm(axis) or 1.0)
-    angle = np.linspace(0, 2 * np.pi, _SIDES + 1)[:, None]
-    circle = radius * (np.cos(angle) * aside + np.sin(angle) * other)
+    aside /= np.linalg.norm(aside)
+    turned = np.stack([aside, np.cross(axis, aside) / np.linalg.norm(axis), axis])
+    circle = shape.get("radius", 1.0) * _circle(_SIDES + 1) @ turned
     return _cells(np.stack([begin + circle, end + circle]))
 
 
@@ -337,7 +279,7 @@ def _cells(grid: Array) -> list[Array]:
 
 
 # Shapes that are drawn, by Mitsuba's name.
-DRAWN: dict[str, Callable[[Mapping[str, Any], str], Sequence[Array]]] = {
-    "mesh_arrays": _mesh, "rectangle": _square, "cube": _cube, "disk": _circle, "sphere": _sphere,
-    "cylinder": _cylinder,
+DRAWN: dict[str, Callable[[Mapping[str, Any]], list[Array]]] = {
+    "mesh_arrays": _mesh, "rectangle": lambda shape: [_SQUARE], "cube": lambda shape: list(_CUBE[_CUBE_FACES]),
+    "disk": lambda shape: [_circle(_SIDES + 1)[:-1]], "sphere": _sphere, "cylinder": _cylinder,
 }  # fmt: skip

@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.array_files.array_file import damage_said, read_npy, read_some
-from torchtransient.array_files.plain_texts import json_data
-from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
+from torchtransient.array_files.array_file import read_npy, read_some
+from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.capture import computed
-from torchtransient.checks import as_whole, of_class, real_array, shown
-from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from torchtransient.checks import Numbers
+from torchtransient.errors import ArgumentError, ShapeError
 
 Source = Any  # Tensor | NDArray | RenderOutput | Result | str | Path, told apart by what they offer
-_HDF5 = (".h5", ".hdf5")
 # Readers of the library's own files, which stand in rooms above this one.
 _READERS = {
-    "torchtransient result": ("torchtransient.files.result_file", "read_result"),
     "torchtransient capture": ("torchtransient.files.capture_file", "read_capture"),
     "torchtransient volume": ("torchtransient.files.volume_file", "read_volume"),
+    "": ("torchtransient.files.result_file", "read_result"),
 }
 _TENSORS = ("transient", "steady", "phasor", "gated", "rates", "beats")
 # Dimensions of what one render has, without Stokes components.
 _DIMENSIONS = {"transient": 4, "gated": 4, "rates": 5, "beats": 5}
-_KNOWN = {
-    *_TENSORS, "start_opl", "bin_width_opl", "num_bins", "gates", "metadata", "frequencies_per_metre",
-}  # fmt: skip
+# What may stand in the place of a transient.
+_OTHERS = {
+    "gated": "images of time gates, which are no bins; frames, frame_grid and histogram draw them",
+    "beats": "spectra of beats, whose places are no times of arrival; tt.sensing.range_and_speed reads them",
+}
 
 
 @dataclass(frozen=True)
@@ -71,18 +70,10 @@ def transient_of(
         StorageError: for a file that cannot be read.
     """
     loaded = _load(source, "transient")
-    if loaded.transient is None and loaded.gated is not None:
-        raise ShapeError(
-            f"{who}: expected a transient (C, T, H, W), and the source holds {loaded.gated.shape[-3]} images of time "
-            "gates, which are no bins. Draw them with frames, frame_grid or histogram, or render with time_axis=..."
-        )
-    if loaded.transient is None and loaded.beats is not None:
-        raise ShapeError(
-            f"{who}: expected a transient (C, T, H, W), and the source holds spectra of beats, whose places are no "
-            "times of arrival. tt.sensing.range_and_speed reads distances and speeds off them."
-        )
-    cube = _only(loaded.transient, "transient", "(C, T, H, W)", who)
-    return _checked_cube(cube, loaded.axis if axis is None else axis, who, any_channels)
+    if loaded.transient is None:
+        held = next((said for name, said in _OTHERS.items() if getattr(loaded, name) is not None), "none")
+        raise ShapeError(f"{who}: expected a transient (C, T, H, W), and the source holds {held}.")
+    return _checked_cube(loaded.transient, loaded.axis if axis is None else axis, who, any_channels)
 
 
 def images_of(
@@ -112,31 +103,9 @@ def _checked_cube(cube: Tensor, axis: TimeAxis | None, who: str, any_channels: b
             f"{who}: expected a transient (C, T, H, W) or (4, C, T, H, W) with C = 1 or 3, got {tuple(cube.shape)}; of "
             "a batch, choose one, and of many channels, choose one or three."
         )
-    if axis is not None and of_class(f"{who}: axis", axis, TimeAxis).num_bins != cube.shape[1]:
+    if axis is not None and axis.num_bins != cube.shape[1]:
         raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the transient {cube.shape[1]}.")
     return cube, axis
-
-
-def steady_of(source: Source, who: str = "picture") -> Tensor:
-    """Return an intensity (C, H, W), C = 1 or 3.
-
-    Args:
-        source: a tensor (C, H, W) or (4, C, H, W), the ``steady`` of a result or file, or a transient, which is added
-            up over time.
-        who: beginning of messages.
-
-    Raises:
-        ShapeError, StorageError: as of :func:`transient_of`.
-    """
-    loaded = _load(source, "")
-    image = loaded.steady
-    if image is None:
-        image = images_of(loaded, None, who)[0].sum(1)
-    if image.ndim == 4 and image.shape[0] == 4:
-        image = image[0]
-    if image.ndim != 3 or image.shape[0] not in (1, 3) or image.numel() == 0:
-        raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
-    return image
 
 
 def stokes_of(source: Source, frame: int | None = None, who: str = "picture") -> Tensor:
@@ -148,30 +117,23 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
         who: beginning of messages.
 
     Raises:
-        ShapeError: for sources without polarization, and bins outside.
+        ShapeError: for sources without polarization.
+        IndexError: for bins outside.
     """
     loaded = _load(source, "")
     cube, image = loaded.gated if loaded.transient is None else loaded.transient, loaded.steady
     if image is not None and (cube is None or frame is None) and image.ndim == 4 and image.shape[0] == 4:
-        result = image
-    elif cube is not None and cube.ndim == 5 and cube.shape[0] == 4:
-        place = as_whole(frame)
-        if frame is not None and (place is None or not -cube.shape[2] <= place < cube.shape[2]):
-            raise ShapeError(f"{who}: bin {shown(frame)} of {cube.shape[2]} does not exist.")
-        result = cube.sum(2) if place is None else cube[:, :, place]
-    else:
-        found = cube if cube is not None else image
-        shape = "neither" if found is None else tuple(found.shape)
-        raise ShapeError(
-            f"{who}: expected Stokes vectors (4, C, T, H, W) or (4, C, H, W), got {shape}; polarized variants such as "
-            "llvm_ad_mono_polarized render them."
-        )
-    if result.numel() == 0:
-        raise ShapeError(f"{who}: expected Stokes vectors of some pixels, got {tuple(result.shape)}.")
-    return result
+        return image
+    if cube is not None and cube.ndim == 5 and cube.shape[0] == 4:
+        return cube.sum(2) if frame is None else cube[:, :, frame]
+    found = cube if cube is not None else image
+    raise ShapeError(
+        f"{who}: expected Stokes vectors (4, C, T, H, W) or (4, C, H, W), got "
+        f"{'neither' if found is None else tuple(found.shape)}; polarized variants render them."
+    )
 
 
-def pixel_of(pixel: Any, size: tuple[int, int], who: str) -> tuple[int, int]:
+def pixel_of(pixel: Sequence[int], size: tuple[int, int], who: str) -> tuple[int, int]:
     """Return (row, column) of a pixel.
 
     Args:
@@ -180,12 +142,9 @@ def pixel_of(pixel: Any, size: tuple[int, int], who: str) -> tuple[int, int]:
         who: beginning of messages.
 
     Raises:
-        ShapeError: for a pixel outside, and for anything else.
+        ShapeError: for a pixel outside.
     """
-    several = isinstance(pixel, Sequence) or getattr(pixel, "ndim", 0) == 1
-    row, column = [as_whole(n) for n in pixel] if several and len(pixel) == 2 else (None, None)
-    if row is None or column is None:
-        raise ShapeError(f"{who}: expected a pixel (row, column), got {shown(pixel)}.")
+    row, column = pixel
     if not (0 <= row < size[0] and 0 <= column < size[1]):
         raise ShapeError(f"{who}: pixel ({row}, {column}) lies outside of an image of {size[0]} x {size[1]}.")
     return row, column
@@ -203,53 +162,16 @@ def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float
         ShapeError: for another shape or a real dtype.
     """
     loaded = _load(source, "phasor")
-    phasor = _only(loaded.phasor, "phasor", "complex (C, F, H, W)", who)
+    phasor = loaded.phasor
+    if phasor is None:
+        raise ShapeError(f"{who}: the source holds no phasor, complex (C, F, H, W).")
     if phasor.ndim == 5 and phasor.shape[0] == 4:
         phasor = phasor[0]
-    if phasor.ndim != 4 or phasor.numel() == 0 or not phasor.is_complex():
+    if phasor.ndim != 4 or not phasor.is_complex():
         raise ShapeError(
             f"{who}: expected complex phasors (C, F, H, W), got {phasor.dtype} of shape {tuple(phasor.shape)}."
         )
     return phasor, loaded.frequencies
-
-
-def given_tensor(value: Any, who: str, expected: str = "a tensor or an array") -> Tensor:
-    """Return a tensor as it is, and one of the numbers of an array.
-
-    Args:
-        value: tensor or array.
-        who: beginning of messages.
-        expected: description of what is expected.
-
-    Raises:
-        ArgumentError: for anything else.
-        ShapeError: for arrays of other things than numbers.
-    """
-    if isinstance(value, Tensor):
-        return value
-    if not isinstance(value, np.ndarray):
-        raise ArgumentError(f"{who}: expected {expected}, got {type(value).__name__}.")
-    try:
-        return torch.from_numpy(np.ascontiguousarray(value))
-    except TypeError:
-        raise ShapeError(f"{who}: expected numbers, got an array of {value.dtype}.") from None
-
-
-def real_tensor(value: Any, who: str) -> Tensor:
-    """Return a tensor as :func:`given_tensor`.
-
-    Args:
-        value: tensor or array.
-        who: beginning of messages.
-
-    Raises:
-        ArgumentError: for anything else.
-        ShapeError: for arrays of other things than numbers, and for complex numbers.
-    """
-    tensor = given_tensor(value, who)
-    if tensor.is_complex():
-        raise ShapeError(f"{who}: expected real numbers, got {tensor.dtype}.")
-    return tensor
 
 
 def as_tensor(value: Any, who: str) -> Tensor:
@@ -260,9 +182,15 @@ def as_tensor(value: Any, who: str) -> Tensor:
         who: beginning of messages.
 
     Raises:
-        ArgumentError, ShapeError: as :func:`given_tensor`.
+        ArgumentError: for anything else.
     """
-    tensor = given_tensor(value, who, "a tensor, an array, a RenderOutput or the path of a result").detach().cpu()
+    if isinstance(value, np.ndarray):
+        value = torch.from_numpy(np.ascontiguousarray(value))
+    if not isinstance(value, Tensor):
+        raise ArgumentError(
+            f"{who}: expected a tensor, an array, a RenderOutput or the path of a result, got {type(value).__name__}."
+        )
+    tensor = value.detach().cpu()
     if tensor.is_complex() or tensor.dtype in (torch.float32, torch.float64):
         return tensor
     return tensor.to(torch.float32)
@@ -270,11 +198,11 @@ def as_tensor(value: Any, who: str) -> Tensor:
 
 def _refuse_batch(source: Any) -> None:
     """Refuse four entries of a batch as components of polarized light, where the source can tell."""
-    given = {name: getattr(source, name, None) for name in _DIMENSIONS}
-    name, cube = next(((n, c) for n, c in given.items() if c is not None), ("", None))
+    name, cube = next(((n, c) for n in _DIMENSIONS if (c := getattr(source, n, None)) is not None), ("", None))
     polarized = getattr(source, "polarized", None)
-    if polarized is None and isinstance(getattr(source, "metadata", None), dict):
-        polarized = _variant_is_polarized(source.metadata)
+    if polarized is None:
+        variant = getattr(source, "metadata", {}).get("stats", {}).get("variant")
+        polarized = None if variant is None else "polarized" in variant
     if polarized is False and cube is not None and cube.ndim > _DIMENSIONS[name]:
         raise ShapeError(
             f"picture: expected one transient (C, T, H, W), got a batch or several sensors, {tuple(cube.shape)}; "
@@ -282,34 +210,15 @@ def _refuse_batch(source: Any) -> None:
         )
 
 
-def _variant_is_polarized(metadata: dict[str, Any]) -> bool | None:
-    variant = (metadata.get("stats") or {}).get("variant")
-    return None if variant is None else "polarized" in variant
-
-
-def frequencies_of(given: Any) -> tuple[float, ...] | None:
+def frequencies_of(given: FrequencyAxis | Numbers | None) -> tuple[float, ...] | None:
     """Return cycles per metre.
 
     Args:
         given: a FrequencyAxis, a row of numbers, or None, which stays None.
-
-    Raises:
-        UnitError: for anything else.
     """
     if given is None:
         return None
-    if isinstance(given, FrequencyAxis):
-        return given.frequencies
-    row = real_array(given)
-    if row is None:
-        raise UnitError(f"picture: expected frequencies in cycles per metre, got {shown(given)}.")
-    return tuple(row.ravel().tolist())
-
-
-def _only(value: Tensor | None, name: str, shape: str, who: str) -> Tensor:
-    if value is None:
-        raise ShapeError(f"{who}: the source holds no {name} {shape}.")
-    return value
+    return given.frequencies if isinstance(given, FrequencyAxis) else tuple(float(nu) for nu in given)
 
 
 def _load(source: Source, name: str) -> Loaded:
@@ -319,7 +228,7 @@ def _load(source: Source, name: str) -> Loaded:
     transient, and the rest a steady image.
     """
     if isinstance(source, str | Path):
-        source = read_file(Path(source))
+        source = read_any(Path(source))
     if isinstance(source, Loaded):
         return source
     if isinstance(source, Capture) and source.transient is not None and name != "phasor":
@@ -333,10 +242,11 @@ def _load(source: Source, name: str) -> Loaded:
         return Loaded(transient=cube.flip(2), axis=axis)
     if any(hasattr(source, name) for name in _TENSORS if name != "steady"):
         _refuse_batch(source)
-        given = {key: getattr(source, key, None) for key in _TENSORS}
         known = frequencies_of(getattr(source, "frequencies", None))
-        tensors = {key: as_tensor(value, key) for key, value in given.items() if value is not None}
-        return Loaded(**_summed(tensors), axis=getattr(source, "axis", None), frequencies=known)
+        held = {key: as_tensor(value, key) for key in _TENSORS if (value := getattr(source, key, None)) is not None}
+        if "rates" in held:
+            held["transient"] = held.pop("rates").sum(-4)
+        return Loaded(**held, axis=getattr(source, "axis", None), frequencies=known)
     tensor = as_tensor(source, "picture")
     if name == "phasor":
         return Loaded(phasor=tensor)
@@ -345,9 +255,7 @@ def _load(source: Source, name: str) -> Loaded:
     return Loaded(steady=tensor)
 
 
-def of_one_spot(
-    capture: Capture, laser: int | tuple[int, ...] | None, who: str
-) -> tuple[Tensor, TimeAxis, Scan]:
+def of_one_spot(capture: Capture, laser: int | tuple[int, ...] | None, who: str) -> tuple[Tensor, TimeAxis, Scan]:
     """Return the light of a capture under one laser spot.
 
     Args:
@@ -359,32 +267,23 @@ def of_one_spot(
         Light (C, T, rows, columns) of a grid or (C, T, N) of a list on the CPU, C = 1 or 3, its axis and its scan.
 
     Raises:
-        ArgumentError: for another object.
         ShapeError: for phasors alone, a batch, other numbers of channels, and a spot that there is none of.
     """
-    _light_of(capture, who)  # before a part is taken
     if capture.scan.kind == "exhaustive":
         capture = capture.single(middle_spot(capture.scan) if laser is None else laser)
     elif laser is not None:
         raise ShapeError(f"{who}: laser= chooses a spot of an exhaustive capture, got a {capture.scan.kind} one.")
-    cube, axis = _light_of(capture, who)
-    if cube.shape[0] not in (1, 3):
-        raise ShapeError(f"{who}: expected one channel or three, got {cube.shape[0]}; choose some.")
-    return cube, axis, capture.scan
-
-
-def _light_of(capture: Any, who: str) -> tuple[Tensor, TimeAxis]:
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"{who}: expected a Capture, which knows its scan and axis, got {type(capture).__name__}.")
     if capture.transient is None or capture.axis is None:
         raise ShapeError(f"{who}: expected a capture with a transient, got phasors alone.")
     cube = computed(capture.transient.detach().cpu())
     rank = len(capture.scan.shape) + 2
     if capture.polarized:
         cube = cube.select(cube.ndim - rank - 1, 0)
-    if cube.ndim != rank:
-        raise ShapeError(f"{who}: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
-    return cube, capture.axis
+    if cube.ndim != rank or cube.shape[0] not in (1, 3):
+        raise ShapeError(
+            f"{who}: expected one capture of one channel or three, got {tuple(cube.shape)}; choose one of a batch."
+        )
+    return cube, capture.axis, capture.scan
 
 
 def middle_spot(scan: Scan) -> tuple[int, ...]:
@@ -397,7 +296,7 @@ def middle_spot(scan: Scan) -> tuple[int, ...]:
 
 
 def read_any(path: Path) -> Any:
-    """Return the content of a file: a result, a capture or a volume; of other files as :func:`read_file`.
+    """Return the content of a file: a result, a capture or a volume, or the one array of a ``.npy``.
 
     Args:
         path: the file.
@@ -405,71 +304,8 @@ def read_any(path: Path) -> Any:
     Raises:
         StorageError: for a missing, damaged or unknown file.
     """
-    if path.suffix.lower() in (*_HDF5, ".npz"):
-        form = str(read_some(path, "view", "format".__eq__).get("format", ""))
-        for kind, (module, name) in _READERS.items():
-            if form.startswith(kind):
-                return getattr(importlib.import_module(module), name)(path)
-    return read_file(path)
-
-
-def _axis_in(values: Mapping[str, Any]) -> TimeAxis | None:
-    if "num_bins" not in values:
-        return None
-    return TimeAxis(float(values["start_opl"]), float(values["bin_width_opl"]), int(values["num_bins"]))
-
-
-def read_rates(path: Path) -> Any:
-    """Return light by rates of a file: an object with `rates`, `axis` and `rate_axis`.
-
-    Args:
-        path: a result, .h5 or .npz.
-
-    Raises:
-        StorageError: as :func:`read_file`, and for files of other films.
-    """
-    if path.suffix.lower() not in (*_HDF5, ".npz"):
-        raise StorageError(f"picture: expected a result, .h5 or .npz, got '{path}'.")
-    names = ("rates_start", "rates_bin_width", "rates_num_bins")
-    values = read_some(path, "picture", {*names, *_KNOWN}.__contains__)
-    if "rates" not in values:
-        raise StorageError(f"picture: '{path}' holds no light by rates; render it with rates=tt.RateAxis(...).")
-    with damage_said(path, "picture", "a result"):
-        start, width, bins = (values[name] for name in names)
-        rate_axis = RateAxis(float(start), float(width), int(bins))
-        return SimpleNamespace(rates=as_tensor(values["rates"], "rates"), axis=_axis_in(values), rate_axis=rate_axis)
-
-
-def _summed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return tensors with the sum over rates in place of light by rates."""
-    rates = tensors.pop("rates", None)
-    return tensors if rates is None else {**tensors, "transient": rates.sum(-4)}
-
-
-def read_file(path: Path) -> Any:
-    """Return a file as a source: a result (``.h5``, ``.hdf5``, ``.npz``) with its axis, or the one array of a ``.npy``.
-
-    Tensors and numbers of the axis are read, each if it is there, and compared with their checksums.
-
-    Args:
-        path: the file.
-
-    Raises:
-        StorageError: for a missing, damaged or unknown file.
-    """
-    if path.suffix.lower() not in (*_HDF5, ".npz", ".npy"):
-        raise StorageError(f"picture: expected a result, .h5, .npz or .npy, got '{path}'.")
     if path.suffix.lower() == ".npy":
         return read_npy(path, "picture")
-    values = read_some(path, "picture", _KNOWN.__contains__)
-    with damage_said(path, "picture", "a result"):
-        axis = _axis_in(values)
-        if "gates" in values and "gated" not in values:
-            values["gated"] = values.pop("transient")  # as files of earlier versions call it
-        arrays = {key: as_tensor(values[key], key) for key in _TENSORS if key in values}
-    if any(arrays[key].ndim > n for key, n in _DIMENSIONS.items() if key in arrays) and "metadata" in values:
-        _refuse_batch(SimpleNamespace(**arrays, metadata=json_data(str(values["metadata"]), f"picture: '{path}'")))
-    if not arrays:
-        raise StorageError(f"picture: '{path}' holds none of {', '.join(_TENSORS[:-1])} and {_TENSORS[-1]}.")
-    return Loaded(**_summed(arrays), axis=axis, frequencies=frequencies_of(values.get("frequencies_per_metre")))
-
+    form = str(read_some(path, "picture", "format".__eq__).get("format", ""))
+    module, name = next(reader for kind, reader in _READERS.items() if form.startswith(kind))
+    return getattr(importlib.import_module(module), name)(path)

@@ -8,12 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import as_number, is_one_of, positive, shown
+from torchtransient.checks import positive
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.vis.sources import real_tensor
 
 BROKEN = (1.0, 0.0, 1.0)  # magenta: a pixel that is not finite must not pass for black or white
-CURVES = ("srgb", "gamma", "log", "linear")
 # Share of the lit pixels of a video that are white.
 _WHITE = 0.01
 _FRAMES_AT_ONCE = 16
@@ -35,15 +33,14 @@ def exposure_of(image: Tensor, quantile: float = 0.99) -> float:
         UnitError: for another quantile.
     """
     image = _checked(image, "exposure_of")
-    share = as_number(quantile)
-    if share is None or not 0 < share <= 1:
-        raise UnitError(f"exposure_of: expected 0 < quantile <= 1, got {shown(quantile)}.")
+    if not 0 < quantile <= 1:
+        raise UnitError(f"exposure_of: expected 0 < quantile <= 1, got {quantile}.")
     brightest = image.amax(0).flatten().to(torch.float64)
     brightest = brightest[torch.isfinite(brightest)]
     if not bool((brightest > 0).any()):
         return 1.0
     lit = brightest.sort().values
-    white = lit[min(lit.numel() - 1, int(share * lit.numel()))].item()
+    white = lit[min(lit.numel() - 1, int(quantile * lit.numel()))].item()
     # A picture with a few bright pixels only: show those.
     return 1.0 / (white if white > 0 else lit[-1].item())
 
@@ -80,19 +77,14 @@ def _lit(transient: Tensor, start: int) -> Tensor:
     return values[torch.isfinite(values) & (values > 0)]
 
 
-def tone_map(
-    image: Tensor, exposure: float | None = None, curve: str = "srgb", *, gamma: float = 2.2, stops: float = 10.0
-) -> Tensor:
+def tone_map(image: Tensor, exposure: float | None = None, curve: str = "srgb") -> Tensor:
     """Map linear radiance to colours of a screen.
 
     Args:
         image: (C, H, W), C = 1 or 3 (linear sRGB).
         exposure: factor before the curve; None takes ``exposure_of(image)``.
-        curve: "srgb" (IEC 61966-2-1), "gamma" (``x ** (1 / gamma)``), "linear", or "log", which spreads ``stops``
-            factors of two below white evenly over the scale: the brightest channel is mapped, the others keep their
-            ratio to it.
-        gamma: exponent of "gamma".
-        stops: range of "log".
+        curve: "srgb" (IEC 61966-2-1), "gamma" (``x ** (1 / 2.2)``), "linear", or "log", which spreads ten factors of
+            two below white evenly over the scale: the brightest channel is mapped, the others keep their ratio to it.
 
     Returns:
         (H, W, 3) float64 in [0, 1]. Negative values are black, pixels that are not finite magenta.
@@ -100,38 +92,37 @@ def tone_map(
     Raises:
         ShapeError: for another shape.
         ArgumentError: for an unknown curve.
-        UnitError: unless exposure, gamma and stops are positive.
+        UnitError: unless the exposure is positive.
     """
     image = _checked(image, "tone_map")
     factor = positive("tone_map: exposure", exposure_of(image) if exposure is None else exposure)
-    if not is_one_of(curve, CURVES):
-        raise ArgumentError(f"tone_map: expected a curve out of {', '.join(CURVES)}, got {shown(curve)}.")
-    gamma, stops = positive("tone_map: gamma", gamma), positive("tone_map: stops", stops)
     mapped = image.detach().to(torch.float64) * factor
     broken = ~torch.isfinite(mapped).all(0)
     mapped = torch.nan_to_num(mapped, nan=0.0, posinf=1.0, neginf=0.0).clamp(min=0)
-    mapped = _curve(mapped, curve, gamma, stops).clamp(0, 1)
+    mapped = _curve(mapped, curve).clamp(0, 1)
     mapped = mapped.expand(3, -1, -1).permute(1, 2, 0).contiguous()
     mapped[broken] = mapped.new_tensor(BROKEN)
     return mapped
 
 
-def _curve(linear: Tensor, curve: str, gamma: float, stops: float) -> Tensor:
+def _curve(linear: Tensor, curve: str) -> Tensor:
     if curve == "srgb":
         return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     if curve == "gamma":
-        return linear ** (1 / gamma)
+        return linear ** (1 / 2.2)
     if curve == "linear":
         return linear
+    if curve != "log":
+        raise ArgumentError(f"tone_map: expected a curve out of srgb, gamma, log, linear, got {curve!r}.")
     brightest = linear.amax(0)
-    level = (1 + brightest.log2() / stops).clamp(0, 1)
+    level = (1 + brightest.log2() / 10).clamp(0, 1)
     # The ratio of the channels is shown on the scale of the eye, else every colour would turn to its primary.
     ratio = linear / torch.where(brightest > 0, brightest, 1.0)
-    return level * _curve(ratio, "srgb", gamma, stops)
+    return level * _curve(ratio, "srgb")
 
 
 def _checked(given: Any, who: str) -> Tensor:
-    image = real_tensor(given, who)
-    if image.ndim != 3 or image.shape[0] not in (1, 3):
-        raise ShapeError(f"{who}: expected an image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
+    image = torch.as_tensor(given)
+    if image.ndim != 3 or image.shape[0] not in (1, 3) or image.is_complex():
+        raise ShapeError(f"{who}: expected a real image (C, H, W) with C = 1 or 3, got {tuple(image.shape)}.")
     return image

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient import checks
 from torchtransient.array_files.part_files import replacing
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import check_folder, function, one_by_one, path_of, positive, short_message, shown
-from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.checks import check_folder, path_of, positive, short_message, shown
+from torchtransient.errors import ShapeError, StorageError, UnitError
 from torchtransient.units import opl_to_seconds
-from torchtransient.vis.files import Image, enlarge, pillow, to_bytes
+from torchtransient.vis.files import Image, enlarge, needed, pillow, to_bytes
 from torchtransient.vis.sources import Source, images_of
 from torchtransient.vis.tone_mapping import exposure_of, exposure_of_video, tone_map
 
@@ -34,17 +33,6 @@ _GREYS = [(level, level, level) for level in range(GROUND[0] + 24, INK[0], 24)]
 _KEPT = (GROUND, DIM, INK, (0, 0, 0), (255, 255, 255), *_GREYS)
 
 
-class FrameSettings(TypedDict, total=False):
-    """Settings of :func:`frames`, whose defaults hold for those that are left out."""
-
-    exposure: float | None
-    curve: str
-    accumulate: bool
-    stamp: bool
-    scale: int | None
-    every: int
-
-
 @dataclass(frozen=True)
 class Frames:
     """Frames (H, W, 3) uint8 that are made when they are asked for; `len`, iteration (any number of times), indices.
@@ -56,10 +44,6 @@ class Frames:
 
     count: int
     make: Callable[[int], Image]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "count", checks.count("Frames: count", self.count, 0, ShapeError))
-        function("Frames: make", self.make, "the number of a frame")
 
     def __len__(self) -> int:
         return self.count
@@ -105,7 +89,6 @@ def frames(
         UnitError: for an exposure that is not positive.
     """
     cube, axis, word = images_of(source, axis, "frames")
-    every = checks.count("frames: every", every, 1, ShapeError)
     bins, (height, width) = cube.shape[1], cube.shape[2:]
     count = -(-bins // every)
     if exposure is not None:
@@ -113,7 +96,6 @@ def frames(
     else:
         exposure = exposure_of(cube.sum(1)) if accumulate else exposure_of_video(_added(cube, every))
     factor = max(1, round(_VISIBLE / max(height, width))) if scale is None else scale
-    factor = checks.count("frames: scale", factor, 1, ShapeError)
     running = _Running(cube) if accumulate else None
 
     def make(index: int) -> Image:
@@ -133,7 +115,7 @@ def video(
     fps: float = 25.0,
     progress: bool = False,
     axis: TimeAxis | None = None,
-    **settings: Unpack[FrameSettings],
+    **settings: Any,
 ) -> Path:
     """Write the :func:`frames` of a transient as ``.mp4`` or ``.gif``.
 
@@ -232,45 +214,36 @@ def write_video(
     """
     target = check_video(path)
     fps = positive("video: fps", fps)
-    one_by_one("video", frames, "frames (H, W, 3) of uint8")
-    many = checks.count("video: count", count, 0, ShapeError)
-    if not many:
-        raise ShapeError("video: expected at least one frame, got none.")
     if target.suffix.lower() != ".mp4" and fps > 50:
         raise UnitError(f"video: a GIF shows at most 50 frames a second, got fps={fps!r}. Write an .mp4.")
     with replacing(target, "video") as unfinished:
         try:
             if target.suffix.lower() == ".mp4":
-                _write_mp4(unfinished, _followed(frames, many, progress), fps)
+                _write_mp4(unfinished, _followed(frames, count, progress), fps)
             else:
-                palette = _palette(frames, many)
-                _write_gif(unfinished, _followed(frames, many, progress), palette, fps)
+                palette = _palette(_followed(frames, count, progress=False), count)
+                _write_gif(unfinished, _followed(frames, count, progress), palette, fps)
         except OSError as error:  # with the command and its output, where it is ffmpeg's
             raise StorageError(f"video: '{target}' could not be written: {short_message(error)}.") from error
     return target
-
-
-def _checked_frame(frame: Any) -> Image:
-    if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
-        raise ShapeError(f"video: expected frames (H, W, 3) of uint8, got {shown(frame)}.")
-    return frame
 
 
 def _followed(frames: Iterable[Image], count: int, progress: bool) -> Iterator[Image]:
     """Yield the frames, checked, behind a progress bar."""
     from tqdm import tqdm
 
-    size: tuple[int, ...] | None = None
-    for given in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
-        frame = _checked_frame(given)
-        if size is not None and frame.shape != size:
-            raise ShapeError(f"video: expected frames of equal size {size}, got {tuple(frame.shape)}.")
-        size = frame.shape
+    size: tuple[int, ...] = ()
+    for frame in tqdm(frames, total=count, desc="video", unit="frame", disable=not progress):
+        size = size or frame.shape
+        if frame.dtype != np.uint8 or frame.shape != size or len(size) != 3 or size[2] != 3:
+            raise ShapeError(f"video: expected frames (H, W, 3) of uint8 and of one size, got {shown(frame)}.")
         yield frame
+    if not size:
+        raise ShapeError("video: expected at least one frame, got none; for a GIF frames are iterated twice.")
 
 
 def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
-    writer = None
+    writer, written = None, 0
     try:
         for frame in frames:
             odd = [(0, n % 2) for n in frame.shape[:2]]
@@ -285,27 +258,15 @@ def _write_mp4(target: Path, frames: Iterator[Image], fps: float) -> None:
                 )  # fmt: skip
                 writer.send(None)
             writer.send(np.ascontiguousarray(even))
+            written += 1
     finally:
         if writer is not None:
             writer.close()
-    if not _is_whole(target):  # which ffmpeg says on stderr alone
-        raise StorageError("video: ffmpeg ended before the file was whole. Is the disk full?")
-
-
-def _is_whole(mp4: Path) -> bool:
-    """Return True for an MP4 whose boxes, each with its length before it, fill the file, with a table."""
-    kinds, place, size = set(), 0, mp4.stat().st_size
-    with mp4.open("rb") as file:
-        while place + 8 <= size:
-            file.seek(place)
-            length, kind = struct.unpack(">I4s", file.read(8))
-            if length == 1:  # it follows, in 64 bits
-                length = int.from_bytes(file.read(8), "big")
-            if length < 8:
-                return False
-            kinds.add(kind)
-            place += length
-    return place == size and kinds >= {b"moov", b"mdat"}
+    with contextlib.suppress(RuntimeError):  # of a file that is none
+        if _ffmpeg().count_frames_and_secs(str(target))[0] == written:
+            return
+    # ffmpeg says so on stderr alone
+    raise StorageError("video: ffmpeg ended before the file was whole. Is the disk full?")
 
 
 def _palette(frames: Iterable[Image], count: int) -> Any:
@@ -314,10 +275,8 @@ def _palette(frames: Iterable[Image], count: int) -> Any:
     seen = []
     for number, frame in enumerate(frames):
         if number % step == 0:
-            pixels = _checked_frame(frame).reshape(-1, 3)
+            pixels = frame.reshape(-1, 3)
             seen.append(pixels[:: max(1, pixels.shape[0] * _PALETTE_FRAMES // _PALETTE_PIXELS)])
-    if not seen:
-        raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none.")
     # A colour that fills the picture, such as black, must not use up the palette.
     colours = np.unique(np.concatenate(seen) & 0xFC, axis=0)
     row = pillow().fromarray(np.ascontiguousarray(colours[None]).astype(np.uint8))
@@ -331,22 +290,13 @@ def _palette(frames: Iterable[Image], count: int) -> Any:
 def _write_gif(target: Path, frames: Iterator[Image], palette: Any, fps: float) -> None:
     none = pillow().Dither.NONE
     images = (pillow().fromarray(frame).quantize(palette=palette, dither=none) for frame in frames)
-    first = next(images, None)
-    if first is None:
-        raise ShapeError("video: expected frames that can be iterated twice for a GIF, got none the second time.")
+    first = next(images)
     duration = max(2, round(100 / fps)) * 10
     first.save(target, format="GIF", save_all=True, append_images=images, duration=duration, loop=0, optimize=False)
 
 
 def _ffmpeg() -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingPackageError(
-            "video: an .mp4 needs the package imageio-ffmpeg, which brings ffmpeg along. Install it with pip install "
-            "'torchtransient[vis]', or choose a name that ends in .gif."
-        ) from error
-    return imageio_ffmpeg
+    return needed("imageio_ffmpeg", "imageio-ffmpeg")
 
 
 # ------------------------------------------------------------------------------------------- the strip with the time

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import Numbers, positive, real_array, shown
+from torchtransient.checks import Numbers, positive
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.vis.files import figure_type, save_figure
 
@@ -137,25 +137,16 @@ def _label(panel: Any, title: str, right: str, upwards: str) -> None:
     panel.tick_params(labelsize=7)
 
 
-def _plain(name: str, values: Any) -> Tensor:
-    try:
-        tensor = torch.as_tensor(values).detach().cpu()
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise ShapeError(f"{name}: expected a tensor of numbers, got {shown(values)}.") from None
-    if tensor.is_complex():
-        return (tensor.real.square() + tensor.imag.square()).double()
-    return tensor.double()
-
-
 def _volume(volume: Any) -> Tensor:
-    values = _plain("volume", volume)
-    if values.ndim != 3 or values.numel() == 0:
+    values = torch.as_tensor(volume).detach().cpu()
+    if values.ndim != 3:
         raise ShapeError(f"volume: expected (Z, Y, X), got {tuple(values.shape)}; choose an item and a channel.")
-    return values.clamp_min(0)
+    values = values.real.square() + values.imag.square() if values.is_complex() else values
+    return values.double().clamp_min(0)
 
 
 def _map(name: str, values: Any, size: tuple[int, ...]) -> Tensor:
-    plain = _plain(name, values)
+    plain = torch.as_tensor(values).detach().cpu().double()
     if tuple(plain.shape) != size:
         raise ShapeError(f"{name}: expected {size}, got {tuple(plain.shape)}; choose an item and a channel.")
     return plain
@@ -166,18 +157,13 @@ def _scales(size: tuple[int, ...], depths: Any, extent: Any) -> tuple[Tensor, tu
     if depths is None:
         z = torch.arange(size[0] + 1, dtype=torch.float64) - 0.5
     else:
-        plain = real_array(depths)
-        if plain is None or plain.shape != (size[0],):
-            raise ShapeError(f"depths: expected ({size[0]},), one for each plane, got {shown(depths)}.")
-        planes = torch.from_numpy(plain)
+        planes = torch.as_tensor(depths, dtype=torch.float64).detach().cpu()
+        if planes.shape != (size[0],):
+            raise ShapeError(f"depths: expected ({size[0]},), one for each plane, got {tuple(planes.shape)}.")
         halves = planes.diff() / 2 if len(planes) > 1 else torch.full((1,), 0.5, dtype=torch.float64)
-        if not bool(torch.isfinite(planes).all()) or not bool((halves > 0).all()):
-            raise UnitError(f"depths: expected finite metres that increase, got {shown(plain.tolist())}.")
+        if not bool((halves > 0).all()):
+            raise UnitError(f"depths: expected metres that increase, got {planes.tolist()}.")
         between = planes[:-1] + halves[: len(planes) - 1]
         z = torch.cat([planes[:1] - halves[:1], between, planes[-1:] + halves[-1:]])
-    if extent is None:
-        return z, (float(size[2]), float(size[1]))
-    pair = real_array(extent)
-    if pair is None or pair.shape != (2,) or not ((pair > 0) & (pair < float("inf"))).all():
-        raise UnitError(f"extent: expected (width, height) in metres, greater than zero, got {shown(extent)}.")
-    return z, (float(pair[0]), float(pair[1]))
+    width, height = (size[2], size[1]) if extent is None else extent
+    return z, (positive("extent: width", width), positive("extent: height", height))

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,19 +29,15 @@ from torchtransient.vis.pages.content import (
 )  # fmt: skip
 from torchtransient.vis.sources import as_tensor, frequencies_of, read_any
 
-# Samples of a data set on a page.
-_SAMPLES = 8
+# What films measure, by the names of results.
+_FILMS = ("rates", "beats", "slow_phasor", "phasor", "gated", "transient")
 
 
-def content_of(
-    x: Any, who: str, *, axis: TimeAxis | None = None, rate_axis: RateAxis | None = None,
-    frequencies: Any = None, samples: int = _SAMPLES,
-) -> Content:  # fmt: skip
+def content_of(x: Any, *, axis: TimeAxis | None, rate_axis: RateAxis | None, frequencies: Any, samples: int) -> Content:
     """Return the content of a page.
 
     Args:
         x: anything that :func:`torchtransient.vis.view` shows.
-        who: beginning of messages.
         axis, rate_axis, frequencies: axes of tensors.
         samples: most samples of a sequence.
 
@@ -49,22 +46,18 @@ def content_of(
     """
     known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
     if isinstance(x, tuple) and len(x) == 2:
-        return _together([_single(part, who, **known) for part in x], ("A", "B"), who)
-    if not isinstance(x, Tensor | np.ndarray | Mapping | str | Path) and _is_sequence(x):
+        return _together([_single(part, **known) for part in x], ("A", "B"))
+    sequence = hasattr(x, "__getitem__") or hasattr(x, "__iter__")
+    if sequence and not isinstance(x, Tensor | np.ndarray | Mapping | str | Path):
         known["axis"] = getattr(x, "axis", None) if axis is None else axis
         parts = list(islice(_each(x), samples))
         if not parts:
-            raise ShapeError(f"{who}: expected at least one sample, got an empty {type(x).__name__}.")
-        found = _together(
-            [_single(part, who, **known) for part in parts], [f"sample {n}" for n in range(len(parts))], who
-        )
+            raise ShapeError(f"view: expected at least one sample, got an empty {type(x).__name__}.")
+        names = [f"sample {n}" for n in range(len(parts))]
+        found = _together([_single(part, **known) for part in parts], names)
         left = len(x) - len(parts) if hasattr(x, "__len__") else 0
         return replace(found, notes=(*found.notes, f"The first {len(parts)} of {len(x)} samples.")) if left else found
-    return _single(x, who, **known)
-
-
-def _is_sequence(x: Any) -> bool:
-    return hasattr(x, "__getitem__") or hasattr(x, "__iter__")
+    return _single(x, **known)
 
 
 def _each(x: Any) -> Iterator[Any]:
@@ -73,7 +66,7 @@ def _each(x: Any) -> Iterator[Any]:
     return iter(x)
 
 
-def _together(parts: list[Content], names: Sequence[str], who: str) -> Content:
+def _together(parts: list[Content], names: Sequence[str]) -> Content:
     first = parts[0]
     for part in parts[1:]:
         same = (part.kind, part.shape, part.layers, part.planes[0].light.shape) == (
@@ -81,89 +74,76 @@ def _together(parts: list[Content], names: Sequence[str], who: str) -> Content:
         )  # fmt: skip
         if not same:
             raise ShapeError(
-                f"{who}: expected results of one kind and shape to compare, got {first.kind} {first.shape} and "
-                f"{part.kind} {part.shape}. Show each on a page of its own, or crop and resample them to one shape."
+                f"view: expected results of one kind and shape to compare, got {first.kind} {first.shape} and "
+                f"{part.kind} {part.shape}."
             )
         if not np.allclose(part.slider.centers, first.slider.centers):
-            ends = [
-                f"{each.slider.centers[0]:.6g} to {each.slider.centers[-1]:.6g} {each.slider.unit}".strip()
-                for each in (first, part)
-            ]
             raise ShapeError(
-                f"{who}: expected results over one {first.slider.name} to compare, got centres of {ends[0]} and of "
-                f"{ends[1]}. Render both with one axis, show each on a page of its own, or give the tensors alone to "
-                "compare them bin by bin."
+                f"view: expected results over one {first.slider.name} to compare, got others. Render both with one "
+                "axis, or give the tensors alone to compare them bin by bin."
             )
     return replace(first, items=tuple(names), planes=tuple(planes for part in parts for planes in part.planes))
 
 
-def _single(x: Any, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
+def _single(x: Any, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
     if isinstance(x, str | Path):
         x = read_any(Path(x))
     if isinstance(x, Mapping):
-        x = _Named(x, axis)
+        # The light of a sample is its measurement where it holds no other.
+        light = {} if {*_FILMS} & {*x} else {"transient": x.get("measurement")}
+        x = SimpleNamespace(**{"axis": axis, **x, **light})
     if isinstance(x, Capture):
-        return _capture(x, who)
+        return _capture(x)
     if hasattr(x, "grid") and hasattr(x, "picture"):
         return _volume(x)
     axis = getattr(x, "axis", None) if axis is None else axis
-    for name, make in (("rates", _rates), ("beats", _beats)):
-        if getattr(x, name, None) is not None:
-            given = getattr(x, "rate_axis", None) if rate_axis is None else rate_axis
-            return make(as_tensor(getattr(x, name), who), axis, given, who)
-    if getattr(x, "slow_phasor", None) is not None:
-        known = getattr(x, "frequencies", None) if frequencies is None else frequencies
-        return _slow_phasors(as_tensor(x.slow_phasor, who), known, getattr(x, "slow_times", None), who)
-    if getattr(x, "phasor", None) is not None:
-        known = getattr(x, "frequencies", None) if frequencies is None else frequencies
-        return _phasors(as_tensor(x.phasor, who), known, who)
-    if getattr(x, "gated", None) is not None:
-        slider = gate_slider(x.gated.shape[-3], getattr(x, "gates", None))
-        return light_content(as_tensor(x.gated, who), slider, "gates", _errors(x), who)
-    if getattr(x, "transient", None) is not None:
-        cube = as_tensor(x.transient, who)
-        return light_content(
-            cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", _errors(x), who
-        )
-    return _plain(as_tensor(x, who), who, axis, rate_axis, frequencies)
+    rate_axis = getattr(x, "rate_axis", None) if rate_axis is None else rate_axis
+    frequencies = getattr(x, "frequencies", None) if frequencies is None else frequencies
+    name = next((name for name in _FILMS if getattr(x, name, None) is not None), "")
+    cube = as_tensor(getattr(x, name) if name else x, "view")
+    match name:
+        case "rates":
+            return _rates(cube, axis, rate_axis)
+        case "beats":
+            return _beats(cube, axis)
+        case "slow_phasor":
+            return _slow_phasors(cube, frequencies, getattr(x, "slow_times", None))
+        case "phasor":
+            return _phasors(cube, frequencies)
+        case "gated":
+            return _light(cube, gate_slider(cube.shape[-3], getattr(x, "gates", None)), "gates", _errors(x))
+        case "transient":
+            return _light(cube, _slider_of(cube, axis), error=_errors(x))
+    return _plain(cube, axis, rate_axis, frequencies)
 
 
-def _plain(cube: Tensor, who: str, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
+def _plain(cube: Tensor, axis: Any, rate_axis: Any, frequencies: Any) -> Content:
     if cube.is_complex():
-        return _phasors(cube, frequencies, who)
+        return _phasors(cube, frequencies)
     if frequencies is not None:
-        raise ArgumentError(f"{who}: frequencies are those of complex phasors (C, F, H, W), got {cube.dtype}.")
+        raise ArgumentError(f"view: frequencies are those of complex phasors (C, F, H, W), got {cube.dtype}.")
     if rate_axis is not None:
-        return _rates(cube, axis, rate_axis, who)
+        return _rates(cube, axis, rate_axis)
     if cube.ndim == 3 and len(cube) == 3 and axis is None:
         raise ShapeError(
-            f"{who}: {tuple(cube.shape)} is a steady picture in colour, or three bins of time. Give light as "
+            f"view: {tuple(cube.shape)} is a steady picture in colour, or three bins of time. Give light as "
             "(C, T, H, W): steady[:, None] of a picture, cube[None] of bins."
         )
     if cube.ndim == 3:
         cube = cube[None]
     if cube.ndim == 5 and cube.shape[0] == 4 and not _may_be_stokes(cube):
         raise ShapeError(
-            f"{who}: expected Stokes components (4, C, T, H, W) with C = 1 or 3 and S1, S2, S3 within S0, got "
+            f"view: expected Stokes components (4, C, T, H, W) with C = 1 or 3 and S1, S2, S3 within S0, got "
             f"{tuple(cube.shape)} without either. Light over rates (C, R, T, H, W) needs rate_axis=tt.RateAxis(...); "
             "polarized light of other channels is shown of its result, or with one channel chosen."
         )
-    return light_content(cube, slider_of(cube.shape[-3] if cube.ndim > 2 else 0, axis, who), "transient", None, who)
+    return _light(cube, _slider_of(cube, axis))
 
 
 def _may_be_stokes(cube: Tensor) -> bool:
     """Sums of Stokes vectors have a polarized part within S0, and so has the sum over all pixels and bins."""
     s0, *others = cube.flatten(1).sum(1, dtype=torch.float64).tolist()
     return cube.shape[1] in (1, 3) and not math.hypot(*others) > 1.01 * s0
-
-
-class _Named:
-    """Entries of a sample by name; its light is the measurement where it holds no other."""
-
-    def __init__(self, entries: Mapping[str, Any], axis: Any) -> None:
-        self.__dict__.update({"axis": axis, **entries})
-        if not {"transient", "phasor", "slow_phasor", "gated", "rates", "beats"} & set(entries):
-            self.__dict__["transient"] = entries.get("measurement")
 
 
 def _errors(x: Any) -> Tensor | None:
@@ -173,24 +153,13 @@ def _errors(x: Any) -> Tensor | None:
     return found[0] if found.ndim == 4 else found
 
 
-def slider_of(bins: int, axis: TimeAxis | None, who: str) -> Slider:
-    """Return the slider of bins of time, which count without an axis.
-
-    Args:
-        bins: number of bins.
-        axis: time axis.
-        who: beginning of messages.
-
-    Raises:
-        ArgumentError: for another object.
-        ShapeError: for another number of bins.
-    """
+def _slider_of(cube: Tensor, axis: TimeAxis | None) -> Slider:
+    """Return the slider of bins of time of light (..., T, H, W), which count without an axis."""
+    bins = cube.shape[-3] if cube.ndim > 2 else 0
     if axis is None:
         return bin_slider(bins)
-    if not isinstance(axis, TimeAxis):
-        raise ArgumentError(f"{who}: expected axis as a TimeAxis, got {shown(axis)}.")
     if axis.num_bins != bins:
-        raise ShapeError(f"{who}: the axis has {axis.num_bins} bins, the light {bins}.")
+        raise ShapeError(f"view: the axis has {axis.num_bins} bins, the light {bins}.")
     return time_slider(axis.centers_opl.numpy())
 
 
@@ -202,21 +171,8 @@ def _grey(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     return mean[None], notes
 
 
-def light_content(
-    cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None, who: str = "view"
-) -> Content:
-    """Return the content of light over time.
-
-    Args:
-        cube: (C, T, H, W), or polarized (4, C, T, H, W). Other numbers of channels than 1 and 3 are averaged.
-        slider: positions of T.
-        kind: "transient" or "gates".
-        error: standard errors (T, H, W).
-        who: beginning of messages.
-
-    Raises:
-        ShapeError: for other shapes.
-    """
+def _light(cube: Tensor, slider: Slider, kind: str = "transient", error: Tensor | None = None) -> Content:
+    """Return the content of light (C, T, H, W), or polarized (4, C, T, H, W), with standard errors (T, H, W)."""
     if cube.ndim == 5 and cube.shape[0] == 4:
         mean, notes = _over_channels(cube.transpose(0, 1))
         ratios = torch.where(mean[:1] > 0, mean[1:] / mean[:1], 0.0)
@@ -224,7 +180,7 @@ def light_content(
         return Content("polarized", slider, ("",), ("",), (planes,), notes=notes)
     if cube.ndim != 4 or not cube.numel():
         raise ShapeError(
-            f"{who}: expected light (C, T, H, W), polarized (4, C, T, H, W) or a result that has some, got "
+            f"view: expected light (C, T, H, W), polarized (4, C, T, H, W) or a result that has some, got "
             f"{tuple(cube.shape)}; of a batch, choose one entry. Rates (C, R, T, H, W) need rate_axis=tt.RateAxis(...)."
         )
     light, notes = _grey(cube)
@@ -232,34 +188,34 @@ def light_content(
     return Content(kind, slider, ("",), ("",), (Planes(light, error=error),), quantity=quantity, notes=notes)
 
 
-def _phasors(cube: Tensor, known: Any, who: str) -> Content:
+def _phasors(cube: Tensor, known: Any) -> Content:
     cube = cube[0] if cube.ndim == 5 and cube.shape[0] == 4 else cube
-    if cube.ndim != 4 or not cube.is_complex() or not cube.numel():
+    if cube.ndim != 4 or not cube.is_complex():
         raise ShapeError(
-            f"{who}: expected complex phasors (C, F, H, W), got {cube.dtype} {tuple(cube.shape)}. Phasors at several "
+            f"view: expected complex phasors (C, F, H, W), got {cube.dtype} {tuple(cube.shape)}. Phasors at several "
             "slow times (C, S, F, H, W) are shown of a result that has them, or of {'slow_phasor': tensor}."
         )
     mean, notes = _over_channels(cube)
-    slider = frequency_slider(_frequencies(known, len(mean), who), len(mean))
+    slider = frequency_slider(_frequencies(known, len(mean)), len(mean))
     planes = Planes(mean.abs()[None], phase=mean.angle())
     return Content("phasors", slider, ("",), ("",), (planes,), quantity="amplitude", notes=notes)
 
 
-def _slow_phasors(cube: Tensor, known: Any, slow_times: Any, who: str) -> Content:
+def _slow_phasors(cube: Tensor, known: Any, slow_times: Any) -> Content:
     """Phasors (C, S, F, H, W): the slider is the slow time, and frequencies are layers."""
     cube = cube[0] if cube.ndim == 6 and cube.shape[0] == 4 else cube
-    if cube.ndim != 5 or not cube.is_complex() or not cube.numel():
+    if cube.ndim != 5 or not cube.is_complex():
         raise ShapeError(
-            f"{who}: expected complex phasors (C, S, F, H, W) at S slow times, got {cube.dtype} {tuple(cube.shape)}."
+            f"view: expected complex phasors (C, S, F, H, W) at S slow times, got {cube.dtype} {tuple(cube.shape)}."
         )
     mean, notes = _over_channels(cube)
-    numbers = _frequencies(known, mean.shape[1], who)
+    numbers = _frequencies(known, mean.shape[1])
     if slow_times is None:
         slider = Slider("slow time", "", np.arange(len(mean), dtype=np.float64))
     else:
         slider = Slider("slow time", "s", np.array(slow_times, dtype=np.float64))
         if len(slow_times) != len(mean):
-            raise ShapeError(f"{who}: expected {len(mean)} slow_times, as the phasors have, got {len(slow_times)}.")
+            raise ShapeError(f"view: expected {len(mean)} slow_times, as the phasors have, got {len(slow_times)}.")
     names = tuple(f"{n}" if numbers is None else f"{numbers[n]:.6g} /m" for n in range(mean.shape[1]))
     planes = tuple(Planes(part.abs()[None], phase=part.angle()) for part in mean.unbind(1))
     return Content(
@@ -267,10 +223,10 @@ def _slow_phasors(cube: Tensor, known: Any, slow_times: Any, who: str) -> Conten
     )
 
 
-def _frequencies(known: Any, count: int, who: str) -> tuple[float, ...] | None:
+def _frequencies(known: Any, count: int) -> tuple[float, ...] | None:
     numbers = frequencies_of(known)
     if numbers is not None and len(numbers) != count:
-        raise ShapeError(f"{who}: expected {count} frequencies, as the phasors have, got {len(numbers)}.")
+        raise ShapeError(f"view: expected {count} frequencies, as the phasors have, got {len(numbers)}.")
     return numbers
 
 
@@ -279,40 +235,39 @@ def _over_channels(cube: Tensor) -> tuple[Tensor, tuple[str, ...]]:
     return cube.mean(0), () if cube.shape[0] == 1 else (f"Mean over {cube.shape[0]} channels.",)
 
 
-def _rows(cube: Tensor, who: str, what: str) -> tuple[Tensor, tuple[str, ...]]:
-    if cube.ndim != 5 or cube.is_complex() or not cube.numel():
-        raise ShapeError(f"{who}: expected {what}, got {tuple(cube.shape)}; of a batch, choose one entry.")
+def _rows(cube: Tensor, what: str) -> tuple[Tensor, tuple[str, ...]]:
+    if cube.ndim != 5 or cube.is_complex():
+        raise ShapeError(f"view: expected {what}, got {tuple(cube.shape)}; of a batch, choose one entry.")
     return _over_channels(cube)
 
 
-def _rates(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
-    mean, notes = _rows(cube, who, "light over rates and lengths (C, R, T, H, W)")
+def _rates(cube: Tensor, axis: Any, rate_axis: Any) -> Content:
+    mean, notes = _rows(cube, "light over rates and lengths (C, R, T, H, W)")
     if not isinstance(rate_axis, RateAxis) or rate_axis.num_bins != len(mean):
-        raise ShapeError(f"{who}: light over {len(mean)} rates needs rate_axis=RateAxis(...), got {shown(rate_axis)}.")
+        raise ShapeError(f"view: light over {len(mean)} rates needs rate_axis=RateAxis(...), got {shown(rate_axis)}.")
     centers = tuple(rate_axis.centers.tolist())
     return Content(
-        "rates", slider_of(mean.shape[1], axis, who), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
+        "rates", _slider_of(mean, axis), ("",), tuple(f"{rate:.4g} m/s" for rate in centers),
         tuple(Planes(part[None]) for part in mean), layer_name="rate", layer_numbers=centers, notes=notes,
     )  # fmt: skip
 
 
-def _beats(cube: Tensor, axis: Any, rate_axis: Any, who: str) -> Content:
-    mean, notes = _rows(cube, who, "beats (C, 2, T, H, W)")
+def _beats(cube: Tensor, axis: Any) -> Content:
+    mean, notes = _rows(cube, "beats (C, 2, T, H, W)")
     planes = tuple(Planes(part[None]) for part in mean)
-    slider = slider_of(mean.shape[1], axis, who)
+    slider = _slider_of(mean, axis)
     names = ("up chirp", "down chirp")
     return Content("beats", slider, ("",), names, planes, quantity="beat power", layer_name="chirp", notes=notes)
 
 
-def _capture(capture: Capture, who: str) -> Content:
+def _capture(capture: Capture) -> Content:
     tensor = capture.transient if capture.transient is not None else capture.phasor
-    assert tensor is not None  # a capture has one
-    cube = as_tensor(tensor, who)
+    cube = as_tensor(tensor, "view")
     scan, rank = capture.scan, len(capture.scan.shape)
     if capture.polarized:
         cube = cube.select(cube.ndim - rank - 3, 0)
     if cube.ndim != rank + 2:
-        raise ShapeError(f"{who}: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
+        raise ShapeError(f"view: expected one capture, got a batch {tuple(cube.shape)}; choose one of it.")
     rows, columns = (1, *scan.sensor_shape)[-2:]
     spots = scan.laser_shape if scan.kind == "exhaustive" else ()
     cube = cube.reshape(*cube.shape[:2], -1, rows, columns)
@@ -326,10 +281,10 @@ def _capture(capture: Capture, who: str) -> Content:
         marks = tuple((float(p @ across), float(p @ up)) for p in lasers) if scan.kind != "confocal" else ()
         common |= {"extent": extent, "unit": "m", "marks": marks if scan.kind in ("single", "exhaustive") else ()}
     if capture.transient is None:
-        parts = [_phasors(cube[:, :, n], capture.frequencies, who) for n in range(cube.shape[2])]
+        parts = [_phasors(cube[:, :, n], capture.frequencies) for n in range(cube.shape[2])]
         return replace(parts[0], planes=tuple(part.planes[0] for part in parts), **common)
     light = [_grey(cube[:, :, n]) for n in range(cube.shape[2])]
-    slider = slider_of(cube.shape[1], capture.axis, who)
+    slider = _slider_of(light[0][0], capture.axis)
     return Content("capture", slider, planes=tuple(Planes(part) for part, _ in light), notes=light[0][1], **common)
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from torchtransient.errors import MissingPackageError
 from torchtransient.vis.colour_maps import oklch
 from torchtransient.vis.colour_maps import rainbow as rainbow_colours
+from torchtransient.vis.files import needed
 from torchtransient.vis.pages.content import Content
 
 _SCRIPT = Path(__file__).with_name("view.js")
@@ -33,15 +33,8 @@ _MODES = {
 
 def import_bokeh() -> Any:
     """Return the package bokeh. Raises MissingPackageError without it."""
-    try:
-        import bokeh
-        import bokeh.models
-        import bokeh.plotting
-    except ImportError as error:
-        raise MissingPackageError(
-            "view: pages need the package bokeh. Install it with pip install 'torchtransient[view]'."
-        ) from error
-    return bokeh
+    needed("bokeh.plotting", "bokeh", "view")
+    return needed("bokeh", "bokeh", "view")
 
 
 def modes_of(content: Content) -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from html import escape
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from torchtransient.array_files.part_files import replacing
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
-from torchtransient.checks import Numbers, check_folder, count, positive
+from torchtransient.checks import Numbers, check_folder
 from torchtransient.errors import UnitError
 from torchtransient.vis.pages.codes import PHASE, RATIO, Table, table_of
 from torchtransient.vis.pages.content import Content, Planes
@@ -92,13 +93,12 @@ def view(
         StorageError: when a file cannot be read or the page not be written.
         MissingPackageError: without bokeh, the extra ``view``.
     """
-    megabytes, samples = positive("view: max_megabytes", max_megabytes), count("view: samples", samples)
-    if megabytes < 2:
+    if not max_megabytes >= 2:
         raise UnitError(f"view: expected max_megabytes of at least 2, as an empty page takes, got {max_megabytes!r}.")
     target = None if path is None else check_folder(path, "view")
     heading = title or (Path(x).name if isinstance(x, str | Path) else "torchtransient")
-    content = content_of(x, "view", axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
-    page = page_of(content, heading, int(megabytes * 1e6))
+    content = content_of(x, axis=axis, rate_axis=rate_axis, frequencies=frequencies, samples=samples)
+    page = _page_of(content, heading, int(max_megabytes * 1e6))
     if target is None:
         return page
     with replacing(target, "view") as unfinished:
@@ -119,14 +119,8 @@ class Encoded:
         return sum(len(packed) for planes in self.packed for packed in planes.values()) * 4 // 3
 
 
-def page_of(content: Content, title: str, max_bytes: int) -> Page:
-    """Return the page of a content, binned until it fits.
-
-    Args:
-        content: the content.
-        title: heading.
-        max_bytes: most bytes of the page.
-    """
+def _page_of(content: Content, title: str, max_bytes: int) -> Page:
+    """Return the page of a content, binned until it fits."""
     import_bokeh()
     not_finite = _not_finite_said(content)
     room = max_bytes - 1_800_000
@@ -173,7 +167,7 @@ def _expected(content: Content, times: int, pixels: int) -> float:
     for start in ((2 * k + 1) * (bins - some) // (2 * number) for k in range(number)):
         planes = content.planes[:: max(1, len(content.planes) // _SAMPLED)]
         parts.append([part.map(lambda x, a=start: x[..., a : a + some, :, :]) for part in planes])  # type: ignore[misc]
-    joined = [_joined([part[n] for part in parts]) for n in range(len(parts[0]))]
+    joined = [_joined(same) for same in zip(*parts, strict=True)]
     share = len(parts) * some * len(joined) / (bins * len(content.planes))
     slider = replace(content.slider, centers=np.arange(float(len(parts) * some)))
     sample = replace(content, planes=tuple(joined), slider=slider)
@@ -182,7 +176,7 @@ def _expected(content: Content, times: int, pixels: int) -> float:
     return encoded.size / share if codes <= _MOST_CODES else float("inf")
 
 
-def _joined(parts: list[Planes]) -> Planes:
+def _joined(parts: Sequence[Planes]) -> Planes:
     """Return bins of several parts in one."""
     names = ("light", "ratios", "phase", "error")
     held = [name for name in names if all(getattr(part, name) is not None for part in parts)]
