@@ -80,7 +80,7 @@ def test_modules_hold_the_options_of_functions(case):
         torch.testing.assert_close(other(*arguments), case(x, y), rtol=0, atol=0)
     assert module.state_dict() == {}
     assert all(getattr(module, name) is value for name, value in case.options.items())
-    with pytest.raises(TypeError, match=f"^{case.module.__name__}"):
+    with pytest.raises(TypeError):
         case.module(redution="sum")
 
 

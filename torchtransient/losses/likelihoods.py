@@ -24,12 +24,12 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import positive
-from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
 from torchtransient.floating import is_true
 from torchtransient.losses.checks import (
     Reduction,
@@ -44,7 +44,7 @@ from torchtransient.losses.checks import (
     reduce,
     working_dtype,
 )
-from torchtransient.losses.layouts import as_columns, bins_dim, item_dims, time_dim
+from torchtransient.losses.layouts import as_columns, bins_dim, item_dims
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, TRANSIENT, Light, Transient, reads
 from torchtransient.sensing.dead_time.renewal import check_dead_bins
@@ -77,7 +77,6 @@ def poisson_nll(
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
-    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -92,7 +91,6 @@ def poisson_nll(
         target: counts, of the same shape.
         floor: added to the mean, number or tensor that broadcasts; `relative_floor` makes one of the model.
         constant: add `log n!`.
-        dim: dimension of time, checked only.
         mask: bins that count.
         reduction: "mean" over bins that count, "sum", or "none".
 
@@ -106,8 +104,6 @@ def poisson_nll(
     """
     where = "poisson_nll"
     mean, counts = _check_prediction(input, target, where)
-    if dim is not None:
-        time_dim(mean, dim, where)
     mask = check_mask(mask, mean, where)
     counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
     _check_rates(mean, where)
@@ -123,7 +119,7 @@ def poisson_nll(
 poisson_loss = poisson_nll
 
 
-class PoissonNLL(LossModule, function=poisson_nll, by_place=("floor", "dim", "reduction")):
+class PoissonNLL(LossModule, function=poisson_nll, by_place=("floor", "reduction")):
     """`poisson_nll` with its options held."""
 
 
@@ -373,15 +369,9 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
         not fit.
 
     Raises:
-        ShapeError: for less than three dimensions.
-        UnitError: for complex counts, and for periods or dead times that are none.
+        UnitError: for periods or dead times that are none.
     """
     where = "armed_periods"
-    (counts,) = check_dense((counts,), where)
-    if counts.ndim < 3:
-        raise ShapeError(f"{where}: expected counts (..., T, H, W), got {tuple(counts.shape)}. Add the missing ones.")
-    if counts.is_complex():
-        raise UnitError(f"{where}: expected counts, got complex numbers ({counts.dtype}). Give the histogram.")
     periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
     whole = math.floor(dead_bins + 1e-9)
     part = max(0.0, dead_bins - whole)
@@ -408,30 +398,23 @@ def _check_prediction(input: object, target: object, where: str) -> tuple[Tensor
     Counts first and a record without gradient that holds none may be meant, and are a warning.
     """
     pair = check_pair(input, target, where, names="prediction and counts")
-    if isinstance(input, Tensor) and not input.is_floating_point():
-        raise UnitError(
-            f"{where}: expected a prediction of a floating dtype first and counts second, got {input.dtype} first. "
-            "Take (input, target) in that order; a prediction of whole numbers as input.float()."
+    input, target = cast(tuple[Tensor, Tensor], (input, target))
+    order = "Take (input, target) in that order"
+    if not input.is_floating_point():
+        raise UnitError(f"{where}: expected a floating prediction first, got {input.dtype}. {order}, or input.float().")
+    if target.requires_grad and not input.requires_grad:
+        raise GradientError(
+            f"{where}: expected the prediction first, got an input without and a target with a gradient. {order}, or "
+            "target.detach()."
         )
-    if isinstance(input, Tensor) and isinstance(target, Tensor):
-        if target.requires_grad and not input.requires_grad:
+    if _are_counts(input) and not _are_counts(target):
+        if target.requires_grad:
             raise GradientError(
-                f"{where}: expected the prediction first, got an input without and a target with a gradient. Take "
-                "(input, target) in that order, or target.detach()."
+                f"{where}: expected the prediction first, got counts (draws of a chain with straight_through?), and a "
+                f"target with a gradient that holds none. {order}; if it is right, target.detach()."
             )
-        if _are_counts(input) and not _are_counts(target):
-            if target.requires_grad:
-                raise GradientError(
-                    f"{where}: expected the prediction first, got counts with a gradient first (draws of a chain with "
-                    "straight_through?) and a target with a gradient that holds none. Take (input, target) in that "
-                    "order; if it is right, target.detach()."
-                )
-            warnings.warn(
-                f"{where}: the first argument holds counts and the second one does not. The prediction comes first: "
-                "(input, target).",
-                TorchTransientWarning,
-                stacklevel=4,
-            )
+        said = f"{where}: the first argument holds counts and the second one does not. {order}."
+        warnings.warn(said, TorchTransientWarning, stacklevel=4)
     return pair
 
 
@@ -457,18 +440,12 @@ def _check_constant(counts: Tensor, constant: bool, where: str) -> None:
 
 
 def _check_dead_time(dead_bins: float, where: str) -> float:
-    check_number("dead_bins", dead_bins, where)
-    number = positive(f"{where}: dead_bins", dead_bins)
-    try:
-        check_dead_bins(number)
-    except UnitError as error:
-        raise UnitError(f"{where}: {error}") from None
-    return number
+    return check_dead_bins(check_number("dead_bins", dead_bins, where))
 
 
 def _exact(target: object, mask: Tensor | None, dim: int) -> Tensor:
     """Counts in float64, 0 in pixels of which no bin counts: single precision may not hold sums of them."""
-    counts = check_dense((target,), "counts")[0].to(torch.float64)
+    counts = cast(Tensor, target).to(torch.float64)
     return counts if mask is None else counted(counts, mask.any(dim, keepdim=True))
 
 
