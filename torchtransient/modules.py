@@ -75,7 +75,8 @@ def let_copy(module: nn.Module) -> None:
 def _reduced(module: nn.Module, _protocol: Any) -> tuple[Any, ...]:
     # What the class itself would put away: torch's class on top refuses to.
     own: Any = parametrize.type_before_parametrizations(module)
-    return _shell, _origin(module), own.__getstate__(module)
+    names = tuple(module.parametrizations) if parametrize.is_parametrized(module) else ()  # type: ignore[arg-type]
+    return _shell, (own, names), own.__getstate__(module)
 
 
 def _parts(module: Any) -> tuple[Any, tuple[Any, ...], Any]:
@@ -113,12 +114,6 @@ def _with_own_containers(module: Any) -> Any:
     twin.__dict__.update(module.__dict__)
     _own_containers(twin)
     return twin
-
-
-def _origin(module: nn.Module) -> tuple[type, tuple[str, ...]]:
-    """Return the class before parametrizations, and their names."""
-    names = tuple(module.parametrizations) if parametrize.is_parametrized(module) else ()  # type: ignore[arg-type]
-    return parametrize.type_before_parametrizations(module), names
 
 
 def _shell(cls: Any, names: tuple[str, ...]) -> Any:

@@ -64,9 +64,7 @@ def check_target(path: str | Path, what: str) -> Path:
         StorageError: for another ending, and a folder that is missing or closed.
         MissingPackageError: for HDF5 without h5py.
     """
-    target = path_of(path, what)
-    if target.suffix.lower() not in ENDINGS:
-        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{target}'.")
+    target = _path_with_ending(path, what)
     check_folder(target, what)
     if target.suffix.lower() in HDF5:
         hdf5_package(what)
@@ -112,16 +110,19 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
     Raises:
         StorageError: for a file that is missing, of another format, or damaged.
     """
-    source = path_of(path, what)
-    if source.suffix.lower() not in ENDINGS:
-        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
-    check_source(source, what)
-
+    source = check_source(_path_with_ending(path, what), what)
     with damage_said(source, what):
         found = _format_of(source, what)
         if found not in forms:
             raise StorageError(f"{what}: '{source}' is {other_kind(found or 'nothing', forms[-1])}")
         return _values(source, what, known, found)
+
+
+def _path_with_ending(path: str | Path, what: str) -> Path:
+    found = path_of(path, what)
+    if found.suffix.lower() not in ENDINGS:
+        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{found}'.")
+    return found
 
 
 def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "a file of arrays") -> dict[str, Any]:

@@ -123,6 +123,7 @@ def write_plain_yaml(data: Any, what: str) -> str:
 
 def _lenient_loader(yaml: Any) -> Any:
     """Return a loader that reads all tags as the plain data under them."""
+
     class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
         """Plain data only."""
 

@@ -177,17 +177,15 @@ def check_number(name: str, value: object, where: str) -> float:
     Raises:
         UnitError: for other values, also for a tensor with a gradient, which a number would drop.
     """
-    if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
+    # forward mode has tangents, which `requires_grad` does not show
+    if isinstance(value, Tensor) and (
+        value.requires_grad or forward_ad.unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
+    ):
         raise UnitError(
             f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
             "no derivative by it: use .detach()."
         )
     return finite(f"{where}: {name}", value)
-
-
-def _tangent(x: Tensor) -> Tensor | None:
-    """Return the tangent of forward mode, which `requires_grad` does not show."""
-    return cast("Tensor | None", forward_ad.unpack_dual(x).tangent)  # type: ignore[no-untyped-call]
 
 
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:

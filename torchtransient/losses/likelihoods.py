@@ -29,7 +29,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from torchtransient.errors import GradientError, TorchTransientWarning, UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError, level_of_user
 from torchtransient.floating import is_true
 from torchtransient.losses.checks import (
     Reduction,
@@ -103,10 +103,8 @@ def poisson_nll(
         ShapeError: for two shapes.
     """
     where = "poisson_nll"
-    mean, counts = _check_prediction(input, target, where)
-    mask = check_mask(mask, mean, where)
-    counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
-    _check_rates(mean, where)
+    mean, counts, mask = _rates(input, target, mask, where)
+    counts = counted(counts, mask)
     _check_constant(counts, constant, where)
     m = _floored(mean, floor, where)
     level = _dark_level(counts, floor, input, averaged=divisor(mean, mask, reduction))
@@ -258,18 +256,16 @@ def first_photon_nll(
     Source: Coates 1968; Shin et al. 2015 for the likelihood.
     """
     where = "first_photon_nll"
-    rate = _check_prediction(input, target, where)[0]
+    rate, _, mask = _rates(input, target, mask, where)
     number = check_whole("cycles", cycles, where, UnitError)
-    dead = None if dead_bins is None else _check_dead_time(dead_bins, where)
+    dead = None if dead_bins is None else check_dead_bins(check_number("dead_bins", dead_bins, where))
     dim = bins_dim(rate, dim, where)
-    mask = check_mask(mask, rate, where)
-    rate = counted(rate, mask, 1.0)
-    _check_rates(rate, where)
     measured = _exact(target, mask, dim)
     _check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(_floored(rate, floor, where), dim).to(torch.float64)
     level = _dark_level(n, floor, input, number, divisor(rate, mask, reduction))
-    dark = None if level is None else _dark_counts(n, r, level)
+    below = None if level is None else (r < level) & (n != 0)
+    dark = below if below is not None and bool(below.any()) else None
     near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead_bins=dead, constant=constant, where=where)
     if level is not None and dark is not None:
@@ -329,12 +325,8 @@ def free_running_nll(
     Source: Rapp et al. 2019 and Gupta et al. 2019, see `sensing.free_running`.
     """
     where = "free_running_nll"
-    rate = _check_prediction(input, target, where)[0]
-    periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
+    rate, _, mask = _rates(input, target, mask, where)
     dim = bins_dim(rate, dim, where)
-    mask = check_mask(mask, rate, where)
-    rate = counted(rate, mask, 1.0)
-    _check_rates(rate, where)
     n = as_columns(_exact(target, mask, dim), dim)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the positions inside a bin leave an uncertainty of about the root of the counts
@@ -372,7 +364,8 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
         UnitError: for periods or dead times that are none.
     """
     where = "armed_periods"
-    periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
+    periods = check_whole("periods", periods, where, UnitError)
+    dead_bins = check_dead_bins(check_number("dead_bins", dead_bins, where))
     whole = math.floor(dead_bins + 1e-9)
     part = max(0.0, dead_bins - whole)
     bins = counts.shape[_TIME]
@@ -414,7 +407,7 @@ def _check_prediction(input: object, target: object, where: str) -> tuple[Tensor
                 f"target with a gradient that holds none. {order}; if it is right, target.detach()."
             )
         said = f"{where}: the first argument holds counts and the second one does not. {order}."
-        warnings.warn(said, TorchTransientWarning, stacklevel=4)
+        warnings.warn(said, TorchTransientWarning, stacklevel=level_of_user())
     return pair
 
 
@@ -427,20 +420,20 @@ def _are_counts(x: Tensor) -> bool:
     return is_true(few == few.round()) and is_true((x == x.round()) & (x.amin() != x.amax()))
 
 
-def _check_rates(model: Tensor, where: str) -> None:
-    """Raise UnitError for negative rates; NaN passes into the loss."""
-    if bool((model < 0).any()):
+def _rates(input: object, target: object, mask: Tensor | None, where: str) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return rates, 1 where they do not count, counts and mask. Raises UnitError for negative rates; NaN passes."""
+    rate, counts = _check_prediction(input, target, where)
+    mask = check_mask(mask, rate, where)
+    rate = counted(rate, mask, 1.0)
+    if bool((rate < 0).any()):
         raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
+    return rate, counts, mask
 
 
 def _check_constant(counts: Tensor, constant: bool, where: str) -> None:
     """Raise UnitError for logarithms of factorials of negative counts."""
     if constant and bool((counts < 0).any()):
         raise UnitError(f"{where}: expected counts >= 0 with constant=True, got negative ones. Leave the constant out.")
-
-
-def _check_dead_time(dead_bins: float, where: str) -> float:
-    return check_dead_bins(check_number("dead_bins", dead_bins, where))
 
 
 def _exact(target: object, mask: Tensor | None, dim: int) -> Tensor:
@@ -512,10 +505,3 @@ def _count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
     level = torch.where(dark, least, 1.0)
     near = torch.where(hit & ~dark, mean, level)
     return torch.where(hit, counts * (near.log() + torch.where(dark, mean / level - 1, 0.0)), 0.0)
-
-
-def _dark_counts(n: Tensor, r: Tensor, level: Tensor) -> Tensor | None:
-    """Mask of counts at rates below the level; None without any."""
-    below = r < level
-    found = below & (n != 0) if bool(below.any()) else below
-    return found if bool(found.any()) else None

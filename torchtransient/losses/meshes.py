@@ -156,14 +156,19 @@ def _reached(mask: Tensor, index: Tensor) -> Tensor:
     return mask | (found > 0)
 
 
+def _sides(index: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the sides (3 F, 2) of faces, the vertices across them, the edges (E, 2), and the edge of each side."""
+    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
+    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
+    return sides, across, *torch.unique(sides.sort(1).values, dim=0, return_inverse=True)
+
+
 def _edges(vertices: Tensor, index: Tensor, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
     """Both ends of each edge (E,) and its weight (..., E)."""
-    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
-    edges, place = torch.unique(sides.sort(1).values, dim=0, return_inverse=True)
+    sides, across, edges, place = _sides(index)
     first, second = edges.unbind(1)
     if weights == "uniform":
         return first, second, vertices.new_ones((*vertices.shape[:-2], len(edges)))
-    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
     a, b = (vertices[..., sides[:, k], :] - vertices[..., across, :] for k in range(2))
     longest = torch.maximum(a.abs().amax(-1), b.abs().amax(-1))[..., None]
     a, b = (x / torch.where(longest > 0, longest, torch.ones_like(longest)) for x in (a, b))
@@ -175,9 +180,7 @@ def _edges(vertices: Tensor, index: Tensor, weights: Weights) -> tuple[Tensor, T
 
 def _hinges(index: Tensor) -> Tensor:
     """(E, 4), for each pair of faces at an edge: the vertices of the edge, and the third one of either face."""
-    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]]).sort(1).values
-    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
-    edges, place = torch.unique(sides, dim=0, return_inverse=True)
+    _, across, edges, place = _sides(index)
     order = place.argsort(stable=True)
     number, most = place[order], int(torch.bincount(place, minlength=1).max())
     pairs = []

@@ -229,13 +229,10 @@ def _iou(input: object, target: object, dims: int, threshold: float, mask: Tenso
     least = share(f"{where}: threshold", threshold)
     a, b = (x.float() if isinstance(x, Tensor) and x.dtype == torch.bool else x for x in (input, target))
     x, y, _ = _compared(a, b, dims, mask, where)
-    ours, theirs = (_there(one.flatten(-dims), least) for one in (x, y))
+    flat = [one.flatten(-dims) for one in (x, y)]
+    ours, theirs = ((one > 0) & (one >= least * _highest(one)) for one in flat)
     both, either = (ours & theirs).sum(-1), (ours | theirs).sum(-1)
     return Tally(both.to(x.dtype) / either.clamp_min(1), either > 0)
-
-
-def _there(x: Tensor, least: float) -> Tensor:
-    return (x > 0) & (x >= least * _highest(x))
 
 
 def _compared(

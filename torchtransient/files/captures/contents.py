@@ -34,17 +34,13 @@ class Contents:
 
     Attributes:
         source: path of the file.
-        reader: function of another package that reads it, for messages.
         shapes: root arrays and structures by name, None for entries without a shape.
         attributes: texts beside the arrays.
-        links: names that lead elsewhere, which are not followed.
     """
 
     source: Path
-    reader: str
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str] = MappingProxyType({})
-    links: frozenset[str] = frozenset()
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         """Return numbers, None for a name that is missing or empty.
@@ -111,51 +107,33 @@ def opened(path: str | Path) -> Iterator[Contents]:
 class Hdf5Contents(Contents):
     """Open HDF5 file."""
 
-    reader = "h5py.File"
-
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
-        self.shapes = {name: self._shape(name) for name in file if name != "#refs#"}
+        self.shapes = {name: getattr(self._entry(name), "shape", None) for name in file if name != "#refs#"}
         said = read_attributes(file, WHAT, ["data order"])
         self.attributes = {name: _sole(value) for name, value in said.items()}
-        self.links = frozenset(name for name in self.shapes if self._is_link(name))
 
-    def _is_link(self, name: str) -> bool:
-        """Return True for a link to elsewhere, or to nothing."""
+    def _entry(self, name: str) -> Any:
+        """Return a dataset or group of the file itself, None for a link to elsewhere, or to nothing."""
         import h5py
 
-        return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
-
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        import h5py
-
-        if self._is_link(name):
-            return None
-        found = self._file[name]
-        return found.shape if isinstance(found, h5py.Dataset) else None
+        return self._file[name] if isinstance(self._file.get(name, getlink=True), h5py.HardLink) else None
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
-        value = self._read(name, part)
+        value = read_dataset(self._file, name, WHAT, part)
         if isinstance(value, str):
             raise StorageError(f"{WHAT}: expected numbers in '{name}', got a text.")
         return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
-        value = self._read(name)
+        value = read_dataset(self._file, name, WHAT)
         if value is not None and not isinstance(value, str):
             raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
-        import h5py
-
-        if self._is_link(name):
-            return frozenset()
-        found = self._file[name]
-        return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
-
-    def _read(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
-        return read_dataset(self._file, name, WHAT, part)
+        found = self._entry(name)
+        return frozenset(found) if hasattr(found, "keys") else frozenset()
 
 
 def _sole(value: Any) -> str:
@@ -166,8 +144,6 @@ def _sole(value: Any) -> str:
 
 class MatContents(Contents):
     """MATLAB file of versions 5 to 7."""
-
-    reader = "scipy.io.loadmat"
 
     def __init__(self, source: Path) -> None:
         self.source = source
@@ -206,8 +182,6 @@ class MatContents(Contents):
 class NpzContents(Contents):
     """Arrays of NumPy in one file. Pickles are not read."""
 
-    reader = "numpy.load"
-
     def __init__(self, source: Path) -> None:
         self.source = source
         self.shapes = npz_shapes(source, WHAT)
@@ -225,8 +199,6 @@ class NpzContents(Contents):
 
 class JsonContents(Contents):
     """JSON object, or list of objects: frames whose entries have one shape each. Arrays are (frames, ...)."""
-
-    reader = "json.load"
 
     def __init__(self, source: Path) -> None:
         self.source = source

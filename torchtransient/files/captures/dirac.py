@@ -71,7 +71,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     sensor_origin, laser_origin = (
         gaps.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
     )
-    scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs)
+    scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs=legs)
     offsets = {
         name: array.tolist() for name in ("offset_laser", "offset_camera", "sample_x", "sample_y")
         if (array := contents.array(name)) is not None

@@ -75,7 +75,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     if reciprocal:
         spots, spot_normals = spots.reshape(3), None if spot_normals is None else spot_normals.reshape(3)
     kind = "single" if reciprocal else "exhaustive"
-    scan = scan_of(kind, points[sensor], spots, sensor_origin, laser_origin, normals[sensor], spot_normals, True)
+    scan = scan_of(kind, points[sensor], spots, sensor_origin, laser_origin, normals[sensor], spot_normals, legs=True)
     tensor = tensor_of(data)
     tensor = tensor[:, 0] if reciprocal else tensor.transpose(1, 2)
     axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltat", gaps), len(data))

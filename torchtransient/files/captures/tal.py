@@ -32,21 +32,26 @@ from torchtransient.files.captures.gaps import (
     assumed_in,
     cannot,
     frequency_axis,
+    number_in,
     one_channel,
     same_points,
     scan_of,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.plain_data import flag_of, plain, restored, whole_of
 from torchtransient.plugins.films.transform_bins import transform_bins
 
 NAME = "tal"
 _STOKES = 4
 _LEGS = "t_accounts_first_and_last_bounces"
-_KNOWN = frozenset(
-    f"{who}_{what}" for who in ("sensor", "laser") for what in ("xyz", "grid_xyz", "grid_normals", "grid_format")
-) | {"H", "H_format", "volume_format", "delta_t", "t_start", _LEGS, "scene_info"}
+# Numbers whose kinds a file that is written of a capture has again.
+_NUMBERS_OF_FILES = {f"{who}_{what}" for who in ("sensor", "laser") for what in ("xyz", "grid_xyz", "grid_normals")} | {
+    "t_start",
+    "delta_t",
+}
+_FORMATS_OF_FILES = ("H_format", "sensor_grid_format", "laser_grid_format", "volume_format")
+_KNOWN = {*_NUMBERS_OF_FILES, *_FORMATS_OF_FILES, "H", _LEGS, "scene_info"}
 _GRIDS = {"UNKNOWN": 0, "N_3": 1, "X_Y_3": 2}
 _VOLUMES = {"UNKNOWN": 0, "N_3": 1, "X_Y_Z_3": 2, "X_Y_3": 3}
 # Our part of the information: a JSON text, in which numbers keep every digit.
@@ -107,21 +112,26 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     Raises:
         StorageError: for other files, wrong entries and missing arguments.
     """
-    number = _whole(contents, "H_format", gaps)
+    number = _whole(contents, "H_format")
     form = next((form for form in _FORMATS.values() if form.number == number), None)
     if form is None:
         raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
-    kept: dict[str, Any] = {"dtypes": {}}
+    measured = _measured(contents, gaps, form)
+    kept: dict[str, Any] = {"dtypes": {"H": measured.dtype.str}}
+    for name in _NUMBERS_OF_FILES:
+        if (array := contents.array(name)) is not None:
+            kept["dtypes"][name] = array.dtype.str
     text = contents.text("scene_info")
     info = None if text is None else _scene_info(text)
     own = _own_part(info)
-    legs = gaps.fill(_LEGS, _flag(contents, _LEGS, kept), False)
-    scan = _scan(contents, gaps, form, legs, kept)
-    measured = _measured(contents, gaps, form, kept)
+    stored = None if contents.array(_LEGS) is None else flag_of({_LEGS: contents.array(_LEGS)}, _LEGS)
+    legs = gaps.fill(_LEGS, stored, False)
+    scan = _scan(contents, gaps, form, legs)
     polarized = measured.ndim == form.dims + 1
-    start, width = _number(contents, "t_start", kept, gaps), _number(contents, "delta_t", kept, gaps)
+    start, width = number_in(contents, "t_start", gaps), number_in(contents, "delta_t", gaps)
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
-    tensor = _from_tal(measured, form, polarized)
+    tensor = _swapped(tensor_of(measured), form)
+    tensor = tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
     if form.frequencies:
         found = _frequencies(info, own, len(measured), start)
         axis = frequency_axis(gaps, found)
@@ -137,8 +147,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     left = sorted(set(contents.shapes) - _KNOWN)
     if own is not None:
         return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
-    volume = None if contents.array("volume_format") is None else _whole(contents, "volume_format", gaps)
-    kept |= {"scene_info_text": text, "volume_format": volume}
+    kept |= {"scene_info_text": text, "volume_format": _whole(contents, "volume_format")}
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
@@ -161,7 +170,7 @@ def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], lef
     }  # fmt: skip
 
 
-def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any]) -> Tensor:
+def _measured(contents: Contents, gaps: Gaps, form: HFormat) -> NDArray[Any]:
     array = contents.array("H")
     if array is None:
         raise gaps.error("H is missing or empty.")
@@ -169,14 +178,7 @@ def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any
         raise gaps.error(f"expected H with {form.dims} dimensions as H_format says, got {array.shape}.")
     if (array.dtype.kind == "c") != form.frequencies:
         raise gaps.error(f"expected {'complex' if form.frequencies else 'real'} numbers in H, got {array.dtype}.")
-    kept["dtypes"]["H"] = array.dtype.str
-    return tensor_of(array)
-
-
-def _from_tal(measured: Tensor, form: HFormat, polarized: bool) -> Tensor:
-    """Return (T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
-    tensor = _swapped(measured, form)
-    return tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
+    return array
 
 
 def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
@@ -186,13 +188,13 @@ def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
     return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
 
 
-def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool, kept: dict[str, Any]) -> Scan:
-    points = {who: _points(contents, gaps, f"{who}_grid_xyz", kept) for who in ("sensor", "laser")}
-    normals = {who: _normals(contents, gaps, who, points[who], kept) for who in ("sensor", "laser")}
+def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool) -> Scan:
+    points = {who: _points(contents, gaps, f"{who}_grid_xyz") for who in ("sensor", "laser")}
+    normals = {who: _normals(contents, gaps, who, points[who]) for who in ("sensor", "laser")}
     for who in points:
-        # UNKNOWN is what y-tal makes of a format that is missing.
-        said = _whole(contents, f"{who}_grid_format", gaps, missing=0)
-        if said not in (0, points[who].ndim - 1):
+        # UNKNOWN, 0, is what y-tal makes of a format that is missing.
+        said = _whole(contents, f"{who}_grid_format")
+        if said not in (None, 0, points[who].ndim - 1):
             raise gaps.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
     kind = _kind(points["sensor"], points["laser"], form, gaps)
     if kind == "single":
@@ -201,13 +203,10 @@ def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool, kept: dict[
     elif kind == "confocal":
         points["laser"] = points["sensor"]
     origins = {
-        who: gaps.origin(f"{who}_origin", _plain(contents, f"{who}_xyz", kept), points[who], normals[who], legs)
+        who: gaps.origin(f"{who}_origin", _plain(contents, f"{who}_xyz"), points[who], normals[who], legs)
         for who in points
     }
-    return scan_of(
-        kind, points["sensor"], points["laser"], origins["sensor"], origins["laser"], normals["sensor"],
-        normals["laser"], legs,
-    )  # fmt: skip
+    return scan_of(kind, *points.values(), *origins.values(), *normals.values(), legs=legs)
 
 
 def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) -> str:
@@ -229,18 +228,16 @@ def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) 
     return "single"
 
 
-def _points(contents: Contents, gaps: Gaps, name: str, kept: dict[str, Any]) -> NDArray[np.float64]:
-    array = _plain(contents, name, kept)
+def _points(contents: Contents, gaps: Gaps, name: str) -> NDArray[np.float64]:
+    array = _plain(contents, name)
     if array is None or array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise gaps.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
     return np.ascontiguousarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
 
 
-def _normals(
-    contents: Contents, gaps: Gaps, who: str, points: NDArray[Any], kept: dict[str, Any]
-) -> NDArray[np.float64] | None:
+def _normals(contents: Contents, gaps: Gaps, who: str, points: NDArray[Any]) -> NDArray[np.float64] | None:
     name = f"{who}_grid_normals"
-    array = _plain(contents, name, kept)
+    array = _plain(contents, name)
     if array is None:
         return None
     found = np.asarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
@@ -249,38 +246,16 @@ def _normals(
     return np.ascontiguousarray(found)
 
 
-def _plain(contents: Contents, name: str, kept: dict[str, Any]) -> NDArray[Any] | None:
+def _plain(contents: Contents, name: str) -> NDArray[Any] | None:
     array = contents.array(name)
-    if array is not None:
-        if array.dtype.kind not in "iuf":
-            raise StorageError(f"{WHAT}: expected real numbers in '{name}', got {array.dtype}.")
-        kept["dtypes"][name] = array.dtype.str
+    if array is not None and array.dtype.kind not in "iuf":
+        raise StorageError(f"{WHAT}: expected real numbers in '{name}', got {array.dtype}.")
     return array
 
 
-def _number(contents: Contents, name: str, kept: dict[str, Any], gaps: Gaps) -> float | None:
-    array = _plain(contents, name, kept)
-    if array is not None and array.size != 1:
-        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
-    return None if array is None else float(array.reshape(-1)[0])
-
-
-def _flag(contents: Contents, name: str, kept: dict[str, Any]) -> bool | None:
+def _whole(contents: Contents, name: str) -> int | None:
     array = contents.array(name)
-    if array is None:
-        return None
-    if array.size != 1 or array.dtype.kind not in "biuf" or array.reshape(-1)[0] not in (0, 1):
-        raise StorageError(f"{WHAT}: expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}.")
-    return bool(array.reshape(-1)[0])
-
-
-def _whole(contents: Contents, name: str, gaps: Gaps, missing: int | None = None) -> int:
-    array = contents.array(name)
-    if array is None and missing is not None:
-        return missing
-    if array is None or array.size != 1 or array.dtype.kind not in "iu":
-        raise gaps.error(f"expected one whole number as {name}, got {None if array is None else array.dtype}.")
-    return int(array.reshape(-1)[0])
+    return None if array is None else whole_of({name: array}, name)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing

@@ -88,7 +88,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         laser, laser_normals = sensor, sensor_normals
     elif transient.ndim == _CONFOCAL:
         raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
-    scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
+    scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, legs=True)
     axis = time_axis(gaps, number_in(contents, "t0", gaps), number_in(contents, "deltaT", gaps), transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
     return Capture(transient, axis, scan, metadata=gaps.metadata(bounces=bounces, hidden_volume=volume or None))
