@@ -15,11 +15,11 @@ from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchtransient.checks import count, finite, shown
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 from torchtransient.floating import is_true
+from torchtransient.sensing.checks import refuse_cut_off
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
@@ -137,7 +137,8 @@ def check_level(
         fits = least <= number <= most or (zero and number == 0)
     if not fits:
         got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
-        hint = " Seconds? Times 299792458 they are metres of optical path." if length else ""
+        name += " in metres of optical path," if length else ""
+        hint = " Seconds? Times 299792458 they are metres." if length else ""
         raise UnitError(
             f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero ({least:.2g} to {most:.1g}), "
             f"got {got}.{hint}"
@@ -175,16 +176,10 @@ def check_number(name: str, value: object, where: str) -> float:
         where: begins the message.
 
     Raises:
-        UnitError: for other values, also for a tensor with a gradient, which a number would drop.
+        UnitError: for other values.
+        GradientError: for a tensor with a gradient, which a number would drop.
     """
-    # forward mode has tangents, which `requires_grad` does not show
-    if isinstance(value, Tensor) and (
-        value.requires_grad or forward_ad.unpack_dual(value).tangent is not None  # type: ignore[no-untyped-call]
-    ):
-        raise UnitError(
-            f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
-            "no derivative by it: use .detach()."
-        )
+    refuse_cut_off(value, name, where)
     return finite(f"{where}: {name}", value)
 
 

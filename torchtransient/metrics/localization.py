@@ -16,12 +16,7 @@ from torchtransient.reconstruction.voxels import VoxelGrid
 
 
 def localization_rmse(
-    input: Volume,
-    points: Any,
-    *,
-    radius_m: float,
-    grid: VoxelGrid | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, points: Any, *, radius_m: float, grid: VoxelGrid | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the root mean square distance of points from the peaks of volumes near them, metres.
 

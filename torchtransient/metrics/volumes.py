@@ -97,12 +97,7 @@ def front_depth_mae(
 
 
 def picture_correlation(
-    input: Tensor,
-    target: Tensor,
-    *,
-    centered: bool = True,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Tensor, target: Tensor, *, centered: bool = True, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the correlation of pictures, such as front views, in [-1, 1]; independent of brightness.
 
@@ -125,12 +120,7 @@ def picture_correlation(
 
 
 def volume_correlation(
-    input: Volume,
-    target: Volume,
-    *,
-    centered: bool = True,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, target: Volume, *, centered: bool = True, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the correlation of volumes (..., Z, Y, X), voxel by voxel.
 
@@ -148,12 +138,7 @@ def volume_correlation(
 
 
 def picture_iou(
-    input: Tensor,
-    target: Tensor,
-    *,
-    threshold: float = 0.5,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Tensor, target: Tensor, *, threshold: float = 0.5, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the intersection over union of the shapes in pictures, such as front views, in [0, 1].
 
@@ -176,12 +161,7 @@ def picture_iou(
 
 
 def volume_iou(
-    input: Volume,
-    target: Volume,
-    *,
-    threshold: float = 0.5,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, target: Volume, *, threshold: float = 0.5, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the intersection over union of volumes (..., Z, Y, X), voxel by voxel.
 

@@ -168,6 +168,23 @@ class Gaps:
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
 
+def real_in(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
+    """Return an array of real numbers, None if it is missing or empty.
+
+    Args:
+        contents: the file.
+        name: of the array.
+        gaps: for messages.
+
+    Raises:
+        StorageError: for other numbers.
+    """
+    array = contents.array(name)
+    if array is not None and array.dtype.kind not in "iuf":
+        raise gaps.error(f"expected real numbers in {name}, got {array.dtype}.")
+    return array
+
+
 def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = None) -> NDArray[Any]:
     """Return an array of real numbers.
 
@@ -180,8 +197,8 @@ def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = Non
     Raises:
         StorageError: for anything else, and for an array that is missing or empty.
     """
-    array = contents.array(name)
-    if array is None or array.dtype.kind not in "iuf" or dims not in (None, array.ndim):
+    array = real_in(contents, name, gaps)
+    if array is None or dims not in (None, array.ndim):
         got = "nothing" if array is None else f"{array.dtype} of {array.shape}"
         raise gaps.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {got}.")
     return array
@@ -198,9 +215,9 @@ def number_in(contents: Contents, name: str, gaps: Gaps) -> float | None:
     Raises:
         StorageError: for anything else.
     """
-    array = contents.array(name)
-    if array is not None and (array.size != 1 or array.dtype.kind not in "iuf"):
-        raise gaps.error(f"expected one number as {name}, got {array.dtype} of {array.shape}.")
+    array = real_in(contents, name, gaps)
+    if array is not None and array.size != 1:
+        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
     return None if array is None else float(array.reshape(-1)[0])
 
 

@@ -25,6 +25,7 @@ from torchtransient.files.captures.gaps import (
     number_in,
     numbers_in,
     only_transient,
+    real_in,
     scan_of,
     tensor_of,
     time_axis,
@@ -86,10 +87,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _field(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
-    array = contents.array(f"dataset/{name}") if name in contents.fields("dataset") else None
-    if array is not None and array.dtype.kind not in "iuf":
-        raise gaps.error(f"expected real numbers in dataset.{name}, got {array.dtype}.")
-    return array
+    return real_in(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
 
 
 def _points(contents: Contents, name: str, gaps: Gaps) -> NDArray[np.float64]:

@@ -34,6 +34,7 @@ from torchtransient.files.captures.gaps import (
     frequency_axis,
     number_in,
     one_channel,
+    real_in,
     same_points,
     scan_of,
     tensor_of,
@@ -203,7 +204,7 @@ def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool) -> Scan:
     elif kind == "confocal":
         points["laser"] = points["sensor"]
     origins = {
-        who: gaps.origin(f"{who}_origin", _plain(contents, f"{who}_xyz"), points[who], normals[who], legs)
+        who: gaps.origin(f"{who}_origin", real_in(contents, f"{who}_xyz", gaps), points[who], normals[who], legs)
         for who in points
     }
     return scan_of(kind, *points.values(), *origins.values(), *normals.values(), legs=legs)
@@ -229,7 +230,7 @@ def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) 
 
 
 def _points(contents: Contents, gaps: Gaps, name: str) -> NDArray[np.float64]:
-    array = _plain(contents, name)
+    array = real_in(contents, name, gaps)
     if array is None or array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise gaps.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
     return np.ascontiguousarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
@@ -237,20 +238,12 @@ def _points(contents: Contents, gaps: Gaps, name: str) -> NDArray[np.float64]:
 
 def _normals(contents: Contents, gaps: Gaps, who: str, points: NDArray[Any]) -> NDArray[np.float64] | None:
     name = f"{who}_grid_normals"
-    array = _plain(contents, name)
-    if array is None:
+    if contents.array(name) is None:
         return None
-    found = np.asarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
+    found = _points(contents, gaps, name)
     if found.shape != points.shape:
-        raise gaps.error(f"expected {name} in the shape of the points, got {array.shape}.")
-    return np.ascontiguousarray(found)
-
-
-def _plain(contents: Contents, name: str) -> NDArray[Any] | None:
-    array = contents.array(name)
-    if array is not None and array.dtype.kind not in "iuf":
-        raise StorageError(f"{WHAT}: expected real numbers in '{name}', got {array.dtype}.")
-    return array
+        raise gaps.error(f"expected {name} in the shape of the points, {points.shape}, got {found.shape}.")
+    return found
 
 
 def _whole(contents: Contents, name: str) -> int | None:

@@ -27,6 +27,7 @@ from torchtransient.files.captures.gaps import (
     hidden_volume,
     number_in,
     only_transient,
+    real_in,
     same_points,
     scan_of,
     tensor_of,
@@ -145,15 +146,15 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
 
 def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None = None) -> NDArray[np.float64] | None:
     """Return (Y, X, 3), from (3, X, Y), or (Y, X, 3) in files that have their axes the other way round."""
-    array = contents.array(name)
+    array = real_in(contents, name, gaps)
     if array is None:
         return None
     if not _reversed(contents):
         array = array.T
     if array.ndim == 1:
         array = array.reshape(1, 1, -1)
-    if array.ndim != 3 or array.shape[-1] != 3 or array.dtype.kind not in "iuf":
-        raise gaps.error(f"expected {name} as a grid of points, got {array.dtype} of {array.shape}.")
+    if array.ndim != 3 or array.shape[-1] != 3:
+        raise gaps.error(f"expected {name} as a grid of points, got {array.shape}.")
     if like is not None and array.shape != like.shape:
         raise gaps.error(f"expected {name} for each of the points {like.shape[:-1]}, got {array.shape[:-1]}.")
     return np.ascontiguousarray(array, np.float64)
