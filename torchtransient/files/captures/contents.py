@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_source, damage_said, npz_shapes, read_npz
 from torchtransient.array_files.hdf5 import check_memory, hdf5_package, read_attributes, read_dataset
 from torchtransient.array_files.plain_texts import json_data, text_of_file
+from torchtransient.checks import shown
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File
 
 WHAT = "capture file"
 _BLOCK = 64
-_ENDINGS = {
-    ".json": "JSON", ".npz": "NumPy's files", ".mat": "MATLAB's files", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5",
-}  # fmt: skip
 
 
 class Contents:
@@ -99,9 +97,7 @@ def opened(path: str | Path) -> Iterator[Contents]:
             with h5py.File(source, "r") as file:
                 yield Hdf5Contents(source, file)
         else:
-            kind = _ENDINGS.get(source.suffix.lower())
-            hint = f"Its ending is that of {kind}: it may be damaged, or be the first part of one." if kind else ""
-            raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file. {hint}".strip())
+            raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file, or is damaged.")
 
 
 class Hdf5Contents(Contents):
@@ -155,16 +151,16 @@ class MatContents(Contents):
         value: Any = self._variable(name.split("/")[0])
         for field in name.split("/")[1:]:
             if not isinstance(value, dict):
-                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {_words(value)}.")
+                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {shown(value)}.")
             value = value.get(field)
         if value is not None and not isinstance(value, np.ndarray):
-            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {_words(value)}.")
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {shown(value)}.")
         return None if value is None else value[part]
 
     def text(self, name: str) -> str | None:
         value = self._variable(name)
         if value is not None and not isinstance(value, str):
-            raise StorageError(f"{WHAT}: expected a text in '{name}', got {_words(value)}.")
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got {shown(value)}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
@@ -256,12 +252,6 @@ def _is_json(source: Path) -> bool:
         while not start and (block := file.read(_BLOCK)):
             start = block.lstrip(b"\xef\xbb\xbf \t\r\n")
     return start[:1] in (b"{", b"[")
-
-
-def _words(value: Any) -> str:
-    if isinstance(value, Other):
-        return value.kind
-    return "a structure" if isinstance(value, dict) else "a text" if isinstance(value, str) else "an array of numbers"
 
 
 def _is_old_mat(source: Path) -> bool:
