@@ -395,17 +395,13 @@ def _check_prediction(input: object, target: object, where: str) -> tuple[Tensor
     order = "Take (input, target) in that order"
     if not input.is_floating_point():
         raise UnitError(f"{where}: expected a floating prediction first, got {input.dtype}. {order}, or input.float().")
-    if target.requires_grad and not input.requires_grad:
+    swapped = _are_counts(input) and not _are_counts(target)
+    if target.requires_grad and (swapped or not input.requires_grad):
         raise GradientError(
-            f"{where}: expected the prediction first, got an input without and a target with a gradient. {order}, or "
-            "target.detach()."
+            f"{where}: expected the prediction first, got a target with a gradient, and an input that has none or holds "
+            f"counts (draws of a chain with straight_through?). {order}; if it is right, target.detach()."
         )
-    if _are_counts(input) and not _are_counts(target):
-        if target.requires_grad:
-            raise GradientError(
-                f"{where}: expected the prediction first, got counts (draws of a chain with straight_through?), and a "
-                f"target with a gradient that holds none. {order}; if it is right, target.detach()."
-            )
+    if swapped:
         said = f"{where}: the first argument holds counts and the second one does not. {order}."
         warnings.warn(said, TorchTransientWarning, stacklevel=level_of_user())
     return pair
