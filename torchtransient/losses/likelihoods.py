@@ -398,8 +398,8 @@ def _check_prediction(input: object, target: object, where: str) -> tuple[Tensor
     swapped = _are_counts(input) and not _are_counts(target)
     if target.requires_grad and (swapped or not input.requires_grad):
         raise GradientError(
-            f"{where}: expected the prediction first, got a target with a gradient, and an input that has none or holds "
-            f"counts (draws of a chain with straight_through?). {order}; if it is right, target.detach()."
+            f"{where}: expected the prediction first, got a target with a gradient, and an input that has none or "
+            f"holds counts (draws of a chain with straight_through?). {order}; if it is right, target.detach()."
         )
     if swapped:
         said = f"{where}: the first argument holds counts and the second one does not. {order}."

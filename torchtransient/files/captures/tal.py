@@ -11,10 +11,10 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ from torchtransient.files.captures.gaps import (
 from torchtransient.files.plain_data import flag_of, plain, restored, whole_of
 from torchtransient.plugins.films.transform_bins import transform_bins
 
+Kind = TypeVar("Kind", int, bool)
+
 NAME = "tal"
 _STOKES = 4
 _LEGS = "t_accounts_first_and_last_bounces"
@@ -63,27 +65,12 @@ _READ = {"format", "assumed", "scene_info", "tal", "not_read"}
 _DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
-@dataclass(frozen=True)
-class HFormat:
-    """Dimensions of ``H``: times or frequencies, ``grids`` of points or lists, with those of the laser or without."""
-
-    number: int
-    frequencies: bool
-    lasers: bool
-    grids: bool
-
-    @property
-    def dims(self) -> int:
-        return 1 + (2 if self.grids else 1) * (2 if self.lasers else 1)
-
-
-_FORMATS = {
-    "T_Sx_Sy": HFormat(1, False, False, True), "T_Lx_Ly_Sx_Sy": HFormat(2, False, True, True),
-    "T_Si": HFormat(3, False, False, False), "T_Li_Si": HFormat(4, False, True, False),
-    "F_Sx_Sy": HFormat(10, True, False, True), "F_Lx_Ly_Sx_Sy": HFormat(11, True, True, True),
-    "F_Si": HFormat(12, True, False, False), "F_Li_Si": HFormat(13, True, True, False),
+# Numbers of the formats of ``H``. A name has a part for each dimension: times or frequencies, then x and y of grids or i
+# of lists, those of the laser before those of the sensor.
+_NUMBERS = {
+    "UNKNOWN": 0, "T_Sx_Sy": 1, "T_Lx_Ly_Sx_Sy": 2, "T_Si": 3, "T_Li_Si": 4,
+    "F_Sx_Sy": 10, "F_Lx_Ly_Sx_Sy": 11, "F_Si": 12, "F_Li_Si": 13,
 }  # fmt: skip
-_NUMBERS = {"UNKNOWN": 0} | {name: form.number for name, form in _FORMATS.items()}
 
 
 def recognises(contents: Contents) -> bool:
@@ -113,10 +100,10 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     Raises:
         StorageError: for other files, wrong entries and missing arguments.
     """
-    number = _whole(contents, "H_format")
-    form = next((form for form in _FORMATS.values() if form.number == number), None)
-    if form is None:
-        raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
+    number = _one(contents, "H_format", whole_of)
+    form = next((name for name, known in _NUMBERS.items() if known == number), "UNKNOWN")
+    if form == "UNKNOWN":
+        raise gaps.error(f"expected H_format to be one of the numbers {list(_NUMBERS.values())[1:]}, got {number}.")
     measured = _measured(contents, gaps, form)
     kept: dict[str, Any] = {"dtypes": {"H": measured.dtype.str}}
     for name in _NUMBERS_OF_FILES:
@@ -125,15 +112,14 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     text = contents.text("scene_info")
     info = None if text is None else _scene_info(text)
     own = _own_part(info)
-    stored = None if contents.array(_LEGS) is None else flag_of({_LEGS: contents.array(_LEGS)}, _LEGS)
-    legs = gaps.fill(_LEGS, stored, False)
+    legs = gaps.fill(_LEGS, _one(contents, _LEGS, flag_of), False)
     scan = _scan(contents, gaps, form, legs)
-    polarized = measured.ndim == form.dims + 1
+    polarized = measured.ndim > _dims(form)
     start, width = number_in(contents, "t_start", gaps), number_in(contents, "delta_t", gaps)
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
     tensor = _swapped(tensor_of(measured), form)
     tensor = tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
-    if form.frequencies:
+    if form.startswith("F"):
         found = _frequencies(info, own, len(measured), start)
         axis = frequency_axis(gaps, found)
         if start is not None and axis.start_opl != start:
@@ -148,7 +134,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     left = sorted(set(contents.shapes) - _KNOWN)
     if own is not None:
         return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
-    kept |= {"scene_info_text": text, "volume_format": _whole(contents, "volume_format")}
+    kept |= {"scene_info_text": text, "volume_format": _one(contents, "volume_format", whole_of)}
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
@@ -171,30 +157,34 @@ def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], lef
     }  # fmt: skip
 
 
-def _measured(contents: Contents, gaps: Gaps, form: HFormat) -> NDArray[Any]:
+def _measured(contents: Contents, gaps: Gaps, form: str) -> NDArray[Any]:
     array = contents.array("H")
     if array is None:
         raise gaps.error("H is missing or empty.")
-    if array.ndim != form.dims and not (array.ndim == form.dims + 1 and array.shape[-1] == _STOKES):
-        raise gaps.error(f"expected H with {form.dims} dimensions as H_format says, got {array.shape}.")
-    if (array.dtype.kind == "c") != form.frequencies:
-        raise gaps.error(f"expected {'complex' if form.frequencies else 'real'} numbers in H, got {array.dtype}.")
+    if array.ndim != _dims(form) and not (array.ndim == _dims(form) + 1 and array.shape[-1] == _STOKES):
+        raise gaps.error(f"expected H with {_dims(form)} dimensions as H_format says, got {array.shape}.")
+    if (array.dtype.kind == "c") != form.startswith("F"):
+        raise gaps.error(f"expected {'complex' if form.startswith('F') else 'real'} numbers in H, got {array.dtype}.")
     return array
 
 
-def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
+def _dims(form: str) -> int:
+    return form.count("_") + 1
+
+
+def _swapped(tensor: Tensor, form: str) -> Tensor:
     """Exchange x and y of each grid, which is its own inverse."""
-    if not form.grids:
+    if "x" not in form:
         return tensor
-    return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
+    return tensor.transpose(1, 2).transpose(3, 4) if "L" in form else tensor.transpose(1, 2)
 
 
-def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool) -> Scan:
+def _scan(contents: Contents, gaps: Gaps, form: str, legs: bool) -> Scan:
     points = {who: _points(contents, gaps, f"{who}_grid_xyz") for who in ("sensor", "laser")}
     normals = {who: _normals(contents, gaps, who, points[who]) for who in ("sensor", "laser")}
     for who in points:
         # UNKNOWN, 0, is what y-tal makes of a format that is missing.
-        said = _whole(contents, f"{who}_grid_format")
+        said = _one(contents, f"{who}_grid_format", whole_of)
         if said not in (None, 0, points[who].ndim - 1):
             raise gaps.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
     kind = _kind(points["sensor"], points["laser"], form, gaps)
@@ -210,8 +200,8 @@ def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool) -> Scan:
     return scan_of(kind, *points.values(), *origins.values(), *normals.values(), legs=legs)
 
 
-def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) -> str:
-    if form.lasers:
+def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: str, gaps: Gaps) -> str:
+    if "L" in form:
         return "exhaustive"
     if sensor.shape == laser.shape:
         # Not what y-tal takes for confocal, which depends on where the origin of coordinates is.
@@ -246,9 +236,9 @@ def _normals(contents: Contents, gaps: Gaps, who: str, points: NDArray[Any]) -> 
     return found
 
 
-def _whole(contents: Contents, name: str) -> int | None:
+def _one(contents: Contents, name: str, kind: Callable[[Mapping[str, Any], str], Kind]) -> Kind | None:
     array = contents.array(name)
-    return None if array is None else whole_of({name: array}, name)
+    return None if array is None else kind({name: array}, name)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing
@@ -265,12 +255,11 @@ def write(target: Path, capture: Capture) -> None:
     Raises:
         StorageError: for a batch, several channels, and a transient beside a phasor.
     """
-    form_name, h = _h(capture)
-    form = _FORMATS[form_name]
+    form, h = _h(capture)
     kept = _kept(capture)
     arrays = _arrays(capture, kept, form)
     text = _scene_info_text(capture, kept)
-    formats = {"H_format": (_NUMBERS, form.number)}
+    formats = {"H_format": (_NUMBERS, _NUMBERS[form])}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
     if kept.get("volume_format") in _VOLUMES.values():
@@ -307,16 +296,16 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
     lasers = {"Si": "Li_", "Sx_Sy": "Lx_Ly_"}[dims] if scan.kind == "exhaustive" else ""
     name = f"{'F' if tensor.is_complex() else 'T'}_{lasers}{dims}"
     tensor = tensor.squeeze(1).movedim(0, -1) if capture.polarized else tensor.squeeze(0)
-    return name, array_of(_swapped(tensor, _FORMATS[name]), WHAT)
+    return name, array_of(_swapped(tensor, name), WHAT)
 
 
-def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[str, NDArray[Any]]:
+def _arrays(capture: Capture, kept: Mapping[str, Any], form: str) -> dict[str, NDArray[Any]]:
     scan, dtypes = capture.scan, kept["dtypes"]
     legs = scan.first_and_last_leg
     arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS, legs) else {_LEGS: np.bool_(legs)}
     axis = capture.axis
     start, width = (None, None) if axis is None else (axis.start_opl, axis.bin_width_opl)
-    if form.frequencies and capture.axis is None:
+    if form.startswith("F") and capture.axis is None:
         frequencies = capture.frequencies
         assert frequencies is not None  # a phasor has them
         start, width = frequencies.start_opl, kept.get("delta_t")
