@@ -65,8 +65,8 @@ _READ = {"format", "assumed", "scene_info", "tal", "not_read"}
 _DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
-# Numbers of the formats of ``H``. A name has a part for each dimension: times or frequencies, then x and y of grids or i
-# of lists, those of the laser before those of the sensor.
+# Numbers of the formats of ``H``. A name has a part for each dimension: times or frequencies, then x and y of grids or
+# i of lists, those of the laser before those of the sensor.
 _NUMBERS = {
     "UNKNOWN": 0, "T_Sx_Sy": 1, "T_Lx_Ly_Sx_Sy": 2, "T_Si": 3, "T_Li_Si": 4,
     "F_Sx_Sy": 10, "F_Lx_Ly_Sx_Sy": 11, "F_Si": 12, "F_Li_Si": 13,
@@ -406,13 +406,14 @@ def _kept(capture: Capture) -> dict[str, Any]:
 
 def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
     """Return the text for a capture: as it was read if nothing about it has changed, None if there was none."""
-    text = kept.get("scene_info_text")
-    added = bool(capture.channels or set(capture.metadata) - _READ)
-    added = added or capture.scan.wall is not None or capture.steady is not None
-    if "scene_info_text" in kept and not added and capture.frequencies == _kept_frequencies(capture, kept):
-        before = None if text is None else _scene_info(text)
-        if capture.metadata.get("scene_info") == before:
-            return None if text is None else str(text)
+    added = capture.channels or set(capture.metadata) - _READ or capture.scan.wall is not None
+    if "scene_info_text" in kept and not added and capture.steady is None:
+        text: str | None = kept["scene_info_text"]
+        before, axis = None if text is None else _scene_info(text), capture.frequencies
+        if axis is not None:
+            axis = _frequencies(before, _own_part(before), axis.num_frequencies, axis.start_opl)
+        if capture.frequencies == axis and capture.metadata.get("scene_info") == before:
+            return text
     info: dict[str, Any] = {"original_format": str(capture.metadata.get("format", _OWN))}
     given = capture.metadata.get("scene_info")
     own = {
@@ -428,15 +429,6 @@ def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
         info["is_polarized"] = True
     info |= given if isinstance(given, Mapping) else {}
     return write_plain_yaml(_as_json(info) | {_OWN: json.dumps(own)}, WHAT)
-
-
-def _kept_frequencies(capture: Capture, kept: Mapping[str, Any]) -> FrequencyAxis | None:
-    if capture.frequencies is None:
-        return None
-    text = kept.get("scene_info_text")
-    info = None if text is None else _scene_info(text)
-    count, start = capture.frequencies.num_frequencies, capture.frequencies.start_opl
-    return _frequencies(info, _own_part(info), count, start)
 
 
 def _as_json(data: Any) -> Any:
