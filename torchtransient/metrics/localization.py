@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import positive
+from torchtransient.checks import numbers, positive
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.losses.results import Volume
 from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite
@@ -52,7 +52,7 @@ def localization_rmse(
             f"{tuple(volume.shape)} {volume.dtype}."
         )
     check_finite(volume, None, "input", where)
-    truth = torch.as_tensor(points, dtype=torch.float64, device="cpu").detach()
+    truth = torch.from_numpy(numbers(f"{where}: points", points))
     if truth.ndim != 2 or truth.shape[-1] != 3:
         raise ShapeError(f"{where}: expected points (N, 3), metres, got {tuple(truth.shape)}.")
     check_finite(truth, None, "points", where)
