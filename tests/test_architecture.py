@@ -257,7 +257,6 @@ BARE = {
     "files/plain_data.py": {"ValueError"},  # likewise
     "files/result_file.py": {"ValueError"},  # likewise
     "nlos/part_file.py": {"ValueError"},  # caught in the same function
-    "losses/loss_module.py": {"TypeError"},  # a wrong keyword argument, as Python says it
     "rendering/films.py": {"KeyError"},  # caught by its callers
     "scene/edits.py": {"RuntimeError"},  # what Mitsuba says, told by its caller with the place
     "vis/videos.py": {"IndexError"},  # the protocol of sequences

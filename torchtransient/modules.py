@@ -26,24 +26,11 @@ class ScalarState(nn.Module):
     def _load_from_state_dict(self, state: Any, prefix: str, *rest: Any) -> None:
         super()._load_from_state_dict(state, prefix, *rest)
         errors = rest[-1]
-        if not _loads_first_of_several():
-            return
         for name, own in itertools.chain(self.named_parameters(), self.named_buffers()):
             given, key = state.get(prefix + name), prefix + name
             several = isinstance(given, Tensor) and given.ndim == 1 and len(given) != 1
             if own.ndim == 0 and several and not any(key in error for error in errors):
                 errors.append(f"size mismatch for {key}: {tuple(given.shape)} in the state, expected one number.")
-
-
-def _loads_first_of_several() -> bool:
-    """Return True if this version of torch loads a number from several."""
-    module = nn.Module()
-    module.register_buffer("number", torch.zeros(()))
-    try:
-        module.load_state_dict({"number": torch.zeros(2)})
-    except RuntimeError:
-        return False
-    return True
 
 
 class CopiesParametrized(ScalarState):
@@ -88,7 +75,8 @@ def let_copy(module: nn.Module) -> None:
 def _reduced(module: nn.Module, _protocol: Any) -> tuple[Any, ...]:
     # What the class itself would put away: torch's class on top refuses to.
     own: Any = parametrize.type_before_parametrizations(module)
-    return _shell, _origin(module), own.__getstate__(module)
+    names = tuple(module.parametrizations) if parametrize.is_parametrized(module) else ()  # type: ignore[arg-type]
+    return _shell, (own, names), own.__getstate__(module)
 
 
 def _parts(module: Any) -> tuple[Any, tuple[Any, ...], Any]:
@@ -126,12 +114,6 @@ def _with_own_containers(module: Any) -> Any:
     twin.__dict__.update(module.__dict__)
     _own_containers(twin)
     return twin
-
-
-def _origin(module: nn.Module) -> tuple[type, tuple[str, ...]]:
-    """Return the class before parametrizations, and their names."""
-    names = tuple(module.parametrizations) if parametrize.is_parametrized(module) else ()  # type: ignore[arg-type]
-    return parametrize.type_before_parametrizations(module), names
 
 
 def _shell(cls: Any, names: tuple[str, ...]) -> Any:

@@ -164,9 +164,6 @@ def test_others_can_read_it_without_the_library(tmp_path):
 
 @each_kind
 def test_what_is_none_of_these(tmp_path, kind):
-    write = {"capture": tt.nlos.write_capture, "volume": tt.nlos.write_volume, "result": write_result}[kind]
-    with pytest.raises(ArgumentError):
-        write(tmp_path / "a.h5", torch.zeros(3))
     (tmp_path / "folder.h5").mkdir()
     for name in ("a.exr", "a", "missing/a.h5", "folder.h5"):
         with pytest.raises(StorageError):
@@ -321,7 +318,7 @@ def test_files_that_are_none(tmp_path, kind, ending):
         with pytest.raises(StorageError):
             read(path)
     other = KINDS["capture" if kind == "result" else "result"][0](tmp_path / f"b.{ending}")
-    with pytest.raises(StorageError, match="reads it"):
+    with pytest.raises(StorageError, match="of format"):
         read(other)
     np.savez(tmp_path / "c.npz", format=np.array(f"torchtransient {kind} 99"))
     with pytest.raises(StorageError, match=f"{kind} 99"):

@@ -80,7 +80,7 @@ def test_modules_hold_the_options_of_functions(case):
         torch.testing.assert_close(other(*arguments), case(x, y), rtol=0, atol=0)
     assert module.state_dict() == {}
     assert all(getattr(module, name) is value for name, value in case.options.items())
-    with pytest.raises(TypeError, match=f"^{case.module.__name__}"):
+    with pytest.raises(TypeError):
         case.module(redution="sum")
 
 
@@ -370,7 +370,7 @@ def test_an_option_with_a_gradient_has_it_or_is_refused(case):
         except TorchTransientError as error:
             refused = str(error)
         if refused:
-            assert "without gradient" in refused
+            assert "without a gradient" in refused
             value(leaf.detach())
         else:
             assert torch.autograd.gradcheck(value, leaf, fast_mode=True), option
@@ -383,7 +383,7 @@ def test_options_with_a_tangent_of_forward_mode():
         lambda v: losses.total_variation(x[None], spacing=(1.0, v, 1.0)),
     )
     for call in calls:
-        with pytest.raises(TorchTransientError, match="without gradient"):
+        with pytest.raises(TorchTransientError, match="without a gradient"):
             torch.func.jvp(call, (torch.tensor(0.5),), (torch.tensor(1.0),))
     _, slope = torch.func.jvp(lambda v: losses.anscombe(x, v).sum(), (torch.tensor(0.5),), (torch.tensor(1.0),))
     torch.testing.assert_close(slope, (1 / (x + 3 / 8 + 0.25).sqrt()).sum())

@@ -125,7 +125,7 @@ def test_frequencies_above_half_of_one_over_the_bin(sign):
 def test_errors():
     with pytest.raises(ShapeError, match="64 bins"):
         losses.transient_phasors(torch.zeros(1, 60, 2, 2), AXIS, BAND)
-    with pytest.raises(ArgumentError, match="TimeAxis and a FrequencyAxis"):
-        losses.transient_phasors(torch.zeros(1, 64, 2, 2), AXIS, [1.0])
+    with pytest.raises(ArgumentError, match="and a FrequencyAxis"):
+        losses.transient_phasors(torch.zeros(1, 64, 2, 2), AXIS)
     with pytest.raises(UnitError, match="complex phasors"):
         losses.phasor_loss(torch.zeros(3), torch.zeros(3))

@@ -100,7 +100,6 @@ def test_angles_modulo_half_a_turn():
     truth, found = torch.tensor([1.5, 0.0]), torch.tensor([-1.5, 0.2])
     x, y = light(torch.full_like(degree, 0.5), found), light(degree, truth)
     short = math.pi - 3.0
-    assert float(metrics.aolp_mae(x, y, weighted=False)) == pytest.approx((short + 0.2) / 2, rel=1e-5)
     assert float(metrics.aolp_mae(x, y)) == pytest.approx(0.1 * short + 0.9 * 0.2, rel=1e-5)
     assert float(metrics.phase_mae(found, truth, period=math.pi)) == pytest.approx((short + 0.2) / 2, rel=1e-5)
     assert float(metrics.dop_mae(x, y)) == pytest.approx(0.4, rel=1e-5)
@@ -130,7 +129,7 @@ def test_dark_and_unpolarized_light():
         metrics.dop_mae(x, y, part="all")
     assert float(metrics.aolp_mae(SimpleNamespace(steady=x), SimpleNamespace(steady=x))) == 0.0
     four = SimpleNamespace(steady=x.movedim(-1, 1).expand(4, 2, 1, 1), polarized=False)
-    with pytest.raises(ShapeError, match="polarized result"):
+    with pytest.raises(ShapeError, match="polarized variant"):
         metrics.dop_mae(four, four)
 
 

@@ -164,11 +164,11 @@ def test_reflectances_stay_below_one():
 def test_what_spectra_refuse():
     with pytest.raises(UnitError, match="rising order"):
         spline_basis(WAVELENGTHS[::-1], 5)
-    with pytest.raises(ShapeError, match="at most one coefficient"):
+    with pytest.raises(ShapeError, match="at most 4"):
         spline_basis([400, 500, 600, 700], 5)
     with pytest.raises(ShapeError, match="at least 4"):
         spline_basis(WAVELENGTHS, 3)
-    with pytest.raises(ShapeError, match="four wavelengths"):
+    with pytest.raises(UnitError, match="real numbers"):
         spline_basis("visible", 3)
     with pytest.raises(ShapeError, match=r"expected coefficients \(\.\.\., 6\)"):
         parametrize.PositiveSpectrum(WAVELENGTHS, 6)(torch.zeros(5))

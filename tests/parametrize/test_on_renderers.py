@@ -87,7 +87,7 @@ def test_what_is_wrong_is_said(renderer, plain):
     with pytest.raises(SceneError, match="has no parametrization"):
         remove(plain, COLOUR)
     for key, kind, error, words in (
-        (COLOUR, Albedo, ArgumentError, r"an nn\.Module, got type"),
+        (COLOUR, Albedo, ArgumentError, r"expected an nn\.Module"),
         (COLOUR, AxisAnglePose(), ShapeError, r"AxisAnglePose: expected transforms \(\.\.\., 4, 4\)"),
         (COLOUR, nn.Unflatten(0, (1, 3)), ShapeError, f"Unflatten does not fit '{COLOUR}'"),
         (WALL_POSE, AxisAnglePose(), UnitError, "rigid motion of the base"),

@@ -104,7 +104,7 @@ def test_states_that_do_not_fit():
     pose, positive = SE3Pose().state_dict(), Positive().state_dict()
     for module, state, error, words in (
         (Holder(Albedo(), colour), three, RuntimeError, r"size mismatch for parametrizations\.w\.0\.low"),
-        (SE3Pose(), AxisAnglePose().state_dict(), SceneError, "SE3Pose: the state is one of AxisAnglePose"),
+        (SE3Pose(), AxisAnglePose().state_dict(), SceneError, "SE3Pose: expected the state of a pose"),
         (SE3Pose(), pose | {"_extra_state": torch.tensor(1)}, SceneError, "expected the state of a pose"),
         (Positive(), positive | {"_extra_state": torch.tensor(7)}, SceneError, "one of softplus, exp"),
     ):  # fmt: skip

@@ -11,11 +11,12 @@ import pytest
 
 from support.capture_files import holdable
 from torchtransient.axes import FrequencyAxis
-from torchtransient.files.captures.formats import LAYOUTS, read_capture
+from torchtransient.files.captures.formats import ENDINGS as ENDINGS_OF
+from torchtransient.files.captures.formats import read_capture
 
 pytestmark = pytest.mark.peer
 
-ENDINGS = {layout.name: layout.endings[0] for layout in LAYOUTS}
+ENDINGS = {name: endings[0] for name, endings in ENDINGS_OF.items()}
 # y-tal finds axes by equal sizes, reads one camera point, and grids with a fixed point.
 NOT_READ_THERE = {"zaragoza-confocal", "phasor_field-exhaustive", "rect_data-confocal"}
 HOLDABLE = {f"{layout}-{name}": (layout, c) for layout, name, c in holdable() if layout != "torchtransient"}

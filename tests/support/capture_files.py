@@ -13,13 +13,14 @@ import torch
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan, Wall
 from torchtransient.errors import StorageError
+from torchtransient.files.captures.formats import ENDINGS as ENDINGS_OF
 from torchtransient.files.captures.formats import LAYOUTS
 from torchtransient.files.captures.matlab import write_mat as write_mat
 from torchtransient.nlos import HiddenVolume, VoxelGrid
 
 # Endings of files by layout, and the layouts that are written.
-ENDINGS = {"torchtransient": ".h5"} | {layout.name: layout.endings[0] for layout in LAYOUTS}
-WRITTEN = ["torchtransient", *(layout.name for layout in LAYOUTS if layout.write is not None)]
+ENDINGS = {"torchtransient": ".h5"} | {name: endings[0] for name, endings in ENDINGS_OF.items()}
+WRITTEN = ["torchtransient", *(name for name, layout in LAYOUTS.items() if hasattr(layout, "write"))]
 
 AXIS = TimeAxis(1.1, 0.003, 7)
 FROM_ZERO = TimeAxis(0.0, 0.003, 7)

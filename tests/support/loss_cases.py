@@ -107,10 +107,10 @@ def _phasors(name, **options):
     )  # fmt: skip
 
 
-def _likelihood(name, function, module, **options):
+def _likelihood(name, function, module, *, dim=-3, **options):
     return LossCase(
         name, function, module, options, draw_target=counts, crop=PIXELS, symmetric=False,
-        zero_at_equality=False, mapped=False, dim=-3,
+        zero_at_equality=False, mapped=False, dim=dim,
     )  # fmt: skip
 
 
@@ -143,9 +143,9 @@ CASES = [
     LossCase("running sums", losses.cumulative_loss, losses.CumulativeLoss, WIDTH, dim=-3),
     LossCase("running sums, by their noise", losses.cumulative_loss, losses.CumulativeLoss,
              {**WIDTH, "per_root_count": True}, symmetric=False, floors_detached=True, dim=-3),
-    LossCase("many scales", losses.multiscale_loss, losses.MultiscaleLoss, {"scales": (1, 2, 3)}, dim=-3),
+    LossCase("many scales", losses.multiscale_loss, losses.MultiscaleLoss, crop=PIXELS, dim=-3),
     LossCase("many scales, first photon", losses.multiscale_loss, losses.MultiscaleLoss,
-             {"compare": functools.partial(losses.first_photon_nll, cycles=CYCLES), "scales": (1, 3)},
+             {"compare": functools.partial(losses.first_photon_nll, cycles=CYCLES)},
              draw_target=counts, crop=None, symmetric=False, zero_at_equality=False, mapped=False, dim=-3),
     LossCase("Anscombe", losses.root_loss, losses.RootLoss),
     LossCase("expected root", losses.expected_root_loss, losses.ExpectedRootLoss, symmetric=False,
@@ -173,8 +173,8 @@ CASES = [
              symmetric=False, floors_detached=True),
     LossCase("SSIM of projections", losses.projection_ssim_loss, losses.ProjectionSSIMLoss,
              {"window": 3, "value_range": 1.1}, crop=None, **VOLUMES),
-    _likelihood("Poisson", losses.poisson_nll, losses.PoissonNLL),
-    _likelihood("Poisson, floor", losses.poisson_nll, losses.PoissonNLL, floor=1e-3),
+    _likelihood("Poisson", losses.poisson_nll, losses.PoissonNLL, dim=None),
+    _likelihood("Poisson, floor", losses.poisson_nll, losses.PoissonNLL, dim=None, floor=1e-3),
     _likelihood("first photon", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES),
     _likelihood("first photon, dead time and floor", losses.first_photon_nll, losses.FirstPhotonNLL, cycles=CYCLES,
                 dead_bins=2.0, floor=1e-3),
@@ -205,10 +205,9 @@ FITS = {
     **dict.fromkeys(("floor", "background", "smoothing", "read_noise", "creation_cost_opl", "share"), 0.7),
     **dict.fromkeys(("bin_width_opl", "balance"), 0.05),
     **dict.fromkeys(("cycles", "periods"), 400.0),
-    **dict.fromkeys(("window", "value_range", "cells"), 3.0),
+    **dict.fromkeys(("window", "value_range"), 3.0),
     "dead_bins": 2.5,
     "spacing": (0.1, 0.2, 0.3),
-    "scales": (1.0, 2.0),
 }
 # Values of which a loss makes a plausible number; of other options a negative one and NaN.
 WRONG = {
@@ -218,7 +217,6 @@ WRONG = {
     "value_range": (-1.0, 0.0),
     "balance": (-0.1, 1.1),
     "window": (0, 4),
-    "scales": ((), (0,), (1, 2.5)),
     "spacing": ((1.0, 1.0), (1.0, 0.0, 1.0)),
 }
 # Options without a part beside the others of a case: phases have a floor, and so do records of mass one.

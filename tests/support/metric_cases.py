@@ -59,7 +59,6 @@ CASES = [
     *(Case(f, (3, 4, 2, 6, 5), (3, 2, 6, 5)) for f in STOKES),
     Case(metrics.dop_mae, (3, 4, 2, 6, 5), (3, 2, 6, 5), {"part": "circular"}, name="dop_mae, circular"),
     Case(metrics.dop_rmse, (3, 4, 2, 3, 6, 5), (3, 2, 3, 6, 5), {"stokes_dim": -5}, name="dop_rmse of transients"),
-    Case(metrics.aolp_mae, (3, 4, 2, 6, 5), (3, 2, 6, 5), {"weighted": False}, name="aolp_mae, even"),
     Case(metrics.histogram_total_variation, LIGHT, LIGHT),
     Case(metrics.histogram_wasserstein_opl, LIGHT, LIGHT, {"axis": AXIS}),
     Case(metrics.histogram_wasserstein_s, LIGHT, LIGHT, {"axis": AXIS}),

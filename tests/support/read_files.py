@@ -191,7 +191,7 @@ READERS: dict[str, Reader] = {
     "result": Reader(_results, lambda path: content_key(read_result(path)), _is_sealed),
     "capture": Reader(_captures, lambda path: content_key(tt.nlos.Capture.read(path)), _is_sealed),
     "volume": Reader(_volumes, lambda path: content_key(tt.nlos.read_volume(path)), _is_sealed),
-    **{f"capture of {layout.name}": _foreign(layout.name) for layout in LAYOUTS},
+    **{f"capture of {name}": _foreign(name) for name in LAYOUTS},
     "shard": Reader(_shards, _read_shard, lambda path: True),
     "data set": Reader(_data_sets, _read_data_set),
     "WebDataset": Reader(_tars, lambda path: deque(tt.data.read_web_dataset(path), 0)),

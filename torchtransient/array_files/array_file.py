@@ -39,12 +39,6 @@ from torchtransient.errors import StorageError, TorchTransientError
 CHECKSUMS = "checksums"
 HDF5 = (".h5", ".hdf5")
 ENDINGS = (*HDF5, ".npz")
-# What reads the library's kinds of files.
-READERS = {
-    "torchtransient result": "torchtransient.files.result_file.read_result",
-    "torchtransient capture": "tt.nlos.Capture.read",
-    "torchtransient volume": "tt.nlos.read_volume",
-}
 _PART_BYTES = 2**26
 # What the readers of NumPy and h5py raise for files that are damaged or something else.
 _DAMAGED = (
@@ -64,9 +58,7 @@ def check_target(path: str | Path, what: str) -> Path:
         StorageError: for another ending, and a folder that is missing or closed.
         MissingPackageError: for HDF5 without h5py.
     """
-    target = path_of(path, what)
-    if target.suffix.lower() not in ENDINGS:
-        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{target}'.")
+    target = _path_with_ending(path, what)
     check_folder(target, what)
     if target.suffix.lower() in HDF5:
         hdf5_package(what)
@@ -112,16 +104,19 @@ def read_arrays(path: str | Path, forms: Sequence[str], what: str, known: Callab
     Raises:
         StorageError: for a file that is missing, of another format, or damaged.
     """
-    source = path_of(path, what)
-    if source.suffix.lower() not in ENDINGS:
-        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{source}'.")
-    check_source(source, what)
-
+    source = check_source(_path_with_ending(path, what), what)
     with damage_said(source, what):
         found = _format_of(source, what)
         if found not in forms:
-            raise StorageError(f"{what}: '{source}' is {other_kind(found or 'nothing', forms[-1])}")
+            raise StorageError(f"{what}: expected '{source}' of format {forms[-1]!r}, got {shown(found or 'nothing')}.")
         return _values(source, what, known, found)
+
+
+def _path_with_ending(path: str | Path, what: str) -> Path:
+    found = path_of(path, what)
+    if found.suffix.lower() not in ENDINGS:
+        raise StorageError(f"{what}: expected a name that ends in {', '.join(ENDINGS)}, got '{found}'.")
+    return found
 
 
 def read_some(path: Path, what: str, known: Callable[[str], bool], kind: str = "a file of arrays") -> dict[str, Any]:
@@ -180,19 +175,6 @@ def _values(source: Path, what: str, known: Callable[[str], bool], form: str) ->
 
 def _read(source: Path, what: str, known: Callable[[str], bool]) -> dict[str, Any]:
     return (_read_hdf5 if source.suffix.lower() in HDF5 else read_npz)(source, what, known)
-
-
-def other_kind(found: str, form: str) -> str:
-    """Return the end of a message about a file of another format.
-
-    Args:
-        found: format of the file.
-        form: format that was expected.
-    """
-    kind = found.rpartition(" ")[0]
-    if kind == form.rpartition(" ")[0] or kind not in READERS:
-        return f"of format {shown(found)}; this version reads '{form}'."
-    return f"of format {shown(found)}, not '{form}'. {READERS[kind]} reads it."
 
 
 @contextmanager

@@ -80,9 +80,7 @@ def yaml_data(text: str, what: str, yaml: Any, loader: Any = None, most_nodes: i
         return yaml.load(text, Loader=own)
     except TorchTransientError:
         raise
-    except yaml.YAMLError as error:
-        raise StorageError(f"{what}: expected YAML, got what cannot be read{_place(error)}.") from error
-    except _WRONG as error:
+    except (yaml.YAMLError, *_WRONG) as error:
         raise StorageError(f"{what}: expected YAML, got what cannot be read: {short_message(error)}.") from error
 
 
@@ -123,6 +121,7 @@ def write_plain_yaml(data: Any, what: str) -> str:
 
 def _lenient_loader(yaml: Any) -> Any:
     """Return a loader that reads all tags as the plain data under them."""
+
     class Loader(safe_loader(yaml)):  # type: ignore[misc]  # the package has no types
         """Plain data only."""
 
@@ -164,16 +163,6 @@ def safe_loader(yaml: Any) -> Any:
         yaml: the package PyYAML.
     """
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-def _place(error: Any) -> str:
-    """Return place and reason of a syntax error."""
-    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-    if mark is None or problem is None:
-        return f": {short_message(error)}"
-    context = getattr(error, "context", None)
-    reason = f"{context}: {problem}" if context else str(problem)
-    return f" in line {mark.line + 1}, column {mark.column + 1}: {short_message(ValueError(reason))}"
 
 
 def _check_events(yaml: Any, text: str, what: str, most: int) -> None:

@@ -32,7 +32,6 @@ from torchtransient.array_files.array_file import (
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.capture.capture import metadata_text
-from torchtransient.errors import ArgumentError
 from torchtransient.files.plain_data import flag_of, names_of, notes_of, number_of, plain, restored, text_of, whole_of
 
 FORMAT = "torchtransient capture 2"
@@ -44,7 +43,7 @@ _ENTRIES = (
     "format", "metadata", "channels", "kind", "polarized", "first_and_last_leg", "start_opl", "bin_width_opl",
     "num_bins", "frequencies_per_metre", "phasor_start_opl", "wall",
 )  # fmt: skip
-_POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
+POINTS = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
 
 
 def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any] | None = None) -> Path:
@@ -63,17 +62,13 @@ def write_capture(path: str | Path, capture: Capture, metadata: Mapping[str, Any
             data.
     """
     target = check_target(path, _WHAT)
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"capture file: expected a tt.nlos.Capture, got {type(capture).__name__}.")
-    metadata = {} if metadata is None else metadata
-    metadata_text(metadata, _WHAT)
-    note = metadata_text({**metadata, **capture.metadata}, _WHAT)
+    note = metadata_text({**(metadata or {}), **capture.metadata}, _WHAT)
     scan = capture.scan
     entries: dict[str, Any] = {
         "format": FORMAT, "metadata": note, "channels": json.dumps(capture.channels), "kind": scan.kind,
         "polarized": int(capture.polarized), "first_and_last_leg": int(scan.first_and_last_leg),
     }  # fmt: skip
-    given = {name: getattr(capture, name) for name in _MEASURED} | {name: getattr(scan, name) for name in _POINTS}
+    given = {name: getattr(capture, name) for name in _MEASURED} | {name: getattr(scan, name) for name in POINTS}
     given |= {"sensor_legs": scan.sensor_legs, "laser_legs": scan.laser_legs}
     arrays = {name: array_of(tensor, _WHAT) for name, tensor in given.items() if tensor is not None}
     if capture.axis is not None:
@@ -99,7 +94,7 @@ def read_capture(path: str | Path) -> Capture:
     Raises:
         StorageError: for a file that is missing, damaged or no capture.
     """
-    known = {*_MEASURED, *_POINTS, *_ENTRIES}
+    known = {*_MEASURED, *POINTS, *_ENTRIES}
     values = read_arrays(path, FORMATS, _WHAT, lambda name: name in known or name.startswith("wall_"))
     with damage_said(Path(path), _WHAT):
         return _capture(values)
@@ -117,7 +112,7 @@ def _capture(values: Mapping[str, Any]) -> Capture:
         found = tuple(np.asarray(values["frequencies_per_metre"]).tolist())
         frequencies = FrequencyAxis(found, number_of(values, "phasor_start_opl"))
     wall = restored(json.loads(text_of(values, "wall")), values) if "wall" in values else None
-    points = {name: tensor(name) for name in _POINTS}
+    points = {name: tensor(name) for name in POINTS}
     legs = flag_of(values, "first_and_last_leg")
     scan = Scan(text_of(values, "kind"), **points, first_and_last_leg=legs, wall=wall)  # type: ignore[arg-type]
     return Capture(

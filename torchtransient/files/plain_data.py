@@ -34,20 +34,16 @@ def plain(value: Any, parts: list[NDArray[Any]] | None, where: str) -> Any:
     Raises:
         StorageError: for anything else.
     """
-    return _plain(value, parts, where, where)
-
-
-def _plain(value: Any, parts: list[NDArray[Any]] | None, where: str, stem: str) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
-        return {str(name): _plain(entry, parts, f"{where}.{name}", stem) for name, entry in value.items()}
+        return {str(name): plain(entry, parts, f"{where}.{name}") for name, entry in value.items()}
     if isinstance(value, tuple):
-        return {_TUPLE: [_plain(entry, parts, where, stem) for entry in value]}
+        return {_TUPLE: [plain(entry, parts, where) for entry in value]}
     if isinstance(value, list):
-        return [_plain(entry, parts, where, stem) for entry in value]
+        return [plain(entry, parts, where) for entry in value]
     if isinstance(value, torch.Tensor):
         value = array_of(value, _WHAT)
     # Transforms of Mitsuba keep their numbers in `matrix`.
@@ -62,7 +58,7 @@ def _plain(value: Any, parts: list[NDArray[Any]] | None, where: str, stem: str) 
         text = base64.b64encode(little.tobytes()).decode("ascii")
         return {_NUMBERS: text, "dtype": little.dtype.str, "shape": list(array.shape)}
     parts.append(array)
-    return {_ARRAY: f"{stem}_{len(parts) - 1}"}
+    return {_ARRAY: f"{where.partition('.')[0]}_{len(parts) - 1}"}
 
 
 def restored(value: Any, arrays: Mapping[str, Any]) -> Any:
@@ -93,8 +89,6 @@ def _number_type(name: Any) -> np.dtype[Any]:
     if dtype.kind not in "biufc":
         raise StorageError(f"capture file: expected a type of numbers, got {name!r}.")
     return dtype
-
-
 
 
 def scan_data(scan: Scan) -> dict[str, Any]:

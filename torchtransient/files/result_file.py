@@ -35,7 +35,7 @@ from torchtransient.array_files.array_file import (
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture.capture import metadata_text
 from torchtransient.chirps import Chirps
-from torchtransient.errors import ArgumentError, StorageError
+from torchtransient.errors import StorageError
 from torchtransient.files.plain_data import names_of, notes_of, number_of, text_of, whole_of
 from torchtransient.gates import Gate
 from torchtransient.rendering.error_bars import ErrorBars, ErrorCells
@@ -118,20 +118,12 @@ def write_result(path: str | Path, output: RenderOutput | Result, metadata: Mapp
         StorageError: for an unknown ending, a folder that is missing, a full disk, or metadata that is not plain.
     """
     target = check_target(path, _WHAT)
-    given: Any = output
-    if not isinstance(given, RenderOutput | Result):
-        raise ArgumentError(
-            f"result file: expected what a render returned, a RenderOutput, got {type(given).__name__}. Tensors alone "
-            "have no axis; write them with torch.save."
-        )
     own = {"stats": asdict(output.stats)} if isinstance(output, RenderOutput) else output.metadata
     note = metadata_text({**(metadata or {}), **own}, _WHAT)
     film = layout_of_output(output)
     tensor = None if film is None else film.tensor(output)
     if film is None or tensor is None:
-        raise StorageError(
-            "result file: expected an output with what its film measured, transient and axis for instance, got neither."
-        )
+        raise StorageError("result file: expected an output with what its film measured, a transient for instance.")
     settings = film.entries()
     values = {name: value for name, value in settings.items() if not isinstance(value, np.ndarray)}
     entries: dict[str, Any] = {
@@ -168,11 +160,8 @@ def read_result(path: str | Path) -> Result:
 
 def _is_known(name: str) -> bool:
     # Films of others know alone what their settings are called.
-    return name in _KNOWN or any(name == film.measures or not _is_ours(film) for film in FILMS)
-
-
-def _is_ours(film: type) -> bool:
-    return film.__module__.startswith("torchtransient.")
+    others = any(not film.__module__.startswith("torchtransient.") for film in FILMS)
+    return others or name in _KNOWN or any(name == film.measures for film in FILMS)
 
 
 def _result(values: Mapping[str, Any], source: Path) -> Result:

@@ -22,7 +22,6 @@ from torchtransient.array_files.array_file import (
     write_arrays,
 )
 from torchtransient.capture.capture import metadata_text
-from torchtransient.errors import ArgumentError
 from torchtransient.files.plain_data import notes_of, text_of
 from torchtransient.reconstruction.voxels import HiddenVolume, VoxelGrid
 
@@ -47,8 +46,6 @@ def write_volume(path: str | Path, volume: HiddenVolume) -> Path:
         StorageError: for an unknown ending, a folder that is missing, a full disk, and metadata that is not plain data.
     """
     target = check_target(path, _WHAT)
-    if not isinstance(volume, HiddenVolume):
-        raise ArgumentError(f"volume file: expected a HiddenVolume, got {type(volume).__name__}.")
     note = metadata_text(volume.metadata, _WHAT)
     grid = volume.grid
     given = {"values": volume.values, "times": volume.times, "directions": volume.directions, "depths": grid.depths}

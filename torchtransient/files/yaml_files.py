@@ -136,11 +136,9 @@ class Section:
             raise SceneError(f"{self._at(name)}: expected one of {some_of(choices)}, got {shown(value)}.")
         return value
 
-    def numbers(self, name: str, counts: Sequence[int], default: Any = _MISSING) -> Any:
+    def numbers(self, name: str, counts: Sequence[int]) -> list[float]:
         """Return a list of finite numbers, as many as one of ``counts``."""
-        value = self.get(name, default)
-        if name not in self:
-            return value
+        value = self.get(name)
         if not isinstance(value, list) or len(value) not in counts:
             words = " or ".join(map(str, counts))
             raise SceneError(f"{self._at(name)}: expected a list of {words} numbers, got {shown(value)}.")

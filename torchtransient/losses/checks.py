@@ -15,28 +15,14 @@ from typing import Literal, cast, get_args
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchtransient.checks import MOST, finite, is_one_of, shown
+from torchtransient.checks import count, finite, shown
 from torchtransient.errors import ArgumentError, ShapeError, TorchTransientError, UnitError
 from torchtransient.floating import is_true
+from torchtransient.sensing.checks import refuse_cut_off
 from torchtransient.units import SHORTEST_OPL
 
 Reduction = Literal["none", "sum", "mean"]
-
-
-def check_reduction(reduction: Reduction, where: str) -> None:
-    """Check the name of a reduction.
-
-    Args:
-        reduction: one of `Reduction`.
-        where: begins the message.
-
-    Raises:
-        ArgumentError: for other names.
-    """
-    if not is_one_of(reduction, get_args(Reduction)):
-        raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {shown(reduction)}.")
 
 
 def check_pair(
@@ -56,11 +42,25 @@ def check_pair(
     """
     input, target = check_dense((input, target), where)
     if input.shape != target.shape:
-        raise ShapeError(
-            f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}."
-        )
+        raise ShapeError(f"{where}: expected {names} of one shape, got {tuple(input.shape)} and {tuple(target.shape)}.")
     dtype = working_dtype((input, target), where, complex_too=complex_too)
     return input.to(dtype), target.to(dtype)
+
+
+def masked_pair(
+    input: object, target: object, mask: Tensor | None, where: str, *, complex_too: bool = False, fill: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return both tensors of `check_pair`, input `fill` and target 0 where the mask does not count, and the mask.
+
+    Args:
+        input, target, complex_too: as of `check_pair`.
+        mask: as of `check_mask`.
+        where: begins the message.
+        fill: value of masked elements of the input.
+    """
+    input, target = check_pair(input, target, where, complex_too=complex_too)
+    mask = check_mask(mask, input, where)
+    return counted(input, mask, fill), counted(target, mask), mask
 
 
 def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
@@ -73,12 +73,9 @@ def check_dense(tensors: tuple[object, ...], where: str) -> tuple[Tensor, ...]:
     Raises:
         ShapeError: for other types and for sparse tensors.
     """
-    kinds = [
-        str(x.layout) if isinstance(x, Tensor) and x.layout != torch.strided else type(x).__name__ for x in tensors
-    ]
-    if not all(isinstance(x, Tensor) and x.layout == torch.strided for x in tensors):
-        number = {1: "a dense tensor", 2: "two dense tensors"}.get(len(tensors), "dense tensors")
-        raise ShapeError(f"{where}: expected {number}, got {' and '.join(kinds)}.")
+    for x in tensors:
+        if not isinstance(x, Tensor) or x.layout != torch.strided:
+            raise ShapeError(f"{where}: expected dense tensors, got {shown(x)}.")
     return cast("tuple[Tensor, ...]", tensors)
 
 
@@ -129,7 +126,9 @@ def check_level(
     length = name.endswith("_opl")
     least = max(least, SHORTEST_OPL) if length else least
     if isinstance(value, Tensor):
-        _check_fit(name, value, like, where)
+        if value.is_complex() or value.dtype == torch.bool:
+            raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
+        expanded(value, like, name, where)
         # of whole numbers and narrower ones in the precision they are used in
         level = value if value.dtype == torch.float64 else value.to(dtype)
         fits = is_true((level >= least) & (level <= most) | (level == 0 if zero else torch.zeros_like(level).bool()))
@@ -138,27 +137,33 @@ def check_level(
         fits = least <= number <= most or (zero and number == 0)
     if not fits:
         got = "some that are not" if isinstance(value, Tensor) and value.ndim else shown(value)
-        if length:
-            raise UnitError(
-                f"{where}: expected {name} in metres of optical path, at least {least:g} (0.3 fs), got {got}. Seconds? "
-                f"Times 299792458 they are metres; a tt.TimeAxis has its {name}."
-            )
+        name += " in metres of optical path," if length else ""
+        hint = " Seconds? Times 299792458 they are metres." if length else ""
         raise UnitError(
-            f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero that {dtype} holds "
-            f"({least:.1g} to {most:.1g}), got {got}."
+            f"{where}: expected {name} {'of zero or ' if zero else ''}greater than zero ({least:.2g} to {most:.1g}), "
+            f"got {got}.{hint}"
         )
     return value.to(like.device, dtype) if isinstance(value, Tensor) else like.new_full((), number, dtype=dtype)
 
 
-def _check_fit(name: str, value: Tensor, like: Tensor, where: str) -> None:
-    if value.is_complex() or value.dtype == torch.bool:
-        raise UnitError(f"{where}: expected {name} of real numbers, got {value.dtype}.")
+def expanded(x: Tensor, like: Tensor, name: str, where: str) -> Tensor:
+    """Return a tensor in the shape of another one.
+
+    Args:
+        x: any tensor.
+        like: of that shape.
+        name: of `x` in the message.
+        where: begins the message.
+
+    Raises:
+        ShapeError: unless it broadcasts.
+    """
     try:
-        value.expand(like.shape)
+        return x.expand(like.shape)
     except RuntimeError:
         raise ShapeError(
-            f"{where}: expected {name} to be a number or a tensor that broadcasts to {tuple(like.shape)}, got "
-            f"{tuple(value.shape)}."
+            f"{where}: expected a {name} that broadcasts to {tuple(like.shape)}, got {tuple(x.shape)}. For each pixel "
+            "of a transient (..., C, T, Y, X) it has T = 1."
         ) from None
 
 
@@ -171,19 +176,11 @@ def check_number(name: str, value: object, where: str) -> float:
         where: begins the message.
 
     Raises:
-        UnitError: for other values, also for a tensor with a gradient, which a number would drop.
+        UnitError: for other values.
+        GradientError: for a tensor with a gradient, which a number would drop.
     """
-    if isinstance(value, Tensor) and (value.requires_grad or _tangent(value) is not None):
-        raise UnitError(
-            f"{where}: expected {name}, a number without gradient, got a tensor that has or requires one. The loss has "
-            "no derivative by it: use .detach()."
-        )
+    refuse_cut_off(value, name, where)
     return finite(f"{where}: {name}", value)
-
-
-def _tangent(x: Tensor) -> Tensor | None:
-    """Return the tangent of forward mode, which `requires_grad` does not show."""
-    return cast("Tensor | None", forward_ad.unpack_dual(x).tangent)  # type: ignore[no-untyped-call]
 
 
 def check_whole(name: str, value: object, where: str, error: type[TorchTransientError] = ShapeError) -> int:
@@ -198,10 +195,8 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
     Raises:
         UnitError: for no number.
     """
-    number = math.nan if isinstance(value, bool) else check_number(name, value, where)
-    if not 1 <= number <= MOST or number != int(number):
-        raise error(f"{where}: expected {name} to be a whole number of at least 1, got {shown(value)}.")
-    return int(number)
+    check_number(name, value, where)
+    return count(f"{where}: {name}", value, 1, error)
 
 
 def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
@@ -221,13 +216,7 @@ def check_mask(mask: Tensor | None, like: Tensor, where: str) -> Tensor | None:
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         kind = mask.dtype if isinstance(mask, Tensor) else type(mask).__name__
         raise UnitError(f"{where}: expected a mask of truth values, True where it counts, got {kind}. Use mask > 0.")
-    try:
-        return mask.expand(like.shape)
-    except RuntimeError:
-        raise ShapeError(
-            f"{where}: expected a mask that broadcasts to {tuple(like.shape)}, got {tuple(mask.shape)}. A mask of "
-            "pixels of a transient (..., C, T, Y, X) has T = 1."
-        ) from None
+    return expanded(mask, like, "mask", where)
 
 
 def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
@@ -272,7 +261,8 @@ def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None 
     Raises:
         ArgumentError: for another reduction.
     """
-    check_reduction(reduction, where)
+    if reduction not in get_args(Reduction):
+        raise ArgumentError(f"{where}: expected reduction 'none', 'sum' or 'mean', got {shown(reduction)}.")
     value = counted(value, mask)
     if reduction == "none":
         return value
@@ -298,7 +288,7 @@ def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> T
     if not dims:  # torch takes no dimensions for all of them
         return size
     if mask is None:
-        return size.mean(dims, keepdim=True) if size.numel() else size.sum(dims, keepdim=True)
+        return size.mean(dims, keepdim=True)
     return size.sum(dims, keepdim=True) / mask.sum(dims, keepdim=True).clamp_min(1)
 
 

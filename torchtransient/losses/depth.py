@@ -7,15 +7,7 @@ from torch import Tensor
 
 from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.checks import (
-    Reduction,
-    check_level,
-    check_mask,
-    check_number,
-    check_pair,
-    counted,
-    reduce,
-)
+from torchtransient.losses.checks import Reduction, check_level, check_mask, check_number, check_pair, counted, reduce
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import DEPTH, DepthMap, reads
 

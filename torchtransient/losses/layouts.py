@@ -10,10 +10,10 @@ of four bins or more are taken. A batch of lists of four channels or more has su
 from __future__ import annotations
 
 import math
+import operator
 
 from torch import Tensor
 
-from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.losses.checks import check_level
 
@@ -42,30 +42,12 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
                 f"Without it (C, T, Y, X) and (B, C, T, Y, X) of {_FEWEST_BINS} bins or more are taken, no others."
             )
         return _IMAGES
-    number = check_dim(dim, where)
+    number = operator.index(dim)
     if not -x.ndim <= number < x.ndim:
         raise ShapeError(
             f"{where}: expected a tensor with time as its dimension {number}, got {tuple(x.shape)}. dim is {_LAYOUTS}."
         )
     return number - x.ndim if number >= 0 else number
-
-
-def check_dim(dim: int, where: str) -> int:
-    """Return a dimension as a whole number.
-
-    Args:
-        dim: number of any type.
-        where: begins the message.
-
-    Raises:
-        ShapeError: for other values.
-    """
-    number = as_whole(dim)
-    if number is None or abs(number) > MOST:
-        raise ShapeError(
-            f"{where}: expected dim, the dimension of time, to be a whole number, got {shown(dim)}. It is {_LAYOUTS}."
-        )
-    return number
 
 
 def bins_dim(x: Tensor, dim: int | None, where: str) -> int:

@@ -24,12 +24,12 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import positive
-from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError
+from torchtransient.errors import GradientError, TorchTransientWarning, UnitError, level_of_user
 from torchtransient.floating import is_true
 from torchtransient.losses.checks import (
     Reduction,
@@ -44,7 +44,7 @@ from torchtransient.losses.checks import (
     reduce,
     working_dtype,
 )
-from torchtransient.losses.layouts import as_columns, bins_dim, item_dims, time_dim
+from torchtransient.losses.layouts import as_columns, bins_dim, item_dims
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, TRANSIENT, Light, Transient, reads
 from torchtransient.sensing.dead_time.renewal import check_dead_bins
@@ -77,7 +77,6 @@ def poisson_nll(
     *,
     floor: Tensor | float | None = None,
     constant: bool = False,
-    dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
@@ -92,7 +91,6 @@ def poisson_nll(
         target: counts, of the same shape.
         floor: added to the mean, number or tensor that broadcasts; `relative_floor` makes one of the model.
         constant: add `log n!`.
-        dim: dimension of time, checked only.
         mask: bins that count.
         reduction: "mean" over bins that count, "sum", or "none".
 
@@ -105,12 +103,8 @@ def poisson_nll(
         ShapeError: for two shapes.
     """
     where = "poisson_nll"
-    mean, counts = _check_prediction(input, target, where)
-    if dim is not None:
-        time_dim(mean, dim, where)
-    mask = check_mask(mask, mean, where)
-    counts, mean = counted(counts, mask), counted(mean, mask, 1.0)
-    _check_rates(mean, where)
+    mean, counts, mask = _rates(input, target, mask, where)
+    counts = counted(counts, mask)
     _check_constant(counts, constant, where)
     m = _floored(mean, floor, where)
     level = _dark_level(counts, floor, input, averaged=divisor(mean, mask, reduction))
@@ -123,7 +117,7 @@ def poisson_nll(
 poisson_loss = poisson_nll
 
 
-class PoissonNLL(LossModule, function=poisson_nll, by_place=("floor", "dim", "reduction")):
+class PoissonNLL(LossModule, function=poisson_nll, by_place=("floor", "reduction")):
     """`poisson_nll` with its options held."""
 
 
@@ -262,18 +256,16 @@ def first_photon_nll(
     Source: Coates 1968; Shin et al. 2015 for the likelihood.
     """
     where = "first_photon_nll"
-    rate = _check_prediction(input, target, where)[0]
+    rate, _, mask = _rates(input, target, mask, where)
     number = check_whole("cycles", cycles, where, UnitError)
-    dead = None if dead_bins is None else _check_dead_time(dead_bins, where)
+    dead = None if dead_bins is None else check_dead_bins(check_number("dead_bins", dead_bins, where))
     dim = bins_dim(rate, dim, where)
-    mask = check_mask(mask, rate, where)
-    rate = counted(rate, mask, 1.0)
-    _check_rates(rate, where)
     measured = _exact(target, mask, dim)
     _check_constant(measured, constant, where)
     n, r = as_columns(measured, dim), as_columns(_floored(rate, floor, where), dim).to(torch.float64)
     level = _dark_level(n, floor, input, number, divisor(rate, mask, reduction))
-    dark = None if level is None else _dark_counts(n, r, level)
+    below = None if level is None else (r < level) & (n != 0)
+    dark = below if below is not None and bool(below.any()) else None
     near = r if level is None or dark is None else torch.where(dark, level, r)
     value = -first_photon_log_prob(n, near, number, dead_bins=dead, constant=constant, where=where)
     if level is not None and dark is not None:
@@ -333,12 +325,8 @@ def free_running_nll(
     Source: Rapp et al. 2019 and Gupta et al. 2019, see `sensing.free_running`.
     """
     where = "free_running_nll"
-    rate = _check_prediction(input, target, where)[0]
-    periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
+    rate, _, mask = _rates(input, target, mask, where)
     dim = bins_dim(rate, dim, where)
-    mask = check_mask(mask, rate, where)
-    rate = counted(rate, mask, 1.0)
-    _check_rates(rate, where)
     n = as_columns(_exact(target, mask, dim), dim)
     armed = armed_periods(n, periods, dead_bins)
     # the ends of the exposure and the positions inside a bin leave an uncertainty of about the root of the counts
@@ -373,16 +361,11 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
         not fit.
 
     Raises:
-        ShapeError: for less than three dimensions.
-        UnitError: for complex counts, and for periods or dead times that are none.
+        UnitError: for periods or dead times that are none.
     """
     where = "armed_periods"
-    (counts,) = check_dense((counts,), where)
-    if counts.ndim < 3:
-        raise ShapeError(f"{where}: expected counts (..., T, H, W), got {tuple(counts.shape)}. Add the missing ones.")
-    if counts.is_complex():
-        raise UnitError(f"{where}: expected counts, got complex numbers ({counts.dtype}). Give the histogram.")
-    periods, dead_bins = check_whole("periods", periods, where, UnitError), _check_dead_time(dead_bins, where)
+    periods = check_whole("periods", periods, where, UnitError)
+    dead_bins = check_dead_bins(check_number("dead_bins", dead_bins, where))
     whole = math.floor(dead_bins + 1e-9)
     part = max(0.0, dead_bins - whole)
     bins = counts.shape[_TIME]
@@ -408,30 +391,19 @@ def _check_prediction(input: object, target: object, where: str) -> tuple[Tensor
     Counts first and a record without gradient that holds none may be meant, and are a warning.
     """
     pair = check_pair(input, target, where, names="prediction and counts")
-    if isinstance(input, Tensor) and not input.is_floating_point():
-        raise UnitError(
-            f"{where}: expected a prediction of a floating dtype first and counts second, got {input.dtype} first. "
-            "Take (input, target) in that order; a prediction of whole numbers as input.float()."
+    input, target = cast(tuple[Tensor, Tensor], (input, target))
+    order = "Take (input, target) in that order"
+    if not input.is_floating_point():
+        raise UnitError(f"{where}: expected a floating prediction first, got {input.dtype}. {order}, or input.float().")
+    swapped = _are_counts(input) and not _are_counts(target)
+    if target.requires_grad and (swapped or not input.requires_grad):
+        raise GradientError(
+            f"{where}: expected the prediction first, got a target with a gradient, and an input that has none or "
+            f"holds counts (draws of a chain with straight_through?). {order}; if it is right, target.detach()."
         )
-    if isinstance(input, Tensor) and isinstance(target, Tensor):
-        if target.requires_grad and not input.requires_grad:
-            raise GradientError(
-                f"{where}: expected the prediction first, got an input without and a target with a gradient. Take "
-                "(input, target) in that order, or target.detach()."
-            )
-        if _are_counts(input) and not _are_counts(target):
-            if target.requires_grad:
-                raise GradientError(
-                    f"{where}: expected the prediction first, got counts with a gradient first (draws of a chain with "
-                    "straight_through?) and a target with a gradient that holds none. Take (input, target) in that "
-                    "order; if it is right, target.detach()."
-                )
-            warnings.warn(
-                f"{where}: the first argument holds counts and the second one does not. The prediction comes first: "
-                "(input, target).",
-                TorchTransientWarning,
-                stacklevel=4,
-            )
+    if swapped:
+        said = f"{where}: the first argument holds counts and the second one does not. {order}."
+        warnings.warn(said, TorchTransientWarning, stacklevel=level_of_user())
     return pair
 
 
@@ -444,10 +416,14 @@ def _are_counts(x: Tensor) -> bool:
     return is_true(few == few.round()) and is_true((x == x.round()) & (x.amin() != x.amax()))
 
 
-def _check_rates(model: Tensor, where: str) -> None:
-    """Raise UnitError for negative rates; NaN passes into the loss."""
-    if bool((model < 0).any()):
+def _rates(input: object, target: object, mask: Tensor | None, where: str) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return rates, 1 where they do not count, counts and mask. Raises UnitError for negative rates; NaN passes."""
+    rate, counts = _check_prediction(input, target, where)
+    mask = check_mask(mask, rate, where)
+    rate = counted(rate, mask, 1.0)
+    if bool((rate < 0).any()):
         raise UnitError(f"{where}: expected rates >= 0, got negative ones. Clamp or use softplus upstream.")
+    return rate, counts, mask
 
 
 def _check_constant(counts: Tensor, constant: bool, where: str) -> None:
@@ -456,19 +432,9 @@ def _check_constant(counts: Tensor, constant: bool, where: str) -> None:
         raise UnitError(f"{where}: expected counts >= 0 with constant=True, got negative ones. Leave the constant out.")
 
 
-def _check_dead_time(dead_bins: float, where: str) -> float:
-    check_number("dead_bins", dead_bins, where)
-    number = positive(f"{where}: dead_bins", dead_bins)
-    try:
-        check_dead_bins(number)
-    except UnitError as error:
-        raise UnitError(f"{where}: {error}") from None
-    return number
-
-
 def _exact(target: object, mask: Tensor | None, dim: int) -> Tensor:
     """Counts in float64, 0 in pixels of which no bin counts: single precision may not hold sums of them."""
-    counts = check_dense((target,), "counts")[0].to(torch.float64)
+    counts = cast(Tensor, target).to(torch.float64)
     return counts if mask is None else counted(counts, mask.any(dim, keepdim=True))
 
 
@@ -535,10 +501,3 @@ def _count_log(counts: Tensor, mean: Tensor, least: Tensor | None) -> Tensor:
     level = torch.where(dark, least, 1.0)
     near = torch.where(hit & ~dark, mean, level)
     return torch.where(hit, counts * (near.log() + torch.where(dark, mean / level - 1, 0.0)), 0.0)
-
-
-def _dark_counts(n: Tensor, r: Tensor, level: Tensor) -> Tensor | None:
-    """Mask of counts at rates below the level; None without any."""
-    below = r < level
-    found = below & (n != 0) if bool(below.any()) else below
-    return found if bool(found.any()) else None

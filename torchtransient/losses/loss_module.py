@@ -47,10 +47,7 @@ class LossModule(nn.Module):
 
         def initialize(self: LossModule, *args: Any, **options: Any) -> None:
             nn.Module.__init__(self)
-            try:
-                bound = cls._signature.bind(*args, **options)
-            except TypeError as error:
-                raise TypeError(f"{cls.__name__}.__init__(): {error}") from None
+            bound = cls._signature.bind(*args, **options)
             bound.apply_defaults()
             for name, value in bound.arguments.items():
                 if isinstance(value, Tensor) and not isinstance(value, nn.Parameter):

@@ -9,14 +9,12 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import function
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_mask,
     check_pair,
-    check_reduction,
     counted,
     real_product,
     squared_modulus,
@@ -33,21 +31,13 @@ class PairLoss(Protocol):
     def __call__(self, input: Tensor, target: Tensor, *, mask: Tensor | None, reduction: Reduction) -> Tensor: ...
 
 
-class PairModule(Protocol):
-    """A loss of two tensors as a module, which holds its `reduction`."""
-
-    reduction: Reduction
-
-    def __call__(self, input: Tensor, target: Tensor, mask: Tensor | None) -> Tensor: ...
-
-
 @reads(volume=VALUES, measured=LIGHT)
 def measurement_consistency(
     volume: Volume,
     measured: Light,
     operator: Callable[[Tensor], Tensor],
     *,
-    compare: PairLoss | PairModule = squared_loss,
+    compare: PairLoss | nn.Module = squared_loss,
     scale_invariant: bool = False,
     dim: int | None = None,
     mask: Tensor | None = None,
@@ -73,34 +63,28 @@ def measurement_consistency(
         Result of `compare`.
 
     Raises:
-        ShapeError: if the prediction is not a tensor of the measurement's shape.
+        ShapeError: for a prediction of another shape than the measurement's.
         ArgumentError: for a module with another reduction, or a `compare` with another `dim`.
     """
     where = "measurement_consistency"
-    function(f"{where}: the operator", operator, "tensors")
-    check_reduction(reduction, where)
     held = getattr(compare, "reduction", None)
     if isinstance(compare, nn.Module) and held != reduction:
-        raise ArgumentError(
-            f"{where}: expected reduction {reduction!r} of compare, too, got {type(compare).__name__} with {held!r}. "
-            "Give both the same."
-        )
+        raise ArgumentError(f"{where}: expected compare of reduction {reduction!r}, got {held!r}. Give both the same.")
     volume, measured = check_dense((volume, measured), where)
     prediction = operator(volume)
-    if not isinstance(prediction, Tensor) or prediction.shape != measured.shape:
-        got = tuple(prediction.shape) if isinstance(prediction, Tensor) else type(prediction).__name__
+    if prediction.shape != measured.shape:
         raise ShapeError(
-            f"{where}: expected the operator to make a tensor of the measurement's shape {tuple(measured.shape)} of a "
-            f"volume {tuple(volume.shape)}, got {got}."
+            f"{where}: expected a prediction of the measurement's shape {tuple(measured.shape)} from the operator, got "
+            f"{tuple(prediction.shape)} of a volume {tuple(volume.shape)}."
         )
     dim = shared_dim(compare, dim, measured, where)
     if scale_invariant:
         pair = check_pair(prediction, measured, where, complex_too=True)
         prediction = _scaled(*pair, check_mask(mask, measured, where), item_dims(measured, dim, where))
     if isinstance(compare, nn.Module):
-        return cast(PairModule, compare)(prediction, measured, mask)
+        return cast(Tensor, compare(prediction, measured, mask))
     options: dict[str, Any] = {"dim": dim} if dim is not None and takes_dim(compare) else {}
-    return cast(PairLoss, compare)(prediction, measured, mask=mask, reduction=reduction, **options)
+    return compare(prediction, measured, mask=mask, reduction=reduction, **options)
 
 
 class MeasurementConsistency(LossModule, function=measurement_consistency, by_place=("operator", "compare")):
@@ -134,21 +118,16 @@ def shared_dim(compare: object, dim: int | None, like: Tensor, where: str) -> in
     held = getattr(compare, "dim", None)
     if not isinstance(compare, nn.Module) and takes_dim(compare):
         held = inspect.signature(cast(Callable[..., Any], compare)).parameters["dim"].default
-    place = None if dim is None else time_dim(like, dim, where)
-    if held is None or held is inspect.Parameter.empty:
-        return place
-    if place is not None and time_dim(like, held, where) != place:
+    places = {time_dim(like, place, where) for place in (dim, held) if place not in (None, inspect.Parameter.empty)}
+    if len(places) > 1:
         raise ArgumentError(
-            f"{where}: expected time in one dimension, got dim={dim}, and dim={held} held by compare. Leave "
-            "the latter out."
+            f"{where}: expected time in one dimension, got dim={dim}, and dim={held} held by compare. Leave one out."
         )
-    return time_dim(like, held, where)
+    return next(iter(places), None)
 
 
 def _scaled(prediction: Tensor, measured: Tensor, mask: Tensor | None, dims: tuple[int, ...]) -> Tensor:
     """Scale each item of the prediction to least squares of the measurement."""
-    if not prediction.numel():
-        return prediction
     seen = counted(prediction, mask)
     peak = seen.detach().abs().amax(dims, keepdim=True)
     dark = peak == 0

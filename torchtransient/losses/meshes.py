@@ -12,23 +12,17 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torchtransient.checks import is_one_of, shown
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.checks import shown
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.checks import (
-    Reduction,
-    check_dense,
-    check_mask,
-    check_whole,
-    counted,
-    reduce,
-    working_dtype,
-)
+from torchtransient.losses.checks import Reduction, check_dense, check_mask, counted, reduce, working_dtype
 from torchtransient.losses.loss_module import LossModule
 
 Weights = Literal["uniform", "cotangent"]
 # The sine, or cotangent, of the sharpest corner that is told from none: ten times the rounding of single precision.
 _SHARPEST = 1e-6
+# Parts of a side of a triangle between the points whose distances are taken.
+_CELLS = 4
 # Numbers held at a time of one of the tensors (points, triangles, 3, 3).
 _MOST = 1 << 24
 
@@ -60,15 +54,16 @@ def mesh_laplacian_smoothing(
         Unit of the vertices, squared; scalar, or (..., V) for "none"; 0 for vertices of no face.
 
     Raises:
-        ShapeError: for other shapes, vertex numbers out of range, and other `weights`.
+        ShapeError: for other shapes, and vertex numbers out of range.
+        ArgumentError: for other `weights`.
         UnitError: for faces of a floating dtype.
 
     Source: Taubin 1995; Desbrun et al. 1999 for cotangents.
     """
     where = "mesh_laplacian_smoothing"
-    if not is_one_of(weights, get_args(Weights)):
-        raise ShapeError(f"{where}: expected weights 'uniform' or 'cotangent', got {shown(weights)}.")
-    vertices, index = _checked(vertices, faces, where)
+    if weights not in get_args(Weights):
+        raise ArgumentError(f"{where}: expected weights 'uniform' or 'cotangent', got {shown(weights)}.")
+    vertices, index = _with_area(*_checked(vertices, faces, where))
     keep = check_mask(mask, vertices[..., 0], where)
     seen = vertices if keep is None else counted(vertices, _reached(keep, index)[..., None])
     first, second, weight = _edges(seen.detach(), index, weights)
@@ -111,7 +106,7 @@ def mesh_normal_consistency(
         UnitError: for faces of a floating dtype.
     """
     where = "mesh_normal_consistency"
-    vertices, index = _checked(vertices, faces, where)
+    vertices, index = _with_area(*_checked(vertices, faces, where))
     keep = check_mask(mask, vertices[..., 0], where)
     corners = _hinges(index)
     kept = None if keep is None else keep[..., corners].all(-1)
@@ -130,16 +125,26 @@ class MeshNormalConsistency(LossModule, function=mesh_normal_consistency, by_pla
 
 
 def _checked(vertices: Tensor, faces: Tensor, where: str) -> tuple[Tensor, Tensor]:
-    """Return vertices in the working dtype, and the faces with three different vertices."""
+    """Return vertices in the working dtype, and the faces.
+
+    Raises ShapeError for other shapes and numbers that are none of vertices, UnitError for faces that are no integers.
+    """
     check_dense((vertices, faces), where)
     if vertices.ndim < 2 or vertices.shape[-1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ShapeError(
             f"{where}: expected vertices (..., V, 3) with one or more faces (F, 3), got {tuple(vertices.shape)} and "
             f"{tuple(faces.shape)}."
         )
-    vertices = vertices.to(working_dtype((vertices,), where))
-    _check_faces(faces, vertices, f"{where}: vertices")
-    index = faces.long()
+    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
+    index, number = faces.long(), vertices.shape[-2]
+    if not is_true((index >= 0) & (index < number)):
+        raise ShapeError(f"{where}: expected faces of numbers from 0 to {number - 1}, got others.")
+    return vertices.to(working_dtype((vertices,), where)), index
+
+
+def _with_area(vertices: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the faces with three different vertices."""
     a, b, c = index.unbind(1)
     return vertices, index[(a != b) & (b != c) & (c != a)]
 
@@ -151,14 +156,19 @@ def _reached(mask: Tensor, index: Tensor) -> Tensor:
     return mask | (found > 0)
 
 
+def _sides(index: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the sides (3 F, 2) of faces, the vertices across them, the edges (E, 2), and the edge of each side."""
+    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
+    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
+    return sides, across, *torch.unique(sides.sort(1).values, dim=0, return_inverse=True)
+
+
 def _edges(vertices: Tensor, index: Tensor, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
     """Both ends of each edge (E,) and its weight (..., E)."""
-    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]])
-    edges, place = torch.unique(sides.sort(1).values, dim=0, return_inverse=True)
+    sides, across, edges, place = _sides(index)
     first, second = edges.unbind(1)
     if weights == "uniform":
         return first, second, vertices.new_ones((*vertices.shape[:-2], len(edges)))
-    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
     a, b = (vertices[..., sides[:, k], :] - vertices[..., across, :] for k in range(2))
     longest = torch.maximum(a.abs().amax(-1), b.abs().amax(-1))[..., None]
     a, b = (x / torch.where(longest > 0, longest, torch.ones_like(longest)) for x in (a, b))
@@ -170,9 +180,7 @@ def _edges(vertices: Tensor, index: Tensor, weights: Weights) -> tuple[Tensor, T
 
 def _hinges(index: Tensor) -> Tensor:
     """(E, 4), for each pair of faces at an edge: the vertices of the edge, and the third one of either face."""
-    sides = torch.cat([index[:, [0, 1]], index[:, [1, 2]], index[:, [2, 0]]]).sort(1).values
-    across = torch.cat([index[:, 2], index[:, 0], index[:, 1]])
-    edges, place = torch.unique(sides, dim=0, return_inverse=True)
+    _, across, edges, place = _sides(index)
     order = place.argsort(stable=True)
     number, most = place[order], int(torch.bincount(place, minlength=1).max())
     pairs = []
@@ -187,19 +195,18 @@ def _hinges(index: Tensor) -> Tensor:
 # ------------------------------------------------------------------------------------------------- distance of surfaces
 
 
-def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor, *, cells: int = 4) -> Tensor:
+def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_faces: Tensor) -> Tensor:
     """Compute the mean distance of two surfaces both ways, from points of each to the nearest point of the other.
 
-    A mean over the area of each surface, then of the two. Independent of how the surfaces are meshed. Time and memory
-    grow with F times G.
+    A mean over the area of each surface, then of the two, by the centers of 16 equal parts of each triangle, whose
+    distances are exact (of triangles flatter than 1e-6, those to their edges). Independent of how the surfaces are
+    meshed. Time and memory grow with F times G.
 
     Args:
         vertices: (V, 3).
         faces: vertex numbers (F, 3), in any order and sense. Triangles without area weigh nothing.
         others: vertices of the other mesh, (W, 3).
         other_faces: (G, 3).
-        cells: points are the centers of `cells`^2 equal parts of each triangle; their distances are exact (of triangles
-            flatter than 1e-6, those to their edges).
 
     Returns:
         Scalar in the unit of the vertices, differentiable in both meshes; float32 for half precision.
@@ -209,18 +216,11 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
         UnitError: for faces of a floating dtype.
     """
     where = "surface_distance"
-    check_dense((vertices, faces, others, other_faces), where)
-    for name, mesh, index in (("vertices", vertices, faces), ("others", others, other_faces)):
-        if mesh.ndim != 2 or mesh.shape[1] != 3 or index.ndim != 2 or index.shape[1] != 3 or not len(index):
-            raise ShapeError(
-                f"{where}: expected {name} (V, 3) with one or more faces (F, 3), got {tuple(mesh.shape)} and "
-                f"{tuple(index.shape)}."
-            )
-        _check_faces(index, mesh, f"{where}: {name}")
-    cells = check_whole("cells", cells, where)
-    dtype = working_dtype((vertices, others), where)
-    first, second = vertices.to(dtype)[faces.long()], others.to(dtype)[other_faces.long()]
-    return 0.5 * (_one_way(first, second, cells) + _one_way(second, first, cells))
+    vertices, faces = _checked(vertices, faces, where)
+    others, other_faces = _checked(others, other_faces, where)
+    dtype = torch.promote_types(vertices.dtype, others.dtype)
+    first, second = vertices.to(dtype)[faces], others.to(dtype)[other_faces]
+    return 0.5 * (_one_way(first, second) + _one_way(second, first))
 
 
 def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
@@ -242,9 +242,9 @@ def point_triangle_distance(points: Tensor, triangles: Tensor) -> Tensor:
     return unit * torch.cat([_distance(part, triangles / unit) for part in torch.split(points / unit, size)])
 
 
-def _one_way(triangles: Tensor, others: Tensor, cells: int) -> Tensor:
+def _one_way(triangles: Tensor, others: Tensor) -> Tensor:
     """Mean distance of points on triangles (F, 3, 3) to others, over the area."""
-    weights = _middles(cells).to(triangles)
+    weights = _middles(_CELLS).to(triangles)
     # no matrix product, whose derivative autocast would narrow wherever the backward pass runs
     points = (weights[:, :, None] * triangles[:, None]).sum(2)
     distance = point_triangle_distance(points.reshape(-1, 3), others).reshape(points.shape[:2])
@@ -288,15 +288,6 @@ def _distance(points: Tensor, triangles: Tensor) -> Tensor:
 
 
 # ----------------------------------------------------------------------------------------------------------- triangles
-
-
-def _check_faces(faces: Tensor, vertices: Tensor, where: str) -> None:
-    """Raise UnitError for floating or boolean faces, ShapeError for numbers that are none of vertices (..., V, 3)."""
-    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise UnitError(f"{where}: expected faces of whole numbers, got {faces.dtype}. Use faces.long().")
-    wide, number = faces.long(), vertices.shape[-2]
-    if not is_true((wide >= 0) & (wide < number)):
-        raise ShapeError(f"{where}: expected faces of numbers from 0 to {number - 1}, got others.")
 
 
 def _unit_normals(first: Tensor, second: Tensor) -> Tensor:

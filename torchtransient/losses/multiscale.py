@@ -11,23 +11,15 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
-from torchtransient.errors import ArgumentError, ShapeError
-from torchtransient.losses.checks import (
-    Reduction,
-    check_level,
-    check_mask,
-    check_pair,
-    check_whole,
-    counted,
-    reduce,
-)
+from torchtransient.errors import ArgumentError
+from torchtransient.losses.checks import Reduction, check_level, counted, masked_pair, reduce
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.likelihoods import divisor, parts_of
 from torchtransient.losses.loss_module import LossModule
@@ -49,12 +41,11 @@ def multiscale_loss(
     target: Binned,
     compare: PairLoss = squared_loss,
     *,
-    scales: Sequence[int] | None = None,
     dim: int | None = None,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Average a loss of two transients over scales, in bins that many times as wide. ::
+    """Average a loss of two transients over scales 1, 2, 4, ... below T, in bins that many times as wide. ::
 
         multiscale_loss(rates, histogram, functools.partial(first_photon_nll, cycles=n))
 
@@ -72,7 +63,6 @@ def multiscale_loss(
             options in bins or lengths (`dead_bins`, `bin_width_opl`, `axis`). All other options are the same at each
             scale, those in units of light too, such as the read noise of a `root` or a threshold, though light grows
             with the scale.
-        scales: whole numbers; None: 1, 2, 4, ... below T. Pulses are pulled from about the largest one.
         dim: dimension of time (`losses.layouts`).
         mask: bins that count. The others are empty in both, and take no cycles of detectors; a coarse bin counts if one
             of its bins does.
@@ -83,81 +73,61 @@ def multiscale_loss(
 
     Raises:
         ArgumentError: for a `compare` that is not supported.
-        ShapeError: for two shapes, scales that are none, or without `dim` where the shape is ambiguous.
+        ShapeError: for two shapes, or without `dim` where the shape is ambiguous.
     """
     where = "multiscale_loss"
-    _check_compare(compare, where)
+    held = compare.keywords if isinstance(compare, functools.partial) else {}
+    for name in _OF_BINS:
+        if held.get(name) is not None:
+            raise ArgumentError(f"{where}: expected compare without {name}=: bins are others at each scale.")
     given = input
-    input, target = check_pair(input, target, where)
+    input, target, mask = masked_pair(input, target, mask, where)
     dim = bins_dim(input, shared_dim(compare, dim, input, where), where)
-    mask = check_mask(mask, input, where)
     bins = input.shape[dim]
-    if scales is None:
-        scales = [2**k for k in range(max(1, math.ceil(math.log2(bins))))]
-    steps = [check_whole("scales", s, where) for s in scales]
-    if not steps:
-        raise ShapeError(f"{where}: expected one or more scales, got none.")
     pixels = None if mask is None else mask.any(dim)
     if not input.numel():
         return reduce((input + target).sum(dim), reduction, where, pixels)
     number = torch.full((), bins) if mask is None else mask.sum(dim).clamp_min(1)
     seen = input.new_ones((1, 1, bins, 1)) if mask is None else _flat(mask.to(input.dtype), dim)
-    records = [_flat(counted(x, mask), dim) for x in (input, target)]
-    windows = _Windows(records[0]), _Windows(records[1]), _Windows(seen)
-    light = {name: _Windows(level) for name, level in _levels(compare, input, mask, seen, dim, where).items()}
+    windows = [_flat(input, dim), _flat(target, dim), seen]
+    light = _levels(held, input, mask, seen, dim, where)
     options: dict[str, Any] = {"dim": _BINS} if takes_dim(compare) else {}
     each: Callable[..., Tensor] = functools.partial(compare, **options)
     # each bin has the mean of the slopes of its coarse ones
     averaged = number.amin().to(input.device) * divisor(input.select(dim, 0), pixels, reduction)
+    values = []
     with parts_of(given, averaged):
-        values = [_at_scale(s, windows, light, input.select(dim, 0), each) for s in steps]
+        for scale in (2**k for k in range(max(1, math.ceil(math.log2(bins))))):
+            if scale > 1:
+                windows = [_doubled(x, scale // 2) for x in windows]
+                light = {name: _doubled(x, scale // 2) for name, x in light.items()}
+            values.append(_at_scale(scale, windows, light, input.select(dim, 0), each))
     mean = torch.stack(values).mean(0) / number.to(input)
     return reduce(mean, reduction, where, pixels)
 
 
-class MultiscaleLoss(LossModule, function=multiscale_loss, by_place=("compare", "scales")):
+class MultiscaleLoss(LossModule, function=multiscale_loss, by_place=("compare",)):
     """`multiscale_loss` with its options held."""
 
 
-class _Windows:
-    """Sums of neighboring bins of a record (batch, C, T, places), from windows of 1, 2, 4, ... that all scales share.
+def _doubled(sums: Tensor, width: int) -> Tensor:
+    """Return the sums of all windows of twice the width that hold a bin of a record.
 
-    Unlike differences of running sums they do not cancel.
+    Args:
+        sums: of all windows of `width` bins (batch, C, T + width - 1, places). Unlike differences of running sums they
+            do not cancel.
     """
-
-    def __init__(self, record: Tensor) -> None:
-        self._doubled = {1: record}
-
-    def coarse(self, scale: int) -> Tensor:
-        """Sums of `scale` bins (scale x batch, C, J, places, 1), an item for each place where coarse bins begin."""
-        sums = self._sums(scale)
-        batch, channels, length, places = sums.shape
-        number = math.ceil(length / scale)
-        sums = functional.pad(sums, (0, 0, 0, number * scale - length))
-        each = sums.reshape(batch, channels, number, scale, places).movedim(3, 0)
-        return each.reshape(scale * batch, channels, number, places, 1)
-
-    def _sums(self, scale: int) -> Tensor:
-        """Sums of the T + scale - 1 windows that hold a bin of the record."""
-        total, width, size = None, 0, 1
-        while True:
-            window = self._doubled[size]
-            if scale & size:
-                total = window if total is None else _both(total, window, width)
-                width += size
-            if 2 * size > scale:
-                return cast(Tensor, total)
-            if 2 * size not in self._doubled:
-                self._doubled[2 * size] = _both(window, window, size)
-            size *= 2
-
-
-def _both(first: Tensor, second: Tensor, later: int) -> Tensor:
-    """Sum of a window and the one that ends `later` bins before it."""
     # padding, since the backward of slices fills a tensor of zeros for each
-    length = max(first.shape[2], second.shape[2] + later)
-    before = functional.pad(second, (0, 0, later, length - later - second.shape[2]))
-    return functional.pad(first, (0, 0, 0, length - first.shape[2])) + before
+    return functional.pad(sums, (0, 0, 0, width)) + functional.pad(sums, (0, 0, width, 0))
+
+
+def _coarse(sums: Tensor, scale: int) -> Tensor:
+    """Sums of `scale` bins (scale x batch, C, J, places, 1), an item for each place where coarse bins begin."""
+    batch, channels, length, places = sums.shape
+    number = math.ceil(length / scale)
+    sums = functional.pad(sums, (0, 0, 0, number * scale - length))
+    each = sums.reshape(batch, channels, number, scale, places).movedim(3, 0)
+    return each.reshape(scale * batch, channels, number, places, 1)
 
 
 def _flat(x: Tensor, dim: int) -> Tensor:
@@ -167,57 +137,35 @@ def _flat(x: Tensor, dim: int) -> Tensor:
     return x.reshape(batch, channels, bins, math.prod(trail))
 
 
-def _held(compare: object) -> dict[str, object]:
-    """Return the options of `_LIGHT_OF_BINS` that a partial holds."""
-    held = compare.keywords if isinstance(compare, functools.partial) else {}
-    return {name: held[name] for name in _LIGHT_OF_BINS if held.get(name) is not None}
-
-
 def _levels(
-    compare: object, input: Tensor, mask: Tensor | None, seen: Tensor, dim: int, where: str
+    held: dict[str, Any], input: Tensor, mask: Tensor | None, seen: Tensor, dim: int, where: str
 ) -> dict[str, Tensor]:
     """Levels that `compare` holds as records (batch, C, T, places) or (1, 1, T, 1), 0 in masked bins."""
     records = {}
-    for name, value in _held(compare).items():
-        level = check_level(name, cast(Tensor, value), input, where, zero=_LIGHT_OF_BINS[name])
+    for name, zero in _LIGHT_OF_BINS.items():
+        if held.get(name) is None:
+            continue
+        level = check_level(name, held[name], input, where, zero=zero)
         records[name] = level * seen if level.ndim == 0 else _flat(counted(level.expand(input.shape), mask), dim)
     return records
 
 
 def _at_scale(
-    scale: int,
-    windows: tuple[_Windows, _Windows, _Windows],
-    light: dict[str, _Windows],
-    like: Tensor,
-    compare: Callable[..., Tensor],
+    scale: int, windows: list[Tensor], light: dict[str, Tensor], like: Tensor, compare: Callable[..., Tensor]
 ) -> Tensor:
     """Sum `compare` over coarse bins and average it over the places where they begin."""
-    first, second, seen = (w.coarse(scale) for w in windows)
+    first, second, seen = (_coarse(w, scale) for w in windows)
 
     def spread(x: Tensor) -> Tensor:
         """Expand a record that all pixels share."""
         return x.repeat_interleave(len(first) // len(x), 0).expand(first.shape)
 
     kept = spread(seen > 0)
-    levels = {name: torch.where(kept, spread(w.coarse(scale)), 1.0) for name, w in light.items()}
+    levels = {name: torch.where(kept, spread(_coarse(w, scale)), 1.0) for name, w in light.items()}
     value = compare(first, second, mask=kept, reduction="none", **levels)
-    if not isinstance(value, Tensor) or value.shape != first.shape:
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+    if value.shape != first.shape:
         raise ArgumentError(
-            f"multiscale_loss: expected compare to give a value for each bin, {tuple(first.shape)}, got {got}. Losses "
-            "of whole records, such as wasserstein_loss, need no scales."
+            f"multiscale_loss: expected compare to give a value for each bin, {tuple(first.shape)}, got "
+            f"{tuple(value.shape)}. Losses of whole records, such as wasserstein_loss, need no scales."
         )
     return value.sum(-3).reshape(scale, *like.shape).mean(0)
-
-
-def _check_compare(compare: object, where: str) -> None:
-    """Raise ArgumentError for modules, and for options that mean something else at each scale."""
-    if isinstance(compare, nn.Module):
-        raise ArgumentError(f"{where}: expected compare to be a function, got the module {type(compare).__name__}.")
-    held = compare.keywords if isinstance(compare, functools.partial) else {}
-    for name in _OF_BINS:
-        if held.get(name) is not None:
-            raise ArgumentError(
-                f"{where}: expected compare without options in bins, got {name}={held[name]}: bins are others at each "
-                "scale."
-            )

@@ -11,17 +11,9 @@ from dataclasses import KW_ONLY, dataclass
 
 from torch import Tensor
 
-from torchtransient.checks import finite, shown
+from torchtransient.checks import finite, positive, shown
 from torchtransient.errors import UnitError
-from torchtransient.losses.checks import (
-    Reduction,
-    check_mask,
-    check_pair,
-    check_whole,
-    counted,
-    real_product,
-    reduce,
-)
+from torchtransient.losses.checks import Reduction, check_mask, check_pair, check_whole, counted, real_product, reduce
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, Light, reads
 
@@ -96,22 +88,13 @@ class SampleSchedule:
     hold: float = 0.6
 
     def __post_init__(self) -> None:
-        for name in ("first", "last", "steps"):
-            object.__setattr__(self, name, check_whole(name, getattr(self, name), "SampleSchedule", UnitError))
-        object.__setattr__(self, "hold", finite("SampleSchedule: hold", self.hold))
-        if self.last < self.first or not 0 <= self.hold <= 1:
-            raise UnitError(
-                f"SampleSchedule: expected first <= last and hold between 0 and 1, got {self.first}, {self.last} and "
-                f"{self.hold}."
-            )
+        if not 1 <= self.first <= self.last or self.steps < 1 or not 0 <= self.hold <= 1:
+            raise UnitError(f"expected 1 <= first <= last, steps of 1 or more and hold between 0 and 1, got {self}.")
 
     def __call__(self, step: int) -> int:
         """Return the samples per pixel of a step, counted from 0."""
-        number = finite("SampleSchedule: step", step)
-        if number < 0:
-            raise UnitError(f"SampleSchedule: expected a step of 0 or more, got {shown(step)}.")
         doublings = math.ceil(math.log2(self.last / self.first))
-        share = number / self.steps
+        share = step / self.steps
         if share < self.hold or doublings == 0:
             return self.first
         done = doublings if share >= 1 else 1 + math.floor((share - self.hold) / (1 - self.hold) * doublings)
@@ -135,16 +118,13 @@ class SampleSchedule:
         """
         where = "SampleSchedule.needed"
         number = check_whole("spp", spp, where, UnitError)
-        limit = finite(f"{where}: allowed", allowed)
-        if limit <= 0:
-            raise UnitError(f"{where}: expected allowed above zero, got {shown(allowed)}.")
-        ratio = finite(f"{where}: bias", bias) / limit
+        ratio = finite(f"{where}: bias", bias) / positive(f"{where}: allowed", allowed)
         # a quotient may be infinite
         doublings = math.ceil(math.log2(min(ratio, 2.0**64))) if ratio > 1 else 0
         found = number << doublings
         if doublings and found > _MOST_SAMPLES:
             raise UnitError(
-                f"{where}: expected a bias at {number} samples that 2^32 bring down to what is allowed, got a bias of "
-                f"{shown(bias)} and {shown(allowed)}. Allow a tenth of what the noise of the target makes of the loss."
+                f"{where}: more than 2^32 samples bring a bias of {shown(bias)} down to {shown(allowed)}. Allow a "
+                "tenth of what the noise of the target makes of the loss."
             )
         return found

@@ -133,7 +133,7 @@ def reads(**measures: tuple[str, ...]) -> Callable[[Callable[Arguments, Returned
 
 def _read(arguments: dict[str, Any], measures: dict[str, tuple[str, ...]], known: set[str], where: str) -> None:
     """Replace results by their tensors, and options that are not given by the settings of results."""
-    results = {name: arguments[name] for name in measures if _is_result(arguments.get(name))}
+    results = {name: arguments[name] for name in measures if not isinstance(arguments[name], Tensor)}
     taken = {name: _attribute(x, measures[name], list(results.values()), name, where) for name, x in results.items()}
     for attribute, settings in _AXES.items():
         alike = [results[name] for name in taken if taken[name] == attribute]
@@ -182,13 +182,6 @@ def _spacing(grid: Any, where: str) -> tuple[float, float, float] | None:
         )
     y, x = grid.pitch
     return float(steps.mean()) if len(steps) else y, y, x
-
-
-def _is_result(x: object) -> bool:
-    """Return True for an object with one of the attributes as a tensor or None; `values` of a dictionary is neither."""
-    if isinstance(x, Tensor):
-        return False
-    return any(hasattr(x, name) and isinstance(getattr(x, name), Tensor | None) for name in _EVERY)
 
 
 def _there(x: object, names: tuple[str, ...]) -> list[str]:

@@ -9,34 +9,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from fractions import Fraction
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import function
-from torchtransient.errors import ShapeError
 from torchtransient.losses.checks import (
     Reduction,
     check_dense,
     check_level,
-    check_mask,
-    check_pair,
-    counted,
     item_scale,
+    masked_pair,
     reduce,
     working_dtype,
 )
-from torchtransient.losses.layouts import item_dims, time_dim
+from torchtransient.losses.layouts import item_dims
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, Light, reads
 
-_OFFSET = Fraction(3, 8)
+_OFFSET = 3 / 8
 _BACKGROUND = 1e-3
 # Table of the expected root between s = sqrt(m + 3/8) at m = 0 and _LAST, every _STEP; the series is good to 1e-11
 # above.
 _FIRST, _LAST, _STEP = math.sqrt(_OFFSET), 8.0, 1 / 32
-_TERMS = 7
+# Coefficients a_k of `sum_k a_k u^(1/2 - k)`, u = m + 3/8, k from 1: Taylor's series of the root over the central
+# moments of a Poisson distribution, `mu_(j+1) = m (mu_j' + j mu_(j-1))`.
+_TAIL = (-1 / 4, -1 / 64, -9 / 512, -949 / 16384, -28455 / 131072, -2034341 / 2097152, -86876713 / 16777216)
 
 
 def anscombe(counts: Tensor, read_noise: Tensor | float = 0.0) -> Tensor:
@@ -58,7 +55,7 @@ def anscombe(counts: Tensor, read_noise: Tensor | float = 0.0) -> Tensor:
     """
     counts = _floating(counts, "anscombe")
     sigma = check_level("read_noise", read_noise, counts, "anscombe", zero=True, square=True)
-    offset = float(_OFFSET) + sigma.square()
+    offset = _OFFSET + sigma.square()
     negative = counts < 0
     root = (torch.where(negative, torch.zeros_like(counts), counts) + offset).sqrt()
     return 2 * root + torch.where(negative, counts, torch.zeros_like(counts)) / offset.sqrt()
@@ -90,16 +87,11 @@ def root_loss(
         Scalar, or the shape of the input for "none".
 
     Raises:
-        ShapeError: for two shapes, and for a root that changes the shape.
+        ShapeError: for two shapes.
     """
     where = "root_loss"
-    function(f"{where}: root", root, "tensors")
-    input, target = check_pair(input, target, where)
-    mask = check_mask(mask, input, where)
-    ours, theirs = root(counted(input, mask)), root(counted(target, mask))
-    if ours.shape != input.shape:
-        raise ShapeError(f"{where}: expected a root that keeps the shape, got {tuple(ours.shape)}.")
-    return reduce((ours - theirs).square(), reduction, where, mask)
+    input, target, mask = masked_pair(input, target, mask, where)
+    return reduce((root(input) - root(target)).square(), reduction, where, mask)
 
 
 class RootLoss(LossModule, function=root_loss, by_place=("root", "reduction")):
@@ -151,9 +143,8 @@ def expected_root_loss(
         ShapeError: for two shapes.
     """
     where = "expected_root_loss"
-    input, target = check_pair(input, target, where)
-    mask = check_mask(mask, input, where)
-    residual = anscombe(counted(target, mask)) - expected_anscombe(counted(input, mask))
+    input, target, mask = masked_pair(input, target, mask, where)
+    residual = anscombe(target) - expected_anscombe(input)
     return reduce(residual.square(), reduction, where, mask)
 
 
@@ -192,10 +183,7 @@ def log_ratio_loss(
         ShapeError: for two shapes, or without `dim` and `background` where the shape is ambiguous.
     """
     where = "log_ratio_loss"
-    input, target = check_pair(input, target, where)
-    dim = None if dim is None else time_dim(input, dim, where)
-    mask = check_mask(mask, input, where)
-    input, target = counted(input, mask), counted(target, mask)
+    input, target, mask = masked_pair(input, target, mask, where)
     if background is None:
         level = _BACKGROUND * item_scale(target, input, item_dims(input, dim, where, " or background="), mask)
     else:
@@ -222,7 +210,7 @@ def _floating(x: Tensor, where: str) -> Tensor:
 
 def _correction(mean: Tensor) -> Tensor:
     """`E[2 sqrt(n + 3/8)] - 2 sqrt(m + 3/8)`, in s = sqrt(m + 3/8), which has a slope at m = 0."""
-    s = (mean + float(_OFFSET)).sqrt()
+    s = (mean + _OFFSET).sqrt()
     tail = torch.where(s < _LAST, torch.full_like(s, _LAST), s)
     near, series = tail.square().reciprocal(), torch.full_like(s, _TAIL[-1])
     for coefficient in reversed(_TAIL[:-1]):
@@ -237,29 +225,6 @@ def _correction(mean: Tensor) -> Tensor:
     return torch.where(s < _LAST, value, series / tail)
 
 
-def _tail() -> list[float]:
-    """Coefficients `a_k` of `sum_k a_k u^(1/2 - k)`, u = m + 3/8, k from 1: Taylor's series over central moments.
-
-    The moments of a Poisson distribution are polynomials in m: `mu_(j+1) = m (mu_j' + j mu_(j-1))`.
-    """
-    moments = [[Fraction(1)], [Fraction(0)]]
-    for j in range(1, 2 * _TERMS):
-        slope = [power * c for power, c in enumerate(moments[j])][1:]
-        before = [j * c for c in moments[j - 1]]
-        size = max(len(slope), len(before))
-        both = [sum((p[i] for p in (slope, before) if i < len(p)), Fraction(0)) for i in range(size)]
-        moments.append([Fraction(0), *both])
-    found, binomial = [Fraction(0)] * (_TERMS + 1), Fraction(1)
-    for j, moment in enumerate(moments):
-        for power, c in enumerate(moment):
-            for i in range(power + 1):  # m^p = (u - 3/8)^p
-                k = j - i
-                if j > 0 and k <= _TERMS:
-                    found[k] += binomial * c * math.comb(power, i) * (-_OFFSET) ** (power - i)
-        binomial *= (Fraction(1, 2) - j) / (j + 1)
-    return [2 * float(c) for c in found[1:]]
-
-
 def _pieces() -> tuple[Tensor, float]:
     """Coefficients (6, pieces) of quintics with value, slope and curvature of the correction at both ends, and a width.
 
@@ -268,12 +233,10 @@ def _pieces() -> tuple[Tensor, float]:
     number = math.ceil((_LAST - _FIRST) / _STEP)
     spacing = (_LAST - _FIRST) / number
     s = torch.linspace(_FIRST, _LAST, number + 1, dtype=torch.float64)[:, None]
-    m, n = (s.square() - float(_OFFSET)).clamp_min(0), torch.arange(200, dtype=torch.float64)
+    m, n = (s.square() - _OFFSET).clamp_min(0), torch.arange(200, dtype=torch.float64)
     probability = (torch.xlogy(n, m) - m - torch.lgamma(n + 1)).exp()
-    g = [2 * (n + k + float(_OFFSET)).sqrt() for k in range(3)]
-    mean, slope, curvature = (
-        (probability * x).sum(1) for x in (g[0], g[1] - g[0], g[2] - 2 * g[1] + g[0])
-    )
+    g = [2 * (n + k + _OFFSET).sqrt() for k in range(3)]
+    mean, slope, curvature = ((probability * x).sum(1) for x in (g[0], g[1] - g[0], g[2] - 2 * g[1] + g[0]))
     s = s[:, 0]
     # by s and in steps of one piece: dm/ds = 2 s, and the 2 s taken away is linear
     value, first, second = mean - 2 * s, (2 * s * slope - 2) * spacing, (4 * s**2 * curvature + 2 * slope) * spacing**2
@@ -285,7 +248,6 @@ def _pieces() -> tuple[Tensor, float]:
     return torch.stack([c0, c1, c2, c3, c4, c5]), spacing
 
 
-_TAIL = _tail()
 _PIECES, _SPACING = _pieces()
 # at a mean of zero
 _SLOPE = 2 * (math.sqrt(1 + _OFFSET) - math.sqrt(_OFFSET))

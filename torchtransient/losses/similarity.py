@@ -6,15 +6,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.errors import ShapeError
-from torchtransient.losses.checks import (
-    Reduction,
-    check_level,
-    check_mask,
-    check_pair,
-    check_whole,
-    counted,
-    reduce,
-)
+from torchtransient.losses.checks import Reduction, check_level, check_whole, masked_pair, reduce
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import STEADY, VALUES, Picture, Volume, reads
 
@@ -55,26 +47,19 @@ def ssim_loss(
     from kornia.metrics import ssim
 
     where = "ssim_loss"
-    input, target = check_pair(input, target, where)
-    window = check_whole("an odd window", window, where)
-    half = window // 2
-    if window % 2 == 0:
-        raise ShapeError(f"{where}: expected an odd window, got {window}.")
-    if input.ndim < 3 or min(input.shape[-2:]) <= half:
+    a, b, mask = masked_pair(input, target, mask, where)
+    window = check_whole("window", window, where)
+    if window % 2 == 0 or a.ndim < 3 or min(a.shape[-2:]) <= window // 2:
         raise ShapeError(
-            f"{where}: expected pictures (..., C, Y, X) with Y and X above {half} for a window of {window}, got "
-            f"{tuple(input.shape)}. Take a smaller window."
+            f"{where}: expected pictures (..., C, Y, X) and an odd window below twice Y and X, got {tuple(a.shape)} "
+            f"and {window}."
         )
-    mask = check_mask(mask, input, where)
-    a, b = counted(input, mask), counted(target, mask)
-    if not input.numel():
-        return reduce((a - b).abs(), reduction, where, mask)
     if value_range is None:
         peak = b.detach().abs().amax((-3, -2, -1), keepdim=True)
         scale = torch.where(peak > 0, peak, torch.ones_like(peak))
     else:
         scale = check_level("value_range", value_range, a[..., :1, :1, :1], where)
-    shape = (-1, *a.shape[-3:])
+    shape = (a.shape[:-3].numel(), *a.shape[-3:])
     # eps 0: with a range of 1 the constants of kornia keep the denominator from zero
     similarity = ssim((a / scale).reshape(shape), (b / scale).reshape(shape), window, max_val=1.0, eps=0.0)
     return reduce(1 - similarity.reshape(a.shape), reduction, where, mask)
@@ -93,13 +78,7 @@ def maximum_projections(volume: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         Front (..., Y, X), top (..., Z, X) and side (..., Z, Y). Gradients go to the brightest voxel of each line, in
         equal parts to equal ones.
-
-    Raises:
-        ShapeError: for complex volumes, and those without voxels.
     """
-    if not isinstance(volume, Tensor) or volume.ndim < 3 or volume.is_complex() or not all(volume.shape[-3:]):
-        got = f"{tuple(volume.shape)} {volume.dtype}" if isinstance(volume, Tensor) else type(volume).__name__
-        raise ShapeError(f"maximum_projections: expected a real volume (..., Z, Y, X), got {got}.")
     return volume.amax(-3), volume.amax(-2), volume.amax(-1)
 
 
@@ -129,11 +108,10 @@ def projection_ssim_loss(
         ShapeError: for volumes smaller than the window, an even window, or two shapes.
     """
     where = "projection_ssim_loss"
-    input, target = check_pair(input, target, where)
+    input, target, mask = masked_pair(input, target, mask, where)
     if input.ndim < 4:
         raise ShapeError(f"{where}: expected volumes (..., C, Z, Y, X), got {tuple(input.shape)}.")
-    mask = check_mask(mask, input, where)
-    ours, theirs = (maximum_projections(counted(x, mask)) for x in (input, target))
+    ours, theirs = maximum_projections(input), maximum_projections(target)
     masks = (None,) * 3 if mask is None else tuple(mask.any(dim) for dim in (-3, -2, -1))
     values = []
     for a, b, seen in zip(ours, theirs, masks, strict=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchtransient.losses.checks import Reduction, check_mask, check_pair, counted, reduce, squared_modulus
+from torchtransient.losses.checks import Reduction, masked_pair, reduce, squared_modulus
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import LIGHT, Light, reads
 
@@ -26,9 +26,8 @@ def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, red
         ShapeError: for two shapes.
     """
     where = "squared_loss"
-    input, target = check_pair(input, target, where, complex_too=True)
-    mask = check_mask(mask, input, where)
-    return reduce(squared_modulus(counted(input, mask) - counted(target, mask)), reduction, where, mask)
+    input, target, mask = masked_pair(input, target, mask, where, complex_too=True)
+    return reduce(squared_modulus(input - target), reduction, where, mask)
 
 
 class SquaredLoss(LossModule, function=squared_loss, by_place=("reduction",)):

@@ -55,8 +55,8 @@ def total_variation(
         Unit of the volume per metre (without spacing: per voxel); scalar, or the shape of the volume for "none".
 
     Raises:
-        ShapeError: for less than three dimensions, and a spacing of other than three numbers.
-        UnitError: for a spacing that is not above zero, or a smoothing below zero.
+        ShapeError: for less than three dimensions, and a spacing of other than three numbers above zero.
+        UnitError: for a smoothing below zero.
 
     Source: Rudin, Osher and Fatemi 1992.
     """
@@ -65,11 +65,11 @@ def total_variation(
     if volume.ndim < 3:
         raise ShapeError(f"{where}: expected a volume (..., Z, Y, X), got {tuple(volume.shape)}.")
     volume = volume.to(working_dtype((volume,), where, complex_too=True))
-    steps = _check_spacing(spacing, volume, where)
+    steps = (1.0, 1.0, 1.0) if spacing is None else tuple(check_number("spacing", step, where) for step in spacing)
+    if len(steps) != 3 or min(steps) <= 0:
+        raise ShapeError(f"{where}: expected three distances above zero, along Z, Y and X, got {shown(spacing)}.")
     mask = check_mask(mask, volume, where)
     seen = counted(volume, mask)
-    if not volume.numel():
-        return reduce(seen.abs(), reduction, where, mask)
     if smoothing is None:
         smooth = _SMOOTHING / min(steps) * item_scale(seen, seen, _DIMS, mask)
     else:
@@ -88,20 +88,6 @@ class TotalVariation(LossModule, function=total_variation, by_place=("spacing",)
 
     def forward(self, volume: Volume, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
         return self.loss(volume, mask=mask)
-
-
-def _check_spacing(spacing: Numbers | None, like: Tensor, where: str) -> tuple[float, float, float]:
-    if spacing is None:
-        return 1.0, 1.0, 1.0
-    if not hasattr(spacing, "__len__") or len(spacing) != 3:
-        raise ShapeError(
-            f"{where}: expected the spacing along Z, Y and X, three numbers, got {shown(spacing)}. For a VoxelGrid "
-            "take the distance of its planes and *grid.pitch."
-        )
-    for step in spacing:
-        check_level("spacing", step, like.new_empty(()), where, square=True)
-    z, y, x = (check_number("spacing", step, where) for step in spacing)
-    return z, y, x
 
 
 def _difference(x: Tensor, mask: Tensor | None, dim: int, step: float) -> Tensor:

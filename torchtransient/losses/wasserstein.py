@@ -10,15 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchtransient.losses.checks import (
-    Reduction,
-    check_level,
-    check_mask,
-    check_pair,
-    counted,
-    item_scale,
-    reduce,
-)
+from torchtransient.losses.checks import Reduction, check_level, counted, item_scale, masked_pair, reduce
 from torchtransient.losses.layouts import bin_width, bins_dim, item_dims
 from torchtransient.losses.loss_module import LossModule
 from torchtransient.losses.results import BINNED, Binned, reads
@@ -70,26 +62,24 @@ def wasserstein_loss(
     Source: Vallender 1974 for cumulative sums; Rubner, Tomasi and Guibas 2000.
     """
     where = "wasserstein_loss"
-    input, target = check_pair(input, target, where)
-    dim = bins_dim(input, dim, where)
-    mask = check_mask(mask, input, where)
-    width = bin_width(bin_width_opl, input, where)
+    a, b, mask = masked_pair(input, target, mask, where)
+    dim = bins_dim(a, dim, where)
+    width = bin_width(bin_width_opl, a, where)
     pixels = None if mask is None else mask.any(dim)
-    a, b = counted(input, mask), counted(target, mask)
     if creation_cost_opl is not None:
         cost = check_level("creation_cost_opl", creation_cost_opl, width, where)
         return reduce(_unbalanced(a, b, width, cost, dim), reduction, where, pixels)
     mass_a, mass_b = a.sum(dim, keepdim=True), b.sum(dim, keepdim=True)
     kept = None if pixels is None else pixels.unsqueeze(dim)
     if floor is None:
-        item = item_dims(input, dim, where)
+        item = item_dims(a, dim, where)
         floor_a, floor_b = (_MASS_FLOOR * item_scale(*m, item, kept) for m in ((mass_a, mass_b), (mass_b, mass_a)))
     else:
         floor_a = floor_b = check_level("floor", floor, mass_a, where)
     counts = torch.ones_like(a) if mask is None else mask.to(a.dtype)
     even = counts / counts.sum(dim, keepdim=True).clamp_min(1)
     difference = _normalized(a, mass_a, even, floor_a) - _normalized(b, mass_b, even, floor_b)
-    return reduce(width * _moved(difference, dim), reduction, where, pixels)
+    return reduce(width * moved_bins(difference, dim), reduction, where, pixels)
 
 
 class WassersteinLoss(LossModule, function=wasserstein_loss, by_place=("bin_width_opl",)):
@@ -130,11 +120,9 @@ def cumulative_loss(
         ShapeError: for two shapes, or without `dim` where the shape is ambiguous.
     """
     where = "cumulative_loss"
-    input, target = check_pair(input, target, where)
-    dim = bins_dim(input, dim, where)
-    mask = check_mask(mask, input, where)
-    width = bin_width(bin_width_opl, input, where)
-    a, b = counted(input, mask), counted(target, mask)
+    a, b, mask = masked_pair(input, target, mask, where)
+    dim = bins_dim(a, dim, where)
+    width = bin_width(bin_width_opl, a, where)
     area = width * counted((a - b).cumsum(dim).abs(), mask).sum(dim)
     if per_root_count:
         area = area / b.detach().sum(dim).clamp_min(1).sqrt()
@@ -152,8 +140,13 @@ def _normalized(x: Tensor, mass: Tensor, even: Tensor, floor: Tensor) -> Tensor:
     return (x + lacking * even) / torch.maximum(mass, least)
 
 
-def _moved(difference: Tensor, dim: int) -> Tensor:
-    """Light times the bins that it is moved by: the sum of the moduli of cumulative sums."""
+def moved_bins(difference: Tensor, dim: int) -> Tensor:
+    """Return light times the bins that it is moved by: the sum of the moduli of cumulative sums.
+
+    Args:
+        difference: of two records of one mass.
+        dim: dimension of time.
+    """
     # without the last sum, which is zero but for rounding, whose sign would be a gradient
     bins = difference.shape[dim]
     return difference.narrow(dim, 0, bins - 1).cumsum(dim).abs().sum(dim)
@@ -169,5 +162,5 @@ def _unbalanced(a: Tensor, b: Tensor, width: Tensor, cost: Tensor, dim: int) -> 
         share = torch.where(longer, darker, torch.ones_like(mass)) / torch.where(longer, mass, torch.ones_like(mass))
         return x * share
 
-    moved = _moved(shortened(a, mass_a) - shortened(b, mass_b), dim)
+    moved = moved_bins(shortened(a, mass_a) - shortened(b, mass_b), dim)
     return width * moved + cost * (mass_a - mass_b).abs().squeeze(dim)

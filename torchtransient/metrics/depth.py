@@ -159,12 +159,7 @@ def depth_delta(
 
 @reads(input=DEPTH, target=DEPTH)
 def depth_gross_errors(
-    input: DepthMap,
-    target: DepthMap,
-    *,
-    beyond_m: float,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: DepthMap, target: DepthMap, *, beyond_m: float, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
 

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import share, shown
+from torchtransient.checks import share
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.checks import check_mask, check_pair, counted
 from torchtransient.losses.layouts import bins_dim
 from torchtransient.losses.results import TRANSIENT, Transient, reads
-from torchtransient.metrics.tally import Reduction, Tally, check_finite
+from torchtransient.losses.wasserstein import moved_bins
+from torchtransient.metrics.tally import Reduction, Tally, measured_pair
 
 
 @reads(input=TRANSIENT, target=TRANSIENT)
@@ -132,8 +132,8 @@ def histogram_kl(
 
 
 def _axis(axis: TimeAxis | None, where: str) -> TimeAxis:
-    if not isinstance(axis, TimeAxis):
-        raise ArgumentError(f"{where}: expected axis=, a tt.TimeAxis, or results that have one, got {shown(axis)}.")
+    if axis is None:
+        raise ArgumentError(f"{where}: expected axis=, a tt.TimeAxis, or results that have one, got None.")
     return axis
 
 
@@ -146,21 +146,17 @@ def _moved(
         raise ShapeError(
             f"{where}: expected the {axis.num_bins} bins of the axis in dimension {place}, got {tuple(p.shape)}."
         )
-    # without the last sum, which is zero but for rounding
-    return (p - q).narrow(place, 0, axis.num_bins - 1).cumsum(place).abs().sum(place), lit, place
+    return moved_bins(p - q, place), lit, place
 
 
 def _distributions(
     input: object, target: object, dim: int | None, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, Tensor, int]:
     """Return normalized records (zero for dark pixels), the pixels that count, the dimension of time."""
-    x, y = check_pair(input, target, where)
+    x, y, _ = measured_pair(input, target, mask, where)
     place = bins_dim(x, dim, where)
-    given = check_mask(mask, x, where)
     records = []
-    for record, name in ((x, "input"), (y, "target")):
-        check_finite(record, given, name, where)
-        kept = counted(record, given)
+    for kept, name in ((x, "input"), (y, "target")):
         if not is_true(kept >= 0):
             raise UnitError(
                 f"{where}: expected {name} without negative bins, got {int((kept < 0).sum())} of them. A record less "

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.checks import check_level, check_mask, check_pair, counted
+from torchtransient.losses.checks import check_level
 from torchtransient.losses.layouts import time_dim
 from torchtransient.losses.results import STEADY, TRANSIENT, Picture, Transient, reads
 from torchtransient.losses.similarity import WINDOW, ssim_loss
-from torchtransient.metrics.tally import Reduction, Tally, check_finite
+from torchtransient.metrics.tally import Reduction, Tally, measured_pair
 
 View = Literal["sum", "bins"]
 _PICTURE = (-3, -2, -1)
@@ -149,20 +149,15 @@ def _psnr(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor) -> Tally:
     from kornia.metrics import psnr as decibels
 
     shape = x.shape[:-3]
-    # -1 is ambiguous for pictures without pixels
     stacked = (shape.numel(), *x.shape[-3:])
     ours, theirs = ((picture / limit).double().reshape(stacked) for picture in (x, y))
-    masks = None if mask is None else mask.reshape(stacked)
-    values, counts = [], []
-    for k in range(len(ours)):
-        # a picture without a pixel has no mean
-        there = masks is None or bool(masks[k].any())
-        a, b = (ours[k], theirs[k]) if masks is None else (ours[k][masks[k]], theirs[k][masks[k]])
-        values.append(decibels(a, b, 1.0) if there and a.numel() else x.new_zeros((), dtype=torch.float64))
-        counts.append(there and a.numel() > 0)
+    kept = torch.ones_like(ours, dtype=torch.bool) if mask is None else mask.reshape(stacked)
+    counts = kept.flatten(1).any(1)
+    # a picture without a pixel has no mean
+    pairs = zip(ours, theirs, kept, counts, strict=True)
+    values = [decibels(a[m], b[m], 1.0) if counted else a.new_zeros(()) for a, b, m, counted in pairs]
     found = torch.stack(values) if values else ours.new_zeros(0)
-    weights = torch.tensor(counts, dtype=torch.bool, device=x.device).reshape(shape)
-    return Tally(found.to(x.dtype).reshape(shape), weights)
+    return Tally(found.to(x.dtype).reshape(shape), counts.reshape(shape))
 
 
 def _ssim(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor, window: int) -> Tally:
@@ -174,11 +169,9 @@ def _ssim(x: Tensor, y: Tensor, mask: Tensor | None, limit: Tensor, window: int)
 def _pictures(
     input: object, target: object, value_range: float | None, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    x, y = check_pair(input, target, where)
+    x, y, given = measured_pair(input, target, mask, where)
     if x.ndim < -_IMAGES:
         raise ShapeError(f"{where}: expected pictures (..., C, Y, X), got {tuple(x.shape)}.")
-    given = check_mask(mask, x, where)
-    x, y = _measured(x, y, given, where)
     return x, y, given, _range(y, value_range, _PICTURE, given, where)
 
 
@@ -194,15 +187,13 @@ def _transients(
     """Return the pictures of both transients, their mask and their ranges."""
     if view not in get_args(View):
         raise ArgumentError(f"{where}: expected view 'sum' or 'bins', got {view!r}.")
-    x, y = check_pair(input, target, where)
+    x, y, given = measured_pair(input, target, mask, where)
     place = time_dim(x, dim, where)
     if place != _IMAGES or x.ndim < 4:
         raise ShapeError(
             f"{where}: expected transients (..., C, T, Y, X), which are pictures, got {tuple(x.shape)} with time in "
             f"dimension {place}."
         )
-    given = check_mask(mask, x, where)
-    x, y = _measured(x, y, given, where)
     if view == "sum":
         x, y = x.sum(_IMAGES), y.sum(_IMAGES)
         given = None if given is None else given.any(_IMAGES)
@@ -212,20 +203,10 @@ def _transients(
     return x.movedim(_IMAGES, -4), y.movedim(_IMAGES, -4), given, limit
 
 
-def _measured(x: Tensor, y: Tensor, mask: Tensor | None, where: str) -> tuple[Tensor, Tensor]:
-    check_finite(x, mask, "input", where)
-    check_finite(y, mask, "target", where)
-    return counted(x, mask), counted(y, mask)
-
-
-def _range(
-    target: Tensor, value_range: float | None, dims: tuple[int, ...], mask: Tensor | None, where: str
-) -> Tensor:
+def _range(target: Tensor, value_range: float | None, dims: tuple[int, ...], mask: Tensor | None, where: str) -> Tensor:
     """Return the range of the values, which broadcasts to the target."""
     if value_range is not None:
         limit = check_level("value_range", value_range, target.new_empty(()), where)
-        if not target.numel():
-            return limit
         low, high = target.clamp(max=0), target.clamp_min(0)
         spread = high.amax(dims, keepdim=True) - low.amin(dims, keepdim=True)
         if not is_true(spread <= limit * (1 + 1e-5)):
@@ -234,8 +215,6 @@ def _range(
                 f"{float(spread.max()):.4g}. Give the range of the data, or none."
             )
         return limit
-    if not target.numel():
-        return target.new_ones(())
     top = target.amax(dims, keepdim=True)
     needed = torch.ones_like(top, dtype=torch.bool) if mask is None else mask.to(top.dtype).amax(dims, keepdim=True) > 0
     if not is_true((top > 0) | ~needed):

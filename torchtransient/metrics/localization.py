@@ -8,21 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import positive, real_array, shown
+from torchtransient.checks import numbers, positive
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.losses.checks import check_dense
 from torchtransient.losses.results import Volume
-from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
+from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite
 from torchtransient.reconstruction.voxels import VoxelGrid
 
 
 def localization_rmse(
-    input: Volume,
-    points: Any,
-    *,
-    radius_m: float,
-    grid: VoxelGrid | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, points: Any, *, radius_m: float, grid: VoxelGrid | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the root mean square distance of points from the peaks of volumes near them, metres.
 
@@ -47,23 +41,20 @@ def localization_rmse(
         ShapeError: for a volume of another shape than its grid.
     """
     where = "localization_rmse"
-    check_reduction(reduction, where)
     radius = positive(f"{where}: radius_m", radius_m)
     grid = getattr(input, "grid", None) if grid is None else grid
-    if not isinstance(grid, VoxelGrid):
-        raise ArgumentError(f"{where}: expected grid=, a VoxelGrid, with a tensor, got {shown(grid)}.")
-    values = input if isinstance(input, Tensor) else getattr(input, "values", None)
-    (volume,) = check_dense((values,), where)
-    if volume.ndim < 3 or tuple(volume.shape[-3:]) != tuple(grid.shape) or volume.is_complex():
+    if grid is None:
+        raise ArgumentError(f"{where}: expected grid=, a VoxelGrid, with a tensor, got None.")
+    volume = input if isinstance(input, Tensor) else input.values
+    if tuple(volume.shape[-3:]) != tuple(grid.shape) or volume.is_complex():
         raise ShapeError(
             f"{where}: expected a real volume (..., {', '.join(map(str, grid.shape))}) on its grid, got "
             f"{tuple(volume.shape)} {volume.dtype}."
         )
     check_finite(volume, None, "input", where)
-    plain = real_array(points)
-    if plain is None or plain.ndim != 2 or plain.shape[-1] != 3 or not len(plain):
-        raise ShapeError(f"{where}: expected points (N, 3), metres, got {shown(points)}.")
-    truth = torch.from_numpy(plain)
+    truth = torch.from_numpy(numbers(f"{where}: points", points))
+    if truth.ndim != 2 or truth.shape[-1] != 3:
+        raise ShapeError(f"{where}: expected points (N, 3), metres, got {tuple(truth.shape)}.")
     check_finite(truth, None, "points", where)
     flat = volume.detach().double().reshape(-1, *grid.shape)
     distances = torch.stack([_distances(flat, grid, point, radius, where) for point in truth], -1)
@@ -74,9 +65,11 @@ def localization_rmse(
 def _distances(volumes: Tensor, grid: VoxelGrid, point: Tensor, radius: float, where: str) -> Tensor:
     """Distances (B,), metres, of a point (3,) from its peak in each volume (B, Z, Y, X)."""
     offset = point - grid.first
+    rows, columns = (torch.arange(n, dtype=torch.float64) * step for n, step in zip(grid.size, grid.pitch, strict=True))
+    places = grid.depths, rows, columns
     away = [
         along - float(offset @ direction)
-        for along, direction in zip(_places(grid), (grid.normal, grid.along_y, grid.along_x), strict=True)
+        for along, direction in zip(places, (grid.normal, grid.along_y, grid.along_x), strict=True)
     ]
     # voxels of the ball among those of a cube around it, since the volume may be large
     box = [torch.nonzero(one.abs() <= radius).flatten() for one in away]
@@ -100,12 +93,6 @@ def _distances(volumes: Tensor, grid: VoxelGrid, point: Tensor, radius: float, w
         parts = [float(away[k][place[k]]) + _step(volume, away[k], place, k) for k in range(3)]
         found.append(math.hypot(*parts))
     return volumes.new_tensor(found)
-
-
-def _places(grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the positions of voxels along the axes of a grid, (Z,), (Y,), (X,), metres."""
-    rows, columns = (torch.arange(n, dtype=torch.float64) * step for n, step in zip(grid.size, grid.pitch, strict=True))
-    return grid.depths, rows, columns
 
 
 def _step(volume: Tensor, along: Tensor, place: list[int], axis: int) -> float:

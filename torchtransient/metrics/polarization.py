@@ -17,10 +17,9 @@ from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.floating import is_true
 from torchtransient.losses.checks import check_level, check_mask, check_pair
-from torchtransient.losses.layouts import check_dim
 from torchtransient.losses.results import Picture
 from torchtransient.metrics.phase import phase_mae
-from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite, check_reduction
+from torchtransient.metrics.tally import Finish, Kind, Reduction, Tally, check_finite
 
 Part = Literal["total", "linear", "circular"]
 _DEGREES = {
@@ -94,33 +93,29 @@ def aolp_mae(
     target: Picture,
     *,
     stokes_dim: int = stokes.STEADY_DIM,
-    weighted: bool = True,
     floor: float = 0.0,
     mask: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """Compute the mean absolute error of the angle of linear polarization, modulo pi, radians in [0, pi/2].
 
-    For angles in place of Stokes components take `phase_mae(..., period=math.pi)`.
+    Each element weighs as the linear part `|(S1, S2)|` of its target: the angle of hardly polarized light is noise. For
+    angles in place of Stokes components take `phase_mae(..., period=math.pi)`.
 
     Args:
-        weighted: weight each element by the linear part `|(S1, S2)|` of its target, since the angle of light that is
-            hardly polarized is noise; False: equal weights.
         floor: linear part that the target has to exceed to count. Other arguments as in `dop_mae`.
 
     Raises:
         UnitError: for an input without linear polarization where the target counts.
     """
     where = "aolp_mae"
-    check_reduction(reduction, where)
     x, y, dim = _stokes_pair(input, target, stokes_dim, where)
     linear = [torch.hypot(s.select(dim, 1), s.select(dim, 2)) for s in (x, y)]
     counts = _counts(linear[1], floor, mask, where)
     clean = _finite((x, y), counts, dim, where)
     _check_there(linear[0], counts, "linear polarization", where)
     angles = [stokes.angle_of_linear_polarization(s, dim) for s in clean]
-    weight = linear[1] if weighted else torch.ones_like(linear[1])
-    weight = torch.where(counts, weight, torch.zeros_like(weight))
+    weight = torch.where(counts, linear[1], torch.zeros_like(linear[1]))
     return phase_mae(angles[0], angles[1], period=math.pi, weight=weight, reduction=reduction)
 
 
@@ -139,13 +134,12 @@ def _degrees(
 
 def _stokes_pair(input: object, target: object, stokes_dim: int, where: str) -> tuple[Tensor, Tensor, int]:
     x, y = check_pair(_picture("input", input, where), _picture("target", target, where), where)
-    dim = check_dim(stokes_dim, where)
-    if not -x.ndim <= dim < x.ndim or x.shape[dim] != _COMPONENTS:
+    if not -x.ndim <= stokes_dim < x.ndim or x.shape[stokes_dim] != _COMPONENTS:
         raise ShapeError(
-            f"{where}: expected four Stokes components along stokes_dim={dim}, got {tuple(x.shape)}. They are along -4 "
-            "of a picture (..., 4, C, Y, X) and -5 of a transient (..., 4, C, T, Y, X) of polarized variants."
+            f"{where}: expected four Stokes components along stokes_dim={stokes_dim}, got {tuple(x.shape)}. They are "
+            "along -4 of a picture (..., 4, C, Y, X) and -5 of a transient (..., 4, C, T, Y, X) of polarized variants."
         )
-    return x, y, dim % x.ndim
+    return x, y, stokes_dim % x.ndim
 
 
 def _picture(name: str, x: object, where: str) -> object:
@@ -154,10 +148,7 @@ def _picture(name: str, x: object, where: str) -> object:
         return x
     steady = getattr(x, "steady", None)
     if not isinstance(steady, Tensor) or getattr(x, "polarized", True) is not True:
-        raise ShapeError(
-            f"{where}: expected {name} to be a tensor or a polarized result with steady, got {shown(x)}. Render with a "
-            "polarized variant."
-        )
+        raise ShapeError(f"{where}: expected {name} as a tensor or a render by a polarized variant, got {shown(x)}.")
     return steady
 
 

@@ -18,12 +18,11 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from torchtransient.checks import shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ArgumentError, UnitError
 from torchtransient.floating import is_true
-from torchtransient.losses.checks import check_mask
+from torchtransient.losses.checks import check_mask, check_pair, counted, expanded
 
 Reduction = Literal["mean", "item", "none"]
-_ROOM = __name__.rpartition(".")[0]
 
 
 class Kind(IntEnum):
@@ -98,12 +97,10 @@ class Tally:
             reduction.sums = torch.stack([total.real, imaginary, weight]).detach()
             reduction.finish = self.finish
             return self._ratio(total, weight)
-        check_reduction(reduction, where)
-        if reduction == "mean":
-            return self._ratio(*self._sums(tuple(range(self.values.ndim))))
-        if reduction == "item":
-            return self._ratio(*self._sums(tuple(range(-min(self.item, self.values.ndim), 0))))
-        return self._ratio(*self._sums(()))
+        if reduction not in get_args(Reduction):
+            raise ArgumentError(f"{where}: expected reduction 'mean', 'item' or 'none', got {reduction!r}.")
+        summed = {"mean": self.values.ndim, "item": min(self.item, self.values.ndim), "none": 0}[reduction]
+        return self._ratio(*self._sums(tuple(range(-summed, 0))))
 
     def _sums(self, dims: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         values = self.values.to(torch.complex128 if self.values.is_complex() else torch.float64)
@@ -117,18 +114,25 @@ class Tally:
         return self.finish.of(total, weight).to(self.values.real.dtype)
 
 
-def check_reduction(reduction: object, where: str) -> None:
-    """Check the name of a reduction.
+def measured_pair(
+    input: object, target: object, mask: Tensor | None, where: str
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return estimate and truth of one shape, 0 where they do not count, and the mask.
 
     Args:
-        reduction: "mean", "item" or "none".
+        input, target: real tensors.
+        mask: boolean tensor that broadcasts, None for all.
         where: begins the message.
 
     Raises:
-        ArgumentError: for other reductions.
+        UnitError: for NaN and infinite numbers that count.
+        ShapeError: for other types, and two shapes.
     """
-    if not isinstance(reduction, Collector) and reduction not in get_args(Reduction):
-        raise ArgumentError(f"{where}: expected reduction 'mean', 'item' or 'none', got {reduction!r}.")
+    x, y = check_pair(input, target, where)
+    kept = check_mask(mask, x, where)
+    check_finite(x, kept, "input", where)
+    check_finite(y, kept, "target", where)
+    return counted(x, kept), counted(y, kept), kept
 
 
 def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
@@ -166,15 +170,7 @@ def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where
     mask = check_mask(mask, like, where)
     if weight is None:
         return mask
-    if not isinstance(weight, Tensor) or weight.is_complex():
-        got = weight.dtype if isinstance(weight, Tensor) else type(weight).__name__
-        raise UnitError(f"{where}: expected weight as a tensor of real numbers, got {got}.")
-    try:
-        full = weight.expand(like.shape).to(torch.float64)
-    except RuntimeError:
-        raise ShapeError(
-            f"{where}: expected a weight that broadcasts to {tuple(like.shape)}, got {tuple(weight.shape)}."
-        ) from None
+    full = expanded(weight, like, "weight", where).to(torch.float64)
     if mask is not None:
         full = torch.where(mask, full, torch.zeros_like(full))
     if not is_true(torch.isfinite(full) & (full >= 0)):
@@ -201,7 +197,7 @@ class Running(nn.Module):
         options: options of the metric, held.
 
     Raises:
-        ArgumentError: for other functions, a median for instance, and for options that the metric does not take.
+        ArgumentError: for functions without a reduction, a median for instance.
     """
 
     sums: Tensor
@@ -210,23 +206,13 @@ class Running(nn.Module):
     def __init__(self, metric: Callable[..., Tensor], **options: Any) -> None:
         super().__init__()
         self.name = str(getattr(metric, "__name__", shown(metric)))
-        known = set(inspect.signature(metric).parameters) if inspect.isfunction(metric) else set()
-        if "reduction" not in known or not metric.__module__.startswith(_ROOM):
-            raise ArgumentError(
-                f"Running: expected a metric of tt.metrics with a reduction, depth_rmse for instance, got {self.name}."
-            )
-        # the collector is the reduction
-        known -= {"reduction"}
-        if set(options) - known:
-            wrong = ", ".join(sorted(set(options) - known))
-            raise ArgumentError(f"Running: {self.name} takes {', '.join(sorted(known))}, got {wrong}.")
+        if "reduction" not in inspect.signature(metric).parameters:
+            raise ArgumentError(f"Running: expected a metric of tt.metrics with a reduction, got {self.name}.")
         self.metric, self.options = metric, options
         self.reset()
 
     def update(self, *args: Any, **keywords: Any) -> Tensor:
         """Add a batch, with the arguments of the metric. Returns the metric of this batch."""
-        if "reduction" in keywords:
-            raise ArgumentError("Running: expected no reduction, got one. Call the metric for maps and items.")
         collector = Collector()
         with torch.no_grad():
             value = self.metric(*args, **{**self.options, **keywords}, reduction=collector)

@@ -11,11 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchtransient.checks import share, shown
+from torchtransient.checks import share
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.losses.checks import check_dense, check_mask, check_pair
+from torchtransient.losses.checks import check_mask, check_pair
 from torchtransient.losses.results import Volume
-from torchtransient.metrics.tally import Reduction, Tally, check_finite, check_reduction
+from torchtransient.metrics.tally import Reduction, Tally, measured_pair
 from torchtransient.reconstruction.surfaces import depth_map
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -32,12 +32,8 @@ def front_view(volume: Volume) -> Tensor:
 
     Returns:
         Pictures (..., Y, X), differentiable, float32 or float64.
-
-    Raises:
-        UnitError: for complex values.
     """
-    values = _values(volume, "front_view")
-    return values.clamp_min(0).amax(-3)
+    return _values(volume).clamp_min(0).amax(-3)
 
 
 def front_depth(volume: Volume, depths: Any = None, *, threshold: float = 0.1) -> Tensor:
@@ -55,14 +51,11 @@ def front_depth(volume: Volume, depths: Any = None, *, threshold: float = 0.1) -
 
     Raises:
         ShapeError: for a tensor without depths.
-        UnitError: for complex values.
     """
-    where = "front_depth"
-    values = _values(volume, where)
     planes = getattr(volume, "grid", None) if depths is None else depths
     if planes is None:
-        raise ShapeError(f"{where}: expected depths= with a tensor, a grid or (Z,) metres, got None.")
-    found = depth_map(values, planes, threshold=threshold)
+        raise ShapeError("front_depth: expected depths= with a tensor, a grid or (Z,) metres, got None.")
+    found = depth_map(_values(volume), planes, threshold=threshold)
     return torch.where(found.mask, found.depth, torch.full_like(found.depth, torch.nan))
 
 
@@ -94,24 +87,17 @@ def front_depth_mae(
         ShapeError: for two shapes, or tensors without depths.
     """
     where = "front_depth_mae"
-    check_reduction(reduction, where)
-    _check_grids(input, target, where)
-    planes = next((g for g in (getattr(x, "grid", None) for x in (input, target)) if g is not None), None)
-    planes = planes if depths is None else depths
-    ours, theirs = check_pair(_taken(input, where), _taken(target, where), where)
-    x, y = (front_depth(volume, planes, threshold=threshold) for volume in (ours, theirs))
+    if depths is None:
+        depths = next((g for g in (getattr(x, "grid", None) for x in (input, target)) if g is not None), None)
+    ours, theirs = check_pair(*_volumes(input, target, where), where)
+    x, y = (front_depth(volume, depths, threshold=threshold) for volume in (ours, theirs))
     seen = torch.isfinite(x) & torch.isfinite(y)
     given = check_mask(mask, x, where)
     return Tally((x - y).abs(), seen if given is None else given & seen, _PICTURE).result(reduction, where)
 
 
 def picture_correlation(
-    input: Tensor,
-    target: Tensor,
-    *,
-    centered: bool = True,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Tensor, target: Tensor, *, centered: bool = True, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the correlation of pictures, such as front views, in [-1, 1]; independent of brightness.
 
@@ -129,18 +115,12 @@ def picture_correlation(
         UnitError: for values that are not finite.
         ShapeError: for two shapes.
     """
-    return _correlation(input, target, _PICTURE, centered, mask, "picture_correlation").result(
-        reduction, "picture_correlation"
-    )
+    where = "picture_correlation"
+    return _correlation(input, target, _PICTURE, centered, mask, where).result(reduction, where)
 
 
 def volume_correlation(
-    input: Volume,
-    target: Volume,
-    *,
-    centered: bool = True,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, target: Volume, *, centered: bool = True, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the correlation of volumes (..., Z, Y, X), voxel by voxel.
 
@@ -158,12 +138,7 @@ def volume_correlation(
 
 
 def picture_iou(
-    input: Tensor,
-    target: Tensor,
-    *,
-    threshold: float = 0.5,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Tensor, target: Tensor, *, threshold: float = 0.5, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the intersection over union of the shapes in pictures, such as front views, in [0, 1].
 
@@ -186,12 +161,7 @@ def picture_iou(
 
 
 def volume_iou(
-    input: Volume,
-    target: Volume,
-    *,
-    threshold: float = 0.5,
-    mask: Tensor | None = None,
-    reduction: Reduction = "mean",
+    input: Volume, target: Volume, *, threshold: float = 0.5, mask: Tensor | None = None, reduction: Reduction = "mean"
 ) -> Tensor:
     """Compute the intersection over union of volumes (..., Z, Y, X), voxel by voxel.
 
@@ -206,9 +176,7 @@ def volume_iou(
     return _iou(x, y, _VOLUME, threshold, mask, where).result(reduction, where)
 
 
-def _correlation(
-    input: object, target: object, dims: int, centered: bool, mask: Tensor | None, where: str
-) -> Tally:
+def _correlation(input: object, target: object, dims: int, centered: bool, mask: Tensor | None, where: str) -> Tally:
     x, y, kept = _compared(input, target, dims, mask, where)
     x, y, kept = (one.flatten(-dims) for one in (x, y, kept))
     dtype, number = x.dtype, kept.sum(-1, keepdim=True).clamp_min(1)
@@ -227,14 +195,12 @@ def _correlation(
 
 
 def _highest(x: Tensor) -> Tensor:
-    top = x.amax(-1, keepdim=True) if x.shape[-1] else x.sum(-1, keepdim=True)
+    top = x.amax(-1, keepdim=True)
     return torch.where(top > 0, top, torch.ones_like(top))
 
 
 def _spread(x: Tensor, kept: Tensor) -> Tensor:
     """Return the highest less the lowest counted value, 0 without any."""
-    if not x.shape[-1]:
-        return x.sum(-1)
     high, low = (torch.where(kept, x, sign * torch.inf) for sign in (-1, 1))
     return (high.amax(-1) - low.amin(-1)).clamp_min(0)
 
@@ -243,67 +209,42 @@ def _iou(input: object, target: object, dims: int, threshold: float, mask: Tenso
     least = share(f"{where}: threshold", threshold)
     a, b = (x.float() if isinstance(x, Tensor) and x.dtype == torch.bool else x for x in (input, target))
     x, y, _ = _compared(a, b, dims, mask, where)
-    ours, theirs = (_there(one.flatten(-dims), least) for one in (x, y))
+    flat = [one.flatten(-dims) for one in (x, y)]
+    ours, theirs = ((one > 0) & (one >= least * _highest(one)) for one in flat)
     both, either = (ours & theirs).sum(-1), (ours | theirs).sum(-1)
     return Tally(both.to(x.dtype) / either.clamp_min(1), either > 0)
-
-
-def _there(x: Tensor, least: float) -> Tensor:
-    return (x > 0) & (x >= least * _highest(x))
 
 
 def _compared(
     input: object, target: object, dims: int, mask: Tensor | None, where: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return both, 0 where nothing counts, and the mask."""
-    x, y = check_pair(input, target, where)
+    x, y, given = measured_pair(input, target, mask, where)
     if x.ndim < dims:
-        layout = "(..., Y, X)" if dims == _PICTURE else "(..., Z, Y, X)"
-        raise ShapeError(f"{where}: expected tensors {layout}, got {tuple(x.shape)}.")
-    given = check_mask(mask, x, where)
-    kept = torch.ones_like(x, dtype=torch.bool) if given is None else given
-    check_finite(x, kept, "input", where)
-    check_finite(y, kept, "target", where)
-    return torch.where(kept, x, torch.zeros_like(x)), torch.where(kept, y, torch.zeros_like(y)), kept
+        raise ShapeError(f"{where}: expected (..., {'Y, X' if dims == _PICTURE else 'Z, Y, X'}), got {tuple(x.shape)}.")
+    return x, y, torch.ones_like(x, dtype=torch.bool) if given is None else given
 
 
 # ----------------------------------------------------------------------------------------------------------- volumes
 
 
-def _taken(x: object, where: str) -> Tensor:
-    """Return the tensor of a volume."""
-    values = x if isinstance(x, Tensor) else getattr(x, "values", None)
-    if not isinstance(values, Tensor):
-        raise ShapeError(f"{where}: expected a volume (..., Z, Y, X) or a HiddenVolume, got {shown(x)}.")
-    return values
+def _values(x: Volume) -> Tensor:
+    """Return the tensor of a volume, in single precision or better."""
+    values = x if isinstance(x, Tensor) else x.values
+    return values if values.dtype == torch.float64 or values.is_complex() else values.float()
 
 
-def _values(x: object, where: str) -> Tensor:
-    """Return the tensor of a real volume, in single precision or better."""
-    (values,) = check_dense((_taken(x, where),), where)
-    if values.is_complex():
-        raise UnitError(f"{where}: expected a volume of real numbers, got {values.dtype}. Give its modulus.")
-    if values.ndim < _VOLUME or not all(values.shape[-_VOLUME:]):
-        raise ShapeError(f"{where}: expected a volume (..., Z, Y, X) of voxels, got {tuple(values.shape)}.")
-    return values if values.dtype == torch.float64 else values.float()
-
-
-def _volumes(input: object, target: object, where: str) -> tuple[Tensor, Tensor]:
-    _check_grids(input, target, where)
-    return _taken(input, where), _taken(target, where)
-
-
-def _check_grids(input: object, target: object, where: str) -> None:
-    """Raise UnitError for volumes on two grids."""
+def _volumes(input: Volume, target: Volume, where: str) -> tuple[Tensor, Tensor]:
+    """Return the tensors of two volumes. Raises UnitError for two grids."""
     a, b = (getattr(x, "grid", None) for x in (input, target))
-    if not (isinstance(a, VoxelGrid) and isinstance(b, VoxelGrid)):
-        return
-    near = _ROUNDING * min(*a.pitch, *b.pitch)
-    if a.shape != b.shape or float((_frame(a) - _frame(b)).abs().max()) > near:
-        raise UnitError(
-            f"{where}: expected volumes on one grid, got {a!r} from {a.first.tolist()} m and {b!r} from "
-            f"{b.first.tolist()} m. Reconstruct both on one, or give tensors."
-        )
+    if isinstance(a, VoxelGrid) and isinstance(b, VoxelGrid):
+        near = _ROUNDING * min(*a.pitch, *b.pitch)
+        if a.shape != b.shape or float((_frame(a) - _frame(b)).abs().max()) > near:
+            raise UnitError(
+                f"{where}: expected volumes on one grid, got {a!r} from {a.first.tolist()} m and {b!r} from "
+                f"{b.first.tolist()} m. Reconstruct both on one, or give tensors."
+            )
+    return input if isinstance(input, Tensor) else input.values, target if isinstance(target, Tensor) else target.values
 
 
 def _frame(grid: VoxelGrid) -> Tensor:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, TorchTransientError, UnknownKeyError
 from torchtransient.floating import without_autocast
 from torchtransient.modules import let_copy
@@ -42,8 +41,7 @@ def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Modu
     """
     if not isinstance(parametrization, nn.Module):
         raise ArgumentError(
-            f"register: expected a parametrization, an nn.Module, got {type(parametrization).__name__}; "
-            "tt.parametrize.Albedo() for instance."
+            f"register: expected an nn.Module, tt.parametrize.Albedo() for instance, got {parametrization!r}."
         )
     owner, name = _place(module, key)
     if isinstance(parametrization, Roughness) and "roughness" in key.replace("/", ".").split("."):
@@ -164,10 +162,6 @@ def _parametrized(module: nn.Module, key: str) -> tuple[nn.Module, str]:
 
 def _place(module: nn.Module, key: str) -> tuple[nn.Module, str]:
     """The module that holds the parameter of a key, and its name there."""
-    if not isinstance(module, nn.Module):
-        raise ArgumentError(f"expected a module with parameters, an nn.Module, got {shown(module)}.")
-    if not isinstance(key, str):
-        raise UnknownKeyError(f"expected the key of a parameter as a text, got {shown(key)}.")
     # Torch forbids dots in names: renderers have slashes for them.
     parts = key.split(".")
     for k in range(len(parts)):

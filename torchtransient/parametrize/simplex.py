@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import MOST, as_whole, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, holds, without_autocast
 from torchtransient.parametrize.bounded import checked_margin
@@ -28,7 +28,6 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
     Raises:
         ShapeError: for a dimension that is missing or empty.
     """
-    dim = _dim(dim, "simplex")
     return torch.softmax(_checked(x, dim, "simplex"), dim)
 
 
@@ -46,7 +45,7 @@ def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None)
     Raises:
         UnitError: for negative weights, sums other than 1, and weights of zero without a margin.
     """
-    return _inverse(weights, _dim(dim, "simplex_inverse"), checked_margin(margin, "simplex_inverse"), "simplex_inverse")
+    return _inverse(weights, dim, checked_margin(margin, "simplex_inverse"), "simplex_inverse")
 
 
 def _inverse(weights: Tensor, dim: int, margin: float | None, where: str) -> Tensor:
@@ -77,7 +76,7 @@ class Simplex(Settings):
 
     def __init__(self, dim: int = -1, margin: float | None = None) -> None:
         super().__init__()
-        self.dim, self.margin = _dim(dim, "Simplex"), checked_margin(margin, "Simplex")
+        self.dim, self.margin = operator.index(dim), checked_margin(margin, "Simplex")
 
     @without_autocast
     def forward(self, x: Tensor) -> Tensor:
@@ -108,13 +107,6 @@ class Simplex(Settings):
 
     def extra_repr(self) -> str:
         return f"dim={self.dim}"
-
-
-def _dim(dim: Any, where: str) -> int:
-    number = as_whole(dim)
-    if number is None or abs(number) > MOST:
-        raise ShapeError(f"{where}: expected dim as a whole number, got {shown(dim)}.")
-    return number
 
 
 def _checked(x: Tensor, dim: int, where: str) -> Tensor:

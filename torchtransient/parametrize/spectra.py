@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.checks import count, real_array, shown
+from torchtransient.checks import count, numbers
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import floating, single, without_autocast
 from torchtransient.parametrize.bounded import Albedo, Positive
@@ -32,16 +32,10 @@ def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:
         ShapeError, UnitError: for other numbers.
     """
     where = "spline_basis"
-    wavelengths = real_array(wavelengths_nm)
-    if wavelengths is None or wavelengths.ndim != 1 or wavelengths.size < 4:
-        raise ShapeError(f"{where}: expected four wavelengths (N,) at least, got {shown(wavelengths_nm)}.")
-    if not (np.isfinite(wavelengths).all() and (np.diff(wavelengths) > 0).all()):
-        raise UnitError(f"{where}: expected finite wavelengths in rising order, in nanometres.")
-    number = count(f"{where}: coefficients", coefficients, 4, ShapeError)
-    if number > wavelengths.size:
-        raise ShapeError(
-            f"{where}: expected at most one coefficient for each of {wavelengths.size} wavelengths, got {number}."
-        )
+    wavelengths = numbers(where, wavelengths_nm)
+    if wavelengths.ndim != 1 or not (np.isfinite(wavelengths).all() and (np.diff(wavelengths) > 0).all()):
+        raise UnitError(f"{where}: expected finite wavelengths (N,) in rising order, in nanometres.")
+    number = count(f"{where}: coefficients", coefficients, 4, ShapeError, wavelengths.size)
     span = wavelengths[-1] - wavelengths[0]
     place = (wavelengths - wavelengths[0]) / span * (number - 3)
     t = np.abs(place[:, None] - (np.arange(number) - 1))

@@ -53,14 +53,11 @@ def test_a_mark_of_the_encoding(tmp_path):
 
 
 def test_files_that_are_of_no_known_kind(tmp_path):
-    """Cut ones, too, of which the ending tells what they were."""
+    """Cut ones, too."""
     np.savez(tmp_path / "whole.npz", **zone_frame())
-    for name, data, hint in (
-        ("a.npz", (tmp_path / "whole.npz").read_bytes()[:-100], "NumPy"),
-        ("a.json", b" " * 300, "JSON"), ("a", b"", ""),
-    ):  # fmt: skip
+    for name, data in (("a.npz", (tmp_path / "whole.npz").read_bytes()[:-100]), ("a.json", b" " * 300), ("a", b"")):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(StorageError, match=f"is no JSON, NumPy, MATLAB or HDF5 file.*{hint}"):
+        with pytest.raises(StorageError, match="is no JSON, NumPy, MATLAB or HDF5 file"):
             tt.nlos.Capture.read(tmp_path / name)
 
 

@@ -403,11 +403,11 @@ WRONG = {
     ],
     "tal": [
         {"H": None}, {"H": lambda h: h[0]}, {"H": lambda h: h[..., None, None]}, {"H": lambda h: h + 1j},
-        {"H_format": 7}, {"H_format": 1.0}, {"H_format": np.array([1, 1])}, {"sensor_grid_format": 1},
+        {"H_format": 7}, {"H_format": 1.5}, {"H_format": np.array([1, 1])}, {"sensor_grid_format": 1},
         {"sensor_grid_xyz": lambda p: p[0, 0]}, {"sensor_grid_xyz": lambda p: p[..., :2]}, {"sensor_grid_xyz": None},
         {"sensor_grid_normals": lambda n: n[:-1]}, {"laser_grid_xyz": lambda p: p[:2], "laser_grid_normals": None},
         {"sensor_xyz": lambda p: p + 0j}, {"delta_t": np.array([0.1, 0.2])}, {"sensor_xyz": np.zeros(4)},
-        {"scene_info": None, "volume_format": 2.0}, *({LEG: value} for value in (np.nan, 2.0, 1j, "False")),
+        {"scene_info": None, "volume_format": 2.5}, *({LEG: value} for value in (np.nan, 2.0, 1j, "False")),
     ],
     "tal phasor": [{"H": lambda h: h.real}, {"scene_info": None}],
     "tal single": [{"laser_grid_xyz": lambda p: np.repeat(p, 2, 0), "laser_grid_normals": None}],
@@ -431,7 +431,7 @@ WRONG = {
     ],
 }  # fmt: skip
 TAKEN = [
-    ("tal", {"laser_grid_xyz": lambda p: p + 0.1}), ("tal", {"volume_format": 2.0}),  # pairs; not needed
+    ("tal", {"laser_grid_xyz": lambda p: p + 0.1}), ("tal", {"volume_format": 2.5}),  # pairs; not needed
     ("phasor_field", {"dataset/cameraNorm": lambda n: n[:, :1], "dataset/t": GONE}),  # one normal for all of them
     ("rect_data", {"SPAD_index": np.array([[3.0], [0.0]])}),
     ("dirac", {"da": lambda t: t + 0.9e-3 * 0.003 * (np.arange(7) == 3)}),

@@ -233,8 +233,6 @@ def test_what_no_foreign_layout_holds(tmp_path, layout):
     for place in (tmp_path / "a.exr", tmp_path / "no" / path.name):
         with pytest.raises(StorageError):
             capture.write(place, format=layout)
-    with pytest.raises(ArgumentError):
-        write_capture(path, torch.zeros(3), format=layout)
     with pytest.raises(StorageError):
         write_capture(path, capture, {"a": 1}, format=layout)
     assert list(tmp_path.iterdir()) == []
@@ -351,11 +349,11 @@ def test_every_layout_names_what_it_does_not_read(tmp_path, number):
         assert capture.metadata["not_read"] == ["unheard_of"], layout
 
 
-def test_files_of_no_layout_name_what_reads_them(tmp_path):
+def test_files_of_no_layout(tmp_path):
     write_mat(tmp_path / "a.mat", {"something": [[1.0, 2.0]]})
     (tmp_path / "a.json").write_text('{"something": [1.0, 2.0]}')
-    for name, reader in (("a.mat", "h5py.File"), ("a.json", "json.load")):
-        with pytest.raises(StorageError, match=rf"holds something\..*read it with {reader}"):
+    for name in ("a.mat", "a.json"):
+        with pytest.raises(StorageError, match="holds something"):
             Capture.read(tmp_path / name)
         for layout in set(ENDINGS) - {"torchtransient"}:
             with pytest.raises(StorageError):

@@ -19,16 +19,14 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_source, damage_said, npz_shapes, read_npz
 from torchtransient.array_files.hdf5 import check_memory, hdf5_package, read_attributes, read_dataset
 from torchtransient.array_files.plain_texts import json_data, text_of_file
+from torchtransient.checks import shown
 from torchtransient.errors import StorageError
-from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File, Other
+from torchtransient.files.captures.matlab import HEADER_BYTES, Mat5File
 
 WHAT = "capture file"
 _BLOCK = 64
 # Root attributes that layouts ask for.
 _ATTRIBUTES = ("data order",)
-_ENDINGS = {
-    ".json": "JSON", ".npz": "NumPy's files", ".mat": "MATLAB's files", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5",
-}  # fmt: skip
 
 
 class Contents:
@@ -36,17 +34,13 @@ class Contents:
 
     Attributes:
         source: path of the file.
-        reader: function of another package that reads it, for messages.
         shapes: root arrays and structures by name, None for entries without a shape.
         attributes: root attributes of HDF5 files as texts, those of `_ATTRIBUTES` alone.
-        links: names that lead elsewhere, which are not followed.
     """
 
     source: Path
-    reader: str
     shapes: Mapping[str, tuple[int, ...] | None]
     attributes: Mapping[str, str] = MappingProxyType({})
-    links: frozenset[str] = frozenset()
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
         """Return numbers, None for a name that is missing or empty.
@@ -105,59 +99,39 @@ def opened(path: str | Path) -> Iterator[Contents]:
             with h5py.File(source, "r") as file:
                 yield Hdf5Contents(source, file)
         else:
-            kind = _ENDINGS.get(source.suffix.lower())
-            hint = f"Its ending is that of {kind}: it may be damaged, or be the first part of one." if kind else ""
-            raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file. {hint}".strip())
+            raise StorageError(f"{WHAT}: '{source}' is no JSON, NumPy, MATLAB or HDF5 file, or is damaged.")
 
 
 class Hdf5Contents(Contents):
     """Open HDF5 file."""
 
-    reader = "h5py.File"
-
     def __init__(self, source: Path, file: Any) -> None:
         self.source, self._file = source, file
-        self.shapes = {name: self._shape(name) for name in file if name != "#refs#"}
+        self.shapes = {name: getattr(self._entry(name), "shape", None) for name in file if name != "#refs#"}
         said = read_attributes(file, WHAT, _ATTRIBUTES)
         self.attributes = {name: _sole(value) for name, value in said.items()}
-        self.links = frozenset(name for name in self.shapes if self._is_link(name))
 
-    def _is_link(self, name: str) -> bool:
-        """Return True for a link to elsewhere, or to nothing."""
+    def _entry(self, name: str) -> Any:
+        """Return a dataset or group of the file itself, None for a link to elsewhere, or to nothing."""
         import h5py
 
-        return not isinstance(self._file.get(name, getlink=True), h5py.HardLink)
-
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        import h5py
-
-        if self._is_link(name):
-            return None
-        found = self._file[name]
-        return found.shape if isinstance(found, h5py.Dataset) else None
+        return self._file[name] if isinstance(self._file.get(name, getlink=True), h5py.HardLink) else None
 
     def array(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | None:
-        value = self._read(name, part)
+        value = read_dataset(self._file, name, WHAT, part)
         if isinstance(value, str):
             raise StorageError(f"{WHAT}: expected numbers in '{name}', got a text.")
         return None if value is None or value.size == 0 else value
 
     def text(self, name: str) -> str | None:
-        value = self._read(name)
+        value = read_dataset(self._file, name, WHAT)
         if value is not None and not isinstance(value, str):
             raise StorageError(f"{WHAT}: expected a text in '{name}', got numbers {value.shape}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
-        import h5py
-
-        if self._is_link(name):
-            return frozenset()
-        found = self._file[name]
-        return frozenset(found) if isinstance(found, h5py.Group) else frozenset()
-
-    def _read(self, name: str, part: tuple[Any, ...] = ()) -> NDArray[Any] | str | None:
-        return read_dataset(self._file, name, WHAT, part)
+        found = self._entry(name)
+        return frozenset(found) if hasattr(found, "keys") else frozenset()
 
 
 def _sole(value: Any) -> str:
@@ -169,8 +143,6 @@ def _sole(value: Any) -> str:
 class MatContents(Contents):
     """MATLAB file of versions 5 to 7."""
 
-    reader = "scipy.io.loadmat"
-
     def __init__(self, source: Path) -> None:
         self.source = source
         self._file = Mat5File(source)
@@ -181,16 +153,16 @@ class MatContents(Contents):
         value: Any = self._variable(name.split("/")[0])
         for field in name.split("/")[1:]:
             if not isinstance(value, dict):
-                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {_words(value)}.")
+                raise StorageError(f"{WHAT}: expected one structure with '{name}', got {shown(value)}.")
             value = value.get(field)
         if value is not None and not isinstance(value, np.ndarray):
-            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {_words(value)}.")
+            raise StorageError(f"{WHAT}: expected an array of numbers in '{name}', got {shown(value)}.")
         return None if value is None else value[part]
 
     def text(self, name: str) -> str | None:
         value = self._variable(name)
         if value is not None and not isinstance(value, str):
-            raise StorageError(f"{WHAT}: expected a text in '{name}', got {_words(value)}.")
+            raise StorageError(f"{WHAT}: expected a text in '{name}', got {shown(value)}.")
         return value
 
     def fields(self, name: str) -> frozenset[str]:
@@ -207,8 +179,6 @@ class MatContents(Contents):
 
 class NpzContents(Contents):
     """Arrays of NumPy in one file. Pickles are not read."""
-
-    reader = "numpy.load"
 
     def __init__(self, source: Path) -> None:
         self.source = source
@@ -227,8 +197,6 @@ class NpzContents(Contents):
 
 class JsonContents(Contents):
     """JSON object, or list of objects: frames whose entries have one shape each. Arrays are (frames, ...)."""
-
-    reader = "json.load"
 
     def __init__(self, source: Path) -> None:
         self.source = source
@@ -286,12 +254,6 @@ def _is_json(source: Path) -> bool:
         while not start and (block := file.read(_BLOCK)):
             start = block.lstrip(b"\xef\xbb\xbf \t\r\n")
     return start[:1] in (b"{", b"[")
-
-
-def _words(value: Any) -> str:
-    if isinstance(value, Other):
-        return value.kind
-    return "a structure" if isinstance(value, dict) else "a text" if isinstance(value, str) else "an array of numbers"
 
 
 def _is_old_mat(source: Path) -> bool:

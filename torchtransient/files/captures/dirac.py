@@ -73,7 +73,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     sensor_origin, laser_origin = (
         gaps.origin(f"{who}_origin", None, points, normals, legs) for who in ("sensor", "laser")
     )
-    scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs)
+    scan = scan_of("confocal", points, points, sensor_origin, laser_origin, normals, normals, legs=legs)
     kept = {name: array.tolist() for name in _KEPT if (array := contents.array(name)) is not None}
     axis = time_axis(gaps, float(da[0]), width, len(da))
     left = sorted(set(contents.shapes) - _KNOWN)

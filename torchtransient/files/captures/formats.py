@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,20 +12,10 @@ from torchtransient.array_files.hdf5 import hdf5_package, read_attributes
 from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.capture import register_files
-from torchtransient.checks import is_one_of, shown, some_of
+from torchtransient.checks import shown, some_of
 from torchtransient.errors import ArgumentError, StorageError
 from torchtransient.files import capture_file
-from torchtransient.files.captures import (
-    cdt,
-    dirac,
-    keyhole,
-    phasor_field,
-    rect_data,
-    tal,
-    tmf8828,
-    vl53l8,
-    zaragoza,
-)
+from torchtransient.files.captures import cdt, dirac, keyhole, phasor_field, rect_data, tal, tmf8828, vl53l8, zaragoza
 from torchtransient.files.captures.contents import WHAT, Contents, opened
 from torchtransient.files.captures.gaps import Gaps
 
@@ -35,36 +23,15 @@ OWN = "torchtransient"
 _MAT = (".mat",)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Layout of files: a module with `NAME`, `recognises`, `read`, and `write` unless it is only read.
-
-    Attributes:
-        name: in `format=` and metadata.
-        recognises: predicate of contents of any kind of file, True for those of this layout alone.
-        read: capture of contents and of the arguments of :func:`read_capture`.
-        write: writer of a capture to a checked path, None for layouts that are only read.
-        endings: endings of its files; one that is written has one of them, one that is read any.
-    """
-
-    name: str
-    recognises: Callable[[Contents], bool]
-    read: Callable[[Contents, Gaps], Capture]
-    write: Callable[[Path, Capture], None] | None
-    endings: tuple[str, ...]
-
-
-def _layout(module: ModuleType, endings: tuple[str, ...]) -> Layout:
-    return Layout(module.NAME, module.recognises, module.read, getattr(module, "write", None), endings)
-
-
-# In the order in which they are tried: names of variables that say most come first.
-LAYOUTS = (
-    _layout(tal, HDF5), _layout(zaragoza, HDF5), _layout(dirac, HDF5), _layout(phasor_field, _MAT),
-    _layout(keyhole, _MAT), _layout(rect_data, _MAT), _layout(cdt, _MAT), _layout(tmf8828, (".json",)),
-    _layout(vl53l8, (".npz",)),
-)  # fmt: skip
-FORMATS = (OWN, *(layout.name for layout in LAYOUTS))
+# Modules with `NAME`, `recognises(contents)`, `read(contents, gaps)`, and, unless they are only read,
+# `write(target, capture)`. In the order in which they are tried: names of variables that say most come first.
+_MODULES = (tal, zaragoza, dirac, phasor_field, keyhole, rect_data, cdt, tmf8828, vl53l8)
+LAYOUTS: dict[str, ModuleType] = {module.NAME: module for module in _MODULES}
+ENDINGS = {
+    "tal": HDF5, "zaragoza": HDF5, "dirac": HDF5, "phasor_field": _MAT, "keyhole": _MAT, "rect_data": _MAT,
+    "cdt": _MAT, "tmf8828": (".json",), "vl53l8": (".npz",),
+}  # fmt: skip
+FORMATS = (OWN, *LAYOUTS)
 
 
 def read_capture(
@@ -116,8 +83,8 @@ def read_capture(
         return capture_file.read_capture(source)
     with opened(source) as contents:
         layout = _found(contents) if format is None else _asked_for(contents, format)
-        gaps = Gaps(given, layout.name, source)
-        capture = layout.read(contents, gaps)
+        gaps = Gaps(given, layout.NAME, source)
+        capture: Capture = layout.read(contents, gaps)
         gaps.check_all_used()
         return capture
 
@@ -142,17 +109,15 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
     _check_name(format, FORMATS)
     if format == OWN:
         return capture_file.write_capture(path, capture, metadata)
-    layout = next(entry for entry in LAYOUTS if entry.name == format)
-    if layout.write is None:
-        names = ", ".join([OWN, *(entry.name for entry in LAYOUTS if entry.write is not None)])
+    layout = LAYOUTS[format]
+    if not hasattr(layout, "write"):
+        names = ", ".join([OWN, *(name for name, entry in LAYOUTS.items() if hasattr(entry, "write"))])
         raise StorageError(f"{WHAT}: the layout {format!r} is only read. Write one of {names}.")
     if metadata is not None:
         raise StorageError(f"{WHAT}: metadata= is for the library's own format; got it with format={format!r}.")
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"{WHAT}: expected a tt.nlos.Capture, got {type(capture).__name__}.")
     target = path_of(path, WHAT)
-    if target.suffix.lower() not in layout.endings:
-        endings = ", ".join(layout.endings)
+    if target.suffix.lower() not in ENDINGS[format]:
+        endings = ", ".join(ENDINGS[format])
         raise StorageError(f"{WHAT}: expected a name that ends in {endings} for format={format!r}, got '{target}'.")
     check_folder(target, WHAT)
     layout.write(target, capture)
@@ -160,7 +125,7 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
 
 
 def _check_name(name: Any, names: tuple[str, ...]) -> None:
-    if name is not None and not is_one_of(name, names):
+    if name is not None and name not in names:
         raise ArgumentError(f"{WHAT}: expected format to be one of {', '.join(names)}, got {shown(name)}.")
 
 
@@ -178,10 +143,10 @@ def _is_own(source: Path) -> bool:
         return str(read_attributes(file, WHAT, ["format"]).get("format", "")).startswith(OWN)
 
 
-def _asked_for(contents: Contents, name: str) -> Layout:
+def _asked_for(contents: Contents, name: str) -> ModuleType:
     """Return the layout of a name. Raises StorageError for a file of another one."""
-    layout = next(entry for entry in LAYOUTS if entry.name == name)
-    others = [entry.name for entry in LAYOUTS if entry.recognises(contents)]
+    layout = LAYOUTS[name]
+    others = [other for other, entry in LAYOUTS.items() if entry.recognises(contents)]
     if others and not layout.recognises(contents):
         raise StorageError(
             f"{WHAT}: expected '{contents.source}' in the layout {name!r}, got one of {others[0]!r} (it holds "
@@ -190,15 +155,15 @@ def _asked_for(contents: Contents, name: str) -> Layout:
     return layout
 
 
-def _found(contents: Contents) -> Layout:
-    for layout in LAYOUTS:
+def _found(contents: Contents) -> ModuleType:
+    for layout in LAYOUTS.values():
         if layout.recognises(contents):
             return layout
-    held = (f"{name} (a link, which is not followed)" if name in contents.links else name for name in contents.shapes)
-    names = some_of(sorted(held), 120) or "nothing"
+    names = some_of(sorted(contents.shapes), 120) or "nothing"
     raise StorageError(
-        f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names}. Give format= if it "
-        f"is one of these; else read it with {contents.reader} and make tt.nlos.Capture(transient, axis, scan) of it."
+        f"{WHAT}: '{contents.source}' has no known layout ({', '.join(FORMATS)}); it holds {names} (links are not "
+        "followed). Give format= if it is one of these; else read its arrays and make tt.nlos.Capture(transient, axis, "
+        "scan) of them."
     )
 
 

@@ -19,10 +19,10 @@ from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import as_whole, finite, positive, real_array, shown
 from torchtransient.errors import StorageError
+from torchtransient.files.capture_file import POINTS
 from torchtransient.files.captures.contents import WHAT, Contents
 from torchtransient.units import opl_to_seconds, seconds_to_opl
 
-Numbers = NDArray[Any]
 _NEEDED = object()
 _WHO = ("sensor", "laser")
 # Of coordinates: some steps of single precision.
@@ -122,9 +122,8 @@ class Gaps:
         Raises:
             StorageError: for an index out of range, and without one.
         """
-        given = self.fill("frame", None, 0) if frames == 1 else self._given.get("frame")
+        given = self._given.get("frame", 0 if frames == 1 else None)
         self._used.add("frame")
-        self.assumed.pop("frame", None)
         if given is None:
             raise self.error(f"it holds {frames} frames. Give frame= to read_capture, 0 to {frames - 1}.")
         number = as_whole(given)
@@ -175,6 +174,23 @@ class Gaps:
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
 
+def real_in(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
+    """Return an array of real numbers, None if it is missing or empty.
+
+    Args:
+        contents: the file.
+        name: of the array.
+        gaps: for messages.
+
+    Raises:
+        StorageError: for other numbers.
+    """
+    array = contents.array(name)
+    if array is not None and array.dtype.kind not in "iuf":
+        raise gaps.error(f"expected real numbers in {name}, got {array.dtype}.")
+    return array
+
+
 def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = None) -> NDArray[Any]:
     """Return an array of real numbers.
 
@@ -187,8 +203,8 @@ def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = Non
     Raises:
         StorageError: for anything else, and for an array that is missing or empty.
     """
-    array = contents.array(name)
-    if array is None or array.dtype.kind not in "iuf" or dims not in (None, array.ndim):
+    array = real_in(contents, name, gaps)
+    if array is None or dims not in (None, array.ndim):
         got = "nothing" if array is None else f"{array.dtype} of {array.shape}"
         raise gaps.error(f"expected {name} as real numbers{f' with {dims} dimensions' if dims else ''}, got {got}.")
     return array
@@ -205,9 +221,9 @@ def optional_number(contents: Contents, name: str, gaps: Gaps) -> float | None:
     Raises:
         StorageError: for anything else.
     """
-    array = contents.array(name)
-    if array is not None and (array.size != 1 or array.dtype.kind not in "iuf"):
-        raise gaps.error(f"expected one number as {name}, got {array.dtype} of {array.shape}.")
+    array = real_in(contents, name, gaps)
+    if array is not None and array.size != 1:
+        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
     return None if array is None else float(array.reshape(-1)[0])
 
 
@@ -266,11 +282,11 @@ def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArr
         Arrays by name, NaN for values that are missing or of another size.
     """
     said = capture.metadata.get("hidden_volume")
-    found = {name: real_array(said.get(name)) if isinstance(said, Mapping) else None for name in sizes}
-    return {
-        name: np.full(size, np.nan) if (array := found[name]) is None or array.size != size else array.reshape(-1)
-        for name, size in sizes.items()
-    }
+    found = {}
+    for name, size in sizes.items():
+        array = real_array(said.get(name)) if isinstance(said, Mapping) else None
+        found[name] = np.full(size, np.nan) if array is None or array.size != size else array.reshape(-1)
+    return found
 
 
 def hidden_side(scan: Scan) -> NDArray[np.float64]:
@@ -337,36 +353,21 @@ def flat_scan(
     laser = points if spot is None else np.asarray(spot, np.float64)
     sensor_origin, laser_origin = (gaps.origin(f"{who}_origin", origin, points, normals, False) for who in _WHO)
     laser_normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
-    return scan_of(kind, points, laser, sensor_origin, laser_origin, normals, laser_normals, False)
+    return scan_of(kind, points, laser, sensor_origin, laser_origin, normals, laser_normals, legs=False)
 
 
-def scan_of(
-    kind: str,
-    sensor_points: Numbers,
-    laser_points: Numbers,
-    sensor_origin: Numbers,
-    laser_origin: Numbers,
-    sensor_normals: Numbers | None,
-    laser_normals: Numbers | None,
-    legs: bool,
-) -> Scan:
+def scan_of(kind: str, *arrays: NDArray[Any] | None, legs: bool) -> Scan:
     """Return a scan of arrays.
 
     Args:
         kind: of the scan.
-        sensor_points: (..., 3), metres.
-        laser_points: (..., 3), metres.
-        sensor_origin: (3,).
-        laser_origin: (3,).
-        sensor_normals: in the shape of the points, or None.
-        laser_normals: in the shape of the spots, or None.
+        arrays: points of sensor and laser (..., 3), metres, their origins (3,), their normals in the shapes of the
+            points, or None.
         legs: lengths count the first and the last leg.
     """
-    arrays = (sensor_points, laser_points, sensor_origin, laser_origin, sensor_normals, laser_normals)
-    names = ("sensor_points", "laser_points", "sensor_origin", "laser_origin", "sensor_normals", "laser_normals")
     tensors: dict[str, Any] = {
         name: None if array is None else torch.from_numpy(np.array(array, np.float64))
-        for name, array in zip(names, arrays, strict=True)
+        for name, array in zip(POINTS, arrays, strict=True)
     }
     return Scan(kind, **tensors, first_and_last_leg=legs)
 

@@ -25,6 +25,7 @@ from torchtransient.files.captures.gaps import (
     numbers_in,
     only_transient,
     optional_number,
+    real_in,
     scan_of,
     tensor_of,
     time_axis,
@@ -76,7 +77,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     if reciprocal:
         spots, spot_normals = spots.reshape(3), None if spot_normals is None else spot_normals.reshape(3)
     kind = "single" if reciprocal else "exhaustive"
-    scan = scan_of(kind, points[sensor], spots, sensor_origin, laser_origin, normals[sensor], spot_normals, True)
+    scan = scan_of(kind, points[sensor], spots, sensor_origin, laser_origin, normals[sensor], spot_normals, legs=True)
     tensor = tensor_of(data)
     tensor = tensor[:, 0] if reciprocal else tensor.transpose(1, 2)
     axis = time_axis(gaps, _number(contents, "t0", gaps), _number(contents, "deltat", gaps), len(data))
@@ -88,10 +89,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
 
 
 def _field(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
-    array = contents.array(f"dataset/{name}") if name in contents.fields("dataset") else None
-    if array is not None and array.dtype.kind not in "iuf":
-        raise gaps.error(f"expected real numbers in dataset.{name}, got {array.dtype}.")
-    return array
+    return real_in(contents, f"dataset/{name}", gaps) if name in contents.fields("dataset") else None
 
 
 def _points(contents: Contents, name: str, gaps: Gaps) -> NDArray[np.float64]:

@@ -11,10 +11,10 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,20 +33,28 @@ from torchtransient.files.captures.gaps import (
     cannot,
     frequency_axis,
     one_channel,
+    optional_number,
+    real_in,
     same_points,
     scan_of,
     tensor_of,
     time_axis,
 )
-from torchtransient.files.plain_data import plain, restored
+from torchtransient.files.plain_data import flag_of, plain, restored, whole_of
 from torchtransient.plugins.films.transform_bins import transform_bins
+
+Kind = TypeVar("Kind", int, bool)
 
 NAME = "tal"
 _STOKES = 4
 _LEGS = "t_accounts_first_and_last_bounces"
-_KNOWN = frozenset(
-    f"{who}_{what}" for who in ("sensor", "laser") for what in ("xyz", "grid_xyz", "grid_normals", "grid_format")
-) | {"H", "H_format", "volume_format", "delta_t", "t_start", _LEGS, "scene_info"}
+# Numbers whose kinds a file that is written of a capture has again.
+_NUMBERS_OF_FILES = {f"{who}_{what}" for who in ("sensor", "laser") for what in ("xyz", "grid_xyz", "grid_normals")} | {
+    "t_start",
+    "delta_t",
+}
+_FORMATS_OF_FILES = ("H_format", "sensor_grid_format", "laser_grid_format", "volume_format")
+_KNOWN = {*_NUMBERS_OF_FILES, *_FORMATS_OF_FILES, "H", _LEGS, "scene_info"}
 _GRIDS = {"UNKNOWN": 0, "N_3": 1, "X_Y_3": 2}
 _VOLUMES = {"UNKNOWN": 0, "N_3": 1, "X_Y_Z_3": 2, "X_Y_3": 3}
 # Our part of the information: a JSON text, in which numbers keep every digit.
@@ -57,27 +65,12 @@ _READ = {"format", "assumed", "scene_info", "tal", "not_read"}
 _DTYPE = re.compile(r"\|b1|[<>|=]([iu][1248]|f(2|4|8|16)|c(8|16))")
 
 
-@dataclass(frozen=True)
-class HFormat:
-    """Dimensions of ``H``: times or frequencies, ``grids`` of points or lists, with those of the laser or without."""
-
-    number: int
-    frequencies: bool
-    lasers: bool
-    grids: bool
-
-    @property
-    def dims(self) -> int:
-        return 1 + (2 if self.grids else 1) * (2 if self.lasers else 1)
-
-
-_FORMATS = {
-    "T_Sx_Sy": HFormat(1, False, False, True), "T_Lx_Ly_Sx_Sy": HFormat(2, False, True, True),
-    "T_Si": HFormat(3, False, False, False), "T_Li_Si": HFormat(4, False, True, False),
-    "F_Sx_Sy": HFormat(10, True, False, True), "F_Lx_Ly_Sx_Sy": HFormat(11, True, True, True),
-    "F_Si": HFormat(12, True, False, False), "F_Li_Si": HFormat(13, True, True, False),
+# Numbers of the formats of ``H``. A name has a part for each dimension: times or frequencies, then x and y of grids or
+# i of lists, those of the laser before those of the sensor.
+_NUMBERS = {
+    "UNKNOWN": 0, "T_Sx_Sy": 1, "T_Lx_Ly_Sx_Sy": 2, "T_Si": 3, "T_Li_Si": 4,
+    "F_Sx_Sy": 10, "F_Lx_Ly_Sx_Sy": 11, "F_Si": 12, "F_Li_Si": 13,
 }  # fmt: skip
-_NUMBERS = {"UNKNOWN": 0} | {name: form.number for name, form in _FORMATS.items()}
 
 
 def recognises(contents: Contents) -> bool:
@@ -107,22 +100,26 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     Raises:
         StorageError: for other files, wrong entries and missing arguments.
     """
-    number = _whole(contents, "H_format", gaps)
-    form = next((form for form in _FORMATS.values() if form.number == number), None)
-    if form is None:
-        raise gaps.error(f"expected H_format to be one of {', '.join(_FORMATS)}, got number {number}.")
-    kept: dict[str, Any] = {"dtypes": {}}
+    number = _one(contents, "H_format", whole_of)
+    form = next((name for name, known in _NUMBERS.items() if known == number), "UNKNOWN")
+    if form == "UNKNOWN":
+        raise gaps.error(f"expected H_format to be one of the numbers {list(_NUMBERS.values())[1:]}, got {number}.")
+    measured = _measured(contents, gaps, form)
+    kept: dict[str, Any] = {"dtypes": {"H": measured.dtype.str}}
+    for name in _NUMBERS_OF_FILES:
+        if (array := contents.array(name)) is not None:
+            kept["dtypes"][name] = array.dtype.str
     text = contents.text("scene_info")
     info = None if text is None else _scene_info(text)
     own = _own_part(info)
-    legs = gaps.fill(_LEGS, _flag(contents, _LEGS, kept), False)
-    scan = _scan(contents, gaps, form, legs, kept)
-    measured = _measured(contents, gaps, form, kept)
-    polarized = measured.ndim == form.dims + 1
-    start, width = _number(contents, "t_start", kept, gaps), _number(contents, "delta_t", kept, gaps)
+    legs = gaps.fill(_LEGS, _one(contents, _LEGS, flag_of), False)
+    scan = _scan(contents, gaps, form, legs)
+    polarized = measured.ndim > _dims(form)
+    start, width = optional_number(contents, "t_start", gaps), optional_number(contents, "delta_t", gaps)
     settings: dict[str, Any] = {"scan": scan, "polarized": polarized}
-    tensor = _from_tal(measured, form, polarized)
-    if form.frequencies:
+    tensor = _swapped(tensor_of(measured), form)
+    tensor = tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
+    if form.startswith("F"):
         found = _frequencies(info, own, len(measured), start)
         axis = frequency_axis(gaps, found)
         if start is not None and axis.start_opl != start:
@@ -137,8 +134,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     left = sorted(set(contents.shapes) - _KNOWN)
     if own is not None:
         return Capture(**(settings | _of_ours(own, scan, gaps.assumed, left)))
-    volume = None if contents.array("volume_format") is None else _whole(contents, "volume_format", gaps)
-    kept |= {"scene_info_text": text, "volume_format": volume}
+    kept |= {"scene_info_text": text, "volume_format": _one(contents, "volume_format", whole_of)}
     return Capture(**settings, metadata=gaps.metadata(scene_info=info, tal=kept, not_read=left or None))
 
 
@@ -161,38 +157,35 @@ def _of_ours(own: Mapping[str, Any], scan: Scan, assumed: Mapping[str, Any], lef
     }  # fmt: skip
 
 
-def _measured(contents: Contents, gaps: Gaps, form: HFormat, kept: dict[str, Any]) -> Tensor:
+def _measured(contents: Contents, gaps: Gaps, form: str) -> NDArray[Any]:
     array = contents.array("H")
     if array is None:
         raise gaps.error("H is missing or empty.")
-    if array.ndim != form.dims and not (array.ndim == form.dims + 1 and array.shape[-1] == _STOKES):
-        raise gaps.error(f"expected H with {form.dims} dimensions as H_format says, got {array.shape}.")
-    if (array.dtype.kind == "c") != form.frequencies:
-        raise gaps.error(f"expected {'complex' if form.frequencies else 'real'} numbers in H, got {array.dtype}.")
-    kept["dtypes"]["H"] = array.dtype.str
-    return tensor_of(array)
+    if array.ndim != _dims(form) and not (array.ndim == _dims(form) + 1 and array.shape[-1] == _STOKES):
+        raise gaps.error(f"expected H with {_dims(form)} dimensions as H_format says, got {array.shape}.")
+    if (array.dtype.kind == "c") != form.startswith("F"):
+        raise gaps.error(f"expected {'complex' if form.startswith('F') else 'real'} numbers in H, got {array.dtype}.")
+    return array
 
 
-def _from_tal(measured: Tensor, form: HFormat, polarized: bool) -> Tensor:
-    """Return (T, x, y, ...[, 4]) as ([4,] 1, T, ...y, x): a view."""
-    tensor = _swapped(measured, form)
-    return tensor.movedim(-1, 0).unsqueeze(1) if polarized else tensor.unsqueeze(0)
+def _dims(form: str) -> int:
+    return form.count("_") + 1
 
 
-def _swapped(tensor: Tensor, form: HFormat) -> Tensor:
+def _swapped(tensor: Tensor, form: str) -> Tensor:
     """Exchange x and y of each grid, which is its own inverse."""
-    if not form.grids:
+    if "x" not in form:
         return tensor
-    return tensor.transpose(1, 2).transpose(3, 4) if form.lasers else tensor.transpose(1, 2)
+    return tensor.transpose(1, 2).transpose(3, 4) if "L" in form else tensor.transpose(1, 2)
 
 
-def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool, kept: dict[str, Any]) -> Scan:
-    points = {who: _points(contents, gaps, f"{who}_grid_xyz", kept) for who in ("sensor", "laser")}
-    normals = {who: _normals(contents, gaps, who, points[who], kept) for who in ("sensor", "laser")}
+def _scan(contents: Contents, gaps: Gaps, form: str, legs: bool) -> Scan:
+    points = {who: _points(contents, gaps, f"{who}_grid_xyz") for who in ("sensor", "laser")}
+    normals = {who: _normals(contents, gaps, who, points[who]) for who in ("sensor", "laser")}
     for who in points:
-        # UNKNOWN is what y-tal makes of a format that is missing.
-        said = _whole(contents, f"{who}_grid_format", gaps, missing=0)
-        if said not in (0, points[who].ndim - 1):
+        # UNKNOWN, 0, is what y-tal makes of a format that is missing.
+        said = _one(contents, f"{who}_grid_format", whole_of)
+        if said not in (None, 0, points[who].ndim - 1):
             raise gaps.error(f"{who}_grid_format says {said}, the points are {points[who].shape}.")
     kind = _kind(points["sensor"], points["laser"], form, gaps)
     if kind == "single":
@@ -201,17 +194,14 @@ def _scan(contents: Contents, gaps: Gaps, form: HFormat, legs: bool, kept: dict[
     elif kind == "confocal":
         points["laser"] = points["sensor"]
     origins = {
-        who: gaps.origin(f"{who}_origin", _plain(contents, f"{who}_xyz", kept), points[who], normals[who], legs)
+        who: gaps.origin(f"{who}_origin", real_in(contents, f"{who}_xyz", gaps), points[who], normals[who], legs)
         for who in points
     }
-    return scan_of(
-        kind, points["sensor"], points["laser"], origins["sensor"], origins["laser"], normals["sensor"],
-        normals["laser"], legs,
-    )  # fmt: skip
+    return scan_of(kind, *points.values(), *origins.values(), *normals.values(), legs=legs)
 
 
-def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) -> str:
-    if form.lasers:
+def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: str, gaps: Gaps) -> str:
+    if "L" in form:
         return "exhaustive"
     if sensor.shape == laser.shape:
         # Not what y-tal takes for confocal, which depends on where the origin of coordinates is.
@@ -229,58 +219,26 @@ def _kind(sensor: NDArray[Any], laser: NDArray[Any], form: HFormat, gaps: Gaps) 
     return "single"
 
 
-def _points(contents: Contents, gaps: Gaps, name: str, kept: dict[str, Any]) -> NDArray[np.float64]:
-    array = _plain(contents, name, kept)
+def _points(contents: Contents, gaps: Gaps, name: str) -> NDArray[np.float64]:
+    array = real_in(contents, name, gaps)
     if array is None or array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise gaps.error(f"expected {name} (X, Y, 3) or (N, 3), got {None if array is None else array.shape}.")
     return np.ascontiguousarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
 
 
-def _normals(
-    contents: Contents, gaps: Gaps, who: str, points: NDArray[Any], kept: dict[str, Any]
-) -> NDArray[np.float64] | None:
+def _normals(contents: Contents, gaps: Gaps, who: str, points: NDArray[Any]) -> NDArray[np.float64] | None:
     name = f"{who}_grid_normals"
-    array = _plain(contents, name, kept)
-    if array is None:
+    if contents.array(name) is None:
         return None
-    found = np.asarray(array.swapaxes(0, 1) if array.ndim == 3 else array, np.float64)
+    found = _points(contents, gaps, name)
     if found.shape != points.shape:
-        raise gaps.error(f"expected {name} in the shape of the points, got {array.shape}.")
-    return np.ascontiguousarray(found)
+        raise gaps.error(f"expected {name} in the shape of the points, {points.shape}, got {found.shape}.")
+    return found
 
 
-def _plain(contents: Contents, name: str, kept: dict[str, Any]) -> NDArray[Any] | None:
+def _one(contents: Contents, name: str, kind: Callable[[Mapping[str, Any], str], Kind]) -> Kind | None:
     array = contents.array(name)
-    if array is not None:
-        if array.dtype.kind not in "iuf":
-            raise StorageError(f"{WHAT}: expected real numbers in '{name}', got {array.dtype}.")
-        kept["dtypes"][name] = array.dtype.str
-    return array
-
-
-def _number(contents: Contents, name: str, kept: dict[str, Any], gaps: Gaps) -> float | None:
-    array = _plain(contents, name, kept)
-    if array is not None and array.size != 1:
-        raise gaps.error(f"expected one number as {name}, got {array.shape}.")
-    return None if array is None else float(array.reshape(-1)[0])
-
-
-def _flag(contents: Contents, name: str, kept: dict[str, Any]) -> bool | None:
-    array = contents.array(name)
-    if array is None:
-        return None
-    if array.size != 1 or array.dtype.kind not in "biuf" or array.reshape(-1)[0] not in (0, 1):
-        raise StorageError(f"{WHAT}: expected {name} as 0 or 1, got {array.dtype} {array.reshape(-1)[:4].tolist()}.")
-    return bool(array.reshape(-1)[0])
-
-
-def _whole(contents: Contents, name: str, gaps: Gaps, missing: int | None = None) -> int:
-    array = contents.array(name)
-    if array is None and missing is not None:
-        return missing
-    if array is None or array.size != 1 or array.dtype.kind not in "iu":
-        raise gaps.error(f"expected one whole number as {name}, got {None if array is None else array.dtype}.")
-    return int(array.reshape(-1)[0])
+    return None if array is None else kind({name: array}, name)
 
 
 # ------------------------------------------------------------------------------------------------------------- writing
@@ -297,12 +255,11 @@ def write(target: Path, capture: Capture) -> None:
     Raises:
         StorageError: for a batch, several channels, and a transient beside a phasor.
     """
-    form_name, h = _h(capture)
-    form = _FORMATS[form_name]
+    form, h = _h(capture)
     kept = _kept(capture)
     arrays = _arrays(capture, kept, form)
     text = _scene_info_text(capture, kept)
-    formats = {"H_format": (_NUMBERS, form.number)}
+    formats = {"H_format": (_NUMBERS, _NUMBERS[form])}
     for who in ("sensor", "laser"):
         formats[f"{who}_grid_format"] = (_GRIDS, arrays[f"{who}_grid_xyz"].ndim - 1)
     if kept.get("volume_format") in _VOLUMES.values():
@@ -339,16 +296,16 @@ def _h(capture: Capture) -> tuple[str, NDArray[Any]]:
     lasers = {"Si": "Li_", "Sx_Sy": "Lx_Ly_"}[dims] if scan.kind == "exhaustive" else ""
     name = f"{'F' if tensor.is_complex() else 'T'}_{lasers}{dims}"
     tensor = tensor.squeeze(1).movedim(0, -1) if capture.polarized else tensor.squeeze(0)
-    return name, array_of(_swapped(tensor, _FORMATS[name]), WHAT)
+    return name, array_of(_swapped(tensor, name), WHAT)
 
 
-def _arrays(capture: Capture, kept: Mapping[str, Any], form: HFormat) -> dict[str, NDArray[Any]]:
+def _arrays(capture: Capture, kept: Mapping[str, Any], form: str) -> dict[str, NDArray[Any]]:
     scan, dtypes = capture.scan, kept["dtypes"]
     legs = scan.first_and_last_leg
     arrays: dict[str, Any] = {} if assumed_in(capture, _LEGS, legs) else {_LEGS: np.bool_(legs)}
     axis = capture.axis
     start, width = (None, None) if axis is None else (axis.start_opl, axis.bin_width_opl)
-    if form.frequencies and capture.axis is None:
+    if form.startswith("F") and capture.axis is None:
         frequencies = capture.frequencies
         assert frequencies is not None  # a phasor has them
         start, width = frequencies.start_opl, kept.get("delta_t")
@@ -449,13 +406,14 @@ def _kept(capture: Capture) -> dict[str, Any]:
 
 def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
     """Return the text for a capture: as it was read if nothing about it has changed, None if there was none."""
-    text = kept.get("scene_info_text")
-    added = bool(capture.channels or set(capture.metadata) - _READ)
-    added = added or capture.scan.wall is not None or capture.steady is not None
-    if "scene_info_text" in kept and not added and capture.frequencies == _kept_frequencies(capture, kept):
-        before = None if text is None else _scene_info(text)
-        if capture.metadata.get("scene_info") == before:
-            return None if text is None else str(text)
+    added = capture.channels or set(capture.metadata) - _READ or capture.scan.wall is not None
+    if "scene_info_text" in kept and not added and capture.steady is None:
+        text: str | None = kept["scene_info_text"]
+        before, axis = None if text is None else _scene_info(text), capture.frequencies
+        if axis is not None:
+            axis = _frequencies(before, _own_part(before), axis.num_frequencies, axis.start_opl)
+        if capture.frequencies == axis and capture.metadata.get("scene_info") == before:
+            return text
     info: dict[str, Any] = {"original_format": str(capture.metadata.get("format", _OWN))}
     given = capture.metadata.get("scene_info")
     own = {
@@ -471,15 +429,6 @@ def _scene_info_text(capture: Capture, kept: Mapping[str, Any]) -> str | None:
         info["is_polarized"] = True
     info |= given if isinstance(given, Mapping) else {}
     return write_plain_yaml(_as_json(info) | {_OWN: json.dumps(own)}, WHAT)
-
-
-def _kept_frequencies(capture: Capture, kept: Mapping[str, Any]) -> FrequencyAxis | None:
-    if capture.frequencies is None:
-        return None
-    text = kept.get("scene_info_text")
-    info = None if text is None else _scene_info(text)
-    count, start = capture.frequencies.num_frequencies, capture.frequencies.start_opl
-    return _frequencies(info, _own_part(info), count, start)
 
 
 def _as_json(data: Any) -> Any:

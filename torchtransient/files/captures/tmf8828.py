@@ -63,7 +63,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
     gaps.assumed["half_field_tangents"] = list(HALF_FIELD)
     points, normals = _points(contents, chosen, shape, pose, gaps)
     origin = pose[:3, 3]
-    scan = scan_of("confocal", points, points, origin, origin, normals, normals, True)
+    scan = scan_of("confocal", points, points, origin, origin, normals, normals, legs=True)
     kept = {name: entry for name in _KEPT if (entry := _entry(contents, name, chosen)) is not None}
     left = sorted(set(contents.shapes) - {"hists", "distances", *_KEPT})
     transient = tensor_of(np.ascontiguousarray(hists[chosen].T)).reshape(1, bins, *shape)

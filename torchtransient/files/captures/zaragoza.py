@@ -27,6 +27,7 @@ from torchtransient.files.captures.gaps import (
     hidden_volume,
     only_transient,
     optional_number,
+    real_in,
     same_points,
     scan_of,
     tensor_of,
@@ -93,7 +94,7 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         laser, laser_normals = sensor, sensor_normals
     elif transient.ndim == _CONFOCAL:
         raise gaps.error("expected laserGridPositions one, or those of the camera: data has no laser axes.")
-    scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, True)
+    scan = scan_of(kind, sensor, laser, sensor_origin, laser_origin, sensor_normals, laser_normals, legs=True)
     start, width = (optional_number(contents, name, gaps) for name in ("t0", "deltaT"))
     axis = time_axis(gaps, start, width, transient.shape[1])
     volume = {name: array.tolist() for name in _VOLUME if (array := contents.array(name)) is not None}
@@ -153,15 +154,15 @@ def _summed(contents: Contents, gaps: Gaps) -> tuple[torch.Tensor, int]:
 
 def _grid(contents: Contents, name: str, gaps: Gaps, like: NDArray[Any] | None = None) -> NDArray[np.float64] | None:
     """Return (Y, X, 3), from (3, X, Y), or (Y, X, 3) in files that have their axes the other way round."""
-    array = contents.array(name)
+    array = real_in(contents, name, gaps)
     if array is None:
         return None
     if not _reversed(contents):
         array = array.T
     if array.ndim == 1:
         array = array.reshape(1, 1, -1)
-    if array.ndim != 3 or array.shape[-1] != 3 or array.dtype.kind not in "iuf":
-        raise gaps.error(f"expected {name} as a grid of points, got {array.dtype} of {array.shape}.")
+    if array.ndim != 3 or array.shape[-1] != 3:
+        raise gaps.error(f"expected {name} as a grid of points, got {array.shape}.")
     if like is not None and array.shape != like.shape:
         raise gaps.error(f"expected {name} for each of the points {like.shape[:-1]}, got {array.shape[:-1]}.")
     return np.ascontiguousarray(array, np.float64)
