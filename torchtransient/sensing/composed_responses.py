@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import MOST_MADE, as_whole, is_one_of, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_seconds, reals
 from torchtransient.sensing.responses import (
@@ -26,7 +26,10 @@ from torchtransient.sensing.responses import (
 )
 from torchtransient.sensing.time_convolution import filter_rows
 
+Align = Literal["center_of_mass", "start"]
+
 _TABLE = 2000  # bins of a response without a closed form
+_FINE = 9  # grid points in a bin, odd
 
 
 class MeasuredResponse(Response):
@@ -57,22 +60,20 @@ class MeasuredResponse(Response):
         bin_width_s: float,
         delay_s: float = 0.0,
         *,
-        align: str = "center_of_mass",
+        align: Align = "center_of_mass",
         floor: float | bool = True,
         learnable: bool = False,
     ) -> None:
         super().__init__(delay_s, learnable)
-        if not isinstance(counts, Tensor) or counts.ndim != 1 or counts.numel() < 2:
-            shape = tuple(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
-            raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {shape}.")
-        if not is_one_of(align, ("center_of_mass", "start")):
-            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {shown(align)}.")
+        check_choice(align, Align, "align", "MeasuredResponse")
         self.bin_width_s = check_seconds(bin_width_s, "bin_width_s", "MeasuredResponse", open_low=True)
         values = reals("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
+        if values.ndim != 1 or values.numel() < 2:
+            raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {tuple(values.shape)}.")
         if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
             raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
         shares = above_floor(values, floor, "MeasuredResponse")
-        self.align = align
+        self.align: Align = align
         if self.learnable:
             # a bin without light starts at e^-30 of the whole, so that it can be learnt at all
             self.register_parameter("share_logits", nn.Parameter(shares.clamp_min(1e-13).log()))
@@ -114,30 +115,16 @@ class ComposedResponse(Response):
     """Independent delays one after another: laser pulse, detector jitter, timing electronics. Variances add.
 
     Normal ones, with at most one `TailedResponse` among them, have a closed form. Others are convolved on a grid finer
-    than the bins, and gathered into bins at the end. The grid keeps the mean and adds a variance of (bin
-    width/oversampling)^2/6 for each; with `within_bin="center"` half of that.
+    than the bins, and gathered into bins at the end. The grid, nine points in a bin, keeps the mean and adds a variance
+    of (bin width/9)^2/6 for each; with `within_bin="center"` half of that.
 
     Args:
         responses: one or more.
-        oversampling: grid points in a bin, odd.
-
-    Raises:
-        ShapeError: for other objects than responses, or an even number.
     """
 
-    def __init__(self, responses: Sequence[Response], *, oversampling: int = 9) -> None:
+    def __init__(self, responses: Sequence[Response]) -> None:
         super().__init__(0.0, learnable=False)
-        responses = several("ComposedResponse", responses, "responses such as GaussianResponse")
-        if len(responses) == 0:
-            raise ShapeError("ComposedResponse: expected at least one response, got none.")
-        wrong = [type(r).__name__ for r in responses if not isinstance(r, Response)]
-        if wrong:
-            raise ShapeError(f"ComposedResponse: expected responses such as GaussianResponse, got {wrong}.")
-        odd = as_whole(oversampling)
-        if odd is None or odd < 1 or odd % 2 == 0 or odd > MOST_MADE:
-            raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {shown(oversampling)}.")
         self.responses = nn.ModuleList(responses)
-        self.oversampling = odd
 
     def _normal_part(self) -> tuple[TailedResponse | None, Tensor, Tensor] | None:
         """Return the one tailed response, delay and standard deviation of all cores; None if there are other parts."""
@@ -203,7 +190,7 @@ class ComposedResponse(Response):
             first, last = self._lags(bin_width_s)
             if last - first <= CLOSED_BINS:
                 return super().kernel(bin_width_s)
-        fine = self.oversampling
+        fine = _FINE
         parts = [kernel_of(r, bin_width_s / fine, within_bin) for r in self.responses]  # type: ignore[arg-type]
         first = sum(begin for begin, _ in parts)
         total = functools.reduce(_full_convolution, [weights for _, weights in parts])

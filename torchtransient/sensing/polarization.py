@@ -35,9 +35,7 @@ POLARSENS_DEG = ((90.0, 45.0), (135.0, 0.0))
 _ROUNDING = 1e-5
 
 
-def linear_analyzers(
-    angles_deg: Numbers, extinction_ratio: float = math.inf, transmission: float = 1.0
-) -> Tensor:
+def linear_analyzers(angles_deg: Numbers, extinction_ratio: float = math.inf, transmission: float = 1.0) -> Tensor:
     """Rows of linear analysers.
 
     Args:

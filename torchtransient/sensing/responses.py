@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.checks import Numbers, several
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.checks import check_choice, check_number, check_seconds, going_together, one_number, reals
+from torchtransient.sensing.checks import check_choice, check_number, check_seconds, reals
 from torchtransient.sensing.parameters import keep_number, remembered
 from torchtransient.sensing.sensor import PhysicalModule
 
@@ -73,12 +73,7 @@ def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> T
         mean_s: mean of the normal part, in seconds.
         sigma_s: standard deviation of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
     """
-    given = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
-    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(u) - _tail_term(u, sigma_s / tau_s)
 
@@ -91,12 +86,7 @@ def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor)
         mean_s: mean of the normal part, in seconds.
         sigma_s: standard deviation of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
     """
-    given = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
-    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(-u) + _tail_term(u, sigma_s / tau_s)
 
@@ -186,7 +176,6 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     if counts.ndim != 1 or edges_s.ndim != 1 or not counts.numel():
         raise ShapeError(f"{me}: expected counts (T,) of one bin or more and edges_s (K + 1,), got "
                          f"{tuple(counts.shape)} and {tuple(edges_s.shape)}.")  # fmt: skip
-    width_s, start_s = one_number(width_s, "width_s", me), one_number(start_s, "start_s", me)
     cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
     bins = counts.shape[0]
     position = ((edges_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)
@@ -211,9 +200,10 @@ def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
         UnitError: for other floors, and where nothing is left.
     """
     numbers = counts.to(torch.float64)
-    level = floor if isinstance(floor, (bool, np.bool_)) else check_number(floor, "floor", where)
-    if isinstance(level, (bool, np.bool_)):
-        level = float(numbers.median()) if level else 0.0
+    if isinstance(floor, bool):
+        level = float(numbers.median()) if floor else 0.0
+    else:
+        level = check_number(floor, "floor", where)
     clean = (numbers - level).clamp_min(0)
     if not float(clean.sum()) > 0:
         raise UnitError(f"{where}: expected counts above the floor of {level:g}, got none.")
@@ -391,8 +381,6 @@ def _between(below: Tensor, above: Tensor) -> Tensor:
 def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
     """Return `Response.kernel`, from a cache while nothing is learnt.
 
-    A response with a kernel of its own may leave out the argument `within_bin`.
-
     Args:
         response: the response.
         bin_width_s: bin width in seconds.
@@ -401,11 +389,8 @@ def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> 
     Returns:
         First lag in bins, and shares (K,).
     """
-
-    def kernel() -> tuple[int, Tensor]:
-        return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
-
-    return remembered(response, ("kernel", bin_width_s, within_bin), kernel)
+    key = ("kernel", bin_width_s, within_bin)
+    return remembered(response, key, lambda: response.kernel(bin_width_s, within_bin))
 
 
 class GaussianResponse(Response):
@@ -519,8 +504,6 @@ class TailedResponse(Response):
     ) -> None:
         super().__init__(delay_s, learnable)
         self._hold_log("fwhm_s", fwhm_s)
-        tails_s = several("TailedResponse: tails_s", tails_s, "numbers of seconds")
-        fractions = several("TailedResponse: fractions", fractions, "shares of light")
         if len(tails_s) != len(fractions) or len(tails_s) == 0:
             raise ShapeError(
                 f"TailedResponse: expected as many fractions as tails_s, got {len(fractions)} and {len(tails_s)}."

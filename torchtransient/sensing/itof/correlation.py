@@ -499,8 +499,8 @@ class ItofCorrelation(Sensor):
                 )
             self.register_parameter(name, value)
         self._learnt = learnt
-        # not saved: code, axis and calibration determine them
-        self.register_buffer("phases_rad", phases.detach(), persistent=False)
+        self.register_buffer("phases_rad", phases.detach())
+        # not saved: code, axis and phases determine them
         self.register_buffer("weights", self._weights(), persistent=False)
         self.num_bins = axis.num_bins
 
@@ -516,6 +516,15 @@ class ItofCorrelation(Sensor):
         if self._turned.harmonics is not None:
             return harmonic_rows(self._turned.harmonics, self.frequencies_hz, self.axis)
         return torch.zeros(0, self.axis.num_bins, dtype=torch.float64)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+        """Take phases of another size with the state, and make their weights."""
+        phases = state_dict.get(f"{prefix}phases_rad")
+        if isinstance(phases, Tensor) and len(phases) == len(self.frequencies_hz) and not self._learnt:
+            self.phases_rad = torch.empty_like(phases, device=self.phases_rad.device)
+        state_dict.pop(f"{prefix}weights", None)  # of versions that saved them
+        super()._load_from_state_dict(state_dict, prefix, *others)
+        self.weights = self._weights().to(self.weights)
 
     def _known(self) -> ItofCalibration:
         """Return the calibration with the parameters and phases as they are now."""
