@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchtransient.checks import unit_of
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
-from torchtransient.sensing.checks import check_dense, check_number, is_dual, no_arrays
+from torchtransient.sensing.checks import check_number, is_dual, no_arrays
 
 
 def check_map(
@@ -36,7 +36,6 @@ def check_map(
     value = no_arrays(value, where)
     if not isinstance(value, Tensor):
         return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
-    check_dense(value, where, name)
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
     if value.ndim == 1:
@@ -144,12 +143,7 @@ def pixels_of(value: float | Tensor, x: Tensor, name: str, where: str) -> float 
     pixels = (*x.shape[:-3], *x.shape[-2:])
     trailing = zip(reversed(value.shape), reversed(pixels), strict=False)
     if value.ndim > len(pixels) or any(have not in (1, wanted) for have, wanted in trailing):
-        image = "an image" if value.ndim <= 2 else "pixels (..., C, H, W)"
-        got = pixels[-2:] if value.ndim <= 2 else pixels
-        raise ShapeError(
-            f"{where}: expected {image} {tuple(value.shape)} as in {name}, got {tuple(got)}. Make the map for this "
-            "sensor."
-        )
+        raise ShapeError(f"{where}: expected pixels {tuple(value.shape)} as in {name}, got {pixels}.")
     return value
 
 

@@ -258,7 +258,7 @@ class _Delays(PhysicalModule):
 
     def bins(self, x: Tensor, where: str) -> Tensor:
         """Delays in bins, (..., C, H, W) or (), float64, checked against the pixels of `x`."""
-        pixels_of(self.delay_ps, x, "delay_s", where)
+        pixels_of(self.delay_ps, check_transient(x, where), "delay_s", where)
         return self.delay_ps.double() * (1e-12 / self.bin_width_s)
 
 
@@ -339,7 +339,6 @@ class PixelSkew(Sensor):
         self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
 
     def expected(self, x: Tensor) -> Tensor:
-        check_transient(x, "PixelSkew")
         return shift_time(x, self.delays.bins(x, "PixelSkew"), boundary=self.boundary)
 
 
@@ -390,7 +389,6 @@ class DetectionSkew(MovedCounts):
         return _moved(split, moves.whole, self.boundary) + _moved(split, moves.whole + 1, self.boundary)
 
     def moves(self, x: Tensor) -> Delayed:
-        check_transient(x, "DetectionSkew")
         return Delayed(*_whole_and_part(self.delays.bins(x, "DetectionSkew"), x), self.boundary)
 
 
