@@ -168,30 +168,6 @@ def test_rates_are_those_of_the_sensor_model(response):
     assert float(arrival[1] - arrival[0]) == pytest.approx(11.25, abs=0.02)
 
 
-class KernelOnly(sensing.Response):
-    """A normal response of which a kernel is known and no distribution function."""
-
-    def __init__(self):
-        super().__init__(0.0, False)
-
-    def kernel(self, bin_width_s, within_bin="uniform"):
-        return sensing.GaussianResponse(400 * PS, delay_s=37 * PS).kernel(bin_width_s, within_bin)
-
-
-def test_a_response_with_a_kernel_alone():
-    """Rates of any place: those of the distribution, to the square of 1/32 of a bin over the width."""
-    exact = sensing.GaussianResponse(400 * PS, delay_s=37 * PS)
-    given = {"distance_m": place(torch.tensor([0.4, 20.3, 41.7])), "signal": 1.0}
-    found, wanted = (return_rates(response, AXIS, **given) for response in (KernelOnly(), exact))
-    # twice the variance of a part of a bin, by the second derivative of a normal distribution
-    bound = (100 / 32) ** 2 / 12 * 2 / (400 / 2.3548) ** 2
-    assert float((found - wanted).abs().max()) < bound < 1e-4
-    assert float(wanted.max()) > 0.2 and bool((found >= 0).all())
-    given = {"distance_m": place(20.3), "signal": 40.0, "background": 0.3}
-    torch.testing.assert_close(crlb(KernelOnly(), AXIS, **given).distance_m, crlb(exact, AXIS, **given).distance_m,
-                               rtol=1e-3, atol=0)  # fmt: skip
-
-
 # ------------------------------------------------------------------------------------------------------------- chains
 
 

@@ -22,14 +22,12 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import TIME, check_count, no_arrays
-from torchtransient.sensing.composed_responses import counts_before
 from torchtransient.sensing.responses import Response
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 _DARK = 1e-100  # a rate of that much is none, and its square still a number
 _SAME = 1e-13  # of a variance, what is left when the others are known: two parameters that do the same but for rounding
-_FINE = 32  # parts of a bin, of responses that know their kernel only
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,30 +190,7 @@ def covariance_bound(mean: Callable[..., Tensor], parameters: Sequence[Tensor], 
 def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
     """Share of a return at `distance` in each bin, (..., T)."""
     edges = axis.edges_s.to(distance.device) - distance.unsqueeze(-1) * (2 / SPEED_OF_LIGHT)
-    return shares_between(response, edges, axis.bin_width_s)
-
-
-def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
-    """Share of a response, of light at one known time, between edges.
-
-    Args:
-        response: impulse response.
-        edges_s: (..., K + 1) in seconds.
-        bin_width_s: width of the bins, for responses without a distribution function.
-
-    Returns:
-        (..., K).
-    """
-    if type(response).cdf is Response.cdf:
-        width = bin_width_s / _FINE
-        first, kernel = response.kernel(width)
-        found = counts_before(kernel, width, (first - 0.5) * width, edges_s).diff(dim=-1)
-    else:
-        below, above = response.cdf(edges_s), response.survival(edges_s)
-        # differences of what is small: tails keep their relative precision
-        late = (below > 0.5)[..., :-1]
-        found = torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
-    return found.clamp_min(0)  # rounding
+    return response.mass(edges)
 
 
 def _inverse(information: Tensor) -> Tensor:
@@ -243,7 +218,7 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
     for name, given in zip(("distance_m", "signal", "background"), values, strict=True):
         # a number stands on the device of the response; a tensor that does not is torch's error
         own = None if isinstance(given, Tensor) and given.ndim else response.delay_ps.device
-        tensor = torch.as_tensor(no_arrays(given, where), device=own).to(torch.float64)
+        tensor = torch.as_tensor(no_arrays(given), device=own).to(torch.float64)
         if not bool((torch.isfinite(tensor) & (tensor >= 0)).all()):
             raise UnitError(f"{where}: expected {name} to be finite and >= 0, got other numbers.")
         tensors.append(tensor)
@@ -253,7 +228,7 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
 
 def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:
     """The dtype of the most precise tensor, float32 at least; torch's default without one."""
-    tensors = [no_arrays(value, "crlb") for value in values]
+    tensors = [no_arrays(value) for value in values]
     dtypes = [v.dtype for v in tensors if isinstance(v, Tensor) and v.is_floating_point()]
     if not dtypes:
         return torch.get_default_dtype()

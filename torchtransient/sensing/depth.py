@@ -33,7 +33,6 @@ from torchtransient.sensing.checks import (
     check_seconds,
     check_transient,
 )
-from torchtransient.sensing.cramer_rao import shares_between
 from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
@@ -413,7 +412,7 @@ def ml_position(
     low, high = max(first - _AROUND, -bins), min(first + kernel.numel() + _AROUND, bins)
     places = torch.arange(-_AROUND * _STEPS, (1 + _AROUND) * _STEPS + 1, device=rows.device) / _STEPS
     edges = (torch.arange(low, high + 1, device=rows.device) - places.double().unsqueeze(-1)) * width
-    table = torch.log1p(ratio * shares_between(response, edges, width))
+    table = torch.log1p(ratio * response.mass(edges))
     reached = start + torch.arange(low, high, device=rows.device)
     inside = (reached >= 0) & (reached < bins)
     seen = torch.where(inside, rows.gather(1, reached.clamp(0, bins - 1)), 0.0)

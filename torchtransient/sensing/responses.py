@@ -294,17 +294,17 @@ class Response(PhysicalModule):
         return None
 
     def mass(self, edges_s: Tensor) -> Tensor:
-        """Share between consecutive edges, with relative precision in the tails.
+        """Share between consecutive edges, not below 0, with relative precision in the tails.
 
         Shares of bins for light that arrives at one known time; `kernel` is for light that is known to a bin.
 
         Args:
-            edges_s: (K + 1,), in seconds.
+            edges_s: (..., K + 1), in seconds.
 
         Returns:
-            (K,).
+            (..., K).
         """
-        return _between(self.cdf(edges_s), self.survival(edges_s))
+        return _between(self.cdf(edges_s), self.survival(edges_s)).clamp_min(0)  # rounding
 
     def kernel(self, bin_width_s: float, within_bin: WithinBin = "uniform") -> tuple[int, Tensor]:
         """Shares of the light of a bin that arrive some bins later.
@@ -368,14 +368,14 @@ class Response(PhysicalModule):
         weight = torch.from_numpy(0.5 * shares / panels).to(device).repeat(panels)
         edges = torch.arange(first, last + 2, dtype=torch.float64, device=device).unsqueeze(1) - place
         flat = (edges * bin_width_s).flatten()
-        mass = _between(self.cdf(flat).view(edges.shape), self.survival(flat).view(edges.shape))
-        return mass @ weight
+        mass = _between(self.cdf(flat).view(edges.shape).T, self.survival(flat).view(edges.shape).T)
+        return mass.T.contiguous() @ weight
 
 
 def _between(below: Tensor, above: Tensor) -> Tensor:
-    """Differences along dimension 0 of a cumulative distribution, beyond the median of its survival."""
-    late = (below > 0.5)[:-1]
-    return torch.where(late, above[:-1] - above[1:], below[1:] - below[:-1])
+    """Differences of a cumulative distribution, beyond the median of its survival."""
+    late = (below > 0.5)[..., :-1]
+    return torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
 
 
 def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:

@@ -36,21 +36,15 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
         Shape and dtype of `x`.
 
     Raises:
-        ShapeError: for even sizes, or a PSF that reaches further than the picture does where that is needed.
+        ShapeError: for even sizes.
     """
     check_transient(x, "blur_image")
     check_choice(border, Border, "border", "blur_image")
     if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
         raise ShapeError(f"blur_image: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
-    height, width = x.shape[-2:]
-    if border in ("reflect", "circular") and (psf.shape[0] // 2 >= height or psf.shape[1] // 2 >= width):
-        raise ShapeError(
-            f"blur_image: expected a picture larger than the half PSF {tuple(psf.shape)}, got {height} x {width}. "
-            "Use border='replicate' or 'constant', or a smaller PSF."
-        )
     from kornia.filters import filter2d
 
-    flat = x.reshape(-1, 1, height, width)
+    flat = x.reshape(-1, 1, *x.shape[-2:])
     work = torch.float32 if x.dtype in (torch.float16, torch.bfloat16) else x.dtype
     # filter2d correlates; a PSF says where the light of one point goes, so it is turned round
     kernel = psf.flip(0, 1).unsqueeze(0).to(work)
@@ -106,7 +100,6 @@ class SpatialPSF(Sensor):
         learnable: learn the PSF, as logits.
 
     Raises:
-        ShapeError: for even sizes.
         UnitError: for negative values, or none.
     """
 
@@ -117,8 +110,6 @@ class SpatialPSF(Sensor):
     def __init__(self, psf: Tensor, border: Border = "reflect", *, learnable: bool = False) -> None:
         super().__init__()
         (psf,) = reals("SpatialPSF", torch.float64, psf=psf)
-        if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
-            raise ShapeError(f"SpatialPSF: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
         values = psf.detach().double()
         if not bool(torch.isfinite(values).all()) or bool((values < 0).any()) or not float(values.sum()) > 0:
             raise UnitError("SpatialPSF: expected finite values >= 0 with a positive sum.")

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing.chain.stages import (
     check_axis,
     check_chain,
@@ -26,7 +26,6 @@ from torchtransient.sensing.chain.stages import (
     mean_of,
     measurement_of,
     normal_of,
-    policies_of,
 )
 from torchtransient.sensing.checks import TIME, check_transient, not_a_transient
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
@@ -417,15 +416,12 @@ class PixelGroups(RandomSensor):
 
     @property
     def grad(self) -> GradPolicy:
-        """The policy of all random sensors. GradientError where they have different ones."""
-        policies = policies_of(self)
-        if len(policies) > 1:
-            raise ArgumentError(f"PixelGroups: expected one policy of all sensors, got {sorted(policies)}. Set grad.")
-        return policies.pop() if policies else "expected"
+        """Policy of the first random sensor; set, that of all of them."""
+        return next((part.grad for part in self.sensors.modules() if isinstance(part, RandomSensor)), "expected")
 
     @grad.setter
     def grad(self, value: GradPolicy) -> None:
-        """Policy of all random sensors. ArgumentError where they have different ones."""
+        """Policy of all random sensors."""
         policy = check_policy(value, "PixelGroups")
         for part in self.sensors.modules():
             if isinstance(part, RandomSensor):

@@ -24,7 +24,7 @@ from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.itof.correlation import TapDifference
 from torchtransient.sensing.photon_budget import PhotonBudget
-from torchtransient.sensing.sensor import SAME_BIN, GradPolicy, Quantity, RandomSensor, Sensor, bins_text
+from torchtransient.sensing.sensor import SAME_BIN, Quantity, RandomSensor, Sensor, bins_text
 from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF
 from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, PixelSkew, SweepJitter
 
@@ -88,22 +88,6 @@ def draws(stage: nn.Module) -> bool:
         stage: a stage of a chain.
     """
     return any(isinstance(part, RandomSensor) for part in stage.modules())
-
-
-def policies_of(stage: nn.Module) -> set[GradPolicy]:
-    """Return the policies of the random stages in a stage, parts of other sensors left out.
-
-    Args:
-        stage: a stage of a chain.
-    """
-    found: set[GradPolicy] = set()
-    for _, part in in_order([("", stage)]):
-        inner = branches_of(part)
-        if inner:
-            found = found.union(*(policies_of(sensor) for _, sensor in inner))
-        elif isinstance(part, RandomSensor):
-            found.add(part.grad)
-    return found
 
 
 def check_draws(stages: Iterable[nn.Module], where: str) -> None:

@@ -81,7 +81,7 @@ class ItofCalibration:
         if self.direction not in (1, -1):
             raise UnitError(f"ItofCalibration: expected direction 1 or -1, got {shown(self.direction)}.")
         for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m"):
-            object.__setattr__(self, name, no_arrays(getattr(self, name), "ItofCalibration"))
+            object.__setattr__(self, name, no_arrays(getattr(self, name)))
         degrees = "Degrees? Say math.radians(...); a phase of more than a turn is one of less."
         _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1), 2 * _TURN, degrees)
         _numbers(self.phase_map_rad, "phase_map_rad", (2, 3), 2 * _TURN, degrees)

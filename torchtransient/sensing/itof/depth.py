@@ -134,7 +134,7 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
 def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
     """Frames as (..., C, F, N, taps of a pixel, H, W)."""
     check_choice(readout, Readout, "readout", where)
-    frames = _precise(as_frames(taps, where), where)
+    frames = _precise(as_frames(taps), where)
     each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
     count = check_count(num_taps, "num_taps", where)
     if count < least or frames.ndim < 4 or not frames.shape[-3] or frames.shape[-3] % (count * each):
@@ -146,17 +146,13 @@ def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
     return frames.reshape(*frames.shape[:-3], frequencies, count, each, *frames.shape[-2:])
 
 
-def as_frames(taps: Frames, where: str) -> Tensor:
+def as_frames(taps: Frames) -> Tensor:
     """Return a tensor as it is, and an array as one.
 
     Args:
         taps: frames.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for anything without numbers.
     """
-    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
+    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps))
 
 
 def _precise(frames: Tensor, where: str) -> Tensor:

@@ -123,7 +123,7 @@ class ItofNoise:
             object.__setattr__(self, "electrons_per_unit", gain)
         object.__setattr__(self, "read_noise_e", check_number(self.read_noise_e, "read_noise_e", me))
         for name in ("offset_e", "std_e"):
-            given = no_arrays(getattr(self, name), me)
+            given = no_arrays(getattr(self, name))
             if isinstance(given, Tensor):
                 if not holds(given >= 0):
                     raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
@@ -278,7 +278,7 @@ def read_itof(
     """
     me = "read_itof"
     values = check_frequencies(frequencies_hz, me)
-    taps = as_frames(taps, me)
+    taps = as_frames(taps)
     steps = steps_of(taps, num_taps, readout, me)
     if steps.shape[-4] != len(values):
         raise ShapeError(
