@@ -8,6 +8,7 @@ counts whose detections move by themselves are multinomial again, with the moved
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -25,7 +26,6 @@ from torchtransient.sensing.chain.stages import (
     flat,
     mean_of,
     measurement_of,
-    normal_of,
 )
 from torchtransient.sensing.checks import TIME, check_transient, not_a_transient
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
@@ -215,7 +215,7 @@ class Compose(Sensor):
             x: light, or a renderer's output.
             generator: source of randomness.
         """
-        return self._run(x, normal_of, generator, "gaussian")
+        return self._run(x, partial(draw_of, "gaussian"), generator, "gaussian")
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """Draw every random stage, whatever its policy, without gradient.
@@ -225,7 +225,7 @@ class Compose(Sensor):
             generator: source of randomness.
         """
         with torch.no_grad():
-            return self._run(x, draw_of, generator, "draw")
+            return self._run(x, partial(draw_of, "sample"), generator, "draw")
 
     def variance(self, x: Any) -> Tensor:
         """Variance of every entry, for chains whose last stage alone draws.
@@ -237,8 +237,7 @@ class Compose(Sensor):
             GradientError: for other chains: draws of several stages have no closed form; `gaussian` has their
                 covariance.
         """
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = list(self.stages)[used:]
+        y, stages = self._opened(x)
         if not stages:
             return torch.zeros_like(y)
         *before, last = stages
@@ -270,8 +269,7 @@ class Compose(Sensor):
         Raises:
             GradientError: for other chains: draws of several stages have no closed form.
         """
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = list(self.stages)[used:]
+        y, stages = self._opened(x)
         while stages:
             last, found = stages[0], moving_together(stages, policy=False)
             if found is not None and len(found[1]) == len(stages) - 1:
@@ -296,8 +294,7 @@ class Compose(Sensor):
         at_once: Literal["own", "gaussian", "draw"] | None = None,
     ) -> Tensor:
         """Call `step` for one stage after another; first photons and their moves are measured `at_once`."""
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = list(self.stages)[used:]
+        y, stages = self._opened(x)
         if self._window_is_open and y.ndim >= 4:
             check_window(self, y.shape[TIME])
         while stages:
@@ -310,8 +307,11 @@ class Compose(Sensor):
             y, stages = moved_first_photons(spad, moves, y, generator, policy), stages[1 + len(moves) :]
         return y
 
-    def _opened(self, output: Any) -> tuple[Tensor, int]:
-        """Return the tensor of a renderer's output, and the number of stages that it has passed already."""
+    def _opened(self, output: Any) -> tuple[Tensor, list[nn.Module]]:
+        """Return a tensor, or that of a renderer's output, and the stages that it has not passed yet."""
+        stages = list(self.stages)
+        if isinstance(output, Tensor):
+            return output, stages
         transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
         beats, first = getattr(output, "beats", None), self.stages[0]
         if isinstance(beats, Tensor) and not isinstance(transient, Tensor):
@@ -327,7 +327,7 @@ class Compose(Sensor):
                 )
         if isinstance(found := beats if transient is None else transient, Tensor):
             check_axis(self, output.axis)
-            return found, 0
+            return found, stages
         if not isinstance(phasor, Tensor):
             raise ShapeError(
                 "Compose: expected a tensor (..., C, T, H, W) or the output of a renderer with a transient, got "
@@ -338,7 +338,7 @@ class Compose(Sensor):
                 f"Compose: expected a transient for {type(first).__name__}, got a phasor image, which ItofCorrelation "
                 "alone takes, as the first stage itself, not in a chain. Render with time_axis=... for a transient."
             )
-        return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), 1
+        return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), stages[1:]
 
 
 def _look_again(chain: nn.Module, incompatible: object) -> None:
@@ -488,11 +488,11 @@ class PixelGroups(RandomSensor):
             x: light (..., C, T, H, W).
             generator: source of randomness.
         """
-        return self._measured(x, lambda sensor, own: normal_of(sensor, own, generator))
+        return self._measured(x, lambda sensor, own: draw_of("gaussian", sensor, own, generator))
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return self._measured(x, lambda sensor, own: draw_of(sensor, own, generator))
+            return self._measured(x, lambda sensor, own: draw_of("sample", sensor, own, generator))
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         parts, places = [], []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +29,7 @@ from torchtransient.sensing.sensor import SAME_BIN, Quantity, RandomSensor, Sens
 from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF
 from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, PixelSkew, SweepJitter
 
+Way = Literal["sample", "gaussian"]
 Places = list[tuple[str, nn.Module]]
 
 
@@ -142,32 +144,18 @@ def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
     return result
 
 
-def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
+def draw_of(way: Way, stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
     """Draw one stage whatever its policy; the mean of one that draws nothing.
 
     Args:
+        way: "sample", or "gaussian" for the normal surrogate.
         stage: a stage of a chain.
         x: its light.
         generator: source of randomness.
     """
-    if isinstance(stage, Sensor) and hasattr(stage, "sample"):
-        result: Tensor = stage.sample(x, generator)  # type: ignore[operator]
-        return result
-    return mean_of(stage, x)
-
-
-def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw the normal surrogate of one stage; the mean of one that draws nothing.
-
-    Args:
-        stage: a stage of a chain.
-        x: its light.
-        generator: source of randomness.
-    """
-    if isinstance(stage, Sensor) and hasattr(stage, "gaussian"):
-        result: Tensor = stage.gaussian(x, generator)  # type: ignore[operator]
-        return result
-    return mean_of(stage, x)
+    draw = getattr(stage, way, None) if isinstance(stage, Sensor) else None
+    result: Tensor = mean_of(stage, x) if draw is None else draw(x, generator)
+    return result
 
 
 def measurement_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -307,20 +295,16 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
     for name, module in sensor.named_modules():
         if not isinstance(module, Sensor):
             continue  # a measured response has bins of its own
-        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
-        slack = SAME_BIN * axis.bin_width_opl
-        same, made_for = module.num_bins in (None, axis.num_bins), f"{module.num_bins} bins"
+        own, stage = getattr(module, "axis", None), Stage(name or "0", module)
+        width, number = _bins(stage)
+        same = number in (None, axis.num_bins)
+        same &= width is None or abs(width - axis.bin_width_s) * axis.num_bins <= SAME_BIN * axis.bin_width_s
         if isinstance(own, TimeAxis):
-            made_for = str(own)
-            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
-            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
-        elif isinstance(width_s, float):
-            made_for = f"bins of {width_s:g} s" if module.num_bins is None else f"{made_for} of {width_s:g} s"
-            same = same and abs(width_s - axis.bin_width_s) * axis.num_bins <= SAME_BIN * axis.bin_width_s
+            same &= abs(own.start_opl - axis.start_opl) <= SAME_BIN * axis.bin_width_opl
         if not same:
             raise UnitError(
-                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {made_for}), got {axis}. "
-                "Make the sensor with the renderer's axis."
+                f"sensor: expected the axis of {stage}, {own or bins_text(width, number)}, got {axis}. Make the sensor "
+                "with the renderer's axis."
             )
 
 
@@ -426,17 +410,17 @@ def check_window(chain: nn.Module, num_bins: int | None) -> None:
         UnitError: if they do not.
     """
     stages = _parts_of(chain)
-    budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
-    for budget in budgets:
-        period_s = 1 / float(budget.sensor.repetition_rate_hz)  # type: ignore[arg-type]
+    rates = [(s, getattr(s.sensor, "repetition_rate_hz", None)) for s in stages]
+    budgets = [(s, 1 / rate) for s, rate in rates if isinstance(rate, float)]
+    for budget, period_s in budgets:
         for stage in stages:
             _check_period(budget, period_s, stage, num_bins)
     goes_on = any(s.sensor.takes == ("rate",) and s.sensor.window_is_period for s in stages)
     for stage in stages:
         own = getattr(stage.sensor, "period_s", None)
         if not goes_on and isinstance(_dead_time(stage), float):
-            for budget in budgets:
-                _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
+            for budget, period_s in budgets:
+                _check_armed(budget, period_s, stage, num_bins)
             if not budgets and isinstance(own, float):
                 _check_armed(stage, own, stage, num_bins)
 
@@ -530,12 +514,8 @@ def has_background(budget: PhotonBudget) -> bool:
     Args:
         budget: the budget.
     """
-    ambient, dark = torch.as_tensor(budget.ambient_rate_hz), torch.as_tensor(budget.dark_count_rate_hz)
-    efficiency = torch.as_tensor(budget.quantum_efficiency)
-    if ambient.requires_grad or dark.requires_grad:
-        return True
-    lit = ambient > 0 if efficiency.requires_grad else ambient * efficiency > 0
-    return bool(lit.any()) or bool((dark > 0).any())
+    rates = (torch.as_tensor(rate) for rate in (budget.ambient_rate_hz, budget.dark_count_rate_hz))
+    return any(rate.requires_grad or bool((rate > 0).any()) for rate in rates)
 
 
 def _detects(stage: nn.Module) -> bool:

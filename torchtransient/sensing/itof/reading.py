@@ -369,19 +369,17 @@ def _depth_std(
         )
     gain = known.electrons_per_unit or 1.0
     offset: Tensor | None = None  # electrons of all light in a step; None where the deviations were given
-    if readout == "differential" and known.offset_e is not None:
+    if readout != "differential":
+        offset = (sums_of(taps, steps.shape[-3], "read_itof") if readout == "two_tap" else steps) * gain
+    elif known.offset_e is not None:
         offset = _of_frequencies(known.offset_e, steps)
-    elif readout == "two_tap":
-        offset = sums_of(taps, steps.shape[-3], "read_itof").clamp_min(0) * gain
-    elif readout == "single":
-        offset = steps.clamp_min(0) * gain
     read = (1 if readout == "single" else 2) * known.read_noise_e**2
     if known.std_e is not None:
         variance = _of_frequencies(known.std_e, steps).square()
     elif offset is None:
         return None
     else:
-        variance = offset + read
+        variance = offset.clamp_min(0) + read
     # The slopes of dark pixels are infinite: neither a product with zero nor a gradient may come of them.
     there = ~torch.isinf(slopes)
     power = ((torch.where(there, slopes, 0.0) / gain).square() * variance).sum(-3)
@@ -395,10 +393,6 @@ def _depth_std(
     if offset is None:
         return std
     rounding = (gain if raw else 0.0) ** 2 / 12
-    if readout == "single":
-        offset = steps * gain  # signs and all
-    elif readout == "two_tap":
-        offset = sums_of(taps, steps.shape[-3], "read_itof") * gain
     lit = _can_be(steps * gain, offset, readout == "differential", read + rounding)
     if lit.numel() and not holds(lit.double().mean() >= 0.5):
         warnings.warn(
