@@ -80,10 +80,9 @@ def is_dual(value: Tensor) -> bool:
 
 def _cut_off_message(name: str, where: str) -> str:
     return (
-        f"{where}: expected {name} without a gradient, which is not supported here and would be cut off in silence; "
-        f"got a tensor that requires one. Give its value, {name}.detach(), and learn it by learnable=True where "
-        f"{where} has that, or by an nn.Parameter where it takes one; a buffer of a module is learnt by "
-        "torch.func.functional_call(module, {its name: tensor}, (x,))."
+        f"{where}: expected {name} without a gradient, which would be cut off in silence; got a tensor that requires "
+        f"one. Give {name}.detach(); learn it by learnable=True or an nn.Parameter where {where} takes them, or as a "
+        "buffer by torch.func.functional_call."
     )
 
 

@@ -13,6 +13,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_seconds, reals
 from torchtransient.sensing.responses import (
     CLOSED_BINS,
+    Core,
     GaussianResponse,
     Response,
     TailedResponse,
@@ -20,8 +21,6 @@ from torchtransient.sensing.responses import (
     above_floor,
     integrated_counts,
     kernel_of,
-    normal_cdf,
-    normal_integrals,
     resample_counts,
 )
 from torchtransient.sensing.time_convolution import filter_rows
@@ -126,40 +125,33 @@ class ComposedResponse(Response):
         super().__init__(0.0, learnable=False)
         self.responses = nn.ModuleList(responses)
 
-    def _normal_part(self) -> tuple[TailedResponse | None, Tensor, Tensor] | None:
-        """Return the one tailed response, delay and standard deviation of all cores; None if there are other parts."""
-        parts = list(self.responses)
+    def _closed(self) -> tuple[GaussianResponse | TailedResponse, Core] | None:
+        """Return the tailed response, or a normal one, and the core of all together; None if there are other parts."""
+        parts = [r for r in self.responses if isinstance(r, (GaussianResponse, TailedResponse))]
         tailed = [r for r in parts if isinstance(r, TailedResponse)]
-        if len(tailed) > 1 or not all(isinstance(r, (GaussianResponse, TailedResponse)) for r in parts):
+        if len(tailed) > 1 or len(parts) < len(self.responses):
             return None
-        delay = torch.stack([r.delay_s for r in parts]).sum()  # type: ignore[misc]
-        sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()  # type: ignore[misc]
-        return (tailed[0] if tailed else None), delay, sigma
+        delay = torch.stack([r.delay_s for r in parts]).sum()
+        sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()
+        return (tailed or parts)[0], (delay, sigma)
 
     def cdf(self, time_s: Tensor) -> Tensor:
         """Without a closed form: from a histogram of 2000 bins, 1e-6 off where the parts are of one size."""
         if len(self.responses) == 1:
             return self.responses[0].cdf(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            return counts_before(shares, width_s, start_s, time_s)
-        tailed, delay, sigma = found
-        return normal_cdf((time_s - delay) / sigma) if tailed is None else tailed.widened_cdf(time_s, delay, sigma)
+        if (closed := self._closed()) is not None:
+            return closed[0].cdf(time_s, closed[1])
+        shares, width_s, start_s = self._table()
+        return counts_before(shares, width_s, start_s, time_s)
 
     def survival(self, time_s: Tensor) -> Tensor:
         if len(self.responses) == 1:
             return self.responses[0].survival(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            # seen from its end, the response runs the other way
-            return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_cdf((delay - time_s) / sigma)
-        above: Tensor = tailed.widened_survival(time_s, delay, sigma)
-        return above
+        if (closed := self._closed()) is not None:
+            return closed[0].survival(time_s, closed[1])
+        shares, width_s, start_s = self._table()
+        # seen from its end, the response runs the other way
+        return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
 
     def _table(self) -> tuple[Tensor, float, float]:
         """Return shares (K,) in bins of a width that suits the response, the width, and the start of the first."""
@@ -169,13 +161,8 @@ class ComposedResponse(Response):
         return shares, width_s, (first - 0.5) * width_s
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        found = self._normal_part()
-        if found is None:
-            return None
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_integrals(time_s, delay, sigma)
-        return tailed.widened_integrals(time_s, delay, sigma)
+        closed = self._closed()
+        return None if closed is None else closed[0].integrals(time_s, closed[1])
 
     def support_s(self) -> tuple[float, float]:
         # the sum of all supports holds all of it, and more
@@ -186,7 +173,7 @@ class ComposedResponse(Response):
         check_choice(within_bin, WithinBin, "within_bin", "ComposedResponse")
         if len(self.responses) == 1:
             return kernel_of(self.responses[0], bin_width_s, within_bin)  # type: ignore[arg-type]
-        if within_bin == "uniform" and self._normal_part() is not None:
+        if within_bin == "uniform" and self._closed() is not None:
             first, last = self._lags(bin_width_s)
             if last - first <= CLOSED_BINS:
                 return super().kernel(bin_width_s)

@@ -49,13 +49,10 @@ def check_map(
     if not holds(inside):
         left = "(" if open_low else "["
         unit = unit_of(name)
-        raise UnitError(f"{where}: expected every {name} in {left}{low:g}, {high:g}]{unit}, got {_span(plain)}.")
+        raise UnitError(
+            f"{where}: expected every {name} in {left}{low:g}, {high:g}]{unit}, got {plain.min():g} to {plain.max():g}."
+        )
     return numbers
-
-
-def _span(values: Tensor) -> str:
-    least, most = float(values.min()), float(values.max())
-    return f"{least:g}" if least == most else f"{least:g} to {most:g}"
 
 
 def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:

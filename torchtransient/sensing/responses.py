@@ -214,6 +214,7 @@ def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
 
 
 WithinBin = Literal["uniform", "center"]
+Core = tuple[Tensor, Tensor]  # delay and standard deviation of a normal part, in seconds
 
 _OUTSIDE = 1e-9  # share of a response that a kernel may leave out on each side before it is normalised
 _MOST_BINS = 1 << 24  # more is a unit gone wrong or a width that ran away, and takes all memory
@@ -419,14 +420,18 @@ class GaussianResponse(Response):
         """Standard deviation, in seconds."""
         return self.fwhm_s / FWHM_PER_SIGMA
 
-    def cdf(self, time_s: Tensor) -> Tensor:
-        return normal_cdf((time_s - self.delay_s) / self.sigma_s)
+    # `core` is another delay and standard deviation, of this response and other normal ones together
 
-    def survival(self, time_s: Tensor) -> Tensor:
-        return normal_cdf((self.delay_s - time_s) / self.sigma_s)
+    def cdf(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        return normal_cdf((time_s - delay) / sigma)
 
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        return normal_integrals(time_s, self.delay_s, self.sigma_s)
+    def survival(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        return normal_cdf((delay - time_s) / sigma)
+
+    def integrals(self, time_s: Tensor, core: Core | None = None) -> tuple[Tensor, Tensor]:
+        return normal_integrals(time_s, *(core or (self.delay_s, self.sigma_s)))
 
     def support_s(self) -> tuple[float, float]:
         delay, reach = float(self.delay_s.detach()), _SIGMAS * float(self.sigma_s.detach())
@@ -541,52 +546,26 @@ class TailedResponse(Response):
 
     def _mix(self, time_s: Tensor, core: Tensor, tail: Tensor) -> Tensor:
         shares = self.fraction_logits.double().softmax(0)
-        weights = shares[1:] if self.has_core else shares
-        mixed = (weights * tail).sum(-1)
+        mixed = (self.fractions * tail).sum(-1)
         return mixed + shares[0] * core if self.has_core else mixed
 
-    def cdf(self, time_s: Tensor) -> Tensor:
-        return self.widened_cdf(time_s, self.delay_s, self.sigma_s)
+    # `core` as in `GaussianResponse`
 
-    def survival(self, time_s: Tensor) -> Tensor:
-        return self.widened_survival(time_s, self.delay_s, self.sigma_s)
+    def cdf(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        tail = emg_cdf(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        return self._mix(time_s, normal_cdf((time_s - delay) / sigma), tail)
 
-    def widened_cdf(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`cdf` with another delay and core, of this response and normal ones together.
+    def survival(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        tail = emg_survival(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        return self._mix(time_s, normal_cdf((delay - time_s) / sigma), tail)
 
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        tail = emg_cdf(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((time_s - delay_s) / sigma_s), tail)
-
-    def widened_survival(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`survival` with another delay and core.
-
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        tail = emg_survival(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((delay_s - time_s) / sigma_s), tail)
-
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.widened_integrals(time_s, self.delay_s, self.sigma_s)
-
-    def widened_integrals(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> tuple[Tensor, Tensor]:
-        """`integrals` with another delay and core.
-
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        core = normal_integrals(time_s, delay_s, sigma_s)
-        tail = emg_integrals(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        below, above = (self._mix(time_s, c, t) for c, t in zip(core, tail, strict=True))
+    def integrals(self, time_s: Tensor, core: Core | None = None) -> tuple[Tensor, Tensor]:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        normal = normal_integrals(time_s, delay, sigma)
+        tail = emg_integrals(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        below, above = (self._mix(time_s, n, t) for n, t in zip(normal, tail, strict=True))
         return below, above
 
     def support_s(self) -> tuple[float, float]:

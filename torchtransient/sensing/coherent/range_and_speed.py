@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,20 +23,9 @@ _OFFSETS = 257
 _SAME_BIN = 1e-6
 
 
-class HasBeats(Protocol):
-    """`RenderOutput`, `Result` of a file: ``beats`` with ``chirps`` and ``axis``."""
-
-    @property
-    def beats(self) -> Tensor | None: ...
-    @property
-    def chirps(self) -> Chirps | None: ...
-    @property
-    def axis(self) -> TimeAxis | None: ...
-
-
 @in_single
 def range_and_speed(
-    beats: Tensor | HasBeats,
+    beats: Any,
     chirps: Chirps | None = None,
     axis: TimeAxis | None = None,
     *,
@@ -51,7 +40,8 @@ def range_and_speed(
     1 / 150 where it is four.
 
     Args:
-        beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some.
+        beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some
+            (`RenderOutput`, `Result` of a file).
         chirps: the chirps; None for those of a result.
         axis: axis over ``opl +- k rate``; likewise.
         bins: "sums" over the width of a bin, as films make them (``temporal_filter="box"``), or "samples" of the
