@@ -223,7 +223,8 @@ def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) 
             raise UnitError(f"{where}: expected {name} to be finite and >= 0, got other numbers.")
         tensors.append(tensor)
     # of their own memory, as forward derivatives want it
-    return tuple(t.clone(memory_format=torch.contiguous_format) for t in torch.broadcast_tensors(*tensors))
+    together = torch.broadcast_tensors(*tensors)  # type: ignore[no-untyped-call]
+    return tuple(t.clone(memory_format=torch.contiguous_format) for t in together)
 
 
 def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:

@@ -41,10 +41,10 @@ def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None) -> Ph
         return deepinverse.SensorPhysics(sensor)
     size = tuple(int(n) for n in img_size)
     light = torch.rand((1, *size), generator=torch.Generator().manual_seed(0))
-    error = linearity_error(sensor, light)
-    if error > 1e-4:
+    deviation = linearity_error(sensor, light)
+    if deviation > 1e-4:
         raise UnitError(
-            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {error:.1e} at double "
-            "the light. Leave img_size out for a physics that is not linear."
+            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {deviation:.1e} at "
+            "double the light. Leave img_size out for a physics that is not linear."
         )
     return deepinverse.LinearSensorPhysics(sensor, size)

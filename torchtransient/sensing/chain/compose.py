@@ -58,7 +58,7 @@ def moving_together(stages: Sequence[nn.Module], *, policy: bool) -> tuple[Synch
         The SPAD and the moves, or None.
     """
     spad = stages[0]
-    if not isinstance(spad, SynchronousSPAD) or type(spad) is not SynchronousSPAD or spad.dead_bins is not None:
+    if type(spad) is not SynchronousSPAD or spad.dead_bins is not None:
         return None
     moves: list[MovedCounts] = []
     for stage in stages[1:]:
@@ -366,7 +366,7 @@ class PixelGroups(RandomSensor):
     Raises:
         ShapeError: for other images and for numbers that are no sensor's.
         UnitError: for sensors of different quantities or bins.
-        GradientError: for a `variance` or `log_prob` that a sensor has not.
+        GradientError: for a `variance` or `log_prob` that a random sensor has not.
     """
 
     which: Tensor
@@ -443,12 +443,12 @@ class PixelGroups(RandomSensor):
         places = [(s, (flat == i).nonzero().squeeze(-1)) for i, s in enumerate(self.sensors)]
         return [(s, place) for s, place in places if isinstance(s, Sensor) and place.numel()]
 
-    def _measured(self, x: Tensor, measure: Callable[[Sensor, Tensor], Tensor]) -> Tensor:
-        """Measure the pixels of each sensor, and put them together again."""
+    def _measured(self, x: Tensor, measure: Callable[..., Tensor], *others: Tensor) -> Tensor:
+        """Measure the pixels of each sensor, and of other images, and put them together again."""
         parts, places = [], []
         for sensor, place in self._apart(x):
-            own = x.flatten(-2).index_select(-1, place).unsqueeze(-2)
-            parts.append(measure(sensor, own).squeeze(-2))
+            own = [image.flatten(-2).index_select(-1, place).unsqueeze(-2) for image in (x, *others)]
+            parts.append(measure(sensor, *own).squeeze(-2))
             places.append(place)
         return self._together(parts, places)
 
@@ -467,7 +467,7 @@ class PixelGroups(RandomSensor):
         Args:
             x: light (..., C, T, H, W).
         """
-        return self._measured(x, lambda sensor, own: sensor.probabilities(own))  # type: ignore[operator]
+        return self._measured(x, lambda sensor, own: sensor.probabilities(own))
 
     def expected(self, x: Tensor) -> Tensor:
         return self._measured(x, mean_of)
@@ -493,14 +493,7 @@ class PixelGroups(RandomSensor):
             return self._measured(x, lambda sensor, own: draw_of("sample", sensor, own, generator))
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        parts, places = [], []
-        for sensor, place in self._apart(x):
-            if not draws(sensor):
-                raise GradientError(f"PixelGroups.log_prob: expected random sensors, got {type(sensor).__name__}.")
-            seen, own = (v.flatten(-2).index_select(-1, place).unsqueeze(-2) for v in (measurement, x))
-            parts.append(sensor.log_prob(seen, own).squeeze(-2))  # type: ignore[operator]
-            places.append(place)
-        return self._together(parts, places)
+        return self._measured(x, lambda sensor, own, seen: sensor.log_prob(seen, own), measurement)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Measure light, every sensor under its own policy and with the same generator in turn.

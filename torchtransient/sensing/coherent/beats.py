@@ -212,6 +212,7 @@ class CoherentReceiver(_Averaged):
     """
 
     gives = None  # spectra over bins of their own
+    looks: int
     transform: Tensor
     window: Tensor
 

@@ -256,12 +256,12 @@ def tap_weights(
         ShapeError: for a code of two taps that is no `TwoTapCode`.
     """
     me = "tap_weights"
-    code, phases = _checked(code, frequencies_hz, contrast, calibration, me)
+    code, values, phases = _checked(code, frequencies_hz, contrast, calibration, me)
     if phases.shape[1:] != (1, 1):
         raise UnitError(f"{me}: expected a calibration without maps of pixels, whose weights ItofCorrelation makes.")
     refuse_cut_off(phases, "calibration", me)
     rows = []
-    for f, phase in zip(check_frequencies(frequencies_hz, me), phases.flatten().tolist(), strict=True):
+    for f, phase in zip(values, phases.flatten().tolist(), strict=True):
         rows.append((1 + contrast * code.bin_means(axis.edges_s * f + phase / _TURN)) / code.num_taps)
     return torch.cat(rows)
 
@@ -272,30 +272,17 @@ def _checked(
     contrast: float,
     calibration: ItofCalibration | None,
     me: str,
-) -> tuple[CorrelationCode, Tensor]:
-    """Return the code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
+) -> tuple[CorrelationCode, tuple[float, ...], Tensor]:
+    """Return the code in the direction of its steps, frequencies, and the phases (F, 1, 1) or (F, H, W)."""
     check_number(contrast, "contrast", me, high=1.0)
     known = calibration or ItofCalibration()
-    code = in_direction(check_code(code, me), known.direction)
-    return code, known.phases_rad(check_frequencies(frequencies_hz, me))
-
-
-def check_code(code: CorrelationCode, where: str) -> CorrelationCode:
-    """Return `code` if it tells phase, amplitude and offset apart.
-
-    Args:
-        code: a code.
-        where: name of the caller, for errors.
-
-    Raises:
-        ShapeError: for two taps.
-    """
     if code.num_taps < 3:
         raise ShapeError(
-            f"{where}: expected three taps or more, from which phase, amplitude and offset can be told apart, got "
+            f"{me}: expected three taps or more, from which phase, amplitude and offset can be told apart, got "
             f"{code.num_taps}. Two phase steps suffice for pixels of two taps: TwoTapCode(code)."
         )
-    return code
+    values = check_frequencies(frequencies_hz, me)
+    return in_direction(code, known.direction), values, known.phases_rad(values)
 
 
 @in_single
@@ -364,8 +351,7 @@ def taps_from_phasor(
             f"{me}: expected a complex phasor (..., C, {phasor_axis.num_frequencies}, H, W), got {phasor.dtype} "
             f"{tuple(phasor.shape)}."
         )
-    values = check_frequencies(frequencies_hz, me)
-    code, phases = _checked(code, values, contrast, calibration, me)
+    code, values, phases = _checked(code, frequencies_hz, contrast, calibration, me)
     phases = fitting_pixels(phases, phasor, me)
     kept = code.harmonics if harmonics is None else tuple(sorted({int(h) for h in harmonics} - {0}))
     if kept is None or any(h < 1 for h in kept):
@@ -481,13 +467,12 @@ class ItofCorrelation(Sensor):
         super().__init__()
         me = type(self).__name__
         self.code = code
-        self.frequencies_hz = check_frequencies(frequencies_hz, me)
         self.axis = axis
-        self.contrast = check_number(contrast, "contrast", me, high=1.0)
         self.background_e = check_number(background_e, "background_e", me)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
         self.calibration = calibration
-        self._turned, phases = _checked(code, self.frequencies_hz, self.contrast, calibration, me)
+        self._turned, self.frequencies_hz, phases = _checked(code, frequencies_hz, contrast, calibration, me)
+        self.contrast = float(contrast)
         learnt = () if calibration is None else calibration.learned
         for name in learnt:
             value = getattr(calibration, name)

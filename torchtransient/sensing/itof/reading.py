@@ -222,7 +222,8 @@ def _unit_shapes(code: CorrelationCode, turns: Tensor, centred: bool) -> Tensor:
 def _best_match(unit: Tensor, table: Tensor) -> Tensor:
     """Index of the row of ``table`` (P, N) with the largest product for each of (..., N)."""
     flat = unit.reshape(-1, unit.shape[-1])
-    return torch.cat([(part @ table.T).argmax(-1) for part in flat.split(_CHUNK)]).reshape(unit.shape[:-1])
+    found = [(part @ table.T).argmax(-1) for part in flat.split(_CHUNK)]  # type: ignore[no-untyped-call]
+    return torch.cat(found).reshape(unit.shape[:-1])
 
 
 def one_tap(code: CorrelationCode, readout: str, where: str) -> CorrelationCode:
