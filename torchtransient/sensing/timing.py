@@ -78,7 +78,6 @@ class DetectionJitter(MovedCounts):
     ) -> None:
         super().__init__(grad)
         check_choice(boundary, Boundary, "boundary", "DetectionJitter")
-        check_choice(within_bin, WithinBin, "within_bin", "DetectionJitter")
         self.response = response
         self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "DetectionJitter")
         self.boundary: Boundary = boundary
@@ -149,8 +148,7 @@ class SweepJitter(RandomSensor):
         self._check(x)
         if self.sigma_bins == 0:
             return x
-        reach = math.ceil(6 * self.sigma_bins) + 1
-        lags = torch.arange(-reach, reach + 1, dtype=torch.float64, device=x.device)
+        reach, lags = self._lags(x)
         # Mean of the tent max(0, 1 - |shift - lag|): second difference of the integral of the normal cumulative, on
         # the side where that keeps its digits.
         low = -lags.abs()
@@ -172,14 +170,17 @@ class SweepJitter(RandomSensor):
         items = x.shape[:-4]
         noise = torch.randn((*items, self.sweeps), generator=generator, device=x.device, dtype=torch.float64)
         shifts = (noise * self.sigma_bins).clamp(-6 * self.sigma_bins, 6 * self.sigma_bins)
-        reach = math.ceil(6 * self.sigma_bins) + 1
-        lags = torch.arange(-reach, reach + 1, dtype=torch.float64, device=x.device)
+        reach, lags = self._lags(x)
         weights = (1 - (shifts.unsqueeze(-1) - lags).abs()).clamp(min=0).mean(-2).to(x.dtype)
         result = torch.zeros_like(x)
         for k, lag in enumerate(range(-reach, reach + 1)):
             if bool((weights[..., k] > 0).any()):
                 result = result + weights[..., k].reshape(*items, 1, 1, 1, 1) * shifted(x, lag, self.boundary)
         return result
+
+    def _lags(self, x: Tensor) -> tuple[int, Tensor]:
+        reach = math.ceil(6 * self.sigma_bins) + 1
+        return reach, torch.arange(-reach, reach + 1, dtype=torch.float64, device=x.device)
 
     def _check(self, x: Tensor) -> None:
         check_transient(x, type(self).__name__)
@@ -333,10 +334,9 @@ class PixelSkew(Sensor):
         learnable: bool = False,
     ) -> None:
         super().__init__()
-        where = "PixelSkew"
         self.boundary: Boundary = boundary
-        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
-        self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "PixelSkew")
+        self.delays = _Delays(delay_s, self.bin_width_s, learnable, "PixelSkew")
 
     def expected(self, x: Tensor) -> Tensor:
         return shift_time(x, self.delays.bins(x, "PixelSkew"), boundary=self.boundary)
@@ -374,11 +374,10 @@ class DetectionSkew(MovedCounts):
         grad: GradPolicy = "expected",
     ) -> None:
         super().__init__(grad)
-        where = "DetectionSkew"
-        check_choice(boundary, Boundary, "boundary", where)
+        check_choice(boundary, Boundary, "boundary", "DetectionSkew")
         self.boundary: Boundary = boundary
-        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
-        self.delays = _Delays(delay_s, self.bin_width_s, learnable, where)
+        self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "DetectionSkew")
+        self.delays = _Delays(delay_s, self.bin_width_s, learnable, "DetectionSkew")
 
     def expected(self, x: Tensor) -> Tensor:
         return shift_time(x, self.delays.bins(x, "DetectionSkew"), boundary=self.boundary)
@@ -564,20 +563,8 @@ class TDC(MovedCounts):
             total[:, first - low : first - low + band.shape[1]] += band / self.sliding_scale
         return low, total
 
-    def check_bins(self, x: object) -> None:
-        if isinstance(x, Tensor) and x.ndim >= 4 and x.shape[TIME] != self.num_bins:
-            raise ShapeError(
-                f"TDC: expected T = {self.num_bins} as in code_widths, got {x.shape[TIME]} of {tuple(x.shape)}. Make "
-                "one width for every bin of the light."
-            )
-
-    def _check(self, x: Tensor) -> Tensor:
-        check_transient(x, "TDC")
-        self.check_bins(x)
-        return x
-
     def expected(self, x: Tensor) -> Tensor:
-        bins = self._check(x).shape[TIME]
+        bins = check_transient(x, "TDC").shape[TIME]
         bands = self.bands.to(x.dtype)
         total, periodic = torch.zeros_like(x), self.goes_round
         for b, column in enumerate(bands.view(bins, -1, 1, 1).unbind(1)):
@@ -593,7 +580,6 @@ class TDC(MovedCounts):
         return total
 
     def moves(self, x: Tensor) -> Moves:
-        self._check(x)
         columns = self.bands.double().unbind(1)
         # a true bin t goes to the code t - offset
         shares = [c.roll(self.first + b) for b, c in enumerate(columns)]

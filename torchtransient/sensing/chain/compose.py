@@ -425,12 +425,6 @@ class PixelGroups(RandomSensor):
             if isinstance(part, RandomSensor):
                 part.grad = policy
 
-    def check_bins(self, x: object) -> None:
-        super().check_bins(x)
-        for sensor in self.sensors:
-            if isinstance(sensor, Sensor):
-                sensor.check_bins(x)
-
     def _apart(self, x: Tensor) -> list[tuple[Sensor, Tensor]]:
         """Return sensors with their pixels' places in a flat image."""
         check_transient(x, "PixelGroups")
