@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchtransient import TimeAxis, sensing
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import UnitError
 
 PS, NS = 1e-12, 1e-9
 AXIS = TimeAxis.from_seconds(0.0, 100 * PS, 64)
@@ -47,20 +47,17 @@ def test_parts_stand_in_the_order_of_light():
 
 
 @pytest.mark.parametrize(
-    "changes, error, words",
+    "changes, words",
     [
-        ({"jitter": 60e-12}, ShapeError, "jitter to be Response or DetectionJitter or None"),
-        ({"pulse": sensing.ShotNoise()}, ShapeError, "pulse to be Response or ImpulseResponse"),
-        ({"detector": sensing.ShotNoise()}, ShapeError, "detector to make counts of rates"),
-        ({"converter": WIDTHS}, ShapeError, "converter to be TDC"),
-        ({"budget": None}, ShapeError, "budget to be PhotonBudget"),
-        ({"detector": sensing.SynchronousSPAD(99)}, UnitError, "one number of cycles"),
-        ({"afterpulsing": sensing.Afterpulsing(0.1, 1e-9, 1e-9, axis=AXIS)}, UnitError, "one laser period"),
+        ({"pulse": sensing.ShotNoise()}, "radiance for stage"),
+        ({"detector": sensing.ShotNoise()}, "SynchronousSPAD"),
+        ({"detector": sensing.SynchronousSPAD(99)}, "one number of cycles"),
+        ({"afterpulsing": sensing.Afterpulsing(0.1, 1e-9, 1e-9, axis=AXIS)}, "one laser period"),
     ],
 )
-def test_parts_that_do_not_fit(changes, error, words):
+def test_parts_that_do_not_fit(changes, words):
     given = {"budget": budget(), "detector": sensing.SynchronousSPAD(500), **changes}
-    with pytest.raises(error, match=f"expected .*{words}"):
+    with pytest.raises(UnitError, match=f"expected .*{words}"):
         sensing.counting_chain(**given)
 
 
@@ -69,5 +66,5 @@ def test_afterpulses_once():
     spad = sensing.SynchronousSPAD(500, dead_time_s=10 * NS, axis=AXIS)
     both = sensing.AfterpulsingSPAD(spad, after)
     assert len(sensing.counting_chain(budget(), both).stages) == 2
-    with pytest.raises(ArgumentError, match="afterpulsing=None"):
+    with pytest.raises(UnitError, match="afterpulses of its own"):
         sensing.counting_chain(budget(), both, afterpulsing=after)

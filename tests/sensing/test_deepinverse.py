@@ -93,8 +93,6 @@ def test_a_sensor_that_is_not_linear(deepinv):
     spad = sensing.SynchronousSPAD(7)
     with pytest.raises(UnitError, match=r"linear sensor for img_size=\(1, 12, 2, 3\), got a deviation"):
         sensing.deepinv_physics(spad, (1, 12, 2, 3))
-    unchecked = sensing.deepinv_physics(spad, (1, 12, 2, 3), check=False)
-    assert isinstance(unchecked, LinearPhysics)
     physics = sensing.deepinv_physics(spad)
     assert isinstance(physics, Physics) and not isinstance(physics, LinearPhysics)
     x, v = light(), light(1)
@@ -115,7 +113,7 @@ def test_a_sensor_that_is_not_linear(deepinv):
 
 def test_sizes_that_are_none(deepinv):
     with pytest.raises(ShapeError, match=r"LinearSensorPhysics: expected img_size \(C, T, H, W\), got \(12, 2, 3\)"):
-        sensing.deepinv_physics(camera(), (12, 2, 3), check=False)
+        sensing.deepinv_physics(camera(), (12, 2, 3))
 
 
 def test_without_the_package(monkeypatch):

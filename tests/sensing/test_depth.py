@@ -41,7 +41,6 @@ def test_matched_filter_is_the_likelihood():
 def test_peak_of_the_matched_filter_is_exact_for_normal_pulses(position):
     scores = depth.log_matched_filter(pulse(position), *reversed(GaussianResponse(471e-12).kernel(WIDTH_S)))
     assert abs(float(depth.peak_position(scores)) - position) < 0.01
-    assert float(depth.peak_position(scores, refine=False)) == 0.5 + math.floor(position)
 
 
 def test_positions_of_a_pulse():

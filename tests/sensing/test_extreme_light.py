@@ -84,7 +84,6 @@ def test_no_added_counts_of_what_is_no_count(policy, value):
     "estimate",
     [
         sensing.peak_position,
-        lambda h: sensing.peak_position(h, refine=False),
         lambda h: sensing.ml_position(h, sensing.GaussianResponse(40 * PS), bin_width_s=20 * PS),
         sensing.soft_argmax,
         sensing.center_of_mass,
@@ -93,7 +92,7 @@ def test_no_added_counts_of_what_is_no_count(policy, value):
         lambda h: sensing.multi_return(h, 1, threshold=0.1).position.squeeze(-3),
         lambda h: sensing.coates(h, 1000).rate.sum(-3),
     ],
-    ids=["peak", "bin", "likeliest", "soft", "mass", "mass near", "first", "multi", "coates"],
+    ids=["peak", "likeliest", "soft", "mass", "mass near", "first", "multi", "coates"],
 )
 def test_depth_of_nan_is_nan(estimate):
     found = estimate(with_nan())
@@ -179,7 +178,7 @@ def test_empty_batches_pass():
     axis = tt.TimeAxis.from_seconds(0.0, 20 * PS, 12)
     x = torch.zeros(0, 1, 12, 2, 3)
     for sensor in (
-        sensing.ImpulseResponse(sensing.GaussianResponse(50 * PS), axis, method="fft"),
+        sensing.ImpulseResponse(sensing.GaussianResponse(50 * PS), axis),
         sensing.Afterpulsing(0.05, 90 * PS, 50 * PS, axis=axis),
         sensing.FreeRunningSPAD(10, 70 * PS, axis=axis),
     ):

@@ -179,21 +179,18 @@ FREQUENCIES = (30e6, 70e6)
 LIGHT = torch.rand(2, 1, 70, 3, 4, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
 
 
-@together("within_bin", ["uniform", "center"])
 @together(
     "name, direction",
     [*pairs(["sine2", "sine4", "harmonics", "square2", "square3"], [1, -1]), ("measured4", 1)],
 )
-def test_maps_are_delays_of_the_light(name, direction, within_bin):
+def test_maps_are_delays_of_the_light(name, direction):
     """Taps of every pixel against weights made for that pixel alone, on an axis that begins later by its delay."""
     code = CODES[name]
     gates = sensing.TwoTapCode(code) if code.num_taps == 2 or name == "measured4" else code
     known = sensing.ItofCalibration(
         phase_offset_rad=(0.2, -1.1), direction=direction, phase_map_rad=torch.stack([MAP, 2 * MAP]), depth_map_m=DEPTHS
     )
-    camera = sensing.ItofCorrelation(
-        gates, FREQUENCIES, AXIS, contrast=0.8, background_e=3.0, within_bin=within_bin, calibration=known
-    )
+    camera = sensing.ItofCorrelation(gates, FREQUENCIES, AXIS, contrast=0.8, background_e=3.0, calibration=known)
     found = camera.expected(LIGHT)
     turned = sensing.ReversedCode(code) if direction < 0 else code
     turned = sensing.TwoTapCode(turned) if isinstance(gates, sensing.TwoTapCode) else turned
@@ -202,7 +199,7 @@ def test_maps_are_delays_of_the_light(name, direction, within_bin):
         for k, f in enumerate(FREQUENCIES):
             phase = (0.2, -1.1)[k] + (k + 1) * float(MAP[i, j]) + 4 * math.pi * f * float(DEPTHS[i, j]) / SPEED_OF_LIGHT
             later = TimeAxis(AXIS.start_opl + phase / TURN * SPEED_OF_LIGHT / f, AXIS.bin_width_opl, AXIS.num_bins)
-            rows.append(sensing.tap_weights(turned, f, later, contrast=0.8, within_bin=within_bin))
+            rows.append(sensing.tap_weights(turned, f, later, contrast=0.8))
         wanted = torch.einsum("mt,bct->bcm", torch.cat(rows), LIGHT[..., i, j]) + 3.0 / gates.num_taps
         torch.testing.assert_close(found[..., i, j], wanted, rtol=1e-9, atol=1e-9)
 
@@ -265,10 +262,10 @@ def test_maps_through_a_phasor_image():
     known = sensing.ItofCalibration(phase_offset_rad=0.4, direction=-1, phase_map_rad=MAP, depth_map_m=DEPTHS)
     axis_f = FrequencyAxis.from_hertz([0.0, *FREQUENCIES], start_opl=0.3)
     angle = -TURN * axis_f.per_metre[:, None] * (AXIS.centers_opl - 0.3)
-    phasor = torch.einsum("ft,bcthw->bcfhw", torch.exp(1j * angle), LIGHT.to(torch.complex128))
-    camera = sensing.ItofCorrelation(
-        sensing.TwoTapCode(sensing.sine_code(2)), FREQUENCIES, AXIS, within_bin="center", calibration=known
-    )
+    # light that is spread evenly over its bin
+    kernel = torch.exp(1j * angle) * torch.sinc(axis_f.per_metre * AXIS.bin_width_opl)[:, None]
+    phasor = torch.einsum("ft,bcthw->bcfhw", kernel, LIGHT.to(torch.complex128))
+    camera = sensing.ItofCorrelation(sensing.TwoTapCode(sensing.sine_code(2)), FREQUENCIES, AXIS, calibration=known)
     torch.testing.assert_close(camera.expected_from_phasor(phasor, axis_f), camera.expected(LIGHT))
     with pytest.raises(ShapeError, match=r"\(3, 4\) pixels"):
         camera.expected_from_phasor(phasor[..., :2], axis_f)

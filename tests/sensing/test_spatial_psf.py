@@ -18,7 +18,7 @@ def point(height=15, width=15):
 
 
 def test_gaussian_blur_has_its_width_and_keeps_energy():
-    y = LensBlur(2.0, border="circular", size=13)(point())[0, 0]
+    y = LensBlur(2.0, border="circular")(point())[0, 0]
     i = torch.arange(15, dtype=torch.float64) - 7
     # integrating over pixels adds 1/12
     assert float((y.sum(1) * i**2).sum()) == pytest.approx((2 / FWHM_PER_SIGMA) ** 2 + 1 / 12, rel=1e-3)

@@ -80,7 +80,6 @@ from torchtransient.sensing.itof.depth import depth_of_phase as depth_of_phase
 from torchtransient.sensing.itof.depth import heterodyne_speed as heterodyne_speed
 from torchtransient.sensing.itof.depth import offset_of as offset_of
 from torchtransient.sensing.itof.depth import phase_of as phase_of
-from torchtransient.sensing.itof.depth import phasor_loss as phasor_loss
 from torchtransient.sensing.itof.depth import tap_phasor as tap_phasor
 from torchtransient.sensing.itof.depth import unambiguous_range_m as unambiguous_range_m
 from torchtransient.sensing.itof.depth import unwrap_depth as unwrap_depth

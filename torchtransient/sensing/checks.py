@@ -18,54 +18,23 @@ from torchtransient.checks import MOST, as_number, as_whole, is_one_of, shown, u
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
 
 
-def tensor_of(array: np.ndarray[Any, Any], where: str) -> Tensor:
-    """Make a tensor of an array of numbers.
+def tensor_of(array: np.ndarray[Any, Any]) -> Tensor:
+    """Make a tensor of an array of numbers, on its memory where that can be written to.
 
     Args:
         array: numbers of any byte order, read-only arrays too.
-        where: name of the caller, for errors.
-
-    Returns:
-        A tensor on the memory of the array where that can be written to.
-
-    Raises:
-        UnitError: for arrays without numbers.
     """
-    native = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("=")) if array.dtype.kind != "O" else array
-    try:
-        return torch.from_numpy(native if native.flags.writeable else native.copy())
-    except TypeError as error:
-        raise UnitError(f"{where}: expected numbers as a tensor or an array, got {shown(array)}.") from error
+    native = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+    return torch.from_numpy(native if native.flags.writeable else native.copy())
 
 
-def check_dense(x: Tensor, where: str, name: str = "") -> Tensor:
-    """Return a tensor that is dense.
-
-    Args:
-        x: tensor.
-        where: name of the caller, for errors.
-        name: name of the argument.
-
-    Raises:
-        ShapeError: for a sparse one.
-    """
-    if x.layout != torch.strided:
-        said = f"{name} as a dense tensor" if name else "a dense tensor"
-        raise ShapeError(f"{where}: expected {said}, got {x.layout}. x.to_dense() makes one.")
-    return x
-
-
-def no_arrays(value: Any, where: str) -> Any:
+def no_arrays(value: Any) -> Any:
     """Return a value, or a tensor of an array with dimensions.
 
     Args:
         value: anything.
-        where: name of the caller, for errors.
-
-    Returns:
-        The value itself, or a tensor.
     """
-    return tensor_of(value, where) if isinstance(value, np.ndarray) and value.ndim else value
+    return tensor_of(value) if isinstance(value, np.ndarray) and value.ndim else value
 
 
 def numbers_of(value: Any, name: str, where: str) -> Any:
@@ -111,10 +80,9 @@ def is_dual(value: Tensor) -> bool:
 
 def _cut_off_message(name: str, where: str) -> str:
     return (
-        f"{where}: expected {name} without a gradient, which is not supported here and would be cut off in silence; "
-        f"got a tensor that requires one. Give its value, {name}.detach(), and learn it by learnable=True where "
-        f"{where} has that, or by an nn.Parameter where it takes one; a buffer of a module is learnt by "
-        "torch.func.functional_call(module, {its name: tensor}, (x,))."
+        f"{where}: expected {name} without a gradient, which would be cut off in silence; got a tensor that requires "
+        f"one. Give {name}.detach(); learn it by learnable=True or an nn.Parameter where {where} takes them, or as a "
+        "buffer by torch.func.functional_call."
     )
 
 
@@ -134,15 +102,12 @@ def careful_init(init: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(init)
     def run(self: nn.Module, *args: Any, **keywords: Any) -> None:
         where = type(self).__name__
-        given = [no_arrays(value, where) for value in args]
-        named = {name: no_arrays(value, where) for name, value in keywords.items()}
-        for value in (*given, *named.values()):
-            if isinstance(value, Tensor):
-                check_dense(value, where)
+        given = [no_arrays(value) for value in args]
+        named = {name: no_arrays(value) for name, value in keywords.items()}
         init(self, *given, **named)
         # once, when the whole object is there; private parts are looked at with what they are part of
         if getattr(type(self).__init__, "__wrapped__", None) is init and not where.startswith("_"):
-            names = init.__code__.co_varnames[1:] if hasattr(init, "__code__") else ()
+            names = init.__code__.co_varnames[1:]
             places = {names[i] if i < len(names) else f"argument {i}": value for i, value in enumerate(given)}
             check_kept(self, {**places, **named}, where)
 
@@ -225,7 +190,7 @@ _OTHER_FILMS = (
 
 
 def check_tensor(x: object, where: str) -> Tensor:
-    """Return `x` if it is a dense tensor.
+    """Return `x` if it is a tensor.
 
     Args:
         x: anything; a renderer's output is answered with what to do.
@@ -236,11 +201,11 @@ def check_tensor(x: object, where: str) -> Tensor:
     """
     if not isinstance(x, Tensor):
         raise ShapeError(f"{where}: expected a tensor (..., C, T, H, W), got {not_a_transient(x)}")
-    return check_dense(x, where)
+    return x
 
 
 def check_tensors(where: str, **given: object) -> None:
-    """Check that arguments are dense tensors.
+    """Check that arguments are tensors.
 
     Args:
         where: name of the caller, for errors.
@@ -252,7 +217,6 @@ def check_tensors(where: str, **given: object) -> None:
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise ShapeError(f"{where}: expected {name} as a tensor, got {shown(value)}. torch.as_tensor makes one.")
-        check_dense(value, where, name)
 
 
 def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tuple[Tensor, ...]:
@@ -280,25 +244,6 @@ def reals(where: str, whole: torch.dtype | None = None, **given: object) -> tupl
     return tuple(found)
 
 
-def complex_tensor(where: str, **given: object) -> Tensor:
-    """Return the one argument given, a complex tensor.
-
-    Args:
-        where: name of the caller, for errors.
-        given: the tensor by its name.
-
-    Raises:
-        ShapeError: for anything that is no tensor.
-        UnitError: for real numbers.
-    """
-    check_tensors(where, **given)
-    ((name, value),) = given.items()
-    if not isinstance(value, Tensor) or not value.is_complex():
-        kind = getattr(value, "dtype", None)
-        raise UnitError(f"{where}: expected {name} as complex numbers, got {kind}. torch.complex makes some.")
-    return value
-
-
 def check_broadcast(where: str, **given: Tensor) -> None:
     """Check that tensors broadcast to one shape.
 
@@ -309,11 +254,10 @@ def check_broadcast(where: str, **given: Tensor) -> None:
     Raises:
         ShapeError: if they do not.
     """
-    shapes = [tuple(x.shape) for x in given.values()]
-    ends = [{shape[-k] for shape in shapes if len(shape) >= k} - {1} for k in range(1, max(map(len, shapes)) + 1)]
-    if any(len(sizes) > 1 for sizes in ends):
-        got = " and ".join(map(str, shapes))
-        raise ShapeError(f"{where}: expected {' and '.join(given)} of shapes that broadcast, got {got}.")
+    try:
+        torch.broadcast_shapes(*(x.shape for x in given.values()))  # type: ignore[no-untyped-call]
+    except RuntimeError as error:
+        raise ShapeError(f"{where}: expected {' and '.join(given)} of shapes that broadcast, got: {error}") from None
 
 
 def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
@@ -329,22 +273,6 @@ def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
     found = reals(where, None, **given)
     check_broadcast(where, **dict(zip(given, found, strict=True)))
     return found
-
-
-def number_or_tensor(value: Any, name: str, where: str) -> Any:
-    """Return a finite number as a float, or a tensor of real numbers with its gradient.
-
-    Args:
-        value: number or tensor.
-        name: name of the argument.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for complex numbers, NaN and infinity.
-    """
-    if isinstance(value, Tensor):
-        return reals(where, None, **{name: value})[0]
-    return check_number(value, name, where, low=-math.inf)
 
 
 def check_transient(x: Tensor, where: str) -> Tensor:
@@ -393,16 +321,12 @@ def not_a_transient(x: object) -> str:
     Args:
         x: the object.
     """
-    if x is None:
-        return f"None, which is the transient of a render with another film. {_OTHER_FILMS}"
     if getattr(x, "transient", None) is not None:
         return f"{type(x).__name__}. Give its tensor, out.transient, or put the sensor into Compose([...])."
-    if hasattr(x, "transient"):
-        there = [name for name in ("phasor", "gated", "rates", "beats", "steady") if getattr(x, name, None) is not None]
-        there += [name for name, value in getattr(x, "others", {}).items() if isinstance(value, Tensor)]
-        held = f"holds {', '.join(there)} and no transient" if there else "holds no transient"
-        return f"{type(x).__name__}, which {held}. {_OTHER_FILMS}"
-    return f"{type(x).__name__}."
+    if x is not None and not hasattr(x, "transient"):
+        return f"{type(x).__name__}."
+    there = [name for name in ("phasor", "gated", "rates", "beats", "steady") if getattr(x, name, None) is not None]
+    return f"{type(x).__name__}, which holds no transient, but {', '.join(there) or 'nothing'}. {_OTHER_FILMS}"
 
 
 def check_number(
@@ -423,8 +347,6 @@ def check_number(
         GradientError: for a tensor that requires a gradient, which a float cannot carry.
     """
     refuse_cut_off(value, name, where)
-    if isinstance(value, Tensor):
-        check_dense(value, where, name)
     number = as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
@@ -446,10 +368,9 @@ def one_number(value: Any, name: str, where: str) -> Any:
     Raises:
         UnitError: for anything else.
     """
-    plain = isinstance(value, Tensor) and value.numel() == 1 and value.layout == torch.strided
-    if plain and not value.is_complex() and value.dtype != torch.bool:
+    if isinstance(value, Tensor) and value.numel() == 1 and not value.is_complex():
         return value
-    number = None if plain or getattr(value, "layout", torch.strided) != torch.strided else as_number(value)
+    number = None if isinstance(value, Tensor) else as_number(value)
     if number is None:
         raise UnitError(f"{where}: expected {name} to be one number, got {shown(value)}.")
     return number
@@ -468,14 +389,10 @@ def check_count(value: float, name: str, where: str, *, low: int = 1, most: int 
     Raises:
         UnitError: for fractions, and outside of the range.
     """
-    number = check_number(value, name, where, low=low)
-    if number != int(number):
-        raise UnitError(f"{where}: expected {name} to be a whole number, got {shown(value)}.")
-    whole = as_whole(value)  # all its digits
-    whole = int(number) if whole is None else whole
-    if whole > most:
-        limit = "2^63 - 1" if most == MOST else most
-        raise UnitError(f"{where}: expected {name} to be a whole number of at most {limit}, got {shown(value)}.")
+    number, exact = check_number(value, name, where, low=low), as_whole(value)
+    whole = int(number) if exact is None else exact
+    if (exact is None and whole != number) or whole > most:
+        raise UnitError(f"{where}: expected {name} to be a whole number, at most {most}, got {shown(value)}.")
     return whole
 
 

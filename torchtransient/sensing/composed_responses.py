@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import MOST_MADE, as_whole, is_one_of, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_seconds, reals
 from torchtransient.sensing.responses import (
     CLOSED_BINS,
+    Core,
     GaussianResponse,
     Response,
     TailedResponse,
@@ -20,13 +21,14 @@ from torchtransient.sensing.responses import (
     above_floor,
     integrated_counts,
     kernel_of,
-    normal_cdf,
-    normal_integrals,
     resample_counts,
 )
 from torchtransient.sensing.time_convolution import filter_rows
 
+Align = Literal["center_of_mass", "start"]
+
 _TABLE = 2000  # bins of a response without a closed form
+_FINE = 9  # grid points in a bin, odd
 
 
 class MeasuredResponse(Response):
@@ -57,22 +59,20 @@ class MeasuredResponse(Response):
         bin_width_s: float,
         delay_s: float = 0.0,
         *,
-        align: str = "center_of_mass",
+        align: Align = "center_of_mass",
         floor: float | bool = True,
         learnable: bool = False,
     ) -> None:
         super().__init__(delay_s, learnable)
-        if not isinstance(counts, Tensor) or counts.ndim != 1 or counts.numel() < 2:
-            shape = tuple(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
-            raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {shape}.")
-        if not is_one_of(align, ("center_of_mass", "start")):
-            raise ShapeError(f"MeasuredResponse: expected align 'center_of_mass' or 'start', got {shown(align)}.")
+        check_choice(align, Align, "align", "MeasuredResponse")
         self.bin_width_s = check_seconds(bin_width_s, "bin_width_s", "MeasuredResponse", open_low=True)
         values = reals("MeasuredResponse", torch.float64, counts=counts)[0].detach().double()
+        if values.ndim != 1 or values.numel() < 2:
+            raise ShapeError(f"MeasuredResponse: expected counts (T,) with T >= 2, got {tuple(values.shape)}.")
         if not bool(torch.isfinite(values).all()) or not bool((values.amax() > values.median()) & (values >= 0).all()):
             raise UnitError("MeasuredResponse: expected finite counts >= 0 with a peak above their median.")
         shares = above_floor(values, floor, "MeasuredResponse")
-        self.align = align
+        self.align: Align = align
         if self.learnable:
             # a bin without light starts at e^-30 of the whole, so that it can be learnt at all
             self.register_parameter("share_logits", nn.Parameter(shares.clamp_min(1e-13).log()))
@@ -114,65 +114,44 @@ class ComposedResponse(Response):
     """Independent delays one after another: laser pulse, detector jitter, timing electronics. Variances add.
 
     Normal ones, with at most one `TailedResponse` among them, have a closed form. Others are convolved on a grid finer
-    than the bins, and gathered into bins at the end. The grid keeps the mean and adds a variance of (bin
-    width/oversampling)^2/6 for each; with `within_bin="center"` half of that.
+    than the bins, and gathered into bins at the end. The grid, nine points in a bin, keeps the mean and adds a variance
+    of (bin width/9)^2/6 for each; with `within_bin="center"` half of that.
 
     Args:
         responses: one or more.
-        oversampling: grid points in a bin, odd.
-
-    Raises:
-        ShapeError: for other objects than responses, or an even number.
     """
 
-    def __init__(self, responses: Sequence[Response], *, oversampling: int = 9) -> None:
+    def __init__(self, responses: Sequence[Response]) -> None:
         super().__init__(0.0, learnable=False)
-        responses = several("ComposedResponse", responses, "responses such as GaussianResponse")
-        if len(responses) == 0:
-            raise ShapeError("ComposedResponse: expected at least one response, got none.")
-        wrong = [type(r).__name__ for r in responses if not isinstance(r, Response)]
-        if wrong:
-            raise ShapeError(f"ComposedResponse: expected responses such as GaussianResponse, got {wrong}.")
-        odd = as_whole(oversampling)
-        if odd is None or odd < 1 or odd % 2 == 0 or odd > MOST_MADE:
-            raise ShapeError(f"ComposedResponse: expected oversampling to be odd and >= 1, got {shown(oversampling)}.")
         self.responses = nn.ModuleList(responses)
-        self.oversampling = odd
 
-    def _normal_part(self) -> tuple[TailedResponse | None, Tensor, Tensor] | None:
-        """Return the one tailed response, delay and standard deviation of all cores; None if there are other parts."""
-        parts = list(self.responses)
+    def _closed(self) -> tuple[GaussianResponse | TailedResponse, Core] | None:
+        """Return the tailed response, or a normal one, and the core of all together; None if there are other parts."""
+        parts = [r for r in self.responses if isinstance(r, (GaussianResponse, TailedResponse))]
         tailed = [r for r in parts if isinstance(r, TailedResponse)]
-        if len(tailed) > 1 or not all(isinstance(r, (GaussianResponse, TailedResponse)) for r in parts):
+        if len(tailed) > 1 or len(parts) < len(self.responses):
             return None
-        delay = torch.stack([r.delay_s for r in parts]).sum()  # type: ignore[misc]
-        sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()  # type: ignore[misc]
-        return (tailed[0] if tailed else None), delay, sigma
+        delay = torch.stack([r.delay_s for r in parts]).sum()
+        sigma = torch.stack([r.sigma_s for r in parts]).square().sum().sqrt()
+        return (tailed or parts)[0], (delay, sigma)
 
     def cdf(self, time_s: Tensor) -> Tensor:
         """Without a closed form: from a histogram of 2000 bins, 1e-6 off where the parts are of one size."""
         if len(self.responses) == 1:
             return self.responses[0].cdf(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            return counts_before(shares, width_s, start_s, time_s)
-        tailed, delay, sigma = found
-        return normal_cdf((time_s - delay) / sigma) if tailed is None else tailed.widened_cdf(time_s, delay, sigma)
+        if (closed := self._closed()) is not None:
+            return closed[0].cdf(time_s, closed[1])
+        shares, width_s, start_s = self._table()
+        return counts_before(shares, width_s, start_s, time_s)
 
     def survival(self, time_s: Tensor) -> Tensor:
         if len(self.responses) == 1:
             return self.responses[0].survival(time_s)  # type: ignore[operator, no-any-return]
-        found = self._normal_part()
-        if found is None:
-            shares, width_s, start_s = self._table()
-            # seen from its end, the response runs the other way
-            return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_cdf((delay - time_s) / sigma)
-        above: Tensor = tailed.widened_survival(time_s, delay, sigma)
-        return above
+        if (closed := self._closed()) is not None:
+            return closed[0].survival(time_s, closed[1])
+        shares, width_s, start_s = self._table()
+        # seen from its end, the response runs the other way
+        return counts_before(shares.flip(0), width_s, -(start_s + shares.numel() * width_s), -time_s)
 
     def _table(self) -> tuple[Tensor, float, float]:
         """Return shares (K,) in bins of a width that suits the response, the width, and the start of the first."""
@@ -182,13 +161,8 @@ class ComposedResponse(Response):
         return shares, width_s, (first - 0.5) * width_s
 
     def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor] | None:
-        found = self._normal_part()
-        if found is None:
-            return None
-        tailed, delay, sigma = found
-        if tailed is None:
-            return normal_integrals(time_s, delay, sigma)
-        return tailed.widened_integrals(time_s, delay, sigma)
+        closed = self._closed()
+        return None if closed is None else closed[0].integrals(time_s, closed[1])
 
     def support_s(self) -> tuple[float, float]:
         # the sum of all supports holds all of it, and more
@@ -199,11 +173,11 @@ class ComposedResponse(Response):
         check_choice(within_bin, WithinBin, "within_bin", "ComposedResponse")
         if len(self.responses) == 1:
             return kernel_of(self.responses[0], bin_width_s, within_bin)  # type: ignore[arg-type]
-        if within_bin == "uniform" and self._normal_part() is not None:
+        if within_bin == "uniform" and self._closed() is not None:
             first, last = self._lags(bin_width_s)
             if last - first <= CLOSED_BINS:
                 return super().kernel(bin_width_s)
-        fine = self.oversampling
+        fine = _FINE
         parts = [kernel_of(r, bin_width_s / fine, within_bin) for r in self.responses]  # type: ignore[arg-type]
         first = sum(begin for begin, _ in parts)
         total = functools.reduce(_full_convolution, [weights for _, weights in parts])

@@ -20,19 +20,14 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import function
-from torchtransient.errors import ArgumentError, DeviceError, GradientError, ShapeError, UnitError
-from torchtransient.sensing.checks import TIME, check_count, check_dense, check_time_axis, no_arrays
-from torchtransient.sensing.composed_responses import counts_before
-from torchtransient.sensing.impulse_response import check_response
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.sensing.checks import TIME, check_count, no_arrays
 from torchtransient.sensing.responses import Response
 from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
-UNKNOWNS = ("distance", "signal", "background")
 _DARK = 1e-100  # a rate of that much is none, and its square still a number
 _SAME = 1e-13  # of a variance, what is left when the others are known: two parameters that do the same but for rounding
-_FINE = 32  # parts of a bin, of responses that know their kernel only
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,16 +37,16 @@ class CramerRaoBound(TensorRecord):
     Attributes:
         distance_m: metres one way.
         delay_s: the same as a time there and back.
-        signal: in the unit it was given in, None if known.
-        background: in the unit it was given in, None if known.
-        covariance: (..., P, P) of distance, signal and background, as far as they are unknown, in that order.
+        signal: in the unit it was given in.
+        background: in the unit it was given in.
+        covariance: (..., 3, 3) of distance, signal and background.
     """
 
     distance_m: Tensor
     _: KW_ONLY
     delay_s: Tensor
-    signal: Tensor | None
-    background: Tensor | None
+    signal: Tensor
+    background: Tensor
     covariance: Tensor
 
 
@@ -79,13 +74,9 @@ def return_rates(
         (..., T) float64. ``.movedim(-1, -3)`` of pixels (..., C, H, W) is what sensors take.
 
     Raises:
-        ShapeError: for shapes that do not broadcast.
         UnitError: for negative numbers.
     """
-    where = "return_rates"
-    check_response(response, where)
-    check_time_axis(axis, where)
-    distance, light, dark = _pixels((distance_m, signal, background), response, where)
+    distance, light, dark = _pixels((distance_m, signal, background), response, "return_rates")
     return light.unsqueeze(-1) * _shares(response, axis, distance) + dark.unsqueeze(-1)
 
 
@@ -97,7 +88,6 @@ def crlb(
     signal: Tensor | float,
     background: Tensor | float = 0.0,
     cycles: int | None = None,
-    unknown: Sequence[str] = UNKNOWNS,
 ) -> CramerRaoBound:
     """Cramer-Rao bound of distance, signal and background of the return of `return_rates`, for each pixel.
 
@@ -116,46 +106,34 @@ def crlb(
         cycles: None for Poisson counts; signal and background are expected detections of the whole exposure. N for the
             first photon of each of N cycles, with pile-up; they are rates per cycle of a detector that is never dead,
             as `first_photon_nll` and `SynchronousSPAD` take them.
-        unknown: estimated together, of "distance" (always), "signal" and "background"; what is known narrows the rest.
 
     Raises:
-        ShapeError: for shapes that do not broadcast.
         UnitError: for negative numbers.
-        ArgumentError: for other unknowns.
-        DeviceError: for tensors on another device than the response.
     """
-    where = "crlb"
-    check_response(response, where)
-    check_time_axis(axis, where)
-    names = _check_unknown(unknown, where)
-    number = None if cycles is None else check_count(cycles, "cycles", where)
-    distance, light, dark = _pixels((distance_m, signal, background), response, where)
+    number = None if cycles is None else check_count(cycles, "cycles", "crlb")
+    distance, light, dark = _pixels((distance_m, signal, background), response, "crlb")
     both = torch.func.jvp(lambda d: _shares(response, axis, d), (distance,), (torch.ones_like(distance),))
     shares, change = both[0], both[1]
     light = light.unsqueeze(-1)
     rates = (light * shares + dark.unsqueeze(-1)).clamp_min(_DARK)
-    slopes = dict(zip(UNKNOWNS, (light * change, shares, torch.ones_like(shares)), strict=True))
-    each = torch.stack([slopes[name] for name in names], -1)
+    each = torch.stack([light * change, shares, torch.ones_like(shares)], -1)
     weights = 1 / rates
     if number is not None:
         before = rates.cumsum(-1) - rates
         weights = number * torch.exp(-before - rates) / -torch.expm1(-rates)
     dtype = _floating((distance_m, signal, background))
     covariance = _inverse(torch.einsum("...ti,...t,...tj->...ij", each, weights, each))
-    deviations = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    found = {name: deviations[..., i].to(dtype) for i, name in enumerate(names)}
+    own, of_signal, of_background = covariance.diagonal(dim1=-2, dim2=-1).sqrt().unbind(-1)
     return CramerRaoBound(
-        distance_m=found["distance"],
-        delay_s=(deviations[..., 0] * 2 / SPEED_OF_LIGHT).to(dtype),
-        signal=found.get("signal"),
-        background=found.get("background"),
+        distance_m=own.to(dtype),
+        delay_s=(own * 2 / SPEED_OF_LIGHT).to(dtype),
+        signal=of_signal.to(dtype),
+        background=of_background.to(dtype),
         covariance=covariance.to(dtype),
     )
 
 
-def covariance_bound(
-    mean: Callable[..., Tensor], parameters: Sequence[Tensor], *, cycles: int | None = None
-) -> Tensor:
+def covariance_bound(mean: Callable[..., Tensor], parameters: Sequence[Tensor], *, cycles: int | None = None) -> Tensor:
     """Least covariance of unbiased estimates of P parameters of any chain's mean.
 
     Derivatives by forward mode, one call each. float64 parameters are advised; differentiable as far as the chain is
@@ -177,13 +155,8 @@ def covariance_bound(
     Raises:
         ShapeError: for other shapes.
         UnitError: for negative means, and more detections than cycles.
-        GradientError: for a chain without forward derivatives.
     """
-    where = "covariance_bound"
-    given = tuple(parameters) if isinstance(parameters, Sequence) else ()
-    function(f"{where}: mean", mean, "the parameters")
-    if not given or any(not isinstance(p, Tensor) or not p.is_floating_point() for p in given):
-        raise ShapeError(f"{where}: expected one or more floating tensors (..., C, H, W) as parameters.")
+    where, given = "covariance_bound", tuple(parameters)
     number = None if cycles is None else check_count(cycles, "cycles", where)
     slopes = []
     for i, parameter in enumerate(given):
@@ -191,10 +164,7 @@ def covariance_bound(
         def one(p: Tensor, i: int = i) -> Tensor:
             return mean(*given[:i], p, *given[i + 1 :])
 
-        try:
-            both = torch.func.jvp(one, (parameter,), (torch.ones_like(parameter),))
-        except (RuntimeError, NotImplementedError) as error:
-            raise GradientError(f"{where}: expected a mean with derivatives in forward mode, got: {error}") from error
+        both = torch.func.jvp(one, (parameter,), (torch.ones_like(parameter),))
         value, slope = both[0], both[1]
         if value.ndim < 4 or (*value.shape[:TIME], *value.shape[TIME + 1 :]) != tuple(parameter.shape):
             raise ShapeError(
@@ -220,30 +190,7 @@ def covariance_bound(
 def _shares(response: Response, axis: TimeAxis, distance: Tensor) -> Tensor:
     """Share of a return at `distance` in each bin, (..., T)."""
     edges = axis.edges_s.to(distance.device) - distance.unsqueeze(-1) * (2 / SPEED_OF_LIGHT)
-    return shares_between(response, edges, axis.bin_width_s)
-
-
-def shares_between(response: Response, edges_s: Tensor, bin_width_s: float) -> Tensor:
-    """Share of a response, of light at one known time, between edges.
-
-    Args:
-        response: impulse response.
-        edges_s: (..., K + 1) in seconds.
-        bin_width_s: width of the bins, for responses without a distribution function.
-
-    Returns:
-        (..., K).
-    """
-    if type(response).cdf is Response.cdf:
-        width = bin_width_s / _FINE
-        first, kernel = response.kernel(width)
-        found = counts_before(kernel, width, (first - 0.5) * width, edges_s).diff(dim=-1)
-    else:
-        below, above = response.cdf(edges_s), response.survival(edges_s)
-        # differences of what is small: tails keep their relative precision
-        late = (below > 0.5)[..., :-1]
-        found = torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
-    return found.clamp_min(0)  # rounding
+    return response.mass(edges)
 
 
 def _inverse(information: Tensor) -> Tensor:
@@ -267,47 +214,23 @@ def _inverse(information: Tensor) -> Tensor:
 
 def _pixels(values: tuple[Tensor | float, ...], response: Response, where: str) -> tuple[Tensor, ...]:
     """Distance, signal and background of every pixel, float64, of one shape, on the device of the response."""
-    names = ("distance_m", "signal", "background")
     tensors = []
-    for name, given in zip(names, values, strict=True):
-        value = no_arrays(given, where)
-        if isinstance(value, bool) or not isinstance(value, (Tensor, int, float)):
-            raise UnitError(f"{where}: expected {name} to be a number or a tensor, got {type(value).__name__}.")
-        value = check_dense(value, where, name) if isinstance(value, Tensor) else float(value)
-        device = response.delay_ps.device
-        tensor = torch.as_tensor(value, device=None if isinstance(value, Tensor) and value.ndim else device)
-        if tensor.device != device:
-            raise DeviceError(
-                f"{where}: expected {name} on the device of the response, got {tensor.device} and {device}. Move the "
-                "response with .to(device)."
-            )
-        if tensor.is_complex() or tensor.dtype == torch.bool:
-            raise UnitError(f"{where}: expected {name} of real numbers, got {tensor.dtype}.")
-        tensor = tensor.to(torch.float64)
+    for name, given in zip(("distance_m", "signal", "background"), values, strict=True):
+        # a number stands on the device of the response; a tensor that does not is torch's error
+        own = None if isinstance(given, Tensor) and given.ndim else response.delay_ps.device
+        tensor = torch.as_tensor(no_arrays(given), device=own).to(torch.float64)
         if not bool((torch.isfinite(tensor) & (tensor >= 0)).all()):
             raise UnitError(f"{where}: expected {name} to be finite and >= 0, got other numbers.")
         tensors.append(tensor)
-    try:
-        shape = torch.broadcast_shapes(*(t.shape for t in tensors))  # type: ignore[no-untyped-call]
-        # of their own memory, as forward derivatives want it
-        return tuple(t.expand(shape).clone(memory_format=torch.contiguous_format) for t in tensors)
-    except RuntimeError:
-        shapes = ", ".join(str(tuple(t.shape)) for t in tensors)
-        raise ShapeError(f"{where}: expected {', '.join(names)} that broadcast, got {shapes}.") from None
+    # of their own memory, as forward derivatives want it
+    together = torch.broadcast_tensors(*tensors)  # type: ignore[no-untyped-call]
+    return tuple(t.clone(memory_format=torch.contiguous_format) for t in together)
 
 
 def _floating(values: tuple[Tensor | float, ...]) -> torch.dtype:
     """The dtype of the most precise tensor, float32 at least; torch's default without one."""
-    tensors = [no_arrays(value, "crlb") for value in values]
+    tensors = [no_arrays(value) for value in values]
     dtypes = [v.dtype for v in tensors if isinstance(v, Tensor) and v.is_floating_point()]
     if not dtypes:
         return torch.get_default_dtype()
     return torch.float64 if torch.float64 in dtypes else torch.float32
-
-
-def _check_unknown(unknown: Sequence[str], where: str) -> list[str]:
-    """Return the unknowns in the order of `UNKNOWNS`."""
-    names = [unknown] if isinstance(unknown, str) else list(unknown)
-    if "distance" not in names or not set(names) <= set(UNKNOWNS):
-        raise ArgumentError(f"{where}: expected unknown as 'distance' and any of {UNKNOWNS[1:]}, got {unknown!r}.")
-    return [name for name in UNKNOWNS if name in names]

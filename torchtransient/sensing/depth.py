@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import count
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.sensing.checks import (
@@ -31,17 +30,13 @@ from torchtransient.sensing.checks import (
     check_bins,
     check_count,
     check_number,
-    check_time_axis,
+    check_seconds,
     check_transient,
-    number_or_tensor,
-    one_number,
-    reals,
 )
-from torchtransient.sensing.cramer_rao import shares_between
-from torchtransient.sensing.impulse_response import check_response
-from torchtransient.sensing.responses import Response
+from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
 from torchtransient.tensor_record import TensorRecord
+from torchtransient.units import SPEED_OF_LIGHT
 
 
 @in_single
@@ -71,18 +66,10 @@ def log_matched_filter(
 
     Raises:
         UnitError: unless the ratio is above zero and the kernel holds shares (>= 0).
-        ShapeError: for other shapes.
     """
     me = "log_matched_filter"
     ratio = check_number(signal_to_background, "signal_to_background", me, open_low=True)
-    if not isinstance(kernel, Tensor) or kernel.ndim != 1 or not kernel.numel():
-        shape = tuple(kernel.shape) if isinstance(kernel, Tensor) else type(kernel).__name__
-        raise ShapeError(
-            f"{me}: expected a kernel (K,) with K >= 1, got {shape}. first, kernel = response.kernel(bin_width_s)."
-        )
     check_transient(histogram, me)
-    (kernel,) = reals(me, kernel=kernel)
-    first = count(f"{me}: first", first, None, UnitError)
     if bool((kernel < 0).any()):
         raise UnitError(f"{me}: expected shares >= 0 in the kernel, got {float(kernel.min()):g}.")
     weights = torch.log1p(ratio * kernel.to(histogram.device))
@@ -90,24 +77,22 @@ def log_matched_filter(
 
 
 @in_single
-def peak_position(scores: Tensor, refine: bool = True) -> Tensor:
-    """Position of the largest entry.
+def peak_position(scores: Tensor) -> Tensor:
+    """Position of the largest entry: the top of the parabola through it and its neighbours, within half a bin of it.
 
-    A normal pulse makes the log-matched filter a parabola, so that ``refine`` is exact there; of a histogram itself it
-    is pulled towards the middle of the bin. Differentiable through the parabola only. Without refinement, in the first
-    or last bin and where the three entries are equal, it is the middle of the bin with derivative zero.
+    A normal pulse makes the log-matched filter a parabola, so that it is exact there; of a histogram itself it is
+    pulled towards the middle of the bin. Differentiable through the parabola only. In the first or last bin and where
+    the three entries are equal, it is the middle of the bin with derivative zero.
 
     Args:
         scores: (..., C, T, H, W).
-        refine: take the top of the parabola through the entry and its neighbours, within half a bin of it.
 
     Returns:
         (..., C, H, W) in bins; NaN for scores with NaN.
     """
     check_bins(scores, "peak_position")
     index = scores.argmax(TIME, keepdim=True)
-    middle = index.squeeze(TIME).to(scores.dtype) + 0.5
-    position = middle + _parabola(scores, index).squeeze(TIME) if refine else middle
+    position = index.squeeze(TIME).to(scores.dtype) + 0.5 + _parabola(scores, index).squeeze(TIME)
     # argmax takes NaN for the largest entry; a position from it would look like any other
     return torch.where(scores.gather(TIME, index).squeeze(TIME).isnan(), math.nan, position)
 
@@ -190,12 +175,10 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
         (..., C, H, W) in bins.
     """
     check_bins(scores, "soft_argmax")
-    dtype = scores.dtype
-    scores = scores if dtype.itemsize > 2 else scores.float()
     scale = check_number(temperature, "temperature", "soft_argmax", open_low=True)
     weights = torch.softmax(scores / scale, dim=TIME)
     middle = scores.shape[TIME] / 2
-    return ((weights * (_positions(scores) - middle)).sum(TIME) + middle).to(dtype)
+    return (weights * (_positions(scores) - middle)).sum(TIME) + middle
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,8 +240,6 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     """
     me = "multi_return"
     check_bins(scores, me)
-    threshold = one_number(threshold, "threshold", me)
-    check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
     # NaN is no maximum anywhere: a histogram with one has no returns that could be told
     unknown = scores.isnan().any(TIME, keepdim=True)
@@ -298,8 +279,6 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     Returns:
         Metres.
     """
-    check_time_axis(axis, "distance_of_position")
-    (position,) = reals("distance_of_position", position=position)
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
@@ -320,14 +299,12 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     Raises:
         ShapeError: for other shapes.
     """
-    distance_m, intrinsics = reals("distance_to_points", distance_m=distance_m, intrinsics=intrinsics)
-    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim not in (2, 3):
-        raise ShapeError(f"distance_to_points: expected intrinsics (3, 3) or (B, 3, 3), got {tuple(intrinsics.shape)}.")
     batched = intrinsics.ndim == 3
-    if distance_m.ndim < 2 or (batched and (distance_m.ndim != 3 or distance_m.shape[0] != intrinsics.shape[0])):
+    fits = not batched or (distance_m.ndim == 3 and distance_m.shape[0] == intrinsics.shape[0])
+    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim > 3 or not fits:
         raise ShapeError(
-            f"distance_to_points: expected distances (..., H, W), with (B, 3, 3) intrinsics (B, H, W), got "
-            f"{tuple(distance_m.shape)} and {tuple(intrinsics.shape)}."
+            f"distance_to_points: expected distances (..., H, W) and intrinsics (3, 3), or (B, H, W) and (B, 3, 3), "
+            f"got {tuple(distance_m.shape)} and {tuple(intrinsics.shape)}."
         )
     from kornia.geometry.depth import depth_to_3d_v2
 
@@ -347,29 +324,21 @@ def range_deviation_m(response_fwhm_s: float, detections: Tensor) -> Tensor:
 
     Args:
         response_fwhm_s: full width at half maximum of the pulse in seconds.
-        detections: expected signal detections, any shape; infinite deviation at zero.
+        detections: expected signal detections, any shape; infinite deviation at zero, NaN below.
 
     Returns:
         Metres.
 
     Raises:
-        UnitError: for negative detections.
+        UnitError: for widths that are no seconds.
     """
-    from torchtransient.sensing.responses import FWHM_PER_SIGMA
-    from torchtransient.units import SPEED_OF_LIGHT
-
-    if isinstance(detections, Tensor):
-        (detections,) = reals("range_deviation_m", detections=detections)
-    if not isinstance(detections, Tensor) or bool((detections < 0).any()):
-        got = "negative ones" if isinstance(detections, Tensor) else type(detections).__name__
-        raise UnitError(f"range_deviation_m: expected a tensor of detections >= 0, got {got}. Give expected numbers.")
-    width = check_number(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True, high=1e-3)
+    width = check_seconds(response_fwhm_s, "response_fwhm_s", "range_deviation_m", open_low=True)
     return 0.5 * SPEED_OF_LIGHT * width / FWHM_PER_SIGMA / detections.sqrt()
 
 
 def _per_pixel(value: Tensor | float, histogram: Tensor, where: str, name: str) -> Tensor:
     """Broadcast a number, or one for each pixel (..., C, H, W), to a histogram."""
-    value = number_or_tensor(value, name, where)
+    value = value if isinstance(value, Tensor) else check_number(value, name, where, low=-math.inf)
     if not isinstance(value, Tensor) or value.ndim == 0:
         return torch.as_tensor(value, dtype=histogram.dtype, device=histogram.device)
     wanted = (*histogram.shape[:TIME], *histogram.shape[TIME + 1 :])
@@ -428,7 +397,6 @@ def ml_position(
     """
     where = "ml_position"
     check_bins(histogram, where)
-    check_response(response, where)
     width = bin_width_of(axis, bin_width_s, where)
     bins = histogram.shape[TIME]
     if axis is not None and axis.num_bins != bins:
@@ -444,7 +412,7 @@ def ml_position(
     low, high = max(first - _AROUND, -bins), min(first + kernel.numel() + _AROUND, bins)
     places = torch.arange(-_AROUND * _STEPS, (1 + _AROUND) * _STEPS + 1, device=rows.device) / _STEPS
     edges = (torch.arange(low, high + 1, device=rows.device) - places.double().unsqueeze(-1)) * width
-    table = torch.log1p(ratio * shares_between(response, edges, width))
+    table = torch.log1p(ratio * response.mass(edges))
     reached = start + torch.arange(low, high, device=rows.device)
     inside = (reached >= 0) & (reached < bins)
     seen = torch.where(inside, rows.gather(1, reached.clamp(0, bins - 1)), 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchtransient.checks import unit_of
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import holds
-from torchtransient.sensing.checks import check_dense, check_number, is_dual, no_arrays
+from torchtransient.sensing.checks import check_number, is_dual, no_arrays
 
 
 def check_map(
@@ -33,10 +33,9 @@ def check_map(
         UnitError: outside of the range, and for NaN.
         ShapeError: for one dimension, which could be rows as well as channels.
     """
-    value = no_arrays(value, where)
+    value = no_arrays(value)
     if not isinstance(value, Tensor):
         return check_number(value, name, where, low=low, high=high, open_low=open_low)  # type: ignore[arg-type]
-    check_dense(value, where, name)
     if value.is_complex() or value.dtype == torch.bool:
         raise UnitError(f"{where}: expected {name} as real numbers, got {value.dtype}.")
     if value.ndim == 1:
@@ -50,13 +49,10 @@ def check_map(
     if not holds(inside):
         left = "(" if open_low else "["
         unit = unit_of(name)
-        raise UnitError(f"{where}: expected every {name} in {left}{low:g}, {high:g}]{unit}, got {_span(plain)}.")
+        raise UnitError(
+            f"{where}: expected every {name} in {left}{low:g}, {high:g}]{unit}, got {plain.min():g} to {plain.max():g}."
+        )
     return numbers
-
-
-def _span(values: Tensor) -> str:
-    least, most = float(values.min()), float(values.max())
-    return f"{least:g}" if least == most else f"{least:g} to {most:g}"
 
 
 def keep_map(module: nn.Module, name: str, value: float | Tensor) -> None:
@@ -144,12 +140,7 @@ def pixels_of(value: float | Tensor, x: Tensor, name: str, where: str) -> float 
     pixels = (*x.shape[:-3], *x.shape[-2:])
     trailing = zip(reversed(value.shape), reversed(pixels), strict=False)
     if value.ndim > len(pixels) or any(have not in (1, wanted) for have, wanted in trailing):
-        image = "an image" if value.ndim <= 2 else "pixels (..., C, H, W)"
-        got = pixels[-2:] if value.ndim <= 2 else pixels
-        raise ShapeError(
-            f"{where}: expected {image} {tuple(value.shape)} as in {name}, got {tuple(got)}. Make the map for this "
-            "sensor."
-        )
+        raise ShapeError(f"{where}: expected pixels {tuple(value.shape)} as in {name}, got {pixels}.")
     return value
 
 
@@ -181,13 +172,7 @@ _LARGEST = 1 << 16  # numbers of a stage, above which comparing them takes as lo
 _MOST = 4  # results of a stage, of different arguments
 
 
-class _Seen(NamedTuple):
-    plain: list[tuple[str, Any]]
-    numbers: list[Tensor]
-    result: Any
-
-
-_RESULTS: WeakKeyDictionary[nn.Module, dict[Hashable, _Seen]] = WeakKeyDictionary()
+_RESULTS: WeakKeyDictionary[nn.Module, dict[Hashable, tuple[list[Any], Any]]] = WeakKeyDictionary()
 
 
 def remembered(module: nn.Module, arguments: Hashable, compute: Callable[[], Result]) -> Result:
@@ -210,19 +195,16 @@ def remembered(module: nn.Module, arguments: Hashable, compute: Callable[[], Res
     state = None if _transformed() else _state(module)
     if state is None:
         return compute()
-    plain, numbers = state
     kept = _RESULTS.setdefault(module, {})
-    seen = kept.get(arguments)
-    if seen is not None and seen.plain == plain and _same(seen.numbers, numbers):
-        result: Result = seen.result
-        return result
-    copies = [number.clone() for number in numbers]
+    before, result = kept.get(arguments, (None, None))
+    if before == state:
+        return result  # type: ignore[return-value]
     # a tensor made in inference mode could not be used in training afterwards
     with torch.inference_mode(False), torch.no_grad():
         result = compute()
-    if seen is None and len(kept) >= _MOST:
+    if before is None and len(kept) >= _MOST:
         kept.clear()
-    kept[arguments] = _Seen(plain, copies, result)
+    kept[arguments] = state, result
     return result
 
 
@@ -237,33 +219,24 @@ def _transformed() -> bool:
     )
 
 
-def _state(module: nn.Module) -> tuple[list[tuple[str, Any]], list[Tensor]] | None:
+def _state(module: nn.Module) -> list[Any] | None:
     """Return attributes and numbers of a module and all parts of it; None where they do not determine its results."""
-    plain: list[tuple[str, Any]] = []
-    numbers: list[Tensor] = []
+    found: list[Any] = []
+    watched = torch.is_grad_enabled()
     for part in module.modules():
         if not type(part).__module__.startswith("torchtransient."):
             return None
-        plain.append(("", type(part).__qualname__))
-        for name, value in part.__dict__.items():
-            if name not in _INTERNALS:
-                if not isinstance(value, _PLAIN):
-                    return None
-                plain.append((name, value))
+        attributes = [(name, value) for name, value in part.__dict__.items() if name not in _INTERNALS]
+        if not all(isinstance(value, _PLAIN) for _, value in attributes):
+            return None
+        found += [type(part), *attributes]
         for name, number in (*part._parameters.items(), *part._buffers.items()):
-            if number is not None:
-                plain.append((name, None))
-                numbers.append(number)
-    watched = torch.is_grad_enabled()
-    for number in numbers:
-        if type(number) not in _TENSORS or number.device.type != "cpu" or number.numel() > _LARGEST:
-            return None
-        if is_dual(number) or (watched and number.requires_grad):
-            return None
-    return plain, numbers
-
-
-def _same(before: list[Tensor], now: list[Tensor]) -> bool:
-    if len(before) != len(now):
-        return False
-    return all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(before, now, strict=True))
+            if number is None:
+                continue
+            if type(number) not in _TENSORS or number.device.type != "cpu" or number.numel() > _LARGEST:
+                return None
+            if is_dual(number) or (watched and number.requires_grad):
+                return None
+            # their bytes, so that a number that was changed in place is another one
+            found.append((name, number.dtype, number.detach().flatten().view(torch.uint8).numpy().tobytes()))
+    return found

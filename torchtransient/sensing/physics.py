@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from deepinv.physics import Physics
 
 
-def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, check: bool = True) -> Physics:
+def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None) -> Physics:
     """Make a physics of DeepInverse of a sensor, ``y = physics(x)`` with x (B, C, T, H, W).
 
     With ``img_size``: a `LinearPhysics` with ``A``, ``A_adjoint``, and all that DeepInverse derives from them. ``A`` is
@@ -25,7 +25,6 @@ def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, ch
     Args:
         sensor: sensor or chain.
         img_size: (C, T, H, W) of the light of a linear sensor, or None.
-        check: try the linearity on random light first.
 
     Raises:
         UnitError: for a sensor that fails by more than 1e-4.
@@ -41,16 +40,11 @@ def deepinv_physics(sensor: Sensor, img_size: Sequence[int] | None = None, *, ch
     if img_size is None:
         return deepinverse.SensorPhysics(sensor)
     size = tuple(int(n) for n in img_size)
-    if check:
-        _check_linear(sensor, size)
-    return deepinverse.LinearSensorPhysics(sensor, size)
-
-
-def _check_linear(sensor: Sensor, size: tuple[int, ...]) -> None:
     light = torch.rand((1, *size), generator=torch.Generator().manual_seed(0))
-    error = linearity_error(sensor, light)
-    if error > 1e-4:
+    deviation = linearity_error(sensor, light)
+    if deviation > 1e-4:
         raise UnitError(
-            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {error:.1e} at double "
-            "the light. Leave img_size out for a physics that is not linear."
+            f"deepinv_physics: expected a linear sensor for img_size={size}, got a deviation of {deviation:.1e} at "
+            "double the light. Leave img_size out for a physics that is not linear."
         )
+    return deepinverse.LinearSensorPhysics(sensor, size)

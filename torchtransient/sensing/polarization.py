@@ -14,17 +14,16 @@ polarimeters" (Opt. Express 2011).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchtransient.checks import Numbers, as_number, count, several, shown
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single, product, without_autocast
-from torchtransient.sensing.checks import check_count, check_dense, check_number, check_tensor, reals, refuse_cut_off
+from torchtransient.sensing.checks import check_count, check_number, check_tensor, reals, refuse_cut_off
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.stokes import TRANSIENT_DIM, circular_polarizer, linear_polarizer
 
@@ -35,9 +34,7 @@ POLARSENS_DEG = ((90.0, 45.0), (135.0, 0.0))
 _ROUNDING = 1e-5
 
 
-def linear_analyzers(
-    angles_deg: Numbers, extinction_ratio: float = math.inf, transmission: float = 1.0
-) -> Tensor:
+def linear_analyzers(angles_deg: Numbers, extinction_ratio: float = math.inf, transmission: float = 1.0) -> Tensor:
     """Rows of linear analysers.
 
     Args:
@@ -50,18 +47,11 @@ def linear_analyzers(
 
     Raises:
         UnitError: for numbers out of range.
-        ShapeError: for no angle.
     """
     me = "linear_analyzers"
     share = _extinction(extinction_ratio, me)
     factor = check_number(transmission, "transmission", me, high=1.0)
-    if not isinstance(angles_deg, Iterable) or getattr(angles_deg, "ndim", 1) == 0:
-        raise ShapeError(f"{me}: expected a list of angles, got {shown(angles_deg)}.")
-    if isinstance(angles_deg, Tensor):
-        check_dense(angles_deg, me, "angles_deg")
     angles = [math.radians(check_number(a, "angles_deg", me, low=-360.0, high=360.0)) for a in angles_deg]
-    if not angles:
-        raise ShapeError(f"{me}: expected at least one angle, got none.")
     return factor * linear_polarizer(torch.tensor(angles, dtype=torch.float64), share)[:, 0]
 
 
@@ -100,9 +90,6 @@ def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
         ShapeError: for other shapes.
     """
     _check_stokes(stokes, "analyze")
-    (rows,) = reals("analyze", rows=rows)
-    if rows.ndim != 2 or rows.shape[1] != 4:
-        raise ShapeError(f"analyze: expected rows (A, 4), got {tuple(rows.shape)}.")
     return _by_rows(rows.to(stokes), stokes)
 
 
@@ -120,16 +107,8 @@ def stokes_from(measurements: Tensor, rows: Tensor) -> Tensor:
 
     Returns:
         (..., 4, C, T, H, W).
-
-    Raises:
-        ShapeError: for other shapes.
     """
-    measurements, rows = reals("stokes_from", measurements=measurements, rows=rows)
-    if rows.ndim != 2 or rows.shape[1] != 4 or measurements.ndim < 5 or measurements.shape[-5] != rows.shape[0]:
-        raise ShapeError(
-            f"stokes_from: expected measurements (..., A, C, T, H, W) and rows (A, 4), got "
-            f"{tuple(measurements.shape)} and {tuple(rows.shape)}."
-        )
+    (measurements,) = reals("stokes_from", measurements=measurements)
     inverse = torch.linalg.pinv(rows.double(), rtol=1e-9)
     return _by_rows(inverse.to(measurements), measurements)
 
@@ -157,7 +136,6 @@ def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Raises:
         ShapeError: for another number of components.
     """
-    (stokes,) = reals("unphysical_part", stokes=stokes)
     s0, length = _parts(stokes, dim)
     return (length - s0).clamp_min(0)
 
@@ -179,7 +157,6 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
     Raises:
         ShapeError: for another number of components.
     """
-    (stokes,) = reals("project_physical", stokes=stokes)
     s0, length = _parts(stokes, dim)
     inside = length <= s0
     nearest = ((s0 + length) / 2).clamp_min(0)
@@ -191,8 +168,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
 def _parts(stokes: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """S0 and |S123|, the latter with derivative zero where it is zero."""
-    dim = count("stokes: dim", dim, None, ShapeError)
-    if not -stokes.ndim <= dim < stokes.ndim or stokes.shape[dim] != 4:
+    if stokes.size(dim) != 4:
         raise ShapeError(f"stokes: expected four components along dim={dim}, got shape {tuple(stokes.shape)}.")
     part = stokes.narrow(dim, 1, 3)
     largest = part.detach().abs().amax(dim, keepdim=True)
@@ -225,7 +201,6 @@ class PolarizationMosaic(Sensor):
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = reals("PolarizationMosaic", torch.float64, rows=rows)
         if rows.ndim != 3 or rows.shape[-1] != 4:
             raise ShapeError(f"PolarizationMosaic: expected rows (P, Q, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
@@ -255,8 +230,7 @@ class PolarizationMosaic(Sensor):
         _check_stokes(x, "PolarizationMosaic")
         # No product of matrices, which autocast would round.
         raw = (self.weights(*x.shape[-2:]).to(x)[:, None, None] * x).sum(TRANSIENT_DIM)
-        slack = -_ROUNDING * x.select(TRANSIENT_DIM, 0)
-        return torch.where((raw < 0) & (raw >= slack), 0.0, raw)
+        return _without_rounding(raw, x.select(TRANSIENT_DIM, 0))
 
     def demosaic(self, raw: Tensor) -> Tensor:
         """Light behind each analyser everywhere, interpolated; see `demosaic`.
@@ -295,18 +269,9 @@ def mosaic_rows(
         (P, Q, 4) float64.
 
     Raises:
-        ShapeError: for rows of unequal length.
         UnitError: for numbers out of range.
     """
-    if isinstance(angles_deg, Tensor):
-        check_dense(angles_deg, "mosaic_rows", "angles_deg")
-    rows = angles_deg.tolist() if hasattr(angles_deg, "tolist") else angles_deg
-    if not isinstance(rows, Sequence) or not all(isinstance(line, Sequence) for line in rows):
-        raise ShapeError(f"mosaic_rows: expected rows of angles, got {shown(angles_deg)}.")
-    flat = [a for line in angles_deg for a in line]
-    if not flat or any(len(line) != len(angles_deg[0]) for line in angles_deg):
-        raise ShapeError("mosaic_rows: expected a block of angles with rows of equal length.")
-    return linear_analyzers(flat, extinction_ratio, transmission).reshape(len(angles_deg), -1, 4)
+    return torch.stack([linear_analyzers(line, extinction_ratio, transmission) for line in angles_deg])
 
 
 @in_single
@@ -328,10 +293,7 @@ def demosaic(raw: Tensor, block: tuple[int, int] = (2, 2)) -> Tensor:
         ShapeError: for less than one block.
     """
     (raw,) = reals("demosaic", raw=raw)
-    sizes: list[Any] = several("demosaic: block", block, "numbers of pixels")
-    if len(sizes) != 2:
-        raise ShapeError(f"demosaic: expected block as two numbers of pixels, got {shown(block)}.")
-    p, q = (check_count(size, "block", "demosaic") for size in sizes)
+    p, q = (check_count(size, "block", "demosaic") for size in block)
     if raw.ndim < 4 or raw.shape[-2] < p or raw.shape[-1] < q:
         raise ShapeError(f"demosaic: expected raw light (..., C, T, H >= {p}, W >= {q}), got {tuple(raw.shape)}.")
     h, w = raw.shape[-2:]
@@ -359,24 +321,16 @@ class Analyzers(Sensor):
 
     Args:
         rows: analysers (A, 4).
-
-    Raises:
-        ShapeError: for other shapes.
     """
 
     rows: Tensor
 
     def __init__(self, rows: Tensor) -> None:
         super().__init__()
-        (rows,) = reals("Analyzers", torch.float64, rows=rows)
-        if rows.ndim != 2 or rows.shape[-1] != 4:
-            raise ShapeError(f"Analyzers: expected rows (A, 4), got {tuple(rows.shape)}.")
         self.register_buffer("rows", rows.detach().double())
 
     def expected(self, x: Tensor) -> Tensor:
-        light = analyze(x, self.rows)
-        slack = -_ROUNDING * x.select(TRANSIENT_DIM, 0).unsqueeze(TRANSIENT_DIM)
-        return torch.where((light < 0) & (light >= slack), 0.0, light)
+        return _without_rounding(analyze(x, self.rows), x.select(TRANSIENT_DIM, 0).unsqueeze(TRANSIENT_DIM))
 
     def stokes(self, measurements: Tensor) -> Tensor:
         """Least-squares Stokes vectors of the pictures.
@@ -390,14 +344,18 @@ class Analyzers(Sensor):
         return stokes_from(measurements, self.rows)
 
 
+def _without_rounding(light: Tensor, s0: Tensor) -> Tensor:
+    """Light behind analysers; what rounding has left below zero is zero."""
+    return torch.where((light < 0) & (light >= -_ROUNDING * s0), 0.0, light)
+
+
 def _extinction(extinction_ratio: float, where: str) -> float:
     refuse_cut_off(extinction_ratio, "extinction_ratio", where)
-    ratio = as_number(extinction_ratio)
-    if ratio is None or not ratio >= 1:
+    if not extinction_ratio >= 1:
         raise UnitError(
             f"{where}: expected extinction_ratio >= 1 (power along over power across), got {extinction_ratio!r}."
         )
-    return 1 / ratio
+    return 1 / float(extinction_ratio)
 
 
 def _check_stokes(stokes: Tensor, where: str) -> None:

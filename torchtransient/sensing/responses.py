@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchtransient.checks import Numbers, several
+from torchtransient.checks import Numbers
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.checks import check_choice, check_number, check_seconds, going_together, one_number, reals
+from torchtransient.sensing.checks import check_choice, check_number, check_seconds, reals
 from torchtransient.sensing.parameters import keep_number, remembered
 from torchtransient.sensing.sensor import PhysicalModule
 
@@ -73,12 +73,7 @@ def emg_cdf(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor) -> T
         mean_s: mean of the normal part, in seconds.
         sigma_s: standard deviation of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
     """
-    given = going_together("emg_cdf", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
-    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(u) - _tail_term(u, sigma_s / tau_s)
 
@@ -91,12 +86,7 @@ def emg_survival(time_s: Tensor, mean_s: Tensor, sigma_s: Tensor, tau_s: Tensor)
         mean_s: mean of the normal part, in seconds.
         sigma_s: standard deviation of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
     """
-    given = going_together("emg_survival", time_s=time_s, mean_s=mean_s, sigma_s=sigma_s, tau_s=tau_s)
-    time_s, mean_s, sigma_s, tau_s = given
     u = (time_s - mean_s) / sigma_s
     return normal_cdf(-u) + _tail_term(u, sigma_s / tau_s)
 
@@ -186,7 +176,6 @@ def resample_counts(counts: Tensor, width_s: float, edges_s: Tensor, *, start_s:
     if counts.ndim != 1 or edges_s.ndim != 1 or not counts.numel():
         raise ShapeError(f"{me}: expected counts (T,) of one bin or more and edges_s (K + 1,), got "
                          f"{tuple(counts.shape)} and {tuple(edges_s.shape)}.")  # fmt: skip
-    width_s, start_s = one_number(width_s, "width_s", me), one_number(start_s, "start_s", me)
     cumulative = torch.nn.functional.pad(counts.to(torch.float64).cumsum(0), (1, 0))
     bins = counts.shape[0]
     position = ((edges_s.to(torch.float64) - start_s) / width_s).clamp(0, bins)
@@ -211,9 +200,10 @@ def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
         UnitError: for other floors, and where nothing is left.
     """
     numbers = counts.to(torch.float64)
-    level = floor if isinstance(floor, (bool, np.bool_)) else check_number(floor, "floor", where)
-    if isinstance(level, (bool, np.bool_)):
-        level = float(numbers.median()) if level else 0.0
+    if isinstance(floor, bool):
+        level = float(numbers.median()) if floor else 0.0
+    else:
+        level = check_number(floor, "floor", where)
     clean = (numbers - level).clamp_min(0)
     if not float(clean.sum()) > 0:
         raise UnitError(f"{where}: expected counts above the floor of {level:g}, got none.")
@@ -224,6 +214,7 @@ def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
 
 
 WithinBin = Literal["uniform", "center"]
+Core = tuple[Tensor, Tensor]  # delay and standard deviation of a normal part, in seconds
 
 _OUTSIDE = 1e-9  # share of a response that a kernel may leave out on each side before it is normalised
 _MOST_BINS = 1 << 24  # more is a unit gone wrong or a width that ran away, and takes all memory
@@ -304,17 +295,17 @@ class Response(PhysicalModule):
         return None
 
     def mass(self, edges_s: Tensor) -> Tensor:
-        """Share between consecutive edges, with relative precision in the tails.
+        """Share between consecutive edges, not below 0, with relative precision in the tails.
 
         Shares of bins for light that arrives at one known time; `kernel` is for light that is known to a bin.
 
         Args:
-            edges_s: (K + 1,), in seconds.
+            edges_s: (..., K + 1), in seconds.
 
         Returns:
-            (K,).
+            (..., K).
         """
-        return _between(self.cdf(edges_s), self.survival(edges_s))
+        return _between(self.cdf(edges_s), self.survival(edges_s)).clamp_min(0)  # rounding
 
     def kernel(self, bin_width_s: float, within_bin: WithinBin = "uniform") -> tuple[int, Tensor]:
         """Shares of the light of a bin that arrive some bins later.
@@ -378,20 +369,18 @@ class Response(PhysicalModule):
         weight = torch.from_numpy(0.5 * shares / panels).to(device).repeat(panels)
         edges = torch.arange(first, last + 2, dtype=torch.float64, device=device).unsqueeze(1) - place
         flat = (edges * bin_width_s).flatten()
-        mass = _between(self.cdf(flat).view(edges.shape), self.survival(flat).view(edges.shape))
-        return mass @ weight
+        mass = _between(self.cdf(flat).view(edges.shape).T, self.survival(flat).view(edges.shape).T)
+        return mass.T.contiguous() @ weight
 
 
 def _between(below: Tensor, above: Tensor) -> Tensor:
-    """Differences along dimension 0 of a cumulative distribution, beyond the median of its survival."""
-    late = (below > 0.5)[:-1]
-    return torch.where(late, above[:-1] - above[1:], below[1:] - below[:-1])
+    """Differences of a cumulative distribution, beyond the median of its survival."""
+    late = (below > 0.5)[..., :-1]
+    return torch.where(late, above[..., :-1] - above[..., 1:], below.diff(dim=-1))
 
 
 def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
     """Return `Response.kernel`, from a cache while nothing is learnt.
-
-    A response with a kernel of its own may leave out the argument `within_bin`.
 
     Args:
         response: the response.
@@ -401,11 +390,8 @@ def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> 
     Returns:
         First lag in bins, and shares (K,).
     """
-
-    def kernel() -> tuple[int, Tensor]:
-        return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
-
-    return remembered(response, ("kernel", bin_width_s, within_bin), kernel)
+    key = ("kernel", bin_width_s, within_bin)
+    return remembered(response, key, lambda: response.kernel(bin_width_s, within_bin))
 
 
 class GaussianResponse(Response):
@@ -434,14 +420,18 @@ class GaussianResponse(Response):
         """Standard deviation, in seconds."""
         return self.fwhm_s / FWHM_PER_SIGMA
 
-    def cdf(self, time_s: Tensor) -> Tensor:
-        return normal_cdf((time_s - self.delay_s) / self.sigma_s)
+    # `core` is another delay and standard deviation, of this response and other normal ones together
 
-    def survival(self, time_s: Tensor) -> Tensor:
-        return normal_cdf((self.delay_s - time_s) / self.sigma_s)
+    def cdf(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        return normal_cdf((time_s - delay) / sigma)
 
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        return normal_integrals(time_s, self.delay_s, self.sigma_s)
+    def survival(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        return normal_cdf((delay - time_s) / sigma)
+
+    def integrals(self, time_s: Tensor, core: Core | None = None) -> tuple[Tensor, Tensor]:
+        return normal_integrals(time_s, *(core or (self.delay_s, self.sigma_s)))
 
     def support_s(self) -> tuple[float, float]:
         delay, reach = float(self.delay_s.detach()), _SIGMAS * float(self.sigma_s.detach())
@@ -519,8 +509,6 @@ class TailedResponse(Response):
     ) -> None:
         super().__init__(delay_s, learnable)
         self._hold_log("fwhm_s", fwhm_s)
-        tails_s = several("TailedResponse: tails_s", tails_s, "numbers of seconds")
-        fractions = several("TailedResponse: fractions", fractions, "shares of light")
         if len(tails_s) != len(fractions) or len(tails_s) == 0:
             raise ShapeError(
                 f"TailedResponse: expected as many fractions as tails_s, got {len(fractions)} and {len(tails_s)}."
@@ -558,52 +546,26 @@ class TailedResponse(Response):
 
     def _mix(self, time_s: Tensor, core: Tensor, tail: Tensor) -> Tensor:
         shares = self.fraction_logits.double().softmax(0)
-        weights = shares[1:] if self.has_core else shares
-        mixed = (weights * tail).sum(-1)
+        mixed = (self.fractions * tail).sum(-1)
         return mixed + shares[0] * core if self.has_core else mixed
 
-    def cdf(self, time_s: Tensor) -> Tensor:
-        return self.widened_cdf(time_s, self.delay_s, self.sigma_s)
+    # `core` as in `GaussianResponse`
 
-    def survival(self, time_s: Tensor) -> Tensor:
-        return self.widened_survival(time_s, self.delay_s, self.sigma_s)
+    def cdf(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        tail = emg_cdf(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        return self._mix(time_s, normal_cdf((time_s - delay) / sigma), tail)
 
-    def widened_cdf(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`cdf` with another delay and core, of this response and normal ones together.
+    def survival(self, time_s: Tensor, core: Core | None = None) -> Tensor:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        tail = emg_survival(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        return self._mix(time_s, normal_cdf((delay - time_s) / sigma), tail)
 
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        tail = emg_cdf(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((time_s - delay_s) / sigma_s), tail)
-
-    def widened_survival(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> Tensor:
-        """`survival` with another delay and core.
-
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        tail = emg_survival(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        return self._mix(time_s, normal_cdf((delay_s - time_s) / sigma_s), tail)
-
-    def integrals(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        return self.widened_integrals(time_s, self.delay_s, self.sigma_s)
-
-    def widened_integrals(self, time_s: Tensor, delay_s: Tensor, sigma_s: Tensor) -> tuple[Tensor, Tensor]:
-        """`integrals` with another delay and core.
-
-        Args:
-            time_s: times in seconds.
-            delay_s: delay of the core.
-            sigma_s: standard deviation of the core.
-        """
-        core = normal_integrals(time_s, delay_s, sigma_s)
-        tail = emg_integrals(time_s.unsqueeze(-1), delay_s, sigma_s, self.tails_s)
-        below, above = (self._mix(time_s, c, t) for c, t in zip(core, tail, strict=True))
+    def integrals(self, time_s: Tensor, core: Core | None = None) -> tuple[Tensor, Tensor]:
+        delay, sigma = core or (self.delay_s, self.sigma_s)
+        normal = normal_integrals(time_s, delay, sigma)
+        tail = emg_integrals(time_s.unsqueeze(-1), delay, sigma, self.tails_s)
+        below, above = (self._mix(time_s, n, t) for n, t in zip(normal, tail, strict=True))
         return below, above
 
     def support_s(self) -> tuple[float, float]:

@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import without_autocast
 from torchtransient.sensing.checks import check_choice, check_count, check_number, check_transient, reals
@@ -17,6 +16,7 @@ from torchtransient.sensing.responses import FWHM_PER_SIGMA
 from torchtransient.sensing.sensor import Sensor
 
 _LARGEST = 1 << 15  # points across a PSF, whose square still fits into memory
+_POINTS = 15  # across a pixel of a disc
 Border = Literal["constant", "reflect", "replicate", "circular"]
 
 
@@ -36,22 +36,15 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
         Shape and dtype of `x`.
 
     Raises:
-        ShapeError: for even sizes, or a PSF that reaches further than the picture does where that is needed.
+        ShapeError: for even sizes.
     """
     check_transient(x, "blur_image")
     check_choice(border, Border, "border", "blur_image")
-    (psf,) = reals("blur_image", psf=psf)
     if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
         raise ShapeError(f"blur_image: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
-    height, width = x.shape[-2:]
-    if border in ("reflect", "circular") and (psf.shape[0] // 2 >= height or psf.shape[1] // 2 >= width):
-        raise ShapeError(
-            f"blur_image: expected a picture larger than the half PSF {tuple(psf.shape)}, got {height} x {width}. "
-            "Use border='replicate' or 'constant', or a smaller PSF."
-        )
     from kornia.filters import filter2d
 
-    flat = x.reshape(-1, 1, height, width)
+    flat = x.reshape(-1, 1, *x.shape[-2:])
     work = torch.float32 if x.dtype in (torch.float16, torch.bfloat16) else x.dtype
     # filter2d correlates; a PSF says where the light of one point goes, so it is turned round
     kernel = psf.flip(0, 1).unsqueeze(0).to(work)
@@ -69,7 +62,6 @@ def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
     Returns:
         (size, size) float64.
     """
-    (fwhm_px,) = reals("gaussian_psf", fwhm_px=fwhm_px)
     size = check_count(size, "size", "gaussian_psf", most=_LARGEST)
     sigma = fwhm_px.double() / FWHM_PER_SIGMA
     edges = torch.arange(size + 1, dtype=torch.float64, device=fwhm_px.device) - size / 2
@@ -78,12 +70,11 @@ def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
     return torch.outer(line, line)
 
 
-def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
+def defocus_psf(radius_px: float) -> Tensor:
     """Area-sampled disc, the defocus of a round aperture, sum 1. Not differentiable in the radius.
 
     Args:
-        radius_px: radius in pixels, a tenth and more.
-        oversampling: points across a pixel.
+        radius_px: radius in pixels.
 
     Returns:
         (n, n) float64.
@@ -91,20 +82,12 @@ def defocus_psf(radius_px: float, oversampling: int = 15) -> Tensor:
     Raises:
         UnitError: for radii out of range.
     """
-    radius = check_number(radius_px, "radius_px", "defocus_psf", open_low=True)
-    oversampling = check_count(oversampling, "oversampling", "defocus_psf")
+    radius = check_number(radius_px, "radius_px", "defocus_psf", open_low=True, high=1000.0)
     half = math.ceil(radius - 0.5) if radius > 0.5 else 0
     size = 2 * half + 1
-    if size * oversampling > _LARGEST:
-        raise UnitError(
-            f"defocus_psf: expected a disc of at most {_LARGEST} points across, got a radius of {shown(radius_px)} "
-            f"pixels times oversampling {oversampling}."
-        )
-    fine = (torch.arange(size * oversampling, dtype=torch.float64) + 0.5) / oversampling - size / 2
+    fine = (torch.arange(size * _POINTS, dtype=torch.float64) + 0.5) / _POINTS - size / 2
     inside = (fine[:, None] ** 2 + fine[None, :] ** 2 <= radius**2).double()
-    area = inside.view(size, oversampling, size, oversampling).mean((1, 3))
-    if not float(area.sum()) > 0:
-        raise UnitError(f"defocus_psf: expected a radius of a tenth of a pixel or more, got {radius_px!r}.")
+    area = inside.view(size, _POINTS, size, _POINTS).mean((1, 3))
     return area / area.sum()
 
 
@@ -117,7 +100,6 @@ class SpatialPSF(Sensor):
         learnable: learn the PSF, as logits.
 
     Raises:
-        ShapeError: for even sizes.
         UnitError: for negative values, or none.
     """
 
@@ -127,10 +109,7 @@ class SpatialPSF(Sensor):
 
     def __init__(self, psf: Tensor, border: Border = "reflect", *, learnable: bool = False) -> None:
         super().__init__()
-        check_choice(border, Border, "border", "SpatialPSF")
         (psf,) = reals("SpatialPSF", torch.float64, psf=psf)
-        if psf.ndim != 2 or psf.shape[0] % 2 == 0 or psf.shape[1] % 2 == 0:
-            raise ShapeError(f"SpatialPSF: expected a PSF (h, w) of odd sizes, got {tuple(psf.shape)}.")
         values = psf.detach().double()
         if not bool(torch.isfinite(values).all()) or bool((values < 0).any()) or not float(values.sum()) > 0:
             raise UnitError("SpatialPSF: expected finite values >= 0 with a positive sum.")
@@ -151,34 +130,26 @@ class SpatialPSF(Sensor):
 class LensBlur(Sensor):
     """Gaussian blur of a lens.
 
-    The size of the kernel is fixed when the module is made.
+    The size of the kernel is fixed when the module is made: 2 FWHM (4.7 standard deviations) to each side.
 
     Args:
         fwhm_px: full width at half maximum in pixels.
         border: as of `blur_image`.
-        size: pixels across the kernel, odd; None for 2 FWHM (4.7 standard deviations) to each side.
         learnable: make the logarithm `log_fwhm_px` a parameter.
 
     Raises:
         UnitError: for widths out of range.
-        ShapeError: for an even size.
     """
 
     gives = "the same"
 
     log_fwhm_px: Tensor
 
-    def __init__(
-        self, fwhm_px: float, border: Border = "reflect", *, size: int | None = None, learnable: bool = False
-    ) -> None:
+    def __init__(self, fwhm_px: float, border: Border = "reflect", *, learnable: bool = False) -> None:
         super().__init__()
-        check_choice(border, Border, "border", "LensBlur")
         fwhm = check_number(fwhm_px, "fwhm_px", "LensBlur", open_low=True)
         self.border: Border = border
-        own = 2 * max(1, math.ceil(2 * fwhm)) + 1
-        self.size = own if size is None else check_count(size, "size", "LensBlur", most=_LARGEST)
-        if self.size < 1 or self.size % 2 == 0:
-            raise ShapeError(f"LensBlur: expected an odd size, got {size!r}.")
+        self.size = 2 * max(1, math.ceil(2 * fwhm)) + 1
         value = torch.tensor(math.log(fwhm), dtype=torch.float64)
         keep_number(self, "log_fwhm_px", value, learnable)
 

@@ -10,13 +10,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchtransient.axes import fast_length
-from torchtransient.checks import count
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ShapeError
 from torchtransient.floating import without_autocast
 from torchtransient.sensing.checks import TIME, check_choice, check_transient, reals
 
 Boundary = Literal["zero", "periodic"]
-Method = Literal["auto", "direct", "fft"]
 # Up to here a direct convolution is as fast as the transform, and it keeps the relative precision of faint late bins.
 _DIRECT_TAPS = 192
 # Short kernels over images: whole images are added, shifted in time, which leaves the layout as it is.
@@ -28,14 +26,12 @@ _WIDE = 64  # images at least this large are summed row by row: torch.cumsum str
 
 
 @without_autocast
-def convolve_time(
-    x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero", method: Method = "auto"
-) -> Tensor:
+def convolve_time(x: Tensor, kernel: Tensor, first: int = 0, *, boundary: Boundary = "zero") -> Tensor:
     """Convolve along time: y[t] = sum over j of kernel[j] x[t - first - j].
 
-    "direct" sums in the dtype of `x`. "fft" works in float64, since the rounding of a float32 transform (1e-7 of the
-    largest bin) would drown late bins, and pads to T + K - 1 and more for "zero". Half precision is computed in
-    float32. Differentiable in `x` and `kernel`.
+    Kernels of up to 192 bins are summed in the dtype of `x`. Longer ones are applied by a transform in float64, since
+    the rounding of one in float32 (1e-7 of the largest bin) would drown late bins, padded to T + K - 1 and more for
+    "zero". Half precision is computed in float32. Differentiable in `x` and `kernel`.
 
     Args:
         x: (..., C, T, H, W).
@@ -43,35 +39,30 @@ def convolve_time(
         first: lag of kernel[0] in bins, of either sign.
         boundary: "zero": light that leaves the window is lost, none enters; "periodic": the window is one period, sums
             are conserved.
-        method: "auto" chooses by the length of the kernel.
 
     Returns:
         Shape, dtype and device of `x`.
 
     Raises:
         ShapeError: for wrong layouts or an empty kernel.
-        ArgumentError: for an unknown boundary or method.
+        ArgumentError: for an unknown boundary.
     """
     check_transient(x, "convolve_time")
     check_choice(boundary, Boundary, "boundary", "convolve_time")
-    check_choice(method, Method, "method", "convolve_time")
     (kernel,) = reals("convolve_time", kernel=kernel)
-    first = count("convolve_time: first", first, None, UnitError)
     if kernel.ndim != 1 or kernel.numel() == 0:
         raise ShapeError(f"convolve_time: expected a kernel (K,) with K >= 1, got {tuple(kernel.shape)}.")
     bins, kernel = x.shape[TIME], kernel.to(x.device)
     kernel, first = window_lags(kernel, first, bins, boundary)
     if kernel.numel() == 0:
         return x * 0
-    if method == "auto":
-        method = "direct" if kernel.numel() <= _DIRECT_TAPS else "fft"
     backward = torch.is_grad_enabled() and (x.requires_grad or kernel.requires_grad)
     shifts = _SHIFTED_TAPS_BACKWARD if backward else _SHIFTED_TAPS
-    if method == "direct" and kernel.numel() <= shifts and x.shape[-1] * x.shape[-2] >= _SHIFTED_PIXELS:
+    if kernel.numel() <= shifts and x.shape[-1] * x.shape[-2] >= _SHIFTED_PIXELS:
         return _by_shifts(x, kernel, first, boundary)
     rows = x.movedim(TIME, -1)
-    y = _direct(rows, kernel, first, boundary) if method == "direct" else _by_fft(rows, kernel, first, boundary)
-    return y.movedim(-1, TIME)
+    convolve = _direct if kernel.numel() <= _DIRECT_TAPS else _by_fft
+    return convolve(rows, kernel, first, boundary).movedim(-1, TIME)
 
 
 def window_lags(kernel: Tensor, first: int, bins: int, boundary: Boundary) -> tuple[Tensor, int]:

@@ -169,7 +169,6 @@ CALLS = {
     "phase_noise_rad": (
         {"amplitude": rand(2, 3), "offset": rand(2, 3), "read_noise_e": number(2.0)}, {"num_taps": 4}),
     "phase_of": ({"phasor": PHASOR}, {}),
-    "phasor_loss": ({"phasor": PHASOR, "target": 2 * PHASOR, "weight": rand(2, 2)}, {}),
     "photon_energy_j": ({"wavelength_m": number(5e-7)}, {}),
     "poisson_log_prob": ({"counts": COUNTS, "mean": LIGHT}, {}),
     "project_physical": ({"stokes": STOKES}, {}),
@@ -200,7 +199,7 @@ CALLS = {
     "unambiguous_range_m": ({"frequencies_hz": number(60e6)}, {}),
     "unphysical_part": ({"stokes": STOKES.neg()}, {}),
     "unwrap_depth": (
-        {"phase": rand(1, 2, 2, 2), "frequencies_hz": torch.tensor([80e6, 60e6]).double(), "weights": rand(2),
+        {"phase": rand(1, 2, 2, 2), "frequencies_hz": torch.tensor([80e6, 60e6]).double(),
          "max_depth_m": number(7.0), "min_depth_m": number(0.0)}, {}),
     "wrapped_difference": ({"a": 6 * rand(3), "b": 6 * rand(3, seed=1)}, {}),
 }  # fmt: skip

@@ -40,14 +40,12 @@ def composed():
 ENTRIES = [
     Entry("ImpulseResponse-gaussian", impulse(lambda: sensing.GaussianResponse(50 * PS, learnable=True))),
     Entry("ImpulseResponse-even", impulse(lambda: sensing.UniformResponse(47 * PS, 3 * PS, learnable=True))),
-    Entry("ImpulseResponse-tails", impulse(tails, method="fft")),
+    Entry("ImpulseResponse-tails", impulse(tails)),
     Entry("ImpulseResponse-measured", impulse(measured, boundary="periodic"), conserves=lambda y: y.sum(-3)),
-    Entry(
-        "ImpulseResponse-composed", impulse(composed, boundary="periodic", method="fft"), conserves=lambda y: y.sum(-3)
-    ),
+    Entry("ImpulseResponse-composed", impulse(composed, boundary="periodic"), conserves=lambda y: y.sum(-3)),
     Entry(
         "LensBlur",
-        lambda: sensing.LensBlur(0.8, "circular", size=3, learnable=True),
+        lambda: sensing.LensBlur(0.5, "circular", learnable=True),
         shape=(2, 1, 3, 4, 5),
         conserves=lambda y: y.sum((-1, -2)),
     ),

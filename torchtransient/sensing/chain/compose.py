@@ -8,30 +8,26 @@ counts whose detections move by themselves are multinomial again, with the moved
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
-from torchtransient.checks import several
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing.chain.stages import (
     check_axis,
+    check_chain,
     check_draws,
-    check_order,
-    check_stages,
     check_window,
     draw_of,
     draws,
     ends_of,
+    flat,
     mean_of,
     measurement_of,
-    normal_of,
-    policies_of,
-    unrolled,
 )
-from torchtransient.sensing.checks import TIME, check_generator, check_transient, not_a_transient
+from torchtransient.sensing.checks import TIME, check_transient, not_a_transient
 from torchtransient.sensing.coherent.beats import BeatNoise, CoherentReceiver, Speckle
 from torchtransient.sensing.counts import MovedCounts
 from torchtransient.sensing.draws import sample_multinomial
@@ -51,9 +47,7 @@ from torchtransient.sensing.spad import SynchronousSPAD, multinomial_noise
 from torchtransient.sensing.timing import TDC
 
 
-def moving_together(
-    stages: Sequence[nn.Module], *, policy: bool
-) -> tuple[SynchronousSPAD, list[MovedCounts]] | None:
+def moving_together(stages: Sequence[nn.Module], *, policy: bool) -> tuple[SynchronousSPAD, list[MovedCounts]] | None:
     """Find the SPAD that a chain begins with and the moves behind it, where they can be drawn at once.
 
     Args:
@@ -64,7 +58,7 @@ def moving_together(
         The SPAD and the moves, or None.
     """
     spad = stages[0]
-    if not isinstance(spad, SynchronousSPAD) or type(spad) is not SynchronousSPAD or spad.dead_bins is not None:
+    if type(spad) is not SynchronousSPAD or spad.dead_bins is not None:
         return None
     moves: list[MovedCounts] = []
     for stage in stages[1:]:
@@ -110,7 +104,6 @@ def moved_first_photons(
         generator: source of randomness.
         policy: gradient policy; None for a draw without gradient.
     """
-    check_generator(generator, type(spad).__name__)
     p = moved_probabilities(spad, moves, x)
     if policy == "gaussian":
         return p * spad.cycles + multinomial_noise(p, spad.cycles, generator)
@@ -161,13 +154,12 @@ class Compose(Sensor):
     under one policy: the same distribution, in less time. Orders are checked again when a state is loaded.
 
     Args:
-        stages: sensors, or other modules of one tensor; stages in an ``nn.Sequential`` or an ``nn.ModuleList`` are
-            taken as if they were given one by one.
+        stages: sensors, or other modules of one tensor; sensors in an ``nn.Sequential`` or an ``nn.ModuleList`` are
+            taken one by one.
         grad: gradient policy of every random stage; None leaves them as they are.
 
     Raises:
-        ArgumentError: for no stage, something that is no module, or a module of another kind with random sensors
-            inside, which cannot be drawn.
+        ArgumentError: for a module of another kind with random sensors inside, which cannot be drawn.
         UnitError: where one stage is not made for what those before it give: other bins, another number of cycles,
             another laser period, or another quantity, as the rates of one cycle where the counts of all are meant; and
             for an order in which constant light starves at the ends of the window, or counts are averaged: light's own
@@ -176,19 +168,10 @@ class Compose(Sensor):
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:
         super().__init__()
-        if isinstance(stages, nn.Module) and not isinstance(stages, (nn.Sequential, nn.ModuleList)):
-            raise ArgumentError(
-                f"Compose: expected a list of sensors, got one {type(stages).__name__}. Put it into []."
-            )
-        stages = several("Compose", stages, "sensors", error=ArgumentError)
-        wrong = [type(s).__name__ for s in stages if not isinstance(s, nn.Module)]
-        if not len(stages) or wrong:
-            raise ArgumentError(f"Compose: expected a list of sensors, got {wrong or 'an empty one'}.")
-        check_draws(stages, "Compose")
-        check_order(stages, "Compose")
-        self.stages = nn.ModuleList(stages)
-        self._window_is_open = check_stages(self)
-        self.takes, self.gives = ends_of(stages)  # type: ignore[assignment]
+        self.stages = nn.ModuleList(flat(stages))
+        check_draws(self.stages, "Compose")
+        self._window_is_open = check_chain(self, self.stages)
+        self.takes, self.gives = ends_of(self.stages)  # type: ignore[assignment]
         self.register_load_state_dict_post_hook(_look_again)  # type: ignore[no-untyped-call]
         if grad is not None:
             self.set_grad(grad)
@@ -232,7 +215,7 @@ class Compose(Sensor):
             x: light, or a renderer's output.
             generator: source of randomness.
         """
-        return self._run(x, normal_of, generator, "gaussian")
+        return self._run(x, partial(draw_of, "gaussian"), generator, "gaussian")
 
     def sample(self, x: Any, generator: torch.Generator | None = None) -> Tensor:
         """Draw every random stage, whatever its policy, without gradient.
@@ -242,7 +225,7 @@ class Compose(Sensor):
             generator: source of randomness.
         """
         with torch.no_grad():
-            return self._run(x, draw_of, generator, "draw")
+            return self._run(x, partial(draw_of, "sample"), generator, "draw")
 
     def variance(self, x: Any) -> Tensor:
         """Variance of every entry, for chains whose last stage alone draws.
@@ -254,10 +237,7 @@ class Compose(Sensor):
             GradientError: for other chains: draws of several stages have no closed form; `gaussian` has their
                 covariance.
         """
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = unrolled(self.stages)[used:]
-        if not stages:
-            return torch.zeros_like(y)
+        y, stages = self._opened(x)
         *before, last = stages
         if any(draws(stage) for stage in before):
             raise GradientError(
@@ -287,8 +267,7 @@ class Compose(Sensor):
         Raises:
             GradientError: for other chains: draws of several stages have no closed form.
         """
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = unrolled(self.stages)[used:]
+        y, stages = self._opened(x)
         while stages:
             last, found = stages[0], moving_together(stages, policy=False)
             if found is not None and len(found[1]) == len(stages) - 1:
@@ -313,8 +292,7 @@ class Compose(Sensor):
         at_once: Literal["own", "gaussian", "draw"] | None = None,
     ) -> Tensor:
         """Call `step` for one stage after another; first photons and their moves are measured `at_once`."""
-        y, used = (x, 0) if isinstance(x, Tensor) else self._opened(x)
-        stages = unrolled(self.stages)[used:]
+        y, stages = self._opened(x)
         if self._window_is_open and y.ndim >= 4:
             check_window(self, y.shape[TIME])
         while stages:
@@ -327,21 +305,14 @@ class Compose(Sensor):
             y, stages = moved_first_photons(spad, moves, y, generator, policy), stages[1 + len(moves) :]
         return y
 
-    def _opened(self, output: Any) -> tuple[Tensor, int]:
-        """Return the tensor of a renderer's output, and the number of stages that it has passed already."""
+    def _opened(self, output: Any) -> tuple[Tensor, list[nn.Module]]:
+        """Return a tensor, or that of a renderer's output, and the stages that it has not passed yet."""
+        stages = list(self.stages)
+        if isinstance(output, Tensor):
+            return output, stages
         transient, phasor = getattr(output, "transient", None), getattr(output, "phasor", None)
-        beats = getattr(output, "beats", None)
-        if getattr(output, "gates", None) is not None:
-            raise ShapeError(
-                f"Compose: expected a transient over time, got the images of {len(output.gates)} time gates, which are "
-                "no bins. Render with time_axis=... and gate the transient with GatedIntegration; or, for stages that "
-                "come after a gate, give the tensor itself: chain(out.gated)."
-            )
-        if isinstance(transient, Tensor):
-            self.check_axis(output.axis)
-            return transient, 0
-        first = unrolled(self.stages)[0]
-        if isinstance(beats, Tensor):
+        beats, first = getattr(output, "beats", None), self.stages[0]
+        if isinstance(beats, Tensor) and not isinstance(transient, Tensor):
             if isinstance(first, Sensor) and not isinstance(first, (BeatNoise, CoherentReceiver, Speckle)):
                 raise ShapeError(
                     f"Compose: expected a transient for {type(first).__name__}, got spectra of beats, which are for "
@@ -352,41 +323,26 @@ class Compose(Sensor):
                     "Compose: expected beats without the line of the chirp, which CoherentReceiver makes, got those of "
                     f"{first.chirps}. Render with chirps.longer(16)."
                 )
-            self.check_axis(output.axis)
-            return beats, 0
-        if isinstance(phasor, Tensor) and isinstance(output.frequencies, FrequencyAxis):
-            if isinstance(first, Compose):
-                raise ShapeError("Compose: expected ItofCorrelation as the first stage itself, not in a chain.")
-            if not isinstance(first, ItofCorrelation):
-                raise ShapeError(
-                    f"Compose: expected a transient for {type(first).__name__}, got a phasor image, which "
-                    "ItofCorrelation alone takes, as the first stage. Render with time_axis=... instead of "
-                    "frequencies, or put ItofCorrelation in front."
-                )
-            return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), 1
-        raise ShapeError(
-            "Compose: expected a tensor (..., C, T, H, W) or the output of a renderer with a transient, got "
-            f"{not_a_transient(output)}"
-        )
-
-    def check_axis(self, axis: TimeAxis) -> None:
-        """Check that all stages were made for the bins of an axis.
-
-        Args:
-            axis: axis of the light.
-
-        Raises:
-            UnitError: for other bins, or no axis.
-        """
-        if not isinstance(axis, TimeAxis):
-            raise UnitError(f"Compose: expected the transient's time axis, got {axis!r}. Give the tensor itself.")
-        check_axis(self, axis)
+        if isinstance(found := beats if transient is None else transient, Tensor):
+            check_axis(self, output.axis)
+            return found, stages
+        if not isinstance(phasor, Tensor):
+            raise ShapeError(
+                "Compose: expected a tensor (..., C, T, H, W) or the output of a renderer with a transient, got "
+                f"{not_a_transient(output)}"
+            )
+        if not isinstance(first, ItofCorrelation):
+            raise ShapeError(
+                f"Compose: expected a transient for {type(first).__name__}, got a phasor image, which ItofCorrelation "
+                "alone takes, as the first stage itself, not in a chain. Render with time_axis=... for a transient."
+            )
+        return first.expected_from_phasor(phasor, output.frequencies, steady=output.steady), stages[1:]
 
 
 def _look_again(chain: nn.Module, incompatible: object) -> None:
     """Raise UnitError for a loaded state under which the order no longer holds, such as one with a new background."""
     if isinstance(chain, Compose):
-        check_order(chain.stages, "Compose")
+        check_chain(chain, chain.stages)
 
 
 # ------------------------------------------------------------------------------------------ pixels of different sensors
@@ -410,24 +366,20 @@ class PixelGroups(RandomSensor):
     Raises:
         ShapeError: for other images and for numbers that are no sensor's.
         UnitError: for sensors of different quantities or bins.
-        GradientError: for a `variance` or `log_prob` that a sensor has not.
+        GradientError: for a `variance` or `log_prob` that a random sensor has not.
     """
 
     which: Tensor
 
     def __init__(self, sensors: Sequence[Sensor], which: Tensor, *, grad: GradPolicy | None = None) -> None:
         super(RandomSensor, self).__init__()
-        sensors = several("PixelGroups", sensors, "sensors", error=ArgumentError)
-        wrong = [type(s).__name__ for s in sensors if not isinstance(s, Sensor)]
-        if not len(sensors) or wrong:
-            raise ArgumentError(f"PixelGroups: expected a list of sensors, got {wrong or 'an empty one'}.")
-        if not isinstance(which, Tensor) or which.ndim != 2 or which.is_complex():
-            shape = tuple(which.shape) if isinstance(which, Tensor) else type(which).__name__
-            raise ShapeError(f"PixelGroups: expected which as (H, W) numbers of sensors, got {shape}.")
         numbers = which.long()
         inside = (numbers == which) & (numbers >= 0) & (numbers < len(sensors))
-        if not bool(inside.all()):
-            raise ShapeError(f"PixelGroups: expected numbers of {len(sensors)} sensors, 0 to {len(sensors) - 1}.")
+        if which.ndim != 2 or not bool(inside.all()):
+            raise ShapeError(
+                f"PixelGroups: expected which as (H, W) numbers of {len(sensors)} sensors, 0 to {len(sensors) - 1}, "
+                f"got {tuple(which.shape)}."
+            )
         check_draws(sensors, "PixelGroups")
         self.sensors = nn.ModuleList(sensors)
         self.register_buffer("which", numbers)
@@ -451,10 +403,7 @@ class PixelGroups(RandomSensor):
 
         Raises:
             UnitError: for more values.
-            ShapeError: for other shapes.
         """
-        if not isinstance(values, Tensor) or values.ndim != 2:
-            raise ShapeError("PixelGroups.by_value: expected a map (H, W), got something else.")
         different, which = torch.unique(values.double(), return_inverse=True)
         if different.numel() > _MOST_GROUPS:
             raise UnitError(
@@ -465,25 +414,16 @@ class PixelGroups(RandomSensor):
 
     @property
     def grad(self) -> GradPolicy:
-        """The policy of all random sensors. GradientError where they have different ones."""
-        policies = policies_of(self)
-        if len(policies) > 1:
-            raise ArgumentError(f"PixelGroups: expected one policy of all sensors, got {sorted(policies)}. Set grad.")
-        return policies.pop() if policies else "expected"
+        """Policy of the first random sensor; set, that of all of them."""
+        return next((part.grad for part in self.sensors.modules() if isinstance(part, RandomSensor)), "expected")
 
     @grad.setter
     def grad(self, value: GradPolicy) -> None:
-        """Policy of all random sensors. ArgumentError where they have different ones."""
+        """Policy of all random sensors."""
         policy = check_policy(value, "PixelGroups")
         for part in self.sensors.modules():
             if isinstance(part, RandomSensor):
                 part.grad = policy
-
-    def check_bins(self, x: object) -> None:
-        super().check_bins(x)
-        for sensor in self.sensors:
-            if isinstance(sensor, Sensor):
-                sensor.check_bins(x)
 
     def _apart(self, x: Tensor) -> list[tuple[Sensor, Tensor]]:
         """Return sensors with their pixels' places in a flat image."""
@@ -497,15 +437,13 @@ class PixelGroups(RandomSensor):
         places = [(s, (flat == i).nonzero().squeeze(-1)) for i, s in enumerate(self.sensors)]
         return [(s, place) for s, place in places if isinstance(s, Sensor) and place.numel()]
 
-    def _measured(self, x: Tensor, measure: Callable[[Sensor, Tensor], Tensor]) -> Tensor:
-        """Measure the pixels of each sensor, and put them together again."""
+    def _measured(self, x: Tensor, measure: Callable[..., Tensor], *others: Tensor) -> Tensor:
+        """Measure the pixels of each sensor, and of other images, and put them together again."""
         parts, places = [], []
         for sensor, place in self._apart(x):
-            own = x.flatten(-2).index_select(-1, place).unsqueeze(-2)
-            parts.append(measure(sensor, own).squeeze(-2))
+            own = [image.flatten(-2).index_select(-1, place).unsqueeze(-2) for image in (x, *others)]
+            parts.append(measure(sensor, *own).squeeze(-2))
             places.append(place)
-        if not parts:  # an image without pixels
-            return x
         return self._together(parts, places)
 
     def _together(self, parts: list[Tensor], places: list[Tensor]) -> Tensor:
@@ -523,7 +461,7 @@ class PixelGroups(RandomSensor):
         Args:
             x: light (..., C, T, H, W).
         """
-        return self._measured(x, lambda sensor, own: sensor.probabilities(own))  # type: ignore[operator]
+        return self._measured(x, lambda sensor, own: sensor.probabilities(own))
 
     def expected(self, x: Tensor) -> Tensor:
         return self._measured(x, mean_of)
@@ -542,21 +480,14 @@ class PixelGroups(RandomSensor):
             x: light (..., C, T, H, W).
             generator: source of randomness.
         """
-        return self._measured(x, lambda sensor, own: normal_of(sensor, own, generator))
+        return self._measured(x, lambda sensor, own: draw_of("gaussian", sensor, own, generator))
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         with torch.no_grad():
-            return self._measured(x, lambda sensor, own: draw_of(sensor, own, generator))
+            return self._measured(x, lambda sensor, own: draw_of("sample", sensor, own, generator))
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        parts, places = [], []
-        for sensor, place in self._apart(x):
-            if not draws(sensor):
-                raise GradientError(f"PixelGroups.log_prob: expected random sensors, got {type(sensor).__name__}.")
-            seen, own = (v.flatten(-2).index_select(-1, place).unsqueeze(-2) for v in (measurement, x))
-            parts.append(sensor.log_prob(seen, own).squeeze(-2))  # type: ignore[operator]
-            places.append(place)
-        return self._together(parts, places)
+        return self._measured(x, lambda sensor, own, seen: sensor.log_prob(seen, own), measurement)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Measure light, every sensor under its own policy and with the same generator in turn.

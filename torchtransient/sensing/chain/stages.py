@@ -1,15 +1,16 @@
 """Stages of a chain: the walk through them, what each takes and gives, and the order that they need.
 
-A row is what light passes one after another: a `Compose`, an ``nn.Sequential``, an ``nn.ModuleList``. Branches are what
-it passes one of: the sensors of `PixelGroups`. Everything else is one stage. Stages in a row have to agree on bins,
-laser cycles, the laser period and on the quantity that one gives and the next takes.
+A row is what light passes one after another, the stages of a `Compose`. Branches are what it passes one of: the sensors
+of `PixelGroups`. Everything else is one stage. Stages in a row have to agree on bins, laser cycles, the laser period
+and on the quantity that one gives and the next takes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -24,59 +25,53 @@ from torchtransient.sensing.gated import GatedIntegration
 from torchtransient.sensing.impulse_response import ImpulseResponse
 from torchtransient.sensing.itof.correlation import TapDifference
 from torchtransient.sensing.photon_budget import PhotonBudget
-from torchtransient.sensing.sensor import SAME_BIN, GradPolicy, Quantity, RandomSensor, Sensor, bins_text
+from torchtransient.sensing.sensor import SAME_BIN, Quantity, RandomSensor, Sensor, bins_text
 from torchtransient.sensing.spatial_psf import LensBlur, SpatialPSF
 from torchtransient.sensing.timing import TDC, DetectionJitter, DetectionSkew, PixelSkew, SweepJitter
 
-Step = Callable[[nn.Module, Tensor], Tensor]
+Way = Literal["sample", "gaussian"]
+Places = list[tuple[str, nn.Module]]
 
 
-def row_of(stage: nn.Module) -> nn.Module | None:
-    """Return the container of the stages that a row is made of; None for a single stage.
+def flat(stages: Iterable[nn.Module]) -> list[nn.Module]:
+    """Return stages one by one, those in torch's own rows that hold sensors too, which know no generator.
 
     Args:
-        stage: a stage of a chain.
+        stages: stages in a row.
     """
-    if isinstance(stage, nn.ModuleList):
-        return stage
-    if isinstance(stage, nn.Sequential):
-        return stage if type(stage).forward is nn.Sequential.forward else None
-    inner = getattr(stage, "stages", None) if isinstance(stage, Sensor) else None
-    return inner if isinstance(inner, (nn.Sequential, nn.ModuleList)) else None
+    found: list[nn.Module] = []
+    for stage in stages:
+        row = isinstance(stage, nn.ModuleList) or getattr(type(stage), "forward", None) is nn.Sequential.forward
+        if row and any(isinstance(part, Sensor) for part in stage.modules()):
+            found += flat(stage)  # type: ignore[arg-type]
+        else:
+            found.append(stage)
+    return found
 
 
-def branches_of(stage: nn.Module) -> Sequence[tuple[str, nn.Module]]:
+def branches_of(stage: nn.Module) -> Places:
     """Return the sensors of which every pixel passes one, with their names; none for a stage without branches.
 
     Args:
         stage: a stage of a chain.
     """
     inner = getattr(stage, "sensors", None) if isinstance(stage, Sensor) else None
-    return named(inner) if isinstance(inner, nn.ModuleList) else []
-
-
-def named(row: nn.Module) -> list[tuple[str, nn.Module]]:
-    """Return the stages of a container by their names, a stage that stands there twice as well, which torch lists once.
-
-    Args:
-        row: a container.
-    """
-    return [(name, stage) for name, stage in row._modules.items() if stage is not None]
+    return list(numbered(inner)) if isinstance(inner, nn.ModuleList) else []
 
 
 def in_order(stages: Iterable[tuple[str, nn.Module]], prefix: str = "") -> Iterator[tuple[str, nn.Module]]:
-    """Yield the single stages of rows in rows, in the order of the light, with their places: ``0``, ``1.0``, ``1.1``.
+    """Yield the single stages of chains in chains, in the order of the light, with places: ``0``, ``1.0``, ``1.1``.
 
     Args:
         stages: stages by their names.
         prefix: put in front of names.
     """
     for name, stage in stages:
-        row = row_of(stage)
-        if row is None:
-            yield f"{prefix}{name}", stage
+        row = getattr(stage, "stages", None) if isinstance(stage, Sensor) else None
+        if isinstance(row, nn.ModuleList):
+            yield from in_order(numbered(row), f"{prefix}{name}.")
         else:
-            yield from in_order(named(row), f"{prefix}{name}.")
+            yield f"{prefix}{name}", stage
 
 
 def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
@@ -88,24 +83,6 @@ def numbered(stages: Iterable[nn.Module]) -> Iterator[tuple[str, nn.Module]]:
     return ((str(number), stage) for number, stage in enumerate(stages))
 
 
-def unrolled(stages: Iterable[nn.Module]) -> list[nn.Module]:
-    """Return stages to call one after another.
-
-    Rows of torch's own with sensors in them are opened: they know no generator.
-
-    Args:
-        stages: stages in a row.
-    """
-    found: list[nn.Module] = []
-    for stage in stages:
-        row = None if isinstance(stage, Sensor) else row_of(stage)
-        if row is None or (isinstance(row, nn.Sequential) and not any(isinstance(p, Sensor) for p in row.modules())):
-            found.append(stage)
-        else:
-            found += unrolled(part for _, part in named(row))
-    return found
-
-
 def draws(stage: nn.Module) -> bool:
     """Return True if anything in a stage draws.
 
@@ -113,22 +90,6 @@ def draws(stage: nn.Module) -> bool:
         stage: a stage of a chain.
     """
     return any(isinstance(part, RandomSensor) for part in stage.modules())
-
-
-def policies_of(stage: nn.Module) -> set[GradPolicy]:
-    """Return the policies of the random stages in a stage, parts of other sensors left out.
-
-    Args:
-        stage: a stage of a chain.
-    """
-    found: set[GradPolicy] = set()
-    for _, part in in_order([("", stage)]):
-        inner = branches_of(part)
-        if inner:
-            found = found.union(*(policies_of(sensor) for _, sensor in inner))
-        elif isinstance(part, RandomSensor):
-            found.add(part.grad)
-    return found
 
 
 def check_draws(stages: Iterable[nn.Module], where: str) -> None:
@@ -146,8 +107,7 @@ def check_draws(stages: Iterable[nn.Module], where: str) -> None:
             inside = sorted({type(part).__name__ for part in stage.modules() if isinstance(part, RandomSensor)})
             raise ArgumentError(
                 f"{where}: expected sensors that can be drawn, got stage '{name}' ({type(stage).__name__}) with "
-                f"{', '.join(inside)} inside and without expected(x) and sample(x, generator) of a RandomSensor. Give "
-                "its parts as stages, or make it a RandomSensor."
+                f"{', '.join(inside)} inside and no sample(x, generator). Give its parts as stages."
             )
 
 
@@ -184,32 +144,18 @@ def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
     return result
 
 
-def draw_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
+def draw_of(way: Way, stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
     """Draw one stage whatever its policy; the mean of one that draws nothing.
 
     Args:
+        way: "sample", or "gaussian" for the normal surrogate.
         stage: a stage of a chain.
         x: its light.
         generator: source of randomness.
     """
-    if isinstance(stage, Sensor) and hasattr(stage, "sample"):
-        result: Tensor = stage.sample(x, generator)  # type: ignore[operator]
-        return result
-    return mean_of(stage, x)
-
-
-def normal_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw the normal surrogate of one stage; the mean of one that draws nothing.
-
-    Args:
-        stage: a stage of a chain.
-        x: its light.
-        generator: source of randomness.
-    """
-    if isinstance(stage, Sensor) and hasattr(stage, "gaussian"):
-        result: Tensor = stage.gaussian(x, generator)  # type: ignore[operator]
-        return result
-    return mean_of(stage, x)
+    draw = getattr(stage, way, None) if isinstance(stage, Sensor) else None
+    result: Tensor = mean_of(stage, x) if draw is None else draw(x, generator)
+    return result
 
 
 def measurement_of(stage: nn.Module, x: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -258,24 +204,49 @@ class _Light:
     cycles: int = 1  # of the exposure that a rate per cycle belongs to
     width: Stage | None = None
     number: Stage | None = None  # of bins
+    background: bool = False  # behind a budget with ambient light or dark counts
+    behind: str | None = None  # detector that has made counts of it
+    codes: str | None = None  # converter that has made codes of its bins
+    difference: bool = False  # behind a difference of taps
+    pulses: bool = False  # the detector has afterpulses of its own
+
+    def unknown(self) -> _Light:
+        """Return light whose quantity and bins are not known any more."""
+        return replace(self, quantity=None, giver=None, cycles=1, width=None, number=None)
+
+    def also(self, other: _Light) -> _Light:
+        """Return light of which pixels have passed one or the other, in the bins of the other."""
+        return replace(
+            self,
+            width=other.width,
+            number=other.number,
+            background=self.background or other.background,
+            behind=self.behind or other.behind,
+            codes=self.codes or other.codes,
+            difference=self.difference or other.difference,
+            pulses=self.pulses or other.pulses,
+        )
 
 
-def check_stages(chain: nn.Module) -> bool:
-    """Check that each stage takes what the stages before it give.
+def check_chain(chain: nn.Module, stages: Iterable[nn.Module]) -> bool:
+    """Check the order of a chain, and that each stage takes what the stages before it give.
 
     Compared are bins, `cycles`, laser periods and quantities. The output of a module of another kind, or of a sensor
-    without `gives`, is unknown: behind these, bins and quantities are compared anew.
+    without `gives`, is unknown: behind these, bins and quantities are compared anew. The order concerns constant light
+    and ends of windows, rates and counts.
 
     Args:
         chain: a chain.
+        stages: its stages.
 
     Returns:
         True if `check_window` has to be called again for light whose bins are known.
 
     Raises:
-        UnitError: for stages that do not go together.
+        UnitError: for stages that do not go together, and where constant light would starve at the end of a window, or
+            counts would be averaged.
     """
-    _through(in_order(named(getattr(chain, "stages", chain))), _Light())
+    _through(list(in_order(numbered(stages))), _Light(), [])
     parts = _parts_of(chain)
     _check_cycles(parts)
     check_dead_times(chain)
@@ -284,19 +255,21 @@ def check_stages(chain: nn.Module) -> bool:
     return any(isinstance(p, float) for p in periods) and any(_bins(part)[1] is None for part in parts)
 
 
-def _through(row: Iterable[tuple[str, nn.Module]], light: _Light) -> _Light:
-    """Compare each stage in a row with its light, every branch with the same, and return the light behind."""
-    for place, module in row:
+def _through(row: Places, light: _Light, after: list[nn.Module]) -> _Light:
+    """Compare each stage in a row with its light and the stages `after` it, and return the light behind."""
+    for place, (name, module) in enumerate(row):
         if not isinstance(module, Sensor):
-            light = _Light()
+            light = light.unknown()
             continue
-        stage = Stage(place, module)
+        stage, branches = Stage(name, module), branches_of(module)
+        rest = [later for _, later in row[place + 1 :]] + after
+        if not branches:
+            _check_place(module, light, rest)
         _check_quantity(light, stage)
-        before = _same_bins(light, stage)
-        for name, sensor in branches_of(module):
-            end = _through(in_order([(f"{place}.{name}", sensor)]), light)
-            before = replace(before, width=end.width, number=end.number)
-        light = _after(stage, before)
+        passed = _same_bins(light, stage)
+        for branch, sensor in branches:
+            passed = passed.also(_through(list(in_order([(f"{name}.{branch}", sensor)])), light, rest))
+        light = _after(stage, passed if branches else _passed(module, passed))
     return light
 
 
@@ -322,20 +295,16 @@ def check_axis(sensor: nn.Module, axis: TimeAxis) -> None:
     for name, module in sensor.named_modules():
         if not isinstance(module, Sensor):
             continue  # a measured response has bins of its own
-        own, width_s = getattr(module, "axis", None), getattr(module, "bin_width_s", None)
-        slack = SAME_BIN * axis.bin_width_opl
-        same, made_for = module.num_bins in (None, axis.num_bins), f"{module.num_bins} bins"
+        own, stage = getattr(module, "axis", None), Stage(name or "0", module)
+        width, number = _bins(stage)
+        same = number in (None, axis.num_bins)
+        same &= width is None or abs(width - axis.bin_width_s) * axis.num_bins <= SAME_BIN * axis.bin_width_s
         if isinstance(own, TimeAxis):
-            made_for = str(own)
-            same = own.num_bins == axis.num_bins and abs(own.start_opl - axis.start_opl) <= slack
-            same = same and abs(own.bin_width_opl - axis.bin_width_opl) * axis.num_bins <= slack
-        elif isinstance(width_s, float):
-            made_for = f"bins of {width_s:g} s" if module.num_bins is None else f"{made_for} of {width_s:g} s"
-            same = same and abs(width_s - axis.bin_width_s) * axis.num_bins <= SAME_BIN * axis.bin_width_s
+            same &= abs(own.start_opl - axis.start_opl) <= SAME_BIN * axis.bin_width_opl
         if not same:
             raise UnitError(
-                f"sensor: expected the axis of stage '{name or 0}' ({type(module).__name__}: {made_for}), got {axis}. "
-                "Make the sensor with the renderer's axis."
+                f"sensor: expected the axis of {stage}, {own or bins_text(width, number)}, got {axis}. Make the sensor "
+                "with the renderer's axis."
             )
 
 
@@ -352,7 +321,7 @@ def _same_bins(light: _Light, stage: Stage) -> _Light:
     if other is not None:
         raise UnitError(
             f"Compose: expected one time axis for all stages, got {bins_text(*_bins(other))} in {other} and "
-            f"{bins_text(width, number)} in {stage}. Make both with the axis of the light."
+            f"{bins_text(width, number)} in {stage}."
         )
     return replace(
         light, width=light.width if width is None else stage, number=light.number if number is None else stage
@@ -388,14 +357,13 @@ def _check_quantity(light: _Light, stage: Stage) -> None:
 def _what_to_do(light: _Light, takes: tuple[Quantity, ...]) -> str:
     if light.quantity == "rate" and "electrons" in takes:
         return (
-            f"They are those of one of {light.cycles} cycles. Count them with SynchronousSPAD({light.cycles}), give "
-            f"electrons_per_unit={light.cycles} where the stage has it, or make the budget with cycles=1 and the "
-            "energy of them all."
+            f"They are those of one of {light.cycles} cycles. Count them with SynchronousSPAD({light.cycles}), or give "
+            f"electrons_per_unit={light.cycles} where the stage has it."
         )
     if light.quantity == "rate" and "counts" in takes:
         return "Put the detector between them: SynchronousSPAD, FreeRunningSPAD or BinaryFrames."
     if "radiance" in takes:
-        return "PhotonBudget takes what a renderer gives; leave out what has made detections of it before."
+        return "PhotonBudget takes what a renderer gives."
     if light.quantity == "counts":
         return "Light is counted once: leave one of them out, or say PixelElectronics(shot_noise=False)."
     return "Electrons of an exposure are no rates per cycle: leave one of the two out."
@@ -406,9 +374,9 @@ def _after(stage: Stage, light: _Light) -> _Light:
     if gives == "the same":
         return light
     if gives is None:
-        return _Light()
+        return light.unknown()
     cycles = getattr(stage.sensor, "cycles", 1)
-    light = _Light() if gives == "electrons" else light  # taps and gates stand where bins were
+    light = light.unknown() if gives == "electrons" else light  # taps and gates stand where bins were
     return replace(light, quantity=gives, giver=stage, cycles=cycles if isinstance(cycles, int) else 1)
 
 
@@ -442,17 +410,17 @@ def check_window(chain: nn.Module, num_bins: int | None) -> None:
         UnitError: if they do not.
     """
     stages = _parts_of(chain)
-    budgets = [s for s in stages if isinstance(getattr(s.sensor, "repetition_rate_hz", None), float)]
-    for budget in budgets:
-        period_s = 1 / float(budget.sensor.repetition_rate_hz)  # type: ignore[arg-type]
+    rates = [(s, getattr(s.sensor, "repetition_rate_hz", None)) for s in stages]
+    budgets = [(s, 1 / rate) for s, rate in rates if isinstance(rate, float)]
+    for budget, period_s in budgets:
         for stage in stages:
             _check_period(budget, period_s, stage, num_bins)
     goes_on = any(s.sensor.takes == ("rate",) and s.sensor.window_is_period for s in stages)
     for stage in stages:
         own = getattr(stage.sensor, "period_s", None)
         if not goes_on and isinstance(_dead_time(stage), float):
-            for budget in budgets:
-                _check_armed(budget, 1 / float(budget.sensor.repetition_rate_hz), stage, num_bins)  # type: ignore[arg-type]
+            for budget, period_s in budgets:
+                _check_armed(budget, period_s, stage, num_bins)
             if not budgets and isinstance(own, float):
                 _check_armed(stage, own, stage, num_bins)
 
@@ -480,8 +448,7 @@ def _check_period(budget: Stage, period_s: float, stage: Stage, num_bins: int | 
     if not math.isclose(number * width_s, period_s, rel_tol=_SAME_PERIOD):
         raise UnitError(
             f"Compose: expected the bins of {stage} to be one laser period of {budget}, {period_s:g} s, got {number} "
-            f"bins of {width_s:g} s, {number * width_s:g} s. Take an axis of the whole period; Afterpulsing takes "
-            "period_s= as well."
+            f"bins of {width_s:g} s. Take an axis of the whole period; Afterpulsing takes period_s= as well."
         )
 
 
@@ -493,8 +460,7 @@ def _check_armed(giver: Stage, period_s: float, stage: Stage, num_bins: int | No
     if dead_s and window_s + dead_s > period_s * (1 + _SAME_PERIOD):
         raise UnitError(
             f"Compose: expected {stage} to be armed again before the next cycle of {giver}, {period_s:g} s later, got "
-            f"a window of {window_s:g} s and a dead time of {dead_s:g} s. A detector that goes on into the next cycle "
-            "is a FreeRunningSPAD on an axis of the whole period; or lower repetition_rate_hz."
+            f"a window of {window_s:g} s and a dead time of {dead_s:g} s. Else take a FreeRunningSPAD."
         )
 
 
@@ -523,7 +489,7 @@ def check_dead_times(chain: nn.Module) -> None:
             if others and (not grouped or len(others) == len(before)):
                 raise UnitError(
                     f"Compose: expected the dead time of {others[0]}, {_dead_time(others[0]):g} s, in {stage}, got "
-                    f"{dead_s:g} s. One detector has one dead time: give both the same."
+                    f"{dead_s:g} s. One detector has one dead time."
                 )
 
 
@@ -542,56 +508,14 @@ _PULSE_AND_JITTER = (
 )
 
 
-def _instead(stage: nn.Module, outer: Sequence[nn.Module]) -> str:
-    """Return the remedy for a zero boundary; a camera that is made of responses has a boundary of its own."""
-    within = any(getattr(o, "boundary", None) and o is not stage and stage in list(o.modules()) for o in outer)
-    return _PULSE_AND_JITTER if isinstance(stage, ImpulseResponse) and not within else "Use boundary='periodic'."
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Properties of the light so far.
-
-    Attributes:
-        background: True behind a budget with ambient light or dark counts.
-        behind: detector that has made counts of it.
-        codes: converter that has made codes of its bins.
-        difference: True behind a difference of taps.
-        pulses: True if the detector has afterpulses of its own.
-        outer: stages of the chain as they were given.
-    """
-
-    background: bool = False
-    behind: str | None = None
-    codes: str | None = None
-    difference: bool = False
-    pulses: bool = False
-    outer: tuple[nn.Module, ...] = ()
-
-    def also(self, other: _Seen) -> _Seen:
-        """Return the properties of light of which pixels have passed one or the other."""
-        return _Seen(
-            background=self.background or other.background,
-            behind=self.behind or other.behind,
-            codes=self.codes or other.codes,
-            difference=self.difference or other.difference,
-            pulses=self.pulses or other.pulses,
-            outer=self.outer,
-        )
-
-
 def has_background(budget: PhotonBudget) -> bool:
     """Return True if a budget adds ambient light or dark counts, or may learn to.
 
     Args:
         budget: the budget.
     """
-    ambient, dark = torch.as_tensor(budget.ambient_rate_hz), torch.as_tensor(budget.dark_count_rate_hz)
-    efficiency = torch.as_tensor(budget.quantum_efficiency)
-    if ambient.requires_grad or dark.requires_grad:
-        return True
-    lit = ambient > 0 if efficiency.requires_grad else ambient * efficiency > 0
-    return bool(lit.any()) or bool((dark > 0).any())
+    rates = (torch.as_tensor(rate) for rate in (budget.ambient_rate_hz, budget.dark_count_rate_hz))
+    return any(rate.requires_grad or bool((rate > 0).any()) for rate in rates)
 
 
 def _detects(stage: nn.Module) -> bool:
@@ -599,36 +523,7 @@ def _detects(stage: nn.Module) -> bool:
     return isinstance(stage, Sensor) and stage.gives == "counts" and bool({"rate", "electrons"} & set(stage.takes))
 
 
-def check_order(stages: Iterable[nn.Module], where: str) -> None:
-    """Check the order of a chain: constant light and ends of windows, rates and counts.
-
-    Args:
-        stages: stages in a row.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: where constant light would starve at the end of a window, or counts would be averaged.
-    """
-    outer = list(stages)
-    _follow([stage for _, stage in in_order(numbered(outer))], _Seen(outer=tuple(outer)), [], where)
-
-
-def _follow(row: list[nn.Module], seen: _Seen, after: list[nn.Module], where: str) -> _Seen:
-    """Check a row of single stages with the stages `after` it, and return the properties of the light behind."""
-    for number, stage in enumerate(row):
-        rest = row[number + 1 :] + after
-        branches = branches_of(stage)
-        if branches:
-            ends = [_follow([s for _, s in in_order([branch])], seen, rest, where) for branch in branches]
-            for end in ends:
-                seen = seen.also(end)
-        else:
-            _check_stage(stage, seen, rest, where)
-            seen = _passed(stage, seen)
-    return seen
-
-
-def _passed(stage: nn.Module, seen: _Seen) -> _Seen:
+def _passed(stage: Sensor, seen: _Light) -> _Light:
     if isinstance(stage, PhotonBudget):
         return replace(seen, background=seen.background or has_background(stage))
     if isinstance(stage, TDC) and stage.acts_on == "detections":
@@ -636,23 +531,25 @@ def _passed(stage: nn.Module, seen: _Seen) -> _Seen:
     if isinstance(stage, TapDifference):
         return replace(seen, difference=True)
     # charge behind an amplifier is spread like light, by a phosphor for instance
-    if isinstance(stage, Sensor) and stage.gives == "counts" and not isinstance(stage, PixelElectronics):
+    if stage.gives == "counts" and not isinstance(stage, PixelElectronics):
         pulses = seen.pulses or any(isinstance(part, AfterpulsingSPAD) for part in stage.modules())
         return replace(seen, behind=seen.behind or type(stage).__name__, pulses=pulses)
     return seen
 
 
-def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: str) -> None:
-    name = type(stage).__name__
-    if seen.background and isinstance(stage, Sensor) and getattr(stage, "boundary", None) == "zero":
+def _check_place(stage: Sensor, seen: _Light, rest: list[nn.Module]) -> None:
+    """Raise UnitError where constant light would starve, or counts be averaged."""
+    name, where = type(stage).__name__, "Compose"
+    if seen.background and getattr(stage, "boundary", None) == "zero":
         raise UnitError(
             f"{where}: expected no {name} with boundary='zero' behind the background of a PhotonBudget, whose "
-            f"ambient light and dark counts would starve at the ends of the window. {_instead(stage, seen.outer)}"
+            f"ambient light and dark counts would starve at the ends of the window. Use boundary='periodic'; or: "
+            f"{_PULSE_AND_JITTER}"
         )
     if seen.background and isinstance(stage, GatedIntegration):
-        _check_gates(stage, where)
+        _check_gates(stage)
     if seen.difference and isinstance(stage, PixelElectronics):
-        _check_signed(stage, where)
+        _check_signed(stage)
     if seen.behind is not None and isinstance(stage, ImpulseResponse):
         raise UnitError(
             f"{where}: expected no ImpulseResponse behind {seen.behind}: it would average counts. {_PULSE_AND_JITTER}"
@@ -665,14 +562,10 @@ def _check_stage(stage: nn.Module, seen: _Seen, rest: list[nn.Module], where: st
         )
     if seen.codes is not None and isinstance(stage, (*_MOVES, Afterpulsing)):
         raise UnitError(
-            f"{where}: expected {name} in front of {seen.codes}, got it behind: bins are codes there, of unequal "
-            "widths, and it needs times. The converter is the last that acts on detections."
+            f"{where}: expected {name} in front of {seen.codes}, got it behind, where bins are codes of unequal widths."
         )
     if seen.pulses and isinstance(stage, Afterpulsing):
-        raise UnitError(
-            f"{where}: expected no {name} behind {seen.behind} with an AfterpulsingSPAD, which has afterpulses of its "
-            "own, got both. Leave one of them out."
-        )
+        raise UnitError(f"{where}: expected no {name} behind an AfterpulsingSPAD, which has afterpulses of its own.")
     later = next((type(s).__name__ for s in rest if _detects(s)), None)
     if (isinstance(stage, _MOVES) or _codes(stage)) and later is not None:
         raise UnitError(
@@ -686,29 +579,26 @@ def _codes(stage: nn.Module) -> bool:
     return isinstance(stage, TDC) and stage.acts_on == "detections"
 
 
-def _check_signed(stage: PixelElectronics, where: str) -> None:
+def _check_signed(stage: PixelElectronics) -> None:
     """Raise UnitError for the electronics of a difference that know no numbers below zero."""
     if stage.shot_noise:
         raise UnitError(
-            f"{where}: expected no shot noise behind a TapDifference, whose negative numbers are no light, got a "
-            "PixelElectronics that draws it. Put it in front of the difference, where both taps have theirs; the one "
-            "behind is PixelElectronics(shot_noise=False, ...)."
+            "Compose: expected no shot noise behind a TapDifference, got a PixelElectronics that draws it. Put it in "
+            "front; the one behind is PixelElectronics(shot_noise=False, ...)."
         )
     low, high = stage.range_dn
     if stage.bits is not None and stage.black_level_dn - low < 0.25 * (high - low):
         raise UnitError(
-            f"{where}: expected a converter with room below zero behind a TapDifference, got codes from {low:g} to "
-            f"{high:g} and a black level of {stage.black_level_dn:g}, which clip negative differences. Say signed=True "
-            "(codes in two's complement), or a black_level_dn in the middle of the range."
+            f"Compose: expected a converter with room below zero behind a TapDifference, got codes from {low:g} to "
+            f"{high:g} and a black level of {stage.black_level_dn:g}. Say signed=True."
         )
 
 
-def _check_gates(stage: GatedIntegration, where: str) -> None:
+def _check_gates(stage: GatedIntegration) -> None:
     missed = stage.outside()
     worst = int(missed.argmax())
     if float(missed[worst]) > _OUTSIDE:
         raise UnitError(
-            f"{where}: expected gates inside the window of {stage.axis} behind a background, got gate {worst} with "
-            f"{float(missed[worst]):.2g} of its time outside, where the ambient light is not known. Move the gate or "
-            "lengthen the axis."
+            f"Compose: expected gates inside the window of {stage.axis} behind a background, got gate {worst} with "
+            f"{float(missed[worst]):.2g} of its time outside, where the ambient light is not known."
         )

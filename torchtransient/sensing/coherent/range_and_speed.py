@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import is_one_of, of_class, shown
 from torchtransient.chirps import Chirps
 from torchtransient.errors import ArgumentError, ShapeError
 from torchtransient.floating import in_single
-from torchtransient.sensing.checks import TIME, check_bins, check_number, check_time_axis
+from torchtransient.sensing.checks import TIME, check_bins, check_choice, check_number
 
 Bins = Literal["sums", "samples"]
-KINDS_OF_BINS: tuple[Bins, ...] = get_args(Bins)
 
 # Offsets of a line in half a bin, of which the table is made that positions are read from.
 _OFFSETS = 257
@@ -25,20 +23,9 @@ _OFFSETS = 257
 _SAME_BIN = 1e-6
 
 
-class HasBeats(Protocol):
-    """`RenderOutput`, `Result` of a file: ``beats`` with ``chirps`` and ``axis``."""
-
-    @property
-    def beats(self) -> Tensor | None: ...
-    @property
-    def chirps(self) -> Chirps | None: ...
-    @property
-    def axis(self) -> TimeAxis | None: ...
-
-
 @in_single
 def range_and_speed(
-    beats: Tensor | HasBeats,
+    beats: Any,
     chirps: Chirps | None = None,
     axis: TimeAxis | None = None,
     *,
@@ -53,7 +40,8 @@ def range_and_speed(
     1 / 150 where it is four.
 
     Args:
-        beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some.
+        beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some
+            (`RenderOutput`, `Result` of a file).
         chirps: the chirps; None for those of a result.
         axis: axis over ``opl +- k rate``; likewise.
         bins: "sums" over the width of a bin, as films make them (``temporal_filter="box"``), or "samples" of the
@@ -67,21 +55,21 @@ def range_and_speed(
 
     Raises:
         ShapeError: unless ``beats`` has two spectra over the bins of the axis.
-        ArgumentError: for other objects than chirps and axes, and other bins.
+        ArgumentError: without chirps or an axis, and for other bins.
 
     The largest bins of both chirps are taken for one surface: with several of them in a pixel, of unlike brightness in
     both, they may be those of two. A line beyond the axis is taken for the middle of its first or last bin.
     """
     me = "range_and_speed"
-    if not isinstance(beats, Tensor) and isinstance(held := getattr(beats, "beats", None), Tensor):
+    if not isinstance(beats, Tensor):
         chirps, axis = beats.chirps if chirps is None else chirps, beats.axis if axis is None else axis
-        beats = held
-    elif not isinstance(beats, Tensor) and hasattr(beats, "beats"):
-        raise ShapeError(f"{me}: expected a result with beats, got one without. Render with chirps=tt.Chirps(...).")
-    beats = check_bins(beats, me)  # type: ignore[arg-type]
-    chirps, axis = of_class(f"{me}: chirps", chirps, Chirps), check_time_axis(axis, me)
-    if not is_one_of(bins, KINDS_OF_BINS):
-        raise ArgumentError(f"{me}: expected bins to be one of {', '.join(KINDS_OF_BINS)}, got {shown(bins)}.")
+        if beats.beats is None:
+            raise ShapeError(f"{me}: expected a result with beats, got one without. Render with chirps=tt.Chirps(...).")
+        beats = beats.beats
+    check_bins(beats, me)
+    if chirps is None or axis is None:
+        raise ArgumentError(f"{me}: expected chirps and axis beside a tensor of beats, got {chirps} and {axis}.")
+    check_choice(bins, Bins, "bins", me)
     level = check_number(threshold, "threshold", me, low=-math.inf)
     if beats.ndim < 4 or beats.shape[-4] != 2 or beats.shape[TIME] != axis.num_bins:
         raise ShapeError(
@@ -137,11 +125,9 @@ def fold_beats(beats: Tensor, axis: TimeAxis) -> tuple[Tensor, TimeAxis]:
 
     Raises:
         ShapeError: for other axes, and unless T is that of the axis.
-        ArgumentError: unless ``axis`` is one.
     """
     me = "fold_beats"
     check_bins(beats, me)
-    check_time_axis(axis, me)
     if beats.shape[TIME] != axis.num_bins:
         raise ShapeError(f"{me}: expected T = {axis.num_bins} bins as in the axis, got {tuple(beats.shape)}.")
     # Middles of bins in half bins: whole numbers, all even or all odd.

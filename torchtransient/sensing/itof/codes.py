@@ -14,14 +14,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import MOST_MADE, as_whole, count, mapping, real_array, several, shown
+from torchtransient.checks import MOST_MADE, shown
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.checks import check_number, reals, refuse_cut_off
+from torchtransient.floating import number_tensor
+from torchtransient.sensing.checks import check_count, check_number, refuse_cut_off
 
 _TURN = 2 * math.pi
 
@@ -90,14 +90,17 @@ class FourierCode(CorrelationCode):
 
     Raises:
         UnitError: when the weights could leave [-1, 1] (the amplitudes sum to more than one), or a harmonic is not a
-            positive whole number.
-        ShapeError: for less than two taps.
+            positive whole number, and for less than two taps.
     """
+
+    shifts: Tensor
 
     def __init__(self, num_taps: int, harmonics_of_one_tap: Mapping[int, tuple[float, float]]) -> None:
         self.num_taps = _check_taps(num_taps)
-        given = mapping("FourierCode", harmonics_of_one_tap, "{harmonic: (amplitude, phase in radians)}")
-        self.parts = dict(sorted(_harmonic(h, pair) for h, pair in given.items()))
+        self.parts: dict[int, tuple[float, float]] = {}
+        for harmonic, pair in sorted(harmonics_of_one_tap.items()):
+            amplitude, phase = (check_number(p, "harmonics_of_one_tap", "FourierCode", low=-math.inf) for p in pair)
+            self.parts[check_count(harmonic, "harmonics", "FourierCode")] = (amplitude, phase)
         if not self.parts:
             raise UnitError("FourierCode: expected harmonics 1, 2, ..., got none.")
         total = sum(abs(a) for a, _ in self.parts.values())
@@ -122,29 +125,16 @@ class FourierCode(CorrelationCode):
         return total
 
     def coefficients(self, harmonics: Sequence[int]) -> Tensor:
-        shifts = _not_none(self.shifts)
         columns = []
         for h in harmonics:
             amplitude, phase = self.parts.get(abs(h), (0.0, 0.0)) if h else (0.0, 0.0)
             phase = phase if h > 0 else -phase
-            columns.append(0.5 * amplitude * torch.exp(1j * (phase - _TURN * h * shifts)))
+            columns.append(0.5 * amplitude * torch.exp(1j * (phase - _TURN * h * self.shifts)))
         return torch.stack(columns, dim=1)
 
     @property
     def harmonics(self) -> tuple[int, ...]:
         return tuple(self.parts)
-
-
-def _harmonic(h: object, pair: object) -> tuple[int, tuple[float, float]]:
-    name, me = "harmonics_of_one_tap", "FourierCode"
-    parts: list[Any] = several(f"{me}: {name}", pair, "numbers, amplitude and phase,")
-    if len(parts) != 2:
-        raise ShapeError(f"{me}: expected {name} as (amplitude, phase in radians), got {shown(pair)}.")
-    amplitude, phase = (check_number(part, name, me, low=-math.inf) for part in parts)
-    number = count(f"{me}: {name}", h, None, UnitError, MOST_MADE)
-    if number < 1:
-        raise UnitError(f"{me}: expected harmonics 1, 2, ..., got {shown(h)}.")
-    return number, (amplitude, phase)
 
 
 class PiecewiseLinearCode(CorrelationCode):
@@ -169,8 +159,7 @@ class PiecewiseLinearCode(CorrelationCode):
                 f"{tuple(values.shape)}."
             )
         self.num_taps = _check_taps(knots.shape[0])
-        rising = bool((knots.diff(dim=1) > 0).all()) and bool((knots[:, -1] - knots[:, 0] < 1).all())
-        if not rising:
+        if not (bool((knots.diff(dim=1) > 0).all()) and bool((knots[:, -1] - knots[:, 0] < 1).all())):
             raise UnitError("PiecewiseLinearCode: expected knots that ascend within one turn along dim 1.")
         if not bool((values.abs() <= 1 + 1e-9).all()):
             raise UnitError(f"PiecewiseLinearCode: expected values in [-1, 1], got up to {float(values.abs().max())}.")
@@ -229,7 +218,7 @@ def sine_code(num_taps: int = 4) -> FourierCode:
         num_taps: N, two and more.
 
     Raises:
-        ShapeError: for less than two taps.
+        UnitError: for less than two taps.
     """
     return FourierCode(num_taps, {1: (1.0, 0.0)})
 
@@ -248,11 +237,6 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
     Raises:
         UnitError: for duties outside (0, 1).
     """
-    light_duty = check_number(light_duty, "light_duty", "square_code")
-    gate_duty = check_number(gate_duty, "gate_duty", "square_code")
-    for name, duty in (("light_duty", light_duty), ("gate_duty", gate_duty)):
-        if not 0 < duty < 1:
-            raise UnitError(f"square_code: expected {name} between 0 and 1 turn, got {duty!r}.")
     start = (light_duty - gate_duty) / 2
     shifts = phase_steps(num_taps)
     gates = [[((float(s) + start), (float(s) + start + gate_duty))] for s in shifts]
@@ -271,11 +255,10 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
     Raises:
         ShapeError: for another number of taps.
     """
-    taps = as_whole(num_taps)
-    if taps == 3:
+    if num_taps == 3:
         shifts = torch.arange(3, dtype=torch.float64) / 3
         return binary_code(1 / 6, [[(float(s), float(s) + 0.5)] for s in shifts], shifts)
-    if taps == 4:
+    if num_taps == 4:
         twelfths = [[(5, 11)], [(2, 8)], [(0, 3), (7, 10)], [(4, 6), (9, 13)]]
         return binary_code(1 / 12, [[(a / 12, b / 12) for a, b in gate] for gate in twelfths])
     raise ShapeError(f"hamiltonian_code: expected 3 or 4 taps, got {shown(num_taps)}; use binary_code for other gates.")
@@ -297,8 +280,6 @@ def binary_code(
         UnitError: where openings overlap.
     """
     light_duty = check_number(light_duty, "light_duty", "binary_code", high=1.0, open_low=True)
-    if shifts is not None:
-        shifts = _plain(shifts, "shifts", "binary_code")
     knots, values = [], []
     for given in gates:
         openings = [tuple(check_number(e, "gates", "binary_code", low=-math.inf) for e in edges) for edges in given]
@@ -314,12 +295,11 @@ def binary_code(
     return PiecewiseLinearCode(torch.stack([k for k, _ in padded]), torch.stack([v for _, v in padded]), shifts)
 
 
-def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
+def measured_code(samples: Tensor) -> PiecewiseLinearCode:
     """Make a code of correlation functions measured at equal steps of the phase over one period.
 
     Args:
         samples: (N, S), any unit; each tap is scaled by its largest magnitude.
-        closed: the last sample repeats the first one of the next period and is left out.
 
     Raises:
         ShapeError: for other shapes.
@@ -328,7 +308,6 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
     table = _plain(samples, "samples", "measured_code")
     if table.ndim != 2 or table.shape[1] < 3:
         raise ShapeError(f"measured_code: expected samples (N, S >= 3), got {tuple(table.shape)}.")
-    table = table[:, :-1] if closed else table
     largest = table.abs().amax(dim=1, keepdim=True)
     if not bool((largest > 0).all()) or not bool(torch.isfinite(table).all()):
         raise UnitError("measured_code: expected finite samples that are not all zero in any tap.")
@@ -339,10 +318,7 @@ def measured_code(samples: Tensor, closed: bool = False) -> PiecewiseLinearCode:
 def _plain(given: object, name: str, where: str) -> Tensor:
     """float64 on the CPU, of a tensor, an array or rows of numbers. GradientError: codes are not learnt."""
     refuse_cut_off(given, name, where)
-    array = None if isinstance(given, Tensor) else real_array(given)
-    if not isinstance(given, Tensor) and array is None:
-        raise ShapeError(f"{where}: expected {name} as rows of numbers of one length, got {shown(given)}.")
-    (table,) = reals(where, torch.float64, **{name: given if array is None else torch.tensor(array)})
+    table = number_tensor(given, f"{where}: expected {name} as rows of numbers of one length")
     return table.detach().to("cpu", torch.float64)
 
 
@@ -383,12 +359,7 @@ def phase_steps(num_taps: int) -> Tensor:
 
 
 def _check_taps(num_taps: int) -> int:
-    number = as_whole(num_taps)
-    if number is None or number < 2:
-        raise ShapeError(f"CorrelationCode: expected at least 2 taps, got {shown(num_taps)}.")
-    if number > MOST_MADE:
-        raise ShapeError(f"CorrelationCode: expected at most {MOST_MADE} taps, got {shown(num_taps)}.")
-    return number
+    return check_count(num_taps, "num_taps", "CorrelationCode", low=2, most=MOST_MADE)
 
 
 def _check_edges(edges_turns: Tensor) -> Tensor:
@@ -398,19 +369,11 @@ def _check_edges(edges_turns: Tensor) -> Tensor:
     return edges
 
 
-def _along_first(shifts: Tensor | None, turns: Tensor) -> Tensor:
-    return _not_none(shifts).to(turns).reshape(-1, *(1,) * turns.ndim)
-
-
-def _not_none(value: Tensor | None) -> Tensor:
-    if value is None:
-        raise ShapeError("CorrelationCode: expected taps of one shape, moved along.")
-    return value
+def _along_first(shifts: Tensor, turns: Tensor) -> Tensor:
+    return shifts.to(turns).reshape(-1, *(1,) * turns.ndim)
 
 
 # -------------------------------------------------------------------------------------------------- codes made of codes
-
-
 
 
 class TwoTapCode(CorrelationCode):
@@ -423,11 +386,11 @@ class TwoTapCode(CorrelationCode):
         code: of any kind, with N >= 2 phase steps, exposed one after another.
 
     Raises:
-        UnitError: for anything else, and for a code that has two taps already.
+        UnitError: for a code that has two taps already.
     """
 
     def __init__(self, code: CorrelationCode) -> None:
-        if not isinstance(code, CorrelationCode) or isinstance(code, TwoTapCode):
+        if isinstance(code, TwoTapCode):
             raise UnitError(f"TwoTapCode: expected a code of one tap such as sine_code(4), got {shown(code)}.")
         self.code = code
         self.num_taps = 2 * code.num_taps
@@ -447,7 +410,6 @@ class TwoTapCode(CorrelationCode):
         return self.code.harmonics
 
 
-
 class ReversedCode(CorrelationCode):
     """Code whose phase steps go the other way: tap n is moved by minus its shift.
 
@@ -459,7 +421,7 @@ class ReversedCode(CorrelationCode):
     """
 
     def __init__(self, code: CorrelationCode) -> None:
-        if not isinstance(code, CorrelationCode) or code.shifts is None:
+        if code.shifts is None:
             raise UnitError(
                 "ReversedCode: expected a code of one function moved along, whose steps have a direction, got "
                 f"{shown(code)}. Give measured or Hamiltonian codes in the order that the camera has."
@@ -484,7 +446,6 @@ class ReversedCode(CorrelationCode):
         return self.code.harmonics
 
 
-
 def in_direction(code: CorrelationCode, direction: int) -> CorrelationCode:
     """Return a code, or the code with its phase steps reversed.
 
@@ -498,7 +459,6 @@ def in_direction(code: CorrelationCode, direction: int) -> CorrelationCode:
     if direction == 1:
         return code
     return TwoTapCode(ReversedCode(code.code)) if isinstance(code, TwoTapCode) else ReversedCode(code)
-
 
 
 def _with_opposites(weights: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -41,17 +41,8 @@ from torch import Tensor, nn
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.checks import Numbers, real_array, shown
 from torchtransient.errors import GradientError, ShapeError, UnitError
-from torchtransient.floating import holds, in_single, product
-from torchtransient.sensing.checks import (
-    check_dense,
-    check_number,
-    check_tensors,
-    check_time_axis,
-    check_transient,
-    no_arrays,
-    reals,
-    refuse_cut_off,
-)
+from torchtransient.floating import holds, in_single, number_tensor, product
+from torchtransient.sensing.checks import check_number, check_transient, no_arrays, reals, refuse_cut_off
 from torchtransient.sensing.itof.codes import CorrelationCode, in_direction
 from torchtransient.sensing.sensor import Sensor
 from torchtransient.units import SPEED_OF_LIGHT
@@ -87,11 +78,10 @@ class ItofCalibration:
     depth_map_m: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.direction, bool) or self.direction not in (1, -1):
+        if self.direction not in (1, -1):
             raise UnitError(f"ItofCalibration: expected direction 1 or -1, got {shown(self.direction)}.")
-        object.__setattr__(self, "direction", int(self.direction))
         for name in ("phase_offset_rad", "phase_map_rad", "depth_map_m"):
-            object.__setattr__(self, name, no_arrays(getattr(self, name), "ItofCalibration"))
+            object.__setattr__(self, name, no_arrays(getattr(self, name)))
         degrees = "Degrees? Say math.radians(...); a phase of more than a turn is one of less."
         _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1), 2 * _TURN, degrees)
         _numbers(self.phase_map_rad, "phase_map_rad", (2, 3), 2 * _TURN, degrees)
@@ -113,33 +103,18 @@ class ItofCalibration:
             (F, H, W) float64 on the CPU, (F, 1, 1) without maps.
 
         Raises:
-            ShapeError: for offsets or maps of another number of frequencies, or maps of different sizes.
+            ShapeError: for offsets or maps of another number of frequencies.
         """
-        count = len(frequencies_hz)
-        offset = _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1))
-        total = (offset.expand(count) if offset.numel() == 1 else offset).reshape(-1, 1, 1)
-        if total.shape[0] != count:
+        hertz = torch.tensor(list(frequencies_hz), dtype=torch.float64).reshape(-1, 1, 1)
+        offset = _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1)).reshape(-1, 1, 1)
+        table = _numbers(self.phase_map_rad, "phase_map_rad", (2, 3))
+        if len(offset) not in (1, len(hertz)) or (table.ndim == 3 and len(table) not in (1, len(hertz))):
             raise ShapeError(
-                f"ItofCalibration: expected phase_offset_rad as one number or {count}, got {offset.numel()}."
+                f"ItofCalibration: expected phase offsets and maps of {len(hertz)} frequencies, got "
+                f"{tuple(offset.shape)} and {tuple(table.shape)}."
             )
-        if self.phase_map_rad is not None:
-            table = _numbers(self.phase_map_rad, "phase_map_rad", (2, 3))
-            if table.ndim == 3 and table.shape[0] not in (1, count):
-                raise ShapeError(
-                    f"ItofCalibration: expected phase_map_rad (H, W) or ({count}, H, W), got {tuple(table.shape)}."
-                )
-            total = total + table
-        if self.depth_map_m is not None:
-            metres = _numbers(self.depth_map_m, "depth_map_m", (2,))
-            if self.phase_map_rad is not None and metres.shape != total.shape[1:]:
-                raise ShapeError(
-                    f"ItofCalibration: expected maps of one size, got {tuple(total.shape[1:])} and "
-                    f"{tuple(metres.shape)}."
-                )
-            hertz = torch.tensor(list(frequencies_hz), dtype=torch.float64).reshape(-1, 1, 1)
-            total = total + metres * hertz * (2 * _TURN / SPEED_OF_LIGHT)
-        return total
-
+        metres = _numbers(self.depth_map_m, "depth_map_m", (2,))
+        return offset + table + metres * hertz * (2 * _TURN / SPEED_OF_LIGHT)
 
 
 def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math.inf, why: str = "") -> Tensor:
@@ -151,18 +126,13 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
     """
     if given is None:
         return torch.zeros((), dtype=torch.float64)
-    if isinstance(given, Tensor) and given.is_floating_point():
-        numbers = check_dense(given, "ItofCalibration", name).to("cpu", torch.float64)
-    else:
-        array = real_array(given)
-        if array is None:
-            raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
-        numbers = torch.from_numpy(array)
+    expected = f"ItofCalibration: expected {name} as finite numbers"
+    numbers = number_tensor(given, expected, UnitError).to("cpu", torch.float64)
     if numbers.ndim not in dims or not numbers.numel():
         got = tuple(numbers.shape)
         raise ShapeError(f"ItofCalibration: expected {name} of {dims} dimensions, got the shape {got}.")
     if not holds(torch.isfinite(numbers)):
-        raise UnitError(f"ItofCalibration: expected {name} as finite numbers, got {shown(given)}.")
+        raise UnitError(f"{expected}, got {shown(given)}.")
     if not holds(numbers.abs() <= most):
         raise UnitError(
             f"ItofCalibration: expected {name} between -{most:.4g} and {most:.4g}, got up to "
@@ -177,14 +147,13 @@ def _numbers(given: object, name: str, dims: tuple[int, ...], most: float = math
 _LARGEST = 1 << 22  # numbers of a table of weights of pixels
 
 
-def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis, within_bin: str) -> Tensor:
+def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: TimeAxis) -> Tensor:
     """Cosine and sine of every harmonic of every frequency, over the bins.
 
     Args:
         harmonics: whole numbers.
         frequencies: F modulation frequencies in hertz.
         axis: axis of the light.
-        within_bin: "uniform" or "center".
 
     Returns:
         (F x 2 harmonics, T) float64.
@@ -194,14 +163,12 @@ def harmonic_rows(harmonics: Sequence[int], frequencies: Sequence[float], axis: 
         for h in harmonics:
             # The mean of a cosine over a bin is its value in the middle times sinc.
             turns = h * f * axis.centers_s
-            keep = torch.sinc(h * f * axis.edges_s.diff()) if within_bin == "uniform" else torch.ones_like(turns)
+            keep = torch.sinc(h * f * axis.edges_s.diff())
             rows += [keep * torch.cos(_TURN * turns), keep * torch.sin(_TURN * turns)]
     return torch.stack(rows)
 
 
-def taps_by_pixel(
-    x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, contrast: float, within_bin: str, phase: Tensor
-) -> Tensor:
+def taps_by_pixel(x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, contrast: float, phase: Tensor) -> Tensor:
     """Taps of light, each pixel with weights of its own.
 
     Args:
@@ -210,7 +177,6 @@ def taps_by_pixel(
         f: modulation frequency in hertz.
         axis: axis of the light.
         contrast: demodulation contrast.
-        within_bin: "uniform" or "center".
         phase: (H, W) or (1, 1), in radians.
 
     Returns:
@@ -219,34 +185,29 @@ def taps_by_pixel(
     light, bins = x.flatten(-2), axis.num_bins
     turns = (phase.to("cpu", torch.float64) / _TURN % 1.0).flatten()
     turns = turns.expand(light.shape[-1]) if turns.numel() == 1 else turns
-    places = axis.edges_s * f if within_bin == "uniform" else axis.centers_s * f
+    places = axis.edges_s * f
     apart = math.ceil(float(places[-1] - places[0])) + 2.0
     rows = math.prod(light.shape[:-2]) * code.num_taps * bins
     size = max(_LARGEST // max(rows, 1), 1)
     taps = []
     for begin in range(0, light.shape[-1], size):
         here = turns[begin : begin + size]
-        if within_bin == "uniform":
-            # Codes are periodic: whole turns between the pixels make one ascending row of all their edges.
-            edges = places + (here + apart * torch.arange(len(here), dtype=torch.float64))[:, None]
-            means = torch.nn.functional.pad(code.bin_means(edges.flatten()), (0, 1))
-            shape = means.reshape(code.num_taps, len(here), bins + 1)[..., :bins]
-        else:
-            shape = code.evaluate(places + here[:, None])
+        # Codes are periodic: whole turns between the pixels make one ascending row of all their edges.
+        edges = places + (here + apart * torch.arange(len(here), dtype=torch.float64))[:, None]
+        means = torch.nn.functional.pad(code.bin_means(edges.flatten()), (0, 1))
+        shape = means.reshape(code.num_taps, len(here), bins + 1)[..., :bins]
         weights = ((1 + contrast * shape) / code.num_taps).movedim(1, -1).to(x)
         # No product of matrices, which autocast would round.
         taps.append((light[..., None, :, begin : begin + size] * weights).sum(-2))
-    together = torch.cat(taps, dim=-1) if taps else light.new_zeros(*light.shape[:-2], code.num_taps, 0)
+    together = torch.cat(taps, dim=-1)
     return together.reshape(*together.shape[:-1], *x.shape[-2:])
 
 
 # ---------------------------------------------------------------------------------------------------------- correlation
 
 
-WithinBin = Literal["uniform", "center"]
 # One number, a sequence, an array or a tensor of them.
 Frequencies = float | Sequence[float] | Tensor | NDArray[Any]
-
 
 
 def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, ...]:
@@ -261,15 +222,9 @@ def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, .
     """
     refuse_cut_off(frequencies_hz, "frequencies_hz", where)
     array = real_array(frequencies_hz)
-    given: Sequence[Any] = [frequencies_hz]  # what is no row of numbers is told by the check of its entries
-    if array is not None and array.ndim <= 1:
-        given = array.reshape(-1).tolist()
-    elif isinstance(frequencies_hz, Sequence) and not isinstance(frequencies_hz, str):
-        given = frequencies_hz
-    values = tuple(check_number(f, "frequencies_hz", where, low=1e3, high=1e12) for f in given)
-    if not values:
-        raise UnitError(f"{where}: expected at least one modulation frequency in hertz, got none.")
-    return values
+    if array is None or array.ndim > 1 or not array.size:
+        raise UnitError(f"{where}: expected modulation frequencies in hertz, got {shown(frequencies_hz)}.")
+    return tuple(check_number(f, "frequencies_hz", where, low=1e3, high=1e12) for f in array.reshape(-1).tolist())
 
 
 def tap_weights(
@@ -278,21 +233,19 @@ def tap_weights(
     axis: TimeAxis,
     *,
     contrast: float = 1.0,
-    within_bin: WithinBin = "uniform",
     calibration: ItofCalibration | None = None,
 ) -> Tensor:
     """Share of the light of every bin in every tap.
 
     The shares of the taps sum to one where the code's shifted copies sum to zero (sine, square with half duty and an
-    even N or any N of its sine part, every `TwoTapCode`), so that light is conserved.
+    even N or any N of its sine part, every `TwoTapCode`), so that light is conserved. Light is spread evenly over its
+    bin.
 
     Args:
         code: N taps.
         frequencies_hz: F modulation frequencies in hertz.
         axis: axis of the light, of T bins.
         contrast: demodulation contrast in [0, 1], 0.5 to 0.9 in cameras.
-        within_bin: "uniform" spreads the light of a bin evenly over it (the mean of the code over the bin, exact for
-            light that is nowhere special); "center" puts it in the middle.
         calibration: phase offset and direction; maps of pixels are for `ItofCorrelation`.
 
     Returns:
@@ -303,61 +256,33 @@ def tap_weights(
         ShapeError: for a code of two taps that is no `TwoTapCode`.
     """
     me = "tap_weights"
-    code, phases = _checked(code, frequencies_hz, axis, contrast, within_bin, calibration, me)
+    code, values, phases = _checked(code, frequencies_hz, contrast, calibration, me)
     if phases.shape[1:] != (1, 1):
         raise UnitError(f"{me}: expected a calibration without maps of pixels, whose weights ItofCorrelation makes.")
-    if phases.requires_grad:
-        refuse_cut_off(phases, "calibration", me)
+    refuse_cut_off(phases, "calibration", me)
     rows = []
-    for f, phase in zip(check_frequencies(frequencies_hz, me), phases.flatten().tolist(), strict=True):
-        if within_bin == "uniform":
-            shape = code.bin_means(axis.edges_s * f + phase / _TURN)
-        else:
-            shape = code.evaluate(axis.centers_s * f + phase / _TURN)
-        rows.append((1 + contrast * shape) / code.num_taps)
+    for f, phase in zip(values, phases.flatten().tolist(), strict=True):
+        rows.append((1 + contrast * code.bin_means(axis.edges_s * f + phase / _TURN)) / code.num_taps)
     return torch.cat(rows)
 
 
 def _checked(
     code: CorrelationCode,
     frequencies_hz: Frequencies,
-    axis: TimeAxis,
     contrast: float,
-    within_bin: str,
     calibration: ItofCalibration | None,
     me: str,
-) -> tuple[CorrelationCode, Tensor]:
-    """Return the code in the direction of its steps, and the phases (F, 1, 1) or (F, H, W) of offsets and maps."""
+) -> tuple[CorrelationCode, tuple[float, ...], Tensor]:
+    """Return the code in the direction of its steps, frequencies, and the phases (F, 1, 1) or (F, H, W)."""
     check_number(contrast, "contrast", me, high=1.0)
-    check_time_axis(axis, me)
-    if not isinstance(within_bin, str) or within_bin not in ("uniform", "center"):
-        raise UnitError(f"{me}: expected within_bin 'uniform' or 'center', got {shown(within_bin)}.")
-    if calibration is not None and not isinstance(calibration, ItofCalibration):
-        raise UnitError(f"{me}: expected calibration to be an ItofCalibration, got {calibration!r}.")
     known = calibration or ItofCalibration()
-    code = in_direction(check_code(code, me), known.direction)
-    return code, known.phases_rad(check_frequencies(frequencies_hz, me))
-
-
-def check_code(code: object, where: str) -> CorrelationCode:
-    """Return `code` if it tells phase, amplitude and offset apart.
-
-    Args:
-        code: anything.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for anything that is no code.
-        ShapeError: for two taps.
-    """
-    if not isinstance(code, CorrelationCode):
-        raise UnitError(f"{where}: expected a code such as sine_code(4), got {code!r}.")
     if code.num_taps < 3:
         raise ShapeError(
-            f"{where}: expected three taps or more, from which phase, amplitude and offset can be told apart, got "
+            f"{me}: expected three taps or more, from which phase, amplitude and offset can be told apart, got "
             f"{code.num_taps}. Two phase steps suffice for pixels of two taps: TwoTapCode(code)."
         )
-    return code
+    values = check_frequencies(frequencies_hz, me)
+    return in_direction(code, known.direction), values, known.phases_rad(values)
 
 
 @in_single
@@ -420,18 +345,14 @@ def taps_from_phasor(
         ShapeError: for a phasor that does not fit its axis.
         UnitError: for a missing frequency.
     """
-    check_tensors("taps_from_phasor", phasor=phasor)
     me = "taps_from_phasor"
     if not phasor.is_complex() or phasor.ndim < 4 or phasor.shape[-3] != phasor_axis.num_frequencies:
         raise ShapeError(
             f"{me}: expected a complex phasor (..., C, {phasor_axis.num_frequencies}, H, W), got {phasor.dtype} "
             f"{tuple(phasor.shape)}."
         )
-    contrast = check_number(contrast, "contrast", me, high=1.0)
-    steady = None if steady is None else reals(me, steady=steady)[0]
-    known = calibration or ItofCalibration()
-    code, values = in_direction(check_code(code, me), known.direction), check_frequencies(frequencies_hz, me)
-    phases = _fitting(known.phases_rad(values), phasor, me)
+    code, values, phases = _checked(code, frequencies_hz, contrast, calibration, me)
+    phases = fitting_pixels(phases, phasor, me)
     kept = code.harmonics if harmonics is None else tuple(sorted({int(h) for h in harmonics} - {0}))
     if kept is None or any(h < 1 for h in kept):
         raise UnitError(
@@ -467,8 +388,17 @@ def _mixed(
     return taps / code.num_taps
 
 
-def _fitting(phases: Tensor, x: Tensor, where: str) -> Tensor:
-    """Return phases (F, H, W) if they are those of the pixels of ``x``, else raise ShapeError."""
+def fitting_pixels(phases: Tensor, x: Tensor, where: str) -> Tensor:
+    """Return phases of a calibration if they are those of the pixels of light or frames.
+
+    Args:
+        phases: (F, H, W) or (F, 1, 1).
+        x: (..., H, W).
+        where: name of the caller, for errors.
+
+    Raises:
+        ShapeError: for other pixels.
+    """
     size = tuple(phases.shape[-2:])
     if size != (1, 1) and size != tuple(x.shape[-2:]):
         raise ShapeError(f"{where}: expected light of {size} pixels, as the calibration's, got {tuple(x.shape)}.")
@@ -509,7 +439,6 @@ class ItofCorrelation(Sensor):
         background_e: electrons of unmodulated light. Light and background are those of *all* N phase steps of a
             frequency and all taps together, which share them equally.
         electrons_per_unit: scales a radiance to electrons.
-        within_bin: as of `tap_weights`.
         calibration: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
             `FourierCode`.
 
@@ -533,20 +462,17 @@ class ItofCorrelation(Sensor):
         contrast: float = 1.0,
         background_e: float = 0.0,
         electrons_per_unit: float = 1.0,
-        within_bin: WithinBin = "uniform",
         calibration: ItofCalibration | None = None,
     ) -> None:
         super().__init__()
         me = type(self).__name__
         self.code = code
-        self.frequencies_hz = check_frequencies(frequencies_hz, me)
         self.axis = axis
-        self.contrast = check_number(contrast, "contrast", me, high=1.0)
         self.background_e = check_number(background_e, "background_e", me)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
-        self.within_bin: WithinBin = within_bin
         self.calibration = calibration
-        self._turned, phases = _checked(code, self.frequencies_hz, axis, self.contrast, within_bin, calibration, me)
+        self._turned, self.frequencies_hz, phases = _checked(code, frequencies_hz, contrast, calibration, me)
+        self.contrast = float(contrast)
         learnt = () if calibration is None else calibration.learned
         for name in learnt:
             value = getattr(calibration, name)
@@ -559,58 +485,40 @@ class ItofCorrelation(Sensor):
             self.register_parameter(name, value)
         self._learnt = learnt
         self.register_buffer("phases_rad", phases.detach())
-        self.register_buffer("weights", self._weights_for(self.phases_rad))
+        # not saved: code, axis and phases determine them
+        self.register_buffer("weights", self._weights(), persistent=False)
         self.num_bins = axis.num_bins
 
     def _of_one(self, phases: Tensor) -> bool:
         """Return True if all pixels have the same phases, which are then in the weights."""
         return not self._learnt and phases.shape[1:] == (1, 1)
 
-    def _weights_for(self, phases: Tensor) -> Tensor:
-        if self._of_one(phases):
+    def _weights(self) -> Tensor:
+        if self._of_one(self.phases_rad):
             return tap_weights(
-                self.code, self.frequencies_hz, self.axis,
-                contrast=self.contrast, within_bin=self.within_bin, calibration=self._with(phases),
-            )  # fmt: skip
+                self.code, self.frequencies_hz, self.axis, contrast=self.contrast, calibration=self._known()
+            )
         if self._turned.harmonics is not None:
-            return harmonic_rows(self._turned.harmonics, self.frequencies_hz, self.axis, self.within_bin)
+            return harmonic_rows(self._turned.harmonics, self.frequencies_hz, self.axis)
         return torch.zeros(0, self.axis.num_bins, dtype=torch.float64)
 
-    def _with(self, phases: Tensor) -> ItofCalibration:
-        """Return the calibration that has these phases."""
-        direction = 1 if self.calibration is None else self.calibration.direction
-        if phases.shape[1:] == (1, 1):
-            return ItofCalibration(phase_offset_rad=phases.flatten().tolist(), direction=direction)
-        return ItofCalibration(direction=direction, phase_map_rad=phases)
-
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        """Take phases of another size with the state; refuse the weights of another camera."""
-        phases, weights = state_dict.get(f"{prefix}phases_rad"), state_dict.get(f"{prefix}weights")
-        if isinstance(phases, Tensor) and isinstance(weights, Tensor) and not self._learnt:
-            if phases.ndim != 3 or phases.shape[0] != len(self.frequencies_hz):
-                raise ShapeError(
-                    f"ItofCorrelation.load_state_dict: expected phases_rad ({len(self.frequencies_hz)}, H, W), got "
-                    f"{tuple(phases.shape)}. Make the camera with the frequencies of the state."
-                )
-            own = self._weights_for(phases.double().cpu()).to(weights)
-            # as much as rounding to their dtype leaves, at least 1e-9 of one
-            largest = max(float(weights.abs().max()) if weights.numel() else 1.0, 1.0)
-            slack = 4 * max(float(torch.finfo(weights.dtype).eps), 1e-9) * largest
-            near = own.shape == weights.shape and torch.allclose(own, weights, rtol=0, atol=slack)
-            if not near:
-                raise UnitError(
-                    "ItofCorrelation.load_state_dict: expected the state of a camera with the code, frequencies, axis, "
-                    "contrast and direction of this one, got weights of another. Make the camera as that one was made; "
-                    "its phases come with the state."
-                )
-            self.phases_rad, self.weights = (torch.empty_like(v, device=self.weights.device) for v in (phases, own))
+        """Take phases of another size with the state, and make their weights."""
+        phases = state_dict.get(f"{prefix}phases_rad")
+        if isinstance(phases, Tensor) and len(phases) == len(self.frequencies_hz) and not self._learnt:
+            self.phases_rad = torch.empty_like(phases, device=self.phases_rad.device)
+        state_dict.pop(f"{prefix}weights", None)  # of versions that saved them
         super()._load_from_state_dict(state_dict, prefix, *others)
+        self.weights = self._weights().to(self.weights)
 
     def _known(self) -> ItofCalibration:
         """Return the calibration with the parameters and phases as they are now."""
-        if self.calibration is None or not self._learnt:
-            return self._with(self.phases_rad)
-        return replace(self.calibration, **{name: getattr(self, name) for name in self._learnt})
+        if self.calibration is not None and self._learnt:
+            return replace(self.calibration, **{name: getattr(self, name) for name in self._learnt})
+        direction = 1 if self.calibration is None else self.calibration.direction
+        if self.phases_rad.shape[1:] == (1, 1):
+            return ItofCalibration(phase_offset_rad=self.phases_rad.flatten(), direction=direction)
+        return ItofCalibration(direction=direction, phase_map_rad=self.phases_rad)
 
     def _phases(self) -> Tensor | None:
         """Return phases of pixels that differ, else None."""
@@ -626,12 +534,11 @@ class ItofCorrelation(Sensor):
 
     def _of_pixels(self, x: Tensor, phases: Tensor) -> Tensor:
         """Taps of pixels whose phases differ."""
-        check_transient(x, type(self).__name__)
-        _fitting(phases, x, "ItofCorrelation")
+        fitting_pixels(phases, check_transient(x, "ItofCorrelation"), "ItofCorrelation")
         code, harmonics = self._turned, self._turned.harmonics
         if harmonics is None:
             given = zip(self.frequencies_hz, phases, strict=True)
-            found = [taps_by_pixel(x, code, f, self.axis, self.contrast, self.within_bin, p) for f, p in given]
+            found = [taps_by_pixel(x, code, f, self.axis, self.contrast, p) for f, p in given]
             return torch.cat(found, dim=-3)
         sums = torch.split(correlate(x, self.weights), 2 * len(harmonics), dim=-3)
         total = x.sum(-3)
@@ -643,12 +550,7 @@ class ItofCorrelation(Sensor):
         return torch.cat(taps, dim=-3)
 
     def expected_from_phasor(
-        self,
-        phasor: Tensor,
-        phasor_axis: FrequencyAxis,
-        *,
-        steady: Tensor | None = None,
-        harmonics: Sequence[int] | None = None,
+        self, phasor: Tensor, phasor_axis: FrequencyAxis, *, steady: Tensor | None = None
     ) -> Tensor:
         """Taps from a phasor image in place of a transient; see `taps_from_phasor`.
 
@@ -656,7 +558,6 @@ class ItofCorrelation(Sensor):
             phasor: complex (..., C, K, H, W).
             phasor_axis: its K frequencies.
             steady: all light, (..., C, H, W), where the phasor does not hold zero.
-            harmonics: those of the code to keep; None for all.
 
         Returns:
             (..., C, F N, H, W).
@@ -667,7 +568,6 @@ class ItofCorrelation(Sensor):
             self.code,
             frequencies_hz=self.frequencies_hz,
             steady=steady,
-            harmonics=harmonics,
             contrast=self.contrast,
             calibration=self._known(),
         )

@@ -6,7 +6,7 @@ of pixels with two taps have the same one. Depth is half the way there and back:
 ``c / (2 f)``.
 
 Gradients: a phase jumps by a turn at the end of its range, so that a loss on it (or on depth) pulls pixels near the
-jump the long way round. `phasor_loss` compares phasors and has no jump; `wrapped_difference` gives the short way. A
+jump the long way round. `tt.losses.phasor_loss` has no jump; `wrapped_difference` gives the short way. A
 pixel without modulated light has phase and derivative zero.
 
 Sources: Lange & Seitz (2001); Payne, Dorrington & Cree, "Illumination waveform optimization for time-of-flight range
@@ -18,28 +18,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.checks import Numbers, as_number, is_one_of, real_array, shown
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.floating import in_single, product
-from torchtransient.sensing.checks import (
-    check_broadcast,
-    check_count,
-    check_dense,
-    check_number,
-    complex_tensor,
-    going_together,
-    number_or_tensor,
-    reals,
-    refuse_cut_off,
-    tensor_of,
-)
+from torchtransient.errors import ShapeError, UnitError
+from torchtransient.floating import in_single, product, single
+from torchtransient.sensing.checks import check_choice, check_count, check_number, reals, tensor_of
 from torchtransient.sensing.itof.codes import phase_steps
 from torchtransient.sensing.itof.correlation import Frequencies, check_frequencies
 from torchtransient.units import SPEED_OF_LIGHT
@@ -97,7 +85,6 @@ def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tenso
         ShapeError: for another number of frames.
         UnitError: for differences, in which it has cancelled.
     """
-    check_readout(readout, "offset_of")
     if readout == "differential":
         raise UnitError("offset_of: expected frames of taps, got differences, in which the offset has cancelled.")
     if readout == "two_tap":
@@ -144,62 +131,38 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
     return split[..., 0, :, :] + split[..., 1, :, :]
 
 
-def check_readout(readout: str, where: str) -> None:
-    """Check the name of a readout.
-
-    Args:
-        readout: anything.
-        where: name of the caller, for errors.
-
-    Raises:
-        ArgumentError: for other names.
-    """
-    if not is_one_of(readout, get_args(Readout)):
-        known = ", ".join(get_args(Readout))
-        raise ArgumentError(f"{where}: expected readout to be one of {known}, got {shown(readout)}.")
-
-
 def _split(taps: Frames, num_taps: int, readout: str, where: str) -> Tensor:
     """Frames as (..., C, F, N, taps of a pixel, H, W)."""
-    check_readout(readout, where)
-    frames = _precise(as_frames(taps, where), where)
+    check_choice(readout, Readout, "readout", where)
+    frames = _precise(as_frames(taps), where)
     each, least = (2 if readout == "two_tap" else 1), (3 if readout == "single" else 2)
     count = check_count(num_taps, "num_taps", where)
-    known = count >= least and frames.ndim >= 4 and frames.shape[-3] > 0 and frames.shape[-3] % (count * each) == 0
-    if not known:
-        frames_of = f"F x {each} x N" if each > 1 else "F x N"
+    if count < least or frames.ndim < 4 or not frames.shape[-3] or frames.shape[-3] % (count * each):
         raise ShapeError(
-            f"{where}: expected {readout} frames (..., C, {frames_of}, H, W) with N = {num_taps} >= {least} phase "
+            f"{where}: expected {readout} frames (..., C, {each} F N, H, W) with N = {num_taps} >= {least} phase "
             f"steps, got {tuple(frames.shape)}."
         )
     frequencies = frames.shape[-3] // (count * each)
     return frames.reshape(*frames.shape[:-3], frequencies, count, each, *frames.shape[-2:])
 
 
-def as_frames(taps: Frames, where: str) -> Tensor:
+def as_frames(taps: Frames) -> Tensor:
     """Return a tensor as it is, and an array as one.
 
     Args:
         taps: frames.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for anything without numbers.
     """
-    if not isinstance(taps, (Tensor, np.ndarray)) and real_array(taps) is None:
-        raise UnitError(f"{where}: expected frames of numbers as a tensor or an array, got {shown(taps)}.")
-    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps), where)
+    return taps if isinstance(taps, Tensor) else tensor_of(np.asarray(taps))
 
 
 def _precise(frames: Tensor, where: str) -> Tensor:
     """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
-    check_dense(frames, where)
-    if frames.is_complex() or frames.dtype == torch.bool:
+    if frames.is_complex():
         raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
     if not frames.is_floating_point():
         # float32 holds every 16-bit number and the sum of two.
         return frames.to(torch.float32 if frames.dtype.itemsize <= 2 else torch.float64)
-    return frames.float() if frames.dtype in (torch.float16, torch.bfloat16) else frames
+    return single(frames)
 
 
 def phase_of(phasor: Tensor) -> Tensor:
@@ -211,7 +174,6 @@ def phase_of(phasor: Tensor) -> Tensor:
     Returns:
         Shape of ``phasor``, radians.
     """
-    phasor = complex_tensor("phase_of", phasor=phasor)
     real, imag, there, scale = _scaled(phasor)
     # At scale one the squares in the derivative of atan2 cannot underflow; the angle does not depend on it.
     angle = torch.atan2(torch.where(there, imag, 0.0) / scale, torch.where(there, real, 1.0) / scale)
@@ -234,7 +196,6 @@ def amplitude_of(phasor: Tensor) -> Tensor:
     Args:
         phasor: complex, any shape.
     """
-    phasor = complex_tensor("amplitude_of", phasor=phasor)
     real, imag, there, scale = _scaled(phasor)
     square = (real / scale).square() + (imag / scale).square()
     return torch.where(there, torch.where(there, square, 1.0).sqrt() * scale, 0.0)
@@ -260,12 +221,9 @@ def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
         Metres, in the shape of ``phase``.
 
     Raises:
-        UnitError: for several frequencies.
+        UnitError: for frequencies that are no hertz.
     """
-    (phase,) = reals("depth_of_phase", phase=phase)
-    if len(values := check_frequencies(frequency_hz, "depth_of_phase")) != 1:
-        raise UnitError(f"depth_of_phase: expected frequency_hz as one number, got {shown(frequency_hz)}.")
-    (f,) = values
+    f = check_number(frequency_hz, "frequency_hz", "depth_of_phase", low=1e3, high=1e12)
     return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
 
 
@@ -297,71 +255,31 @@ def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     Args:
         a: in radians.
         b: in radians; shapes broadcast.
-
-    Raises:
-        ShapeError: for shapes that do not.
     """
-    a, b = going_together("wrapped_difference", a=a, b=b)
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
     return difference - _TURN * turns
 
 
-def phasor_loss(phasor: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Squared distance of phasors, ``|z - target|^2``: a loss of phases without a branch cut.
-
-    Scale both to amplitude one (``z / amplitude``) for a loss on the phase alone, ``2 (1 - cos(difference))``.
-
-    Args:
-        phasor: complex, any shape.
-        target: complex; shapes broadcast.
-        weight: real factor, None for one.
-
-    Returns:
-        Real, elementwise.
-
-    Raises:
-        UnitError: for real numbers.
-        ShapeError: for shapes that do not broadcast.
-    """
-    phasor, target = complex_tensor("phasor_loss", phasor=phasor), complex_tensor("phasor_loss", target=target)
-    check_broadcast("phasor_loss", phasor=phasor, target=target)
-    difference = phasor - target
-    loss = difference.real.square() + difference.imag.square()
-    if weight is None:
-        return loss
-    weight = number_or_tensor(weight, "weight", "phasor_loss")
-    if isinstance(weight, Tensor):
-        check_broadcast("phasor_loss", phasor=phasor, weight=weight)
-    return loss * weight
-
-
-def shares_of_depth(frequencies_hz: Sequence[float], weights: Sequence[float] | None = None) -> list[float]:
-    """Weights of the depths of several frequencies in their least-squares mean: ``w f^2`` over their sum.
+def shares_of_depth(frequencies_hz: Sequence[float]) -> list[float]:
+    """Weights of the depths of several frequencies in their least-squares mean: ``f^2`` over their sum.
 
     Args:
         frequencies_hz: F frequencies in hertz.
-        weights: one over the variance of each phase; None for equal ones.
     """
-    given = [1.0] * len(frequencies_hz) if weights is None else weights
-    # A phase of frequency f measures depth with the weight w / period^2.
-    parts = [w * f**2 for w, f in zip(given, frequencies_hz, strict=True)]
+    # A phase of frequency f measures depth with the weight 1 / period^2.
+    parts = [f**2 for f in frequencies_hz]
     return [part / sum(parts) for part in parts]
 
 
 @in_single
 def unwrap_depth(
-    phase: Tensor,
-    frequencies_hz: Frequencies,
-    *,
-    max_depth_m: float | None = None,
-    min_depth_m: float = 0.0,
-    weights: Numbers | None = None,
+    phase: Tensor, frequencies_hz: Frequencies, *, max_depth_m: float | None = None, min_depth_m: float = 0.0
 ) -> Tensor:
     """Unwrap phases of several frequencies to depth: the lattice of wraps, searched.
 
     For every number of turns of the highest frequency within the range the other frequencies take their nearest number
-    of turns, and the weighted least-squares depth with the least residual wins. The whole turns are detached; the
+    of turns, and the least-squares depth with the least residual wins. The whole turns are detached; the
     gradient is that of the least-squares depth in the phases. Memory does not grow with the number of candidates.
 
     Args:
@@ -369,7 +287,6 @@ def unwrap_depth(
         frequencies_hz: F modulation frequencies in hertz.
         max_depth_m: in metres; None for one range after which everything repeats.
         min_depth_m: in metres; with noise around zero depth a little below zero.
-        weights: one over the variance of each *phase*; equal by default.
 
     Returns:
         (..., C, H, W), metres.
@@ -383,8 +300,7 @@ def unwrap_depth(
     (phase,) = reals(me, phase=phase)
     if phase.ndim < 4 or phase.shape[-3] != len(values):
         raise ShapeError(f"{me}: expected phases (..., C, {len(values)}, H, W), got {tuple(phase.shape)}.")
-    least, most = check_depths(min_depth_m, max_depth_m, me)
-    min_depth_m, longest = least, least + unambiguous_range_m(values) if most is None else most
+    longest = min_depth_m + unambiguous_range_m(values) if max_depth_m is None else max_depth_m
     if not (math.isfinite(longest) and longest > min_depth_m):
         raise UnitError(f"{me}: expected min_depth_m < max_depth_m in metres, got {min_depth_m!r} and {longest!r}.")
     # a tenth more leaves room for noise at both ends
@@ -393,52 +309,23 @@ def unwrap_depth(
             f"{me}: expected max_depth_m - min_depth_m of at most {unambiguous_range_m(values):.4g} m, after which the "
             f"phases of {values} Hz repeat, got {longest - min_depth_m:.4g} m. Metres? Or add a frequency."
         )
-    refuse_cut_off(weights, "weights", me)
-    given = np.ones(len(values)) if weights is None else real_array(weights)
-    if given is None or given.shape != (len(values),) or not (given > 0).all():
-        raise UnitError(f"{me}: expected {len(values)} positive weights, got {shown(weights)}.")
-    weight = given.tolist()
 
     turns = phase / _TURN
     periods = [SPEED_OF_LIGHT / (2 * f) for f in values]  # metres per turn
-    share = shares_of_depth(values, weight)
+    share = shares_of_depth(values)
     reference = min(range(len(values)), key=lambda i: periods[i])
     with torch.no_grad():
-        _, whole = _search(turns, periods, share, weight, reference, (float(min_depth_m), longest))
+        whole = _search(turns, periods, share, reference, (float(min_depth_m), float(longest)))
     metres = turns.new_tensor([s * p for s, p in zip(share, periods, strict=True)]).reshape(-1, 1, 1)
     depth: Tensor = ((turns + whole) * metres).sum(-3)
     return depth
 
 
-def check_depths(min_depth_m: Any, max_depth_m: Any, where: str) -> tuple[float, float | None]:
-    """Return the ends of a range of depths as numbers.
-
-    Args:
-        min_depth_m: in metres.
-        max_depth_m: in metres, or None.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for anything that is no number.
-    """
-    least, most = as_number(min_depth_m), None if max_depth_m is None else as_number(max_depth_m)
-    if least is None or (most is None and max_depth_m is not None):
-        got = f"{shown(min_depth_m)} and {shown(max_depth_m)}"
-        raise UnitError(f"{where}: expected min_depth_m and max_depth_m as numbers of metres, got {got}.")
-    return least, most
-
-
 def _search(
-    turns: Tensor,
-    periods: list[float],
-    share: list[float],
-    weight: list[float],
-    reference: int,
-    limits: tuple[float, float],
-) -> tuple[Tensor, Tensor]:
-    """Return the least residual and the whole turns (..., F, H, W) that give it."""
-    shape = (-1, 1, 1)
-    period, part, importance = (turns.new_tensor(v).reshape(shape) for v in (periods, share, weight))
+    turns: Tensor, periods: list[float], share: list[float], reference: int, limits: tuple[float, float]
+) -> Tensor:
+    """Return the whole turns (..., F, H, W) of the least residual."""
+    period, part = (turns.new_tensor(v).reshape(-1, 1, 1) for v in (periods, share))
     first = math.floor(limits[0] / periods[reference]) - 1
     last = math.ceil(limits[1] / periods[reference])
     best = torch.full_like(turns.select(-3, 0), math.inf)
@@ -449,14 +336,14 @@ def _search(
         candidate.select(-3, reference).fill_(n)
         depths = (turns + candidate) * period
         depth = (depths * part).sum(-3)
-        residual = (((depths - depth.unsqueeze(-3)) / period).square() * importance).sum(-3)
+        residual = ((depths - depth.unsqueeze(-3)) / period).square().sum(-3)
         inside = (depth >= limits[0]) & (depth < limits[1])
         residual = torch.where(inside, residual, math.inf)
         # Rounding leaves residuals of 1e-14 that mean nothing; the nearer of two equal candidates stays.
         better = residual < best - 1e-12
         best = torch.where(better, residual, best)
         whole = torch.where(better.unsqueeze(-3), candidate, whole)
-    return best, whole
+    return whole
 
 
 # -------------------------------------------------------------------------------------------------- heterodyne cameras
@@ -486,11 +373,10 @@ def heterodyne_speed(
 
     Raises:
         UnitError: for numbers out of range, and real tensors.
-        ShapeError: for shapes that do not go together.
     """
     me = "heterodyne_speed"
-    beat, plain = complex_tensor(me, beat=beat), complex_tensor(me, plain=plain)
-    check_broadcast(me, beat=beat, plain=plain)
+    if not (beat.is_complex() and plain.is_complex()):
+        raise UnitError(f"{me}: expected complex phasors, got {beat.dtype} and {plain.dtype}. tap_phasor makes some.")
     values, turns = check_frequencies(frequencies_hz, me), check_count(beats, "beats", me)
     seconds = check_number(duration_s, "duration_s", me, open_low=True)
     dark = plain == 0
@@ -500,5 +386,4 @@ def heterodyne_speed(
     hertz = torch.tensor(values, dtype=ratio.dtype, device=ratio.device)
     if len(values) > 1:
         hertz = hertz[:, None, None]
-        check_broadcast(me, beat=beat, frequencies_hz=hertz)
     return turns * ratio / (1 - ratio) * (SPEED_OF_LIGHT / (2 * seconds)) / hertz

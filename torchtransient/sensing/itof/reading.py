@@ -20,31 +20,22 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import MOST_MADE, shown
+from torchtransient.checks import shown
 from torchtransient.errors import ArgumentError, PhysicsWarning, ShapeError, UnitError
 from torchtransient.floating import holds, in_single, without_autocast
-from torchtransient.sensing.checks import (
-    check_count,
-    check_number,
-    going_together,
-    no_arrays,
-    reals,
-)
+from torchtransient.sensing.checks import check_choice, check_count, check_number, no_arrays
 from torchtransient.sensing.itof.codes import CorrelationCode, TwoTapCode, in_direction, phase_steps
-from torchtransient.sensing.itof.correlation import Frequencies, ItofCalibration, check_frequencies
+from torchtransient.sensing.itof.correlation import Frequencies, ItofCalibration, check_frequencies, fitting_pixels
 from torchtransient.sensing.itof.depth import (
     Frames,
     Readout,
     amplitude_of,
     as_frames,
     below_a_turn,
-    check_depths,
-    check_readout,
     depth_of_phase,
     offset_of,
     phase_of,
@@ -59,6 +50,8 @@ from torchtransient.tensor_record import TensorRecord
 from torchtransient.units import SPEED_OF_LIGHT
 
 _TURN = 2 * math.pi
+_PHASES = 1024  # of the table that shapes are compared with
+_CHUNK = 1 << 14  # pixels that are compared at once
 _SMALL_PHASE = 0.2  # radians of noise, up to which a phase is right to first order
 
 
@@ -86,11 +79,6 @@ class ItofReading(TensorRecord):
     offset: Tensor | None
     depth_std_m: Tensor | None
     depth_m: Tensor
-
-    def __getattr__(self, name: str) -> Any:
-        instead = " What it stood for: depth_std_m (metres), amplitude, or contrast (amplitude / offset)."
-        hint = instead * (name == "confidence")
-        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'.{hint}")
 
     @property
     def contrast(self) -> Tensor | None:
@@ -135,12 +123,13 @@ class ItofNoise:
             object.__setattr__(self, "electrons_per_unit", gain)
         object.__setattr__(self, "read_noise_e", check_number(self.read_noise_e, "read_noise_e", me))
         for name in ("offset_e", "std_e"):
-            given = no_arrays(getattr(self, name), me)
-            if given is not None and not isinstance(given, Tensor):
+            given = no_arrays(getattr(self, name))
+            if isinstance(given, Tensor):
+                if not holds(given >= 0):
+                    raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
+            elif given is not None:
                 # no light at all has no phase, and no noise no deviation
                 given = check_number(given, name, me, open_low=True)
-            elif given is not None and not holds(reals(me, None, **{name: given})[0] >= 0):
-                raise UnitError(f"{me}: expected every {name} to be a number >= 0, got {shown(given)}.")
             object.__setattr__(self, name, given)
 
 
@@ -166,16 +155,15 @@ def phase_noise_rad(
         Radians.
     """
     read = check_number(read_noise_e, "read_noise_e", "phase_noise_rad")
-    amplitude, offset = going_together("phase_noise_rad", amplitude=amplitude, offset=offset)
-    check_readout(readout, "phase_noise_rad")
+    check_choice(readout, Readout, "readout", "phase_noise_rad")
     power = 2 * (offset + (1 if readout == "single" else 2) * read**2)
     return (power / check_count(num_taps, "num_taps", "phase_noise_rad")).sqrt() / amplitude
 
 
-def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, readout: Readout = "single") -> Tensor:
+def decode_code(taps: Frames, code: CorrelationCode, *, readout: Readout = "single") -> Tensor:
     """Decode frames of *any* code by the closest shape of the N steps.
 
-    The steps at length one, single taps without their mean, are compared with the code at ``num_phases`` phases
+    The steps at length one, single taps without their mean, are compared with the code at 1024 phases
     (normalised cross-correlation, Gupta et al. 2018); the best of them, detached, is refined by one Gauss-Newton step
     on the code's slope, which carries the gradient. Needs no model of amplitude or background. A dark or flat pixel has
     phase zero.
@@ -183,7 +171,6 @@ def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, 
     Args:
         taps: frames of a camera, see `read_itof`.
         code: that of one tap, or its `TwoTapCode`.
-        num_phases: phases in the table.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -191,16 +178,14 @@ def decode_code(taps: Frames, code: CorrelationCode, *, num_phases: int = 1024, 
 
     Raises:
         ShapeError: for another number of frames.
-        UnitError: for anything that is no code.
         ArgumentError: for a `TwoTapCode` of single taps.
     """
     code = one_tap(code, readout, me := "decode_code")
-    phases = check_count(num_phases, "num_phases", me, most=MOST_MADE)
-    return _by_shape(steps_of(taps, code.num_taps, readout, me), code, phases, readout)[0]
+    return _by_shape(steps_of(taps, code.num_taps, readout, me), code, readout)[0]
 
 
 @without_autocast
-def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: str) -> tuple[Tensor, Tensor]:
+def _by_shape(steps: Tensor, code: CorrelationCode, readout: str) -> tuple[Tensor, Tensor]:
     """Return phases (..., F, H, W) of steps (..., F, N, H, W), and their slopes ``d phi / d X_n`` (..., F, N, H, W)."""
     split = steps.movedim(-3, -1)
     # Differences have no unmodulated light in them, and two have nothing to spare.
@@ -210,16 +195,16 @@ def _by_shape(steps: Tensor, code: CorrelationCode, num_phases: int, readout: st
     faint = (1e-6 if single else 0.0) * split.abs().amax(-1, keepdim=True)
     there = ~(length <= faint)
     unit = torch.where(there, centred, 0.0) / torch.where(there, length, 1.0)
-    x = torch.arange(num_phases, dtype=torch.float64) / num_phases
+    x = torch.arange(_PHASES, dtype=torch.float64) / _PHASES
     table = _unit_shapes(code, x, single).to(unit)
     best = _best_match(unit, table)
-    step = 0.5 / num_phases
+    step = 0.5 / _PHASES
     slope = ((_unit_shapes(code, x + step, single) - _unit_shapes(code, x - step, single)) / (2 * step)).to(unit)
     here, direction = table[best], slope[best]
     # Along the curve of shapes, the distance to the measured one in units of the curve's speed.
     speed = direction.square().sum(-1).clamp_min(1e-12)
     shift = ((unit - here) * direction).sum(-1) / speed
-    turns = x.to(unit)[best] + shift.clamp(-2 / num_phases, 2 / num_phases)
+    turns = x.to(unit)[best] + shift.clamp(-2 / _PHASES, 2 / _PHASES)
     phase = below_a_turn((turns - torch.floor(turns)) * _TURN)
     slopes = _TURN * direction / (torch.where(there, length, 1.0) * speed.unsqueeze(-1))
     slopes = torch.where(there, slopes, math.inf)
@@ -234,12 +219,10 @@ def _unit_shapes(code: CorrelationCode, turns: Tensor, centred: bool) -> Tensor:
     return unit
 
 
-def _best_match(unit: Tensor, table: Tensor, chunk: int = 1 << 14) -> Tensor:
-    """Index of the row of ``table`` (P, N) with the largest product for each of (..., N); memory chunk x P."""
-    if unit.numel() == 0:
-        return torch.zeros(unit.shape[:-1], dtype=torch.int64, device=unit.device)
+def _best_match(unit: Tensor, table: Tensor) -> Tensor:
+    """Index of the row of ``table`` (P, N) with the largest product for each of (..., N)."""
     flat = unit.reshape(-1, unit.shape[-1])
-    found = [(flat[i : i + chunk] @ table.T).argmax(-1) for i in range(0, flat.shape[0], chunk)]
+    found = [(part @ table.T).argmax(-1) for part in flat.split(_CHUNK)]  # type: ignore[no-untyped-call]
     return torch.cat(found).reshape(unit.shape[:-1])
 
 
@@ -252,11 +235,8 @@ def one_tap(code: CorrelationCode, readout: str, where: str) -> CorrelationCode:
         where: name of the caller, for errors.
 
     Raises:
-        UnitError: for anything that is no code.
         ArgumentError: for a `TwoTapCode` of single taps.
     """
-    if not isinstance(code, CorrelationCode):
-        raise UnitError(f"{where}: expected a code such as hamiltonian_code(3), got {shown(code)}.")
     if isinstance(code, TwoTapCode) and readout == "single":
         raise ArgumentError(f"{where}: expected readout='two_tap' or 'differential' for a TwoTapCode, got 'single'.")
     return code.code if isinstance(code, TwoTapCode) else code
@@ -299,7 +279,7 @@ def read_itof(
     """
     me = "read_itof"
     values = check_frequencies(frequencies_hz, me)
-    taps = as_frames(taps, me)
+    taps = as_frames(taps)
     steps = steps_of(taps, num_taps, readout, me)
     if steps.shape[-4] != len(values):
         raise ShapeError(
@@ -315,13 +295,12 @@ def read_itof(
         gates = in_direction(one_tap(code, readout, me), known.direction)
         if gates.num_taps != num_taps:
             raise ShapeError(f"{me}: expected num_taps = {gates.num_taps} of the code, got {num_taps}.")
-        phase, slopes = _by_shape(steps, gates, 1024, readout)
+        phase, slopes = _by_shape(steps, gates, readout)
     offset = None if readout == "differential" else offset_of(taps, num_taps, readout)
     at_corners = None if code is None else functools.partial(_at_corners, steps, phase, gates, readout)
     phase = _without_offsets(phase, known, values)
     std = _depth_std(taps, steps, slopes, values, readout, noise, at_corners)
     if len(values) == 1:
-        check_depths(min_depth_m, max_depth_m, me)
         depth = depth_of_phase(phase, values[0]).squeeze(-3)
     else:
         depth = unwrap_depth(phase, values, max_depth_m=max_depth_m, min_depth_m=min_depth_m)
@@ -330,12 +309,7 @@ def read_itof(
 
 def _without_offsets(phase: Tensor, calibration: ItofCalibration, frequencies: tuple[float, ...]) -> Tensor:
     """Take the phases of a calibration off phases (..., F, H, W), in [0, 2 pi)."""
-    added = calibration.phases_rad(frequencies)
-    if tuple(added.shape[1:]) not in ((1, 1), tuple(phase.shape[-2:])):
-        raise ShapeError(
-            f"read_itof: expected frames of {tuple(added.shape[1:])} pixels, as the maps of the calibration, got "
-            f"{tuple(phase.shape[-2:])}."
-        )
+    added = fitting_pixels(calibration.phases_rad(frequencies), phase, "read_itof")
     # In [0, 2 pi) before the dtype of the frames rounds it.
     phase = phase - (added % _TURN).to(phase)
     return below_a_turn(phase - _TURN * torch.floor(phase / _TURN))
@@ -370,7 +344,7 @@ def _at_corners(
     for row in torch.eye(steps.shape[-3], dtype=steps.dtype, device=steps.device):
         away = far * row.view(-1, 1, 1)
         for moved in (steps + away, steps - away):
-            found.append(wrapped_difference(_by_shape(moved, code, 1024, readout)[0], phase))
+            found.append(wrapped_difference(_by_shape(moved, code, readout)[0], phase))
     return torch.where(first < _SMALL_PHASE**2, torch.stack(found).var(0, correction=0), first)
 
 
@@ -396,19 +370,17 @@ def _depth_std(
         )
     gain = known.electrons_per_unit or 1.0
     offset: Tensor | None = None  # electrons of all light in a step; None where the deviations were given
-    if readout == "differential" and known.offset_e is not None:
+    if readout != "differential":
+        offset = (sums_of(taps, steps.shape[-3], "read_itof") if readout == "two_tap" else steps) * gain
+    elif known.offset_e is not None:
         offset = _of_frequencies(known.offset_e, steps)
-    elif readout == "two_tap":
-        offset = sums_of(taps, steps.shape[-3], "read_itof").clamp_min(0) * gain
-    elif readout == "single":
-        offset = steps.clamp_min(0) * gain
     read = (1 if readout == "single" else 2) * known.read_noise_e**2
     if known.std_e is not None:
         variance = _of_frequencies(known.std_e, steps).square()
     elif offset is None:
         return None
     else:
-        variance = offset + read
+        variance = offset.clamp_min(0) + read
     # The slopes of dark pixels are infinite: neither a product with zero nor a gradient may come of them.
     there = ~torch.isinf(slopes)
     power = ((torch.where(there, slopes, 0.0) / gain).square() * variance).sum(-3)
@@ -422,10 +394,6 @@ def _depth_std(
     if offset is None:
         return std
     rounding = (gain if raw else 0.0) ** 2 / 12
-    if readout == "single":
-        offset = steps * gain  # signs and all
-    elif readout == "two_tap":
-        offset = sums_of(taps, steps.shape[-3], "read_itof") * gain
     lit = _can_be(steps * gain, offset, readout == "differential", read + rounding)
     if lit.numel() and not holds(lit.double().mean() >= 0.5):
         warnings.warn(
@@ -455,11 +423,6 @@ def _can_be(steps: Tensor, offset: Tensor, from_picture: bool, read: float) -> T
 
 
 def _of_frequencies(given: float | Tensor, steps: Tensor) -> Tensor:
-    """(..., F, 1, H, W) of a number or of (..., C, F, H, W). Raises ShapeError for other sizes."""
+    """(..., F, 1, H, W) of a number or of (..., C, F, H, W)."""
     like = steps.select(-3, 0)
-    value = given.to(like) if isinstance(given, Tensor) else like.new_tensor(given)
-    try:
-        return value.broadcast_to(like.shape).unsqueeze(-3)
-    except RuntimeError as error:
-        got = f"expected a number or what broadcasts to {tuple(like.shape)}, got {tuple(value.shape)}"
-        raise ShapeError(f"ItofNoise: {got}.") from error
+    return torch.as_tensor(given, dtype=torch.float64).to(like).broadcast_to(like.shape).unsqueeze(-3)
