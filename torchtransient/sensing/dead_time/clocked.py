@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,35 +37,14 @@ _STATES = 1 << 24  # numbers that are held at a time while bins are cut
 # --------------------------------------------------------------------------------------------------- bins cut in pieces
 
 
-class _LevelCounts(torch.autograd.Function):
-    """Numbers of rows of levels 0, 1, 2, ..., and a flag of torch.func.vmap, under which rows cannot be told."""
-
-    @staticmethod
-    def forward(level: Tensor, mapped: bool) -> Tensor:
-        number = torch.bincount(level.reshape(-1), minlength=1)
-        return torch.cat([number.new_full((1,), int(mapped)), number])
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, None]:
-        return None, None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], level: Tensor, mapped: bool) -> tuple[Tensor, None]:
-        # of all that is mapped over: a number that can be looked at
-        return _LevelCounts.apply(level, True), None  # type: ignore[no-untyped-call]
-
-
-def _level_counts(level: Tensor) -> list[int]:
-    """List of `_LevelCounts`, without autograd where nothing is mapped over: it costs as much as small images."""
-    if torch._C._functorch.is_functorch_wrapped_tensor(level):
-        # One by one: torch 2.6 makes no list inside of torch.func.
-        hidden: Tensor = _LevelCounts.apply(level, False)  # type: ignore[no-untyped-call]
-        return [int(number) for number in hidden.unbind()]
-    return _LevelCounts.forward(level, False).tolist()
+def _level_counts(level: Tensor) -> tuple[list[int], bool]:
+    """Numbers of rows of levels 0, 1, 2, ..., of all rows that are mapped over inside of torch.func.vmap; True there."""
+    mapped = False
+    while torch._C._functorch.is_functorch_wrapped_tensor(level):
+        mapped = mapped or torch._C._functorch.is_batchedtensor(level)
+        level = torch._C._functorch.get_unwrapped(level)
+    # One by one: torch 2.6 makes no list inside of torch.func.
+    return [int(number) for number in torch.bincount(level.reshape(-1), minlength=1).unbind()], mapped
 
 
 def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tensor, list[int], bool]:
@@ -84,14 +63,14 @@ def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tu
     """
     peak = torch.nan_to_num(rate.detach().amax(-1), nan=0.0) / (photons * least)
     level = torch.ceil(torch.log2(peak.clamp(1, 2.0**40)) - 1e-9).long()
-    found = _level_counts(level)
-    present = [k for k, number in enumerate(found[1:]) if number]
+    found, hidden = _level_counts(level)
+    present = [k for k, number in enumerate(found) if number]
     if present and (least << present[-1]) > MOST_PIECES:
         raise TorchTransientError(
             f"detections_with_dead_time: expected at most {photons * MOST_PIECES:g} photons in a bin, got "
             f"{float(peak.amax()) * photons * least:g}. Use narrower bins, or less light."
         )
-    return level, present, bool(found[0])
+    return level, present, hidden
 
 
 def highest_level(level: Tensor) -> int:
@@ -100,7 +79,7 @@ def highest_level(level: Tensor) -> int:
     Args:
         level: integers.
     """
-    return len(_level_counts(level)) - 2
+    return len(_level_counts(level)[0]) - 1
 
 
 def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
@@ -531,8 +510,8 @@ def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | 
 def mean_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
     """Mean detections per cycle and bin, differentiable to any order.
 
-    First derivatives in the light take the adjoint of the scan; others (in the dead time, forward mode, higher orders)
-    the recursion in differentiable steps, which takes longer.
+    First derivatives in the light take the adjoint of the scan; others (in the dead time, forward mode, higher orders,
+    transforms of torch.func) the recursion in differentiable steps, which takes longer.
 
     Args:
         rate: (T, P) per cycle and bin, float64.
@@ -541,34 +520,19 @@ def mean_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
     Returns:
         (T, P) float64.
     """
+    if not torch.compiler.is_compiling():
+        wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+        if any(is_dual(x) or wrapped(x) for x in (rate, dead_bins)):
+            return _means_in_steps(rate, dead_bins)
+        if not torch.is_grad_enabled():
+            return _Detected.forward(rate, dead_bins, False)[0]  # calls of autograd take as long as small images
     keep = torch.is_grad_enabled() and rate.requires_grad
-    watched = torch.is_grad_enabled() or torch.compiler.is_compiling()
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    if not watched and not any(is_dual(x) or wrapped(x) for x in (rate, dead_bins)):
-        return _Detected.forward(rate, dead_bins, False)[0]  # calls of autograd take as long as small images
     found: Tensor = _Detected.apply(rate, dead_bins, keep)[0]  # type: ignore[no-untyped-call]
     return found
 
 
 def _means_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
     return mean_detections_in_steps(rate.T, dead_bins).T
-
-
-def _gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    found: tuple[Tensor, Tensor] = torch.func.vjp(_means_in_steps, rate, dead_bins)[1](weights)
-    return found
-
-
-def _light_gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) -> Tensor:
-    return _gradient_in_steps(rate, dead_bins, weights)[0]
-
-
-def _jvp(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor | None, ...]) -> Tensor:
-    """Derivative along a direction, as the derivative of the (linear) gradient in its weights."""
-    value, pull, *_ = torch.func.vjp(of, *at)
-    along = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(at, along, strict=True))
-    found: Tensor = torch.func.vjp(pull, torch.zeros_like(value))[1](along)[0]
-    return found
 
 
 class _Detected(torch.autograd.Function):
@@ -589,73 +553,24 @@ class _Detected(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(inputs[0], inputs[1], output[1])
-        ctx.save_for_forward(inputs[0], inputs[1])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor | None, None]:
         rate, dead_bins, kept = ctx.saved_tensors
         # batches of torch.autograd (is_grads_batched) know no rule of ours
-        if ctx.needs_input_grad[1] or torch._C._functorch.is_legacy_batchedtensor(gradients[0]):
-            return *_gradient_in_steps(rate, dead_bins, gradients[0]), None
-        found: Tensor = _Adjoint.apply(rate, dead_bins, gradients[0], kept)  # type: ignore[no-untyped-call]
-        return found, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor, None]:
-        return _jvp(_means_in_steps, ctx.saved_tensors, tangents[:2]), None
-
-    @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[int | None, ...], rate: Tensor, dead_bins: Tensor, keep: bool
-    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
-        given = _batch_as_columns(info.batch_size, in_dims, rate, dead_bins)
-        detected, kept = _Detected.apply(*given, keep)  # type: ignore[no-untyped-call]
-        detected = detected.view(detected.shape[0], info.batch_size, -1)
-        if kept.ndim == 1:
-            return (detected, kept), (1, None)
-        return (detected, kept.view(*kept.shape[:2], info.batch_size, -1)), (1, 2)
+        batched = torch._C._functorch.is_legacy_batchedtensor(gradients[0])
+        if ctx.needs_input_grad[1] or torch.is_grad_enabled() or batched:
+            return *torch.func.vjp(_means_in_steps, rate, dead_bins)[1](gradients[0]), None
+        return _light_gradient(rate, dead_bins, gradients[0], kept), None, None
 
 
-class _Adjoint(torch.autograd.Function):
+def _light_gradient(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
     """Derivatives (T, P) in the rates of the sum of detections with weights (T, P)."""
-
-    @staticmethod
-    def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
-        gradient = torch.empty_like(rate)
-        for columns, scan in detection_scans(rate, dead_bins):
-            states = kept if kept.ndim > 1 else scan.forward()
-            given = torch.zeros_like(states)
-            own = weights[:, columns]
-            given[1:, 1] = own.repeat_interleave(scan.pieces, 0) if scan.pieces > 1 else own
-            gradient[:, columns] = scan.adjoint(states, given)
-        return gradient
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:3])
-        ctx.save_for_forward(*inputs[:3])
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return *torch.func.vjp(_light_gradient_in_steps, *ctx.saved_tensors)[1](gradients[0]), None
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _jvp(_light_gradient_in_steps, ctx.saved_tensors, tangents[:3])
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
-        found: Tensor = _Adjoint.apply(*_batch_as_columns(info.batch_size, in_dims, *inputs))  # type: ignore[no-untyped-call]
-        return found.view(found.shape[0], info.batch_size, -1), 1
-
-
-def _batch_as_columns(batch: int, in_dims: tuple[int | None, ...], *inputs: Tensor) -> list[Tensor]:
-    """Columns of a batch beside one another, with one dead time for all of them."""
-    given = []
-    for place, x in zip(in_dims, inputs, strict=False):
-        if x.ndim < 2:
-            given.append(x)
-            continue
-        wide = x.unsqueeze(-2).expand(*x.shape[:-1], batch, -1) if place is None else x.movedim(place, -2)
-        given.append(wide.flatten(-2))
-    return given
+    gradient = torch.empty_like(rate)
+    for columns, scan in detection_scans(rate, dead_bins):
+        states = kept if kept.ndim > 1 else scan.forward()
+        given = torch.zeros_like(states)
+        own = weights[:, columns]
+        given[1:, 1] = own.repeat_interleave(scan.pieces, 0) if scan.pieces > 1 else own
+        gradient[:, columns] = scan.adjoint(states, given)
+    return gradient
