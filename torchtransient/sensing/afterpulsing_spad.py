@@ -24,6 +24,7 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from torch.autograd.functional import jvp
 
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.floating import in_single
@@ -128,14 +129,9 @@ class _Trapped(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
         loss, kept, source, part, x = ctx.saved_tensors
         given = (loss, kept, source, part)
-        along = [torch.zeros_like(v) if t is None else t for v, t in zip(given, tangents, strict=False)]
-        with torch.enable_grad():
-            leaves = [v.detach().requires_grad_() for v in given]
-            value = _step(leaves, ctx.whole, x)
-            weights = torch.zeros_like(value, requires_grad=True)
-            gradients = torch.autograd.grad(value, leaves, weights, create_graph=True)
-            total = torch.stack([(g * t).sum() for g, t in zip(gradients, along, strict=True)]).sum()
-            right = torch.autograd.grad(total, weights)[0]
+        along = tuple(torch.zeros_like(v) if t is None else t for v, t in zip(given, tangents, strict=False))
+        # by two backward passes, which are the derivative of the gradient in its weights
+        right = jvp(lambda *leaves: _step(leaves, ctx.whole, x), given, along)[1]
         found = []
         for at in torch.split(torch.arange(loss.shape[0], device=loss.device), _ROWS_AT_ONCE):
             found.append(_LossyChain(loss[at], kept[at], part, ctx.whole).solve(right[at]))

@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.functional import jvp
 
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing.checks import one_number
@@ -636,20 +637,6 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     return torch.cat(found)
 
 
-def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Tensor, by_part: Tensor) -> Tensor:
-    """Derivative of one step from `pi` along changes of the rate and of the fraction of a bin.
-
-    By two backward passes: the gradient is linear in its weights, and its derivative in those is the one sought.
-    """
-    with torch.enable_grad():
-        leaves = rate.detach().requires_grad_(), part.detach().requires_grad_()
-        value = RenewalChain(leaves[0], whole, leaves[1]).step(pi)
-        weights = torch.zeros_like(value, requires_grad=True)
-        gradients = torch.autograd.grad(value, leaves, weights, create_graph=True)
-        along = (gradients[0] * by_rate).sum() + gradients[1] * by_part
-        return torch.autograd.grad(along, weights)[0]
-
-
 class _StationaryPhases(torch.autograd.Function):
     """Stationary lines of (rate, part), with both modes by the implicit function theorem."""
 
@@ -668,7 +655,8 @@ class _StationaryPhases(torch.autograd.Function):
         by_part = torch.zeros_like(part) if by_part is None else by_part
         found = []
         for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (rate, pi, by_rate)), strict=True):
-            right = _step_along(r, ctx.whole, part, p, d, by_part)
+            # by two backward passes, which are the derivative of the gradient in its weights
+            right = jvp(lambda r, part, p=p: RenewalChain(r, ctx.whole, part).step(p), (r, part), (d, by_part))[1]
             found.append(_solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=False))
         return torch.cat(found)
 
