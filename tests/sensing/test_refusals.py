@@ -68,13 +68,6 @@ class Backward(torch.autograd.Function):
         return 2 * g
 
 
-class Cut(sensing.Sensor):
-    """Loses its gradient."""
-
-    def expected(self, x):
-        return x.detach()
-
-
 def one_backward(*maps):
     return Backward.apply(mean(*maps))
 
@@ -133,7 +126,6 @@ SHAPES = [
     lambda: sensing.ComposedResponse([sensing.UniformResponse(PS)], oversampling=4),
     lambda: sensing.convolve_time(LIGHT, torch.ones(2, 2)),
     lambda: sensing.PixelGroups.by_value(torch.ones(3), lambda value: sensing.SynchronousSPAD(7)),
-    lambda: sensing.adjoint(sensing.ShotNoise(), LIGHT[:, :5], LIGHT.shape),
     lambda: sensing.ShotNoise()(LIGHT[0]),
     lambda: after(period_s=2e-9, background=torch.ones(2, 2))(LIGHT),
     lambda: sensing.MeasuredDelays(torch.ones(2, 2), 1e-9),
@@ -194,7 +186,6 @@ UNITS = [
     lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
     lambda: sensing.defocus_psf(0.01, oversampling=2),
     lambda: sensing.SpatialPSF(torch.tensor([[3.0, -1.0, 1.0]])),
-    lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9),
     lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT),
     lambda: sensing.PixelElectronics(gain_e_per_dn=2.0),
     lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
@@ -220,7 +211,6 @@ UNITS = [
     lambda: after(tau_s=None, delays=sensing.PowerLawDelays(1.0, 1e-8), counted_from="avalanche"),
     lambda: after(tau_s=None, dead_time_s=9e-9, delays=sensing.MeasuredDelays(COUNTED, 1e-9)),
     lambda: sensing.MeasuredDelays(COUNTED, 1e-9, floor=5.0),
-    lambda: sensing.AfterpulsingSPAD(sensing.ShotNoise(), after()),
     lambda: sensing.AfterpulsingSPAD(FREE, after()),
     lambda: sensing.Crosstalk(0.5),
     lambda: sensing.Speckle(0.5),
@@ -228,10 +218,8 @@ UNITS = [
     lambda: sensing.Speckle().sample(-LIGHT),
     lambda: sensing.CoherentReceiver(CHIRPS, TimeAxis(1.0, 0.1, 12)),
     lambda: sensing.heterodyne_speed(LIGHT, LIGHT, F, duration_s=5e-3),
-    lambda: sensing.MacroPixel(sensing.ShotNoise(), 4),
     lambda: sensing.MacroPixel(SPAD, 2, weights=[1.0, -1.0]),
     lambda: sensing.MacroPixel(SPAD, 2, weights=[0.0, 0.0]),
-    lambda: coincidence(sensing.ShotNoise()),
     lambda: coincidence(k=3),
     lambda: coincidence(FREE, window_s=3e-10),
     lambda: coincidence(window_s=7e-10).expected(LIGHT),
@@ -244,7 +232,6 @@ UNITS = [
 OTHERS = [
     (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS), ArgumentError),
     (lambda: sensing.ItofCorrelation(SINE, F, 50e-12), ArgumentError),
-    (lambda: sensing.ShotNoise("straight_through")(LIGHT, generator=0), ArgumentError),
     (lambda: sensing.ShotNoise(grad="sometimes"), ArgumentError),
     (lambda: sensing.read_itof(FRAMES, F, 4, readout="double"), ArgumentError),
     (lambda: sensing.decode_code(FRAMES, sensing.TwoTapCode(sensing.sine_code(2))), ArgumentError),
@@ -259,7 +246,6 @@ OTHERS = [
     (lambda: sensing.Optics(), ArgumentError),
     (lambda: sensing.Compose([torch.relu]), ArgumentError),
     (lambda: sensing.covariance_bound(one_backward, MAPS), GradientError),
-    (lambda: sensing.adjoint(Cut(), LIGHT, LIGHT.shape), GradientError),
     (lambda: sensing.Moves(0, torch.ones(2, 6) / 2, "zero").log_prob(torch.ones(2, 1)), GradientError),
     (lambda: sensing.detections_with_dead_time(torch.full((1, 6, 1, 1), 1e12), 1.5), TorchTransientError),
 ]  # fmt: skip
