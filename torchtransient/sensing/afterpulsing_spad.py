@@ -20,7 +20,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -111,7 +111,12 @@ def _step(given: Sequence[Tensor], whole: int, x: Tensor) -> Tensor:
 
 
 class _Trapped(torch.autograd.Function):
-    """Lines of trapped carriers, with both modes by the implicit function theorem."""
+    """Stationary lines (R, 2 T) of the loss of an armed detector that holds trapped carriers.
+
+    Of the rate (R, T) > 0 at which the state is left while armed, the share (R, T) of the loss that returns after the
+    dead time, the lines (R, 2 T) that are put in after it, and the dead time in bins, split. Both modes by the implicit
+    function theorem.
+    """
 
     @staticmethod
     def forward(ctx: Any, loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
@@ -151,43 +156,7 @@ class _Trapped(torch.autograd.Function):
         return *gradients, None
 
 
-def trapped_carrier_lines(loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
-    """Stationary lines of the loss of an armed detector that holds trapped carriers; differentiable once in all four
-    tensors.
-
-    Args:
-        loss: (R, T) > 0, rate at which the state is left while armed, float64.
-        kept: (R, T), share of the loss that returns after the dead time.
-        source: lines (R, 2 T) that are put in after the dead time.
-        part, whole: dead time in bins, split.
-
-    Returns:
-        Lines (R, 2 T).
-
-    Raises:
-        TorchTransientError: if the iteration does not converge.
-    """
-    x: Tensor = _Trapped.apply(loss, kept, source, part, whole)  # type: ignore[no-untyped-call]
-    return x
-
-
 # ----------------------------------------------------------------------------------------- carriers and armed detectors
-
-
-class Train(Protocol):
-    """Detector whose detections are on straight lines, in pieces of bins."""
-
-    def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Rates (R, N) -> time armed in each piece (R, N), lines of detections (R, 2, N)."""
-        ...
-
-    def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of a state with trapped carriers.
-
-        It is also left at the rate `lost` (R, 1), returns by the share `back` (R, 1) of detections and is put in by the
-        lines `source` (R, 2, N).
-        """
-        ...
 
 
 def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
@@ -211,16 +180,22 @@ def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
 
 @dataclass(frozen=True)
 class ClockedTrain:
-    """Detector armed at the start of a cycle, without carriers of this cycle."""
+    """Detector armed at the start of a cycle, without carriers of this cycle. Detections are on straight lines."""
 
     whole: int
     part: Tensor
     largest: float  # rates, but for those lost
 
     def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Rates (R, N) -> time armed in each piece (R, N), lines of detections (R, 2, N)."""
         return self._solve(rate, rate, None, None, self.largest)
 
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of a state with trapped carriers.
+
+        It is also left at the rate `lost` (R, 1), returns by the share `back` (R, 1) of detections and is put in by the
+        lines `source` (R, 2, N).
+        """
         return self._solve(rate, rate + lost, back.unsqueeze(-1), source, self.largest + float(lost.detach().amax()))
 
     def _solve(
@@ -262,7 +237,7 @@ class ClockedTrain:
 
 @dataclass(frozen=True)
 class FreeRunningTrain:
-    """Free-running detector in its stationary state."""
+    """Free-running detector in its stationary state; methods as of `ClockedTrain`."""
 
     whole: int
     part: Tensor
@@ -277,7 +252,8 @@ class FreeRunningTrain:
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         loss = rate + lost
         kept = rate / loss
-        lines = trapped_carrier_lines(loss, kept * back, source.flatten(1), self.part, self.whole).view_as(source)
+        lines: Tensor = _Trapped.apply(loss, kept * back, source.flatten(1), self.part, self.whole)  # type: ignore[no-untyped-call]
+        lines = lines.view_as(source)
         return lines[:, 0] / loss, lines * kept.unsqueeze(1)
 
 
@@ -288,7 +264,7 @@ def _safe_ratio(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def carrier_hazard(
-    train: Train,
+    train: ClockedTrain | FreeRunningTrain,
     photons: Callable[[Tensor], Tensor] | None,
     first: Tensor,
     gate: Tensor | None,
@@ -507,10 +483,6 @@ class AfterpulsingSPAD(WrappedDetector):
         grad: GradPolicy | None = None,
     ) -> None:
         where = "AfterpulsingSPAD"
-        if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD)):
-            raise UnitError(f"{where}: expected detector to be a SynchronousSPAD or FreeRunningSPAD, got {detector!r}.")
-        if not isinstance(afterpulsing, Afterpulsing):
-            raise UnitError(f"{where}: expected afterpulsing to be an Afterpulsing, got {afterpulsing!r}.")
         own = detector.dead_time_s
         own = float(own.detach()) if isinstance(own, Tensor) else own
         if own is not None and not math.isclose(own, afterpulsing.dead_time_s, rel_tol=1e-6):
@@ -660,6 +632,12 @@ class AfterpulsingSPAD(WrappedDetector):
     @in_single
     def expected(self, x: Tensor) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.expected(rate))
+
+    def variance(self, x: Tensor) -> Tensor:
+        return self.detector.variance(self.rate(x))
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        return self.detector.log_prob(measurement, self.rate(x))
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.gaussian(rate, generator))

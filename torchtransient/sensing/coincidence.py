@@ -162,9 +162,7 @@ def _detections(
     pixels, bins = rate.shape
     flux = _Flux(rate)
     end = float(length * bins)
-    owner = torch.arange(pixels * blocks * trains.number, device=rate.device).div(
-        trains.number, rounding_mode="floor"
-    )
+    owner = torch.arange(pixels * blocks * trains.number, device=rate.device).div(trains.number, rounding_mode="floor")
     armed = torch.zeros(owner.shape, dtype=torch.float64, device=rate.device)
     if lead:
         # A bright pulse keeps a detector of long dead time in step with every n-th period: all n have to be drawn.

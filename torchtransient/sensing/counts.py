@@ -21,6 +21,7 @@ from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces, check_rates, 
 from torchtransient.sensing.sensor import RandomSensor, record_score, standard_normal, straight_through
 from torchtransient.sensing.time_convolution import Boundary
 
+
 @in_single
 def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Draw Poisson counts of a given mean, without gradient.

@@ -91,6 +91,7 @@ def _forget() -> None:
     _POOLS.clear()
     _OWN.works_alone = False
 
+
 os.register_at_fork(after_in_child=_forget)
 
 
@@ -348,9 +349,7 @@ def _share_tables() -> tuple[tuple[BinomialTables, int], ...]:
     return (BinomialTables(coarse, _FEW_TRIALS, 4096), 32), (BinomialTables(fine, _FEW_TRIALS, 512), 1024)
 
 
-def draw_lower_share(
-    trials: Tensor, share: Tensor, generator: torch.Generator | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def draw_lower_share(trials: Tensor, share: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
     """Draw binomial numbers with a probability just below `share`, in steps of 1/32, then of 1/1024 of what is left.
 
     Args:

@@ -531,7 +531,7 @@ def added(parts: Iterable[Tensor]) -> Tensor:
 class WrappedDetector(RandomSensor):
     """Base of random sensors around a detector, which makes the draws.
 
-    A subclass defines `rate`. ``grad`` is the detector's, and sets it.
+    ``grad`` is the detector's, and sets it.
 
     Args:
         detector: the detector.
@@ -561,49 +561,6 @@ class WrappedDetector(RandomSensor):
     def check_bins(self, x: object) -> None:
         super().check_bins(x)
         self.detector.check_bins(x)
-
-    def rate(self, x: Tensor) -> Tensor:
-        """Rate of the detector.
-
-        Args:
-            x: light (..., C, T, H, W).
-        """
-        raise NotImplementedError(f"{type(self).__name__} has to define rate(x).")
-
-    def probabilities(self, x: Tensor) -> Tensor:
-        """Expected detections per cycle and bin.
-
-        Args:
-            x: light (..., C, T, H, W).
-        """
-        result: Tensor = self.detector.probabilities(self.rate(x))  # type: ignore[operator]
-        return result
-
-    def expected(self, x: Tensor) -> Tensor:
-        return self.detector.expected(self.rate(x))
-
-    def variance(self, x: Tensor) -> Tensor:
-        return self.detector.variance(self.rate(x))
-
-    def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        return self.detector.gaussian(self.rate(x), generator)
-
-    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
-        return self.detector.log_prob(measurement, self.rate(x))
-
-    def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        with torch.no_grad():
-            return self.detector.sample(self.rate(x), generator)
-
-    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Measure light under the policy of the detector.
-
-        Args:
-            x: light (..., C, T, H, W).
-            generator: source of randomness.
-        """
-        result: Tensor = self.detector(self.rate(x), generator=generator)
-        return result
 
 
 def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> RandomSensor:

@@ -38,7 +38,7 @@ _STATES = 1 << 24  # numbers that are held at a time while bins are cut
 
 
 def _level_counts(level: Tensor) -> tuple[list[int], bool]:
-    """Numbers of rows of levels 0, 1, 2, ..., of all rows that are mapped over inside of torch.func.vmap; True there."""
+    """Numbers of rows of levels 0, 1, 2, ..., of all that torch.func.vmap maps over; True inside of it."""
     mapped = False
     while torch._C._functorch.is_functorch_wrapped_tensor(level):
         mapped = mapped or torch._C._functorch.is_batchedtensor(level)

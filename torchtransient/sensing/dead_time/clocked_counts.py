@@ -622,8 +622,7 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
     """
     if check_dead_bins(dead_bins) < 1 - 1e-9:
         raise UnitError(
-            f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower "
-            "bins to undo it."
+            f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower bins to undo it."
         )
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)
