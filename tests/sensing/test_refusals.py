@@ -191,7 +191,6 @@ UNITS = [
     lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
     lambda: sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS),
     lambda: sensing.FreeRunningSPAD(10, 50 * PS, **WIDTH),
-    lambda: sensing.FreeRunningSPAD(10, 1e-9, axis=AXIS, period_s=7e-10),
     lambda: sensing.coates(LIGHT, 10, 0.7),
     lambda: sensing.paralyzable_histogram(LIGHT, -0.5),
     lambda: sensing.first_photon_log_prob(LIGHT + 9, LIGHT, 10),

@@ -18,7 +18,7 @@ import copy
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from torch import nn
 from torchtransient.array_files.part_files import write_text
 from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_data
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_whole, short_errors, short_message, shown, some_of
+from torchtransient.checks import short_errors, short_message, shown, some_of
 from torchtransient.chirps import Chirps
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.sensing.afterpulsing import Afterpulsing, MeasuredDelays, PowerLawDelays
@@ -195,51 +195,29 @@ class Device:
             raise StorageError(f"Device '{self.name}': expected stages that are modules, got {', '.join(wrong)}.")
         return Compose(stages, grad=grad)
 
-    def changed(self, stage: int | str, **arguments: Any) -> Device:
+    def changed(self, stage: str, **arguments: Any) -> Device:
         """Make the same device with other arguments of one stage.
 
         Args:
-            stage: its number, or its kind where that is there once; a kind may be that of a part, the `SynchronousSPAD`
-                of a `MacroPixel` for instance.
+            stage: its kind, which is there once; it may be that of a part, the `SynchronousSPAD` of a `MacroPixel` for
+                instance.
             arguments: new arguments.
 
         Raises:
             StorageError: for a stage that is missing or there twice.
         """
-        stages = [copy.deepcopy(s) for s in self.stages]
-        if isinstance(stage, str):
-            parts = [part for part in _parts(stages) if part["kind"] == stage]
-            if len(parts) != 1:
-                kinds = [part["kind"] for part in _parts(stages)]
-                raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
-            parts[0].update(arguments)
-        else:
-            number = as_whole(stage)
-            if number is None or not -len(stages) <= number < len(stages):
-                raise StorageError(
-                    f"Device '{self.name}': expected a stage by its kind or by a number from 0 to {len(stages) - 1}, "
-                    f"got {shown(stage)}."
-                )
-            stages[number].update(arguments)
-        return Device(
-            self.name,
-            description=self.description,
-            sources=self.sources,
-            stages=tuple(stages),
-            bin_width_s=self.bin_width_s,
-            num_bins=self.num_bins,
-        )
+        stages = copy.deepcopy(self.stages)
+        parts = [part for part in _parts(stages) if part["kind"] == stage]
+        if len(parts) != 1:
+            kinds = [part["kind"] for part in _parts(stages)]
+            raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
+        parts[0].update(arguments)
+        return replace(self, stages=stages)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, dictionaries, numbers and strings."""
-        return {
-            "name": self.name,
-            "description": self.description,
-            "sources": list(self.sources),
-            "stages": copy.deepcopy(list(self.stages)),
-            "bin_width_s": self.bin_width_s,
-            "num_bins": self.num_bins,
-        }
+        data = asdict(self)
+        return {**data, "sources": list(data["sources"]), "stages": list(data["stages"])}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
@@ -252,19 +230,12 @@ class Device:
             StorageError: for missing or unknown entries.
         """
         with short_errors("Device"):
-            return cls._from_dict(data)
-
-    @classmethod
-    def _from_dict(cls, data: Mapping[str, Any]) -> Device:
-        wanted = {"name", "description", "sources", "stages"}
-        found = set(data) if isinstance(data, Mapping) else set()
-        if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
-            got = shown(data) if not found else some_of(sorted(shown(name) for name in found), 160)
-            raise StorageError(f"Device: expected the entries {', '.join(sorted(wanted))}, got {got}.")
-        return cls(
-            data["name"], description=data["description"], sources=data["sources"], stages=data["stages"],
-            bin_width_s=data.get("bin_width_s"), num_bins=data.get("num_bins"),
-        )  # fmt: skip
+            wanted = {"name", "description", "sources", "stages"}
+            found = set(data) if isinstance(data, Mapping) else set()
+            if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
+                got = shown(data) if not found else some_of(sorted(shown(name) for name in found), 160)
+                raise StorageError(f"Device: expected the entries {', '.join(sorted(wanted))}, got {got}.")
+            return cls(**data)
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Write JSON text.
