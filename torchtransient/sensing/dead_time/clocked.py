@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.checks import is_dual
-from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, check_dead_bins, split_dead_time
+from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, split_dead_time
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5
 MOST_PIECES = 1 << 14
@@ -220,14 +220,13 @@ def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
     Returns:
         (P, T).
     """
-    dead, bins = check_dead_bins(dead_bins), rate.shape[-1]
-    least = 1 if dead >= 1 - 1e-9 else 2
+    least = 1 if float(dead_bins.detach()) >= 1 - 1e-9 else 2
     level, present, hidden = subdivision_levels(rate, least)
 
     def solved(rows: Tensor, k: int) -> Tensor:
         # as many rows at a time as stay in the cache
         found = []
-        for few in torch.split(rows, max(1, _PIECES_AT_ONCE // (bins << k))):
+        for few in torch.split(rows, max(1, _PIECES_AT_ONCE // (rate.shape[-1] << k))):
             found.append(cycle_means(few, dead_bins, least << k).count.view(*few.shape, least << k).sum(-1))
         return torch.cat(found) if len(found) > 1 else found[0]
 
@@ -256,7 +255,7 @@ def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
         (P, T).
     """
     twice = torch.zeros_like(rate)
-    for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+    for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
         own = rate if rows is None else rate[rows]
         cycle = cycle_means(own, dead_bins, pieces)
         lines = torch.stack([cycle.count, cycle.slope], 1).view(own.shape[0], 2, -1, pieces)
@@ -488,12 +487,7 @@ def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | 
     Yields:
         Columns, and the scan over them.
     """
-    dead = check_dead_bins(dead_bins)
-    least = 1 if dead >= 1 - 1e-9 else 2
-    level, present, _ = subdivision_levels(rate.T, least)
-    for k in present:
-        pieces = least << k
-        columns = None if len(present) == 1 else (level == k).nonzero().squeeze(-1)
+    for columns, pieces in rows_by_subdivision(rate.T, float(dead_bins.detach())):
         whole, part = split_dead_time(dead_bins.double() * pieces)
         number = rate.shape[1] if columns is None else columns.numel()
         few = max(1, _STATES // (3 * pieces * rate.shape[0]))

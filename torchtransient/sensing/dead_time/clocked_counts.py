@@ -12,6 +12,7 @@ are corrected by the difference of that mean to the mean of cut bins.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -427,7 +428,7 @@ def draw_cycle_steps(
     """
     counts, drawn = torch.zeros_like(rate), []
     with torch.no_grad():
-        for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+        for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
             own = rate if rows is None else rate[rows]
             steps = _cycle_steps(own, dead_bins, pieces)
             path = draw_steps(steps.chances, cycles, generator)
@@ -476,7 +477,7 @@ def normal_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch
         (P, T).
     """
     counts = torch.zeros_like(rate)
-    for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+    for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
         own = rate if rows is None else rate[rows]
         steps = _cycle_steps(own, dead_bins, pieces)
         noisy = cycles * steps.count + _noise(steps, cycles, generator)
@@ -491,23 +492,14 @@ def _noise(steps: CycleSteps, cycles: int, generator: torch.Generator | None) ->
     def noise(number: Tensor, chance: Tensor) -> tuple[Tensor, ...]:
         return gaussian_noise(cycles * number * chance * (1 - chance), generator).unbind(0)
 
-    of_armed = noise(steps.armed, chances.fire)
-    of_back = noise(steps.back, chances.soon)
-    of_late = noise(steps.count, chances.late)
-    fire, soon, late = (c.unbind(0) for c in (chances.fire, chances.soon, chances.late))
-    pieces, whole = len(fire), chances.whole
-    armed = torch.zeros_like(fire[0])
-    returning = [armed] * pieces
-    found = []
-    for k in range(pieces):
-        hit = fire[k] * armed + of_armed[k] + soon[k] * returning[k] + of_back[k]
-        delayed = late[k] * hit + of_late[k]
-        for slot, amount in ((k + whole, hit - delayed), (k + whole + 1, delayed)):
-            if slot < pieces:
-                returning[slot] = returning[slot] + amount
-        armed = armed + returning[k] - hit
-        found.append(hit)
-    return torch.stack(found)
+    own = [noise(steps.armed, chances.fire), noise(steps.back, chances.soon), noise(steps.count, chances.late)]
+    # piece by piece, in the order of the steps
+    added = itertools.chain.from_iterable(zip(*own, strict=True))
+
+    def draw(number: Tensor, chance: Tensor, _: torch.Generator | None) -> Tensor:
+        return chance * number + next(added)
+
+    return draw_steps(chances, 0, generator, draw).counts
 
 
 # --------------------------------------------------------------------------------------------- from counts to the light

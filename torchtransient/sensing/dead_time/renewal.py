@@ -43,17 +43,16 @@ _BLOCK = 6  # bins of a block at least: smaller ones cost more calls than they s
 _ROWS_OF_BLOCKS = 32
 
 
-def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> float:
+def check_dead_bins(dead_bins: Tensor | float) -> float:
     """Return a dead time in bins as a number.
 
     Args:
         dead_bins: number or scalar tensor, in bins.
-        where: name of the caller, for errors.
 
     Raises:
         UnitError: below half a bin, or not finite.
     """
-    given = one_number(dead_bins, "dead_bins", where)
+    given = one_number(dead_bins, "dead_bins", "dead time")
     value = float(given.detach()) if isinstance(given, Tensor) else given
     if not 0.5 - 1e-9 <= value < 1e9:
         raise UnitError(
