@@ -326,16 +326,19 @@ class MeasuredDelays(AfterpulseDelays):
         return left
 
     def yet_to_come(self, delay: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
-        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
-        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        shares, yet, left = self._polygon(dead_time_s)
         inside = ((delay * bin_width_s - self.start_s) / self.own_width_s).clamp(0, shares.numel())
         whole = inside.floor().clamp_max(shares.numel() - 1).long()
         return (yet[whole] - (inside - whole) * shares[whole]) / left
 
+    def _polygon(self, dead_time_s: float) -> tuple[Tensor, Tensor, float]:
+        """Shares of bins (K,), shares yet to come at their edges (K + 1,), and the share after the dead time."""
+        shares = self.share_of_bins.double()
+        return shares, torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)]), self.released_after(dead_time_s)
+
     def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
         # exact: what is yet to come is a polygon
-        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
-        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        shares, yet, left = self._polygon(dead_time_s)
         # integral over delays of what is yet to come, in own bins, a parabola in each
         sums = torch.cat([yet.new_zeros(1), (0.5 * (yet[:-1] + yet[1:])).cumsum(0)])
         dead = dead_time_s / bin_width_s
@@ -360,9 +363,6 @@ class MeasuredDelays(AfterpulseDelays):
         later = torch.searchsorted(sums, yet)
         place = shares.numel() - 1 - later + (sums[later] - yet) / shares[later]
         return (self.start_s + place * self.own_width_s).clamp_min(dead_time_s)
-
-    def extra_repr(self) -> str:
-        return f"bins={self.share_of_bins.numel()}, bin_width_s={self.own_width_s:g}, start_s={self.start_s:g}"
 
 
 # ---------------------------------------------------------------------------------------------------------- afterpulses
@@ -544,7 +544,9 @@ class Afterpulsing(AddedCounts):
         return p * torch.exp(-self.dead_time_s / self.tau_s.reshape(-1))
 
     def _period_bins(self, x: Tensor) -> int:
-        return self.period_bins or x.shape[TIME]
+        period = self.period_bins or x.shape[TIME]
+        _check_period(period, x.shape[TIME])
+        return period
 
     def kernel(self, period_bins: int) -> Tensor:
         """Return the afterpulses of one detection k bins after it, folded into one period.
@@ -578,7 +580,6 @@ class Afterpulsing(AddedCounts):
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
         bins, period = x.shape[TIME], self._period_bins(x)
-        _check_period(period, bins)
         gain, length = remembered(self, ("gain", period, bins), lambda: _gain(1.0, self._kernel(period), bins))
         added = _filtered(x, gain.to(x.device), length)
         beyond = self._from_background(x)
@@ -629,7 +630,6 @@ class Afterpulsing(AddedCounts):
         check_transient(counts, "Afterpulsing")
         p = float(self.seen().detach().sum())
         period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
-        _check_period(period, bins)
         draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:

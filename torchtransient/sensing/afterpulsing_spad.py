@@ -66,6 +66,8 @@ _LEFT_INDEPENDENT = 1e-8  # of all counts, where generations of independent rele
 _FEW = 1e-5  # carriers of a detection, whose time inside a bin does not show
 _STEP, _MOST_STEPS = 1.2, 3  # mean delays that a part of a bin is wide, at most, and the logarithm of their number
 _Detector = SynchronousSPAD | FreeRunningSPAD
+# transfer functions of a period, and of two windows for what is to be left out, of the same cycle; period in bins
+_Transfers = tuple[Tensor, Tensor | None, int]
 
 
 # ------------------------------------------------------------------------------------------- carriers on a ring of bins
@@ -498,8 +500,7 @@ class AfterpulsingSPAD(WrappedDetector):
         super().check_bins(x)
         self.afterpulsing.check_bins(x)
 
-    def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
-        """Transfer functions of a period, and of two windows for the part to be left out; period in bins."""
+    def _transfers(self, x: Tensor) -> _Transfers:
         check_transient(x, "AfterpulsingSPAD")
         bins = x.shape[TIME]
         period = self.afterpulsing.period_bins or bins
@@ -509,20 +510,10 @@ class AfterpulsingSPAD(WrappedDetector):
                 f"SynchronousSPAD), got {period} bins. Set period_s."
             )
         round_period = torch.fft.rfft(self.afterpulsing.kernel(period).to(x.device))
-        if self.detector.dead_time_s is not None:
+        if isinstance(self.detector, FreeRunningSPAD) or (self.detector.dead_bins and not self._follows_carriers):
             return round_period, None, period
         same_cycle = torch.fft.rfft(self.afterpulsing.first_kernel(bins).to(x.device), n=2 * bins)
         return round_period, same_cycle, period
-
-    def _released(self, detected: Tensor, transfers: tuple[Tensor, Tensor | None, int]) -> Tensor:
-        """Independent releases per cycle and bin, float64, without those in a dead cycle."""
-        bins = detected.shape[TIME]
-        round_period, same_cycle, period = transfers
-        rows = detected.movedim(TIME, -1).contiguous().double()
-        free = filter_rows(rows, round_period, period, 0, bins)
-        if same_cycle is not None:
-            free = (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
-        return free.movedim(-1, TIME)
 
     def _from_outside(self, x: Tensor, round_period: Tensor, period: int) -> Tensor | float:
         """Releases of the constant counts outside of the window, per cycle and bin, float64."""
@@ -543,9 +534,7 @@ class AfterpulsingSPAD(WrappedDetector):
         dead = spad.dead_bins is not None if isinstance(spad, SynchronousSPAD) else spad.kind == "non_paralyzable"
         return self.afterpulsing.delays is None and dead
 
-    def _of_armed(
-        self, x: Tensor, transfers: tuple[Tensor, Tensor | None, int], outside: Tensor | float, steps: int
-    ) -> Tensor:
+    def _of_armed(self, x: Tensor, transfers: _Transfers, outside: Tensor | float, steps: int) -> Tensor:
         """Releases per cycle, part of a bin and armed detector, float64."""
         module, spad, bins = self.afterpulsing, self.detector, x.shape[TIME]
         if x.numel() == 0:
@@ -556,14 +545,11 @@ class AfterpulsingSPAD(WrappedDetector):
         rows = wide.reshape(-1, bins)
         if isinstance(spad, SynchronousSPAD):
             dead = torch.as_tensor(spad.dead_bins, dtype=torch.float64, device=x.device)
-            round_period, _, period = transfers
-            same_cycle = torch.fft.rfft(module.first_kernel(bins).to(x.device), n=2 * bins)
             given = outside.expand(x.shape).movedim(TIME, -1).reshape(rows.shape) if isinstance(outside, Tensor) else 0
 
             def earlier(detected: Tensor, at: Tensor | slice) -> Tensor:
                 """Releases of other cycles, which are independent of this one."""
-                free = filter_rows(detected, round_period, period, 0, bins)
-                free = (free - filter_rows(detected, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
+                free = _released(detected, transfers)
                 return free + given[at] if isinstance(given, Tensor) else free
 
             gate = None if spad.gate is None else spad.gate.to(x.device)
@@ -595,8 +581,8 @@ class AfterpulsingSPAD(WrappedDetector):
         # where all carriers are set free during the dead time, there is nothing to iterate
         rounds = max(1, math.ceil(math.log(_LEFT_INDEPENDENT) / math.log(most)) - 1) if most > _LEFT_INDEPENDENT else 1
         for _ in range(rounds):
-            inside = self._released(self.detector.probabilities(x + free), transfers)
-            free = (inside + outside).to(x.dtype)
+            rows = self.detector.probabilities(x + free).movedim(TIME, -1).contiguous().double()
+            free = (_released(rows, transfers).movedim(-1, TIME) + outside).to(x.dtype)
         return free
 
     @in_single
@@ -625,11 +611,9 @@ class AfterpulsingSPAD(WrappedDetector):
         found = measure(_in_parts(self.detector, steps), rate)
         return found.reshape(*x.shape[:TIME], x.shape[TIME], steps, *x.shape[TIME + 1 :]).sum(TIME)
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.probabilities(rate))
 
-    @in_single
     def expected(self, x: Tensor) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.expected(rate))
 
@@ -648,6 +632,16 @@ class AfterpulsingSPAD(WrappedDetector):
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad(rate, generator=generator))
+
+
+def _released(rows: Tensor, transfers: _Transfers) -> Tensor:
+    """Independent releases (..., T) per cycle and bin of detections, float64, without those left out."""
+    round_period, same_cycle, period = transfers
+    bins = rows.shape[-1]
+    free = filter_rows(rows, round_period, period, 0, bins)
+    if same_cycle is None:
+        return free
+    return (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
 
 
 def _in_parts(detector: _Detector, steps: int) -> _Detector:

@@ -25,7 +25,6 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import Numbers
 from torchtransient.errors import GradientError, UnitError
-from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.checks import (
     TIME,
@@ -380,7 +379,6 @@ class CoincidencePixel(RandomSensor):
         """Laser cycles of an exposure."""
         return cycles_of(self.detector)
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected coincidences per cycle and bin.
 

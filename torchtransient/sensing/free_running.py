@@ -247,7 +247,6 @@ class FreeRunningSPAD(RandomSensor):
     def _dead_bins(self) -> Tensor:
         return self.dead_time_s / self.bin_width_s
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per period and bin.
 

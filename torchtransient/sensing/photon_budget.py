@@ -322,7 +322,6 @@ class PhotonBudget(Sensor):
         dark = over_time(kept_map(self, "dark_count_rate_hz"), x, "dark_count_rate_hz", where)
         return ambient, torch.as_tensor(dark)
 
-    @in_single
     def expected(self, x: Tensor) -> Tensor:
         signal = self.signal(x)
         ambient_hz, dark_hz = self._background_hz(x)
