@@ -23,6 +23,7 @@ Source: Mohamed et al., Monte Carlo gradient estimation in machine learning, JML
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import inspect
@@ -37,11 +38,10 @@ import torch
 from torch import Tensor, nn
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import is_one_of, shown
 from torchtransient.errors import ArgumentError, GradientError, ShapeError, TorchTransientError, UnitError
 from torchtransient.floating import in_single
 from torchtransient.modules import ScalarState
-from torchtransient.sensing.checks import TIME, careful_init
+from torchtransient.sensing.checks import TIME, careful_init, check_choice
 
 GradPolicy = Literal["expected", "gaussian", "straight_through", "score"]
 GRAD_POLICIES: tuple[GradPolicy, ...] = get_args(GradPolicy)
@@ -62,8 +62,7 @@ def check_policy(grad: str, where: str) -> GradPolicy:
     Raises:
         ArgumentError: for anything else.
     """
-    if not is_one_of(grad, GRAD_POLICIES):
-        raise ArgumentError(f"{where}: expected grad to be one of {', '.join(GRAD_POLICIES)}, got {shown(grad)}.")
+    check_choice(grad, GradPolicy, "grad", where)
     return cast("GradPolicy", grad)
 
 
@@ -256,19 +255,14 @@ class PhysicalModule(ScalarState):
         """Arguments that the module was made with, by their names; tensors of many numbers by their size."""
         made = [cls.__init__ for cls in type(self).__mro__ if "__init__" in cls.__dict__ and issubclass(cls, nn.Module)]
         names = [name for init in made for name in inspect.signature(init).parameters]
-        given = {name: _shown(self, name) for name in [*names, "bin_width_s", "num_bins"]}
+        given = {}
+        for name in [*names, "bin_width_s", "num_bins"]:
+            with contextlib.suppress(TorchTransientError):  # of a learnt value out of its range
+                given[name] = _text(getattr(self, name, None))
         return ", ".join(f"{name}={text}" for name, text in given.items() if text)
 
 
 _FEW = 8  # numbers of a list that a repr shows
-
-
-def _shown(module: nn.Module, name: str) -> str:
-    """Return an attribute as a repr shows it; nothing for one that is missing, or has learnt a value out of range."""
-    try:
-        return _text(getattr(module, name, None))
-    except TorchTransientError:
-        return ""
 
 
 def _text(value: object) -> str:
