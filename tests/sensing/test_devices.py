@@ -84,7 +84,7 @@ def test_changes():
     preset = device("kinect_v2_like").changed("PixelElectronics", read_noise_e=3.0)
     assert preset.sensor().stages[1].read_noise_e == 3.0
     assert device("kinect_v2_like").sensor().stages[1].read_noise_e == 20.0
-    other = preset.changed("ItofCorrelation", frequencies_hz=[50e6])
+    other = preset.changed(0, frequencies_hz=[50e6])
     assert other.sensor().stages[0].frequencies_hz == (50e6,)
     with pytest.raises(StorageError, match="one stage of kind"):
         preset.changed("ShotNoise", x=1)

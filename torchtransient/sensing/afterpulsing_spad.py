@@ -36,6 +36,7 @@ from torchtransient.sensing.dead_time.clocked import (
     armed_probabilities,
     response_series,
     series_degree,
+    solve_by_level,
     subdivision_levels,
 )
 from torchtransient.sensing.dead_time.free_running import DARK, detections_per_period, rows_by_contrast
@@ -57,7 +58,6 @@ from torchtransient.sensing.time_convolution import filter_rows
 
 _LEFT = 1e-5  # of a detection, where generations end: some ten times the error of counts that is left
 _SERIES = 2.0  # photons of a piece, up to which powers of them add up to all digits that count
-_PIECES_AT_ONCE = 1 << 15  # as many as stay in the cache
 _EXPONENT = 500.0  # of a stretch, inside float64
 _TOLERANCE = 1e-10  # of carriers on a ring; derivatives are compared to 1e-6
 _LARGEST_RESIDUAL = 1e-7  # of carriers on a ring, above which it is an error
@@ -138,7 +138,7 @@ class _Trapped(torch.autograd.Function):
         given = (loss, kept, source, part)
         along = tuple(torch.zeros_like(v) if t is None else t for v, t in zip(given, tangents, strict=False))
         # by two backward passes, which are the derivative of the gradient in its weights
-        right = jvp(lambda *leaves: _step(leaves, ctx.whole, x), given, along)[1]
+        right = jvp(lambda *v: _step(v, ctx.whole, x), given, along)[1]  # type: ignore[no-untyped-call]
         found = []
         for at in torch.split(torch.arange(loss.shape[0], device=loss.device), _ROWS_AT_ONCE):
             found.append(_LossyChain(loss[at], kept[at], part, ctx.whole).solve(right[at]))
@@ -354,7 +354,7 @@ def clocked_hazard(
     gate: Tensor | None,
     seen: Tensor,
     tau: Tensor,
-    earlier: Callable[[Tensor, Tensor | slice], Tensor],
+    earlier: Callable[[Tensor, Tensor], Tensor],
     steps: int = 1,
 ) -> Tensor:
     """Rate of carriers that fire an armed detector that is armed at the start of cycles.
@@ -373,9 +373,8 @@ def clocked_hazard(
     """
     size = rate.shape[-1]
     least = max(steps, 1 if float(dead_bins) >= 1 - 1e-9 else 2)
-    level, present, hidden = subdivision_levels(rate + (seen / tau).sum(), least)
 
-    def solved(rows: Tensor, at: Tensor | slice, pieces: int) -> Tensor:
+    def solved(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
         def photons(detected: Tensor) -> Tensor:
             free = earlier(detected.view(rows.shape[0], size, pieces).sum(-1), at)
             last.append(free)
@@ -391,23 +390,7 @@ def clocked_hazard(
             own = _safe_ratio(own, gate.repeat_interleave(steps, -1).expand_as(own))
         return own + _subdivide(last[-1], steps)
 
-    def chunks(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
-        few = max(1, _PIECES_AT_ONCE // (size * pieces))
-        parts = [solved(r, i, pieces) for r, i in zip(torch.split(rows, few), torch.split(at, few), strict=True)]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    if len(present) == 1:
-        return chunks(rate, torch.arange(rate.shape[0], device=rate.device), least << present[0])
-    found = rate.new_zeros(rate.shape[0], steps * size)
-    for k in present:
-        if hidden:
-            here = (level == k).unsqueeze(-1)
-            own = solved(torch.where(here, rate, 0.0), slice(None), least << k)
-            found = found + torch.where(here, own, 0.0)
-        else:
-            rows = (level == k).nonzero().squeeze(-1)
-            found = found.index_copy(0, rows, chunks(rate[rows], rows, least << k))
-    return found
+    return solve_by_level(rate, subdivision_levels(rate + (seen / tau).sum(), least), least, solved)
 
 
 def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
@@ -547,7 +530,7 @@ class AfterpulsingSPAD(WrappedDetector):
             dead = torch.as_tensor(spad.dead_bins, dtype=torch.float64, device=x.device)
             given = outside.expand(x.shape).movedim(TIME, -1).reshape(rows.shape) if isinstance(outside, Tensor) else 0
 
-            def earlier(detected: Tensor, at: Tensor | slice) -> Tensor:
+            def earlier(detected: Tensor, at: Tensor) -> Tensor:
                 """Releases of other cycles, which are independent of this one."""
                 free = _released(detected, transfers)
                 return free + given[at] if isinstance(given, Tensor) else free

@@ -430,7 +430,7 @@ class CoincidencePixel(RandomSensor):
         """A SPAD in the light (..., T, H, W) of the pixel, one of `number` with a `share` of it."""
         spad, rate = self._spad(x, share)
         once = isinstance(spad, SynchronousSPAD) and spad.dead_time_s is None
-        seen = spad._gated(rate).double().clamp_max(_FLOOD) if once else None
+        seen = cast("SynchronousSPAD", spad)._gated(rate).double().clamp_max(_FLOOD) if once else None
         return _Group(spad.probabilities(rate).double(), seen, number)
 
     def _reached(self, parts: list[_Group], at: float, window: float) -> Tensor:

@@ -189,19 +189,19 @@ class Device:
             raise StorageError(f"Device '{self.name}': expected stages that are modules, got {', '.join(wrong)}.")
         return Compose(stages, grad=grad)
 
-    def changed(self, stage: str, **arguments: Any) -> Device:
+    def changed(self, stage: int | str, **arguments: Any) -> Device:
         """Make the same device with other arguments of one stage.
 
         Args:
-            stage: its kind, which is there once; it may be that of a part, the `SynchronousSPAD` of a `MacroPixel` for
-                instance.
+            stage: its number, or its kind where that is there once; a kind may be that of a part, the `SynchronousSPAD`
+                of a `MacroPixel` for instance.
             arguments: new arguments.
 
         Raises:
             StorageError: for a stage that is missing or there twice.
         """
         stages = copy.deepcopy(self.stages)
-        parts = [part for part in _parts(stages) if part["kind"] == stage]
+        parts = [stages[stage]] if isinstance(stage, int) else [p for p in _parts(stages) if p["kind"] == stage]
         if len(parts) != 1:
             kinds = [part["kind"] for part in _parts(stages)]
             raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,6 +97,48 @@ def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> 
     level, present, _ = subdivision_levels(rate, least, photons)
     for k in present:
         yield (None if len(present) == 1 else (level == k).nonzero().squeeze(-1)), least << k
+
+
+def solve_by_level(
+    rate: Tensor,
+    levels: tuple[Tensor, list[int], bool],
+    least: int,
+    solve: Callable[[Tensor, Tensor, int], Tensor],
+) -> Tensor:
+    """Solve rows with their bins cut in pieces, as many rows at a time as stay in the cache.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        levels: of the rows, by `subdivision_levels`.
+        least: pieces of a bin at level 0.
+        solve: function of rates (K, T), indices (K,) of their rows, and pieces of a bin.
+
+    Returns:
+        Results of the rows, (P, N).
+    """
+    level, present, hidden = levels
+    every = torch.arange(rate.shape[0], device=rate.device)
+
+    def solved(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
+        few = max(1, _PIECES_AT_ONCE // (rate.shape[-1] * pieces))
+        parts = [solve(r, i, pieces) for r, i in zip(torch.split(rows, few), torch.split(at, few), strict=True)]
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    if len(present) == 1:
+        return solved(rate, every, least << present[0])
+    found: Tensor | None = None
+    for k in present:
+        if hidden:
+            here = (level == k).unsqueeze(-1)
+            # rows of other levels are dark here, and add nothing: no number of theirs can spoil a gradient
+            own = torch.where(here, solved(torch.where(here, rate, 0.0), every, least << k), 0.0)
+            found = own if found is None else found + own
+        else:
+            rows = (level == k).nonzero().squeeze(-1)
+            own = solved(rate[rows], rows, least << k)
+            found = rate.new_zeros(rate.shape[0], own.shape[-1]) if found is None else found
+            found = found.index_copy(0, rows, own)
+    return torch.zeros_like(rate) if found is None else found
 
 
 # -------------------------------------------------------------------------------- the recursion in differentiable steps
@@ -221,27 +263,11 @@ def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
         (P, T).
     """
     least = 1 if float(dead_bins.detach()) >= 1 - 1e-9 else 2
-    level, present, hidden = subdivision_levels(rate, least)
 
-    def solved(rows: Tensor, k: int) -> Tensor:
-        # as many rows at a time as stay in the cache
-        found = []
-        for few in torch.split(rows, max(1, _PIECES_AT_ONCE // (rate.shape[-1] << k))):
-            found.append(cycle_means(few, dead_bins, least << k).count.view(*few.shape, least << k).sum(-1))
-        return torch.cat(found) if len(found) > 1 else found[0]
+    def solve(rows: Tensor, _: Tensor, pieces: int) -> Tensor:
+        return cycle_means(rows, dead_bins, pieces).count.view(*rows.shape, pieces).sum(-1)
 
-    if len(present) == 1:
-        return solved(rate, present[0])
-    detected = torch.zeros_like(rate)
-    for k in present:
-        if hidden:
-            here = (level == k).unsqueeze(-1)
-            # rows of other levels are dark here, and add nothing: no number of theirs can spoil a gradient
-            detected = detected + solved(torch.where(here, rate, 0.0), k)
-        else:
-            rows = (level == k).nonzero().squeeze(-1)
-            detected = detected.index_copy(0, rows, solved(rate[rows], k))
-    return detected
+    return solve_by_level(rate, subdivision_levels(rate, least), least, solve)
 
 
 def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:

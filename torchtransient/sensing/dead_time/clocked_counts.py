@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -494,7 +494,7 @@ def _noise(steps: CycleSteps, cycles: int, generator: torch.Generator | None) ->
 
     own = [noise(steps.armed, chances.fire), noise(steps.back, chances.soon), noise(steps.count, chances.late)]
     # piece by piece, in the order of the steps
-    added = itertools.chain.from_iterable(zip(*own, strict=True))
+    added: Iterator[Tensor] = itertools.chain.from_iterable(zip(*own, strict=True))
 
     def draw(number: Tensor, chance: Tensor, _: torch.Generator | None) -> Tensor:
         return chance * number + next(added)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -636,6 +637,10 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     return torch.cat(found)
 
 
+def _step(whole: int, lines: Tensor, rate: Tensor, part: Tensor) -> Tensor:
+    return RenewalChain(rate, whole, part).step(lines)
+
+
 class _StationaryPhases(torch.autograd.Function):
     """Stationary lines of (rate, part), with both modes by the implicit function theorem."""
 
@@ -655,7 +660,7 @@ class _StationaryPhases(torch.autograd.Function):
         found = []
         for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (rate, pi, by_rate)), strict=True):
             # by two backward passes, which are the derivative of the gradient in its weights
-            right = jvp(lambda r, part, p=p: RenewalChain(r, ctx.whole, part).step(p), (r, part), (d, by_part))[1]
+            right = jvp(partial(_step, ctx.whole, p), (r, part), (d, by_part))[1]  # type: ignore[no-untyped-call]
             found.append(_solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=False))
         return torch.cat(found)
 
@@ -671,8 +676,7 @@ class _StationaryPhases(torch.autograd.Function):
             adjoint = _solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=True)
             with torch.enable_grad():
                 leaves = r.detach().requires_grad_(), part.detach().requires_grad_()
-                value = RenewalChain(leaves[0], ctx.whole, leaves[1]).step(p)
-                found = torch.autograd.grad(value, leaves, adjoint)
+                found = torch.autograd.grad(_step(ctx.whole, p, *leaves), leaves, adjoint)
             by_rate.append(found[0])
             by_part = by_part + found[1]
         return torch.cat(by_rate), by_part, None
