@@ -136,19 +136,8 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
     return torch.where(fits, fire, whole_chance), torch.where(fits, bounded_ratio(rest, back), whole_chance)
 
 
-def draw_binomial(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw binomial numbers.
-
-    Args:
-        number: trials.
-        chance: probability.
-        generator: source of randomness.
-    """
-    return torch.binomial(number, chance, generator=generator)
-
-
 def draw_normal(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw normal numbers with mean and variance of `draw_binomial`.
+    """Draw normal numbers with mean and variance of binomial ones.
 
     Args:
         number: trials.
@@ -163,7 +152,7 @@ def draw_steps(
     chances: StepProbabilities,
     periods: int,
     generator: torch.Generator | None,
-    draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = draw_binomial,
+    draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = torch.binomial,
 ) -> StepCounts:
     """Draw the steps of `periods` independent detectors, each run over one period.
 
@@ -171,7 +160,7 @@ def draw_steps(
         chances: step probabilities, (..., T, H, W).
         periods: number of detectors.
         generator: source of randomness.
-        draw: `draw_binomial` or `draw_normal`.
+        draw: of numbers and chances, `torch.binomial` or `draw_normal`.
     """
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
@@ -280,9 +269,13 @@ def _delay(x: Tensor, by: int) -> Tensor:
     return torch.nn.functional.pad(x, (by, 0))[..., : x.shape[-1]]
 
 
-def _columns(x: Tensor) -> Tensor:
-    """Rows (P, N) as columns (N, P, 1), with time as the third dimension from behind."""
-    return x.T.unsqueeze(-1)  # time is the third dimension from behind
+def columns_of(x: Tensor) -> Tensor:
+    """Return rows (P, N) as columns (N, P, 1), with time as the third dimension from behind.
+
+    Args:
+        x: the rows.
+    """
+    return x.T.unsqueeze(-1)
 
 
 def _merged_pieces(pieces: int, whole: int) -> int:
@@ -322,7 +315,7 @@ def _cycle_steps(rate: Tensor, dead_bins: Tensor, pieces: int) -> CycleSteps:
     count, armed, whole = cycle.count.view(shape).sum(-1), cycle.armed.view(shape)[..., 0], cycle.whole // wider
     flux = (rate * (wider / pieces)).repeat_interleave(pieces // wider, -1)
     back = _delay(count - late, whole) + _delay(late, whole + 1)
-    flux, count, armed, late, back = map(_columns, (flux, count, armed, late, back))
+    flux, count, armed, late, back = map(columns_of, (flux, count, armed, late, back))
     chances = step_probabilities(flux, count, armed, late, back, None, whole)
     return CycleSteps(armed, count, back, chances, pieces // wider)
 
