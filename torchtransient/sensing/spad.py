@@ -492,6 +492,7 @@ class BinaryFrames(RandomSensor):
         return self._probability(x) * torch.exp(-x) * self.frames
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        check_transient(x, "BinaryFrames")
         # beyond 2^24 trials the variance of torch.binomial in float32 is 13 to 38 % too large
         exact = torch.float64 if self.frames > WHOLE_FLOAT32 or x.dtype == torch.float64 else torch.float32
         p = self._probability(x.detach().to(exact))
