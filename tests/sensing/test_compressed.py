@@ -72,8 +72,7 @@ def test_coded_histograms():
     g = torch.Generator().manual_seed(0)
     x = torch.rand(2, 1, 64, 3, 2, dtype=torch.float64, generator=g)
     y = torch.rand(2, 1, 8, 3, 2, dtype=torch.float64, generator=g)
-    torch.testing.assert_close((sensor(x) * y).sum(), (x * sensor.adjoint(y)).sum())
-    torch.testing.assert_close(sensor(sensor.pseudo_inverse(y)), y)
+    torch.testing.assert_close((sensor(x) * y).sum(), (x * sensing.adjoint(sensor, y, x.shape)).sum())
     # the phase of the first harmonic is the delay
     delta = torch.zeros(1, 64, 1, 1, dtype=torch.float64)
     delta[0, 20] = 1.0
@@ -81,5 +80,5 @@ def test_coded_histograms():
     assert phase / (2 * torch.pi) * 64 == pytest.approx(20.5)
     with pytest.raises(ShapeError, match="at most"):
         sensing.fourier_codes(4, 9)
-    with pytest.raises(ShapeError, match="dimension -3"):
+    with pytest.raises(ShapeError, match="as in codes"):
         sensor(torch.ones(1, 3, 1, 1))

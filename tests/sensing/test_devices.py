@@ -238,7 +238,7 @@ def test_a_map_of_values_and_of_chains():
     "inside", [float("nan"), [1.0, float("inf")], [[1.0], [float("nan")]], {"a": [float("nan")]}, (float("nan"),)]
 )
 def test_numbers_that_are_none_are_found_everywhere(inside):
-    with pytest.raises(StorageError, match="finite numbers in tensor"):
+    with pytest.raises(StorageError, match="finite numbers"):
         Device(
             "d",
             description="",
@@ -251,14 +251,6 @@ def test_unknown_kinds_are_found_in_lists():
     for inside in ([{"kind": "os.system"}], [[{"kind": "os.system"}]], {"a": {"kind": "os.system"}}):
         with pytest.raises(StorageError, match=r"os\.system"):
             Device("d", description="", sources=(), stages=({"kind": "PixelGroups", "sensors": inside, "which": 0},))
-
-
-@pytest.mark.parametrize("stage", [17, -2, 1, True, 0.0, None])
-def test_a_stage_that_is_not_there(stage):
-    device = Device("d", description="", sources=(), stages=({"kind": "SynchronousSPAD", "cycles": 9},))
-    with pytest.raises(StorageError, match="by its kind or by a number from 0 to 0"):
-        device.changed(stage, cycles=10)
-    assert device.changed(-1, cycles=10).stages[0]["cycles"] == 10
 
 
 # ------------------------------------------------------------------------------------------------------ parts

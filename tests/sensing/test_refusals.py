@@ -56,11 +56,6 @@ def coincidence(detector=SPAD, spads=2, window_s=1e-10, k=2):
     return sensing.CoincidencePixel(detector, spads, coincidence=k, window_s=window_s, **WIDTH)
 
 
-class Cut(sensing.Sensor):
-    """Loses its gradient."""
-
-    def expected(self, x):
-        return x.detach()
 
 
 def calibrated(**numbers):
@@ -104,7 +99,6 @@ SHAPES = [
     lambda: sensing.TailedResponse(PS, [PS, 2 * PS], [0.1]),
     lambda: sensing.convolve_time(LIGHT, torch.ones(2, 2)),
     lambda: sensing.PixelGroups.by_value(torch.ones(3), lambda value: sensing.SynchronousSPAD(7)),
-    lambda: sensing.adjoint(sensing.ShotNoise(), LIGHT[:, :5], LIGHT.shape),
     lambda: sensing.ShotNoise()(LIGHT[0]),
     lambda: after(period_s=2e-9, background=torch.ones(2, 2))(LIGHT),
     lambda: sensing.MeasuredDelays(torch.ones(2, 2), 1e-9),
@@ -158,13 +152,11 @@ UNITS = [
     lambda: budget(repetition_rate_hz=2e9)(LIGHT),
     lambda: sensing.frames_to_rate(torch.tensor([10.0, 400.0]), 255),
     lambda: sensing.SpatialPSF(torch.tensor([[3.0, -1.0, 1.0]])),
-    lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9),
     lambda: sensing.SweepJitter(1.5e-9, AXIS)(LIGHT),
     lambda: sensing.PixelElectronics(gain_e_per_dn=2.0),
     lambda: sensing.SynchronousSPAD(10, gate=torch.full((6,), 1.1)),
     lambda: sensing.SynchronousSPAD(10, dead_time_s=5 * PS, bin_width_s=20 * PS),
     lambda: sensing.FreeRunningSPAD(10, 50 * PS, **WIDTH),
-    lambda: sensing.FreeRunningSPAD(10, 1e-9, axis=AXIS, period_s=7e-10),
     lambda: sensing.coates(LIGHT, 10, 0.7),
     lambda: sensing.paralyzable_histogram(LIGHT, -0.5),
     lambda: sensing.first_photon_log_prob(LIGHT + 9, LIGHT, 10),
@@ -183,7 +175,6 @@ UNITS = [
     lambda: after(tau_s=None, delays=sensing.PowerLawDelays(1.0, 1e-8), counted_from="avalanche"),
     lambda: after(tau_s=None, dead_time_s=9e-9, delays=sensing.MeasuredDelays(COUNTED, 1e-9)),
     lambda: sensing.MeasuredDelays(COUNTED, 1e-9, floor=5.0),
-    lambda: sensing.AfterpulsingSPAD(sensing.ShotNoise(), after()),
     lambda: sensing.AfterpulsingSPAD(FREE, after()),
     lambda: sensing.Crosstalk(0.5),
     lambda: sensing.Speckle(0.5),
@@ -191,10 +182,8 @@ UNITS = [
     lambda: sensing.Speckle().sample(-LIGHT),
     lambda: sensing.CoherentReceiver(CHIRPS, TimeAxis(1.0, 0.1, 12)),
     lambda: sensing.heterodyne_speed(LIGHT, LIGHT, F, duration_s=5e-3),
-    lambda: sensing.MacroPixel(sensing.ShotNoise(), 4),
     lambda: sensing.MacroPixel(SPAD, 2, weights=[1.0, -1.0]),
     lambda: sensing.MacroPixel(SPAD, 2, weights=[0.0, 0.0]),
-    lambda: coincidence(sensing.ShotNoise()),
     lambda: coincidence(k=3),
     lambda: coincidence(FREE, window_s=3e-10),
     lambda: coincidence(window_s=7e-10).expected(LIGHT),
@@ -205,7 +194,6 @@ UNITS = [
     lambda: sensing.equi_depth_edges(-LIGHT, 4),
 ]  # fmt: skip
 OTHERS = [
-    (lambda: sensing.ShotNoise("straight_through")(LIGHT, generator=0), ArgumentError),
     (lambda: sensing.ShotNoise(grad="sometimes"), ArgumentError),
     (lambda: sensing.read_itof(FRAMES, F, 4, readout="double"), ArgumentError),
     (lambda: sensing.decode_code(FRAMES, sensing.TwoTapCode(sensing.sine_code(2))), ArgumentError),
@@ -214,7 +202,6 @@ OTHERS = [
     (lambda: sensing.FreeRunningSPAD(500, 75 * PS), ArgumentError),
     (lambda: budget(cycles=None), ArgumentError),
     (lambda: sensing.Optics(), ArgumentError),
-    (lambda: sensing.adjoint(Cut(), LIGHT, LIGHT.shape), GradientError),
     (lambda: sensing.Moves(0, torch.ones(2, 6) / 2, "zero").log_prob(torch.ones(2, 1)), GradientError),
     (lambda: sensing.detections_with_dead_time(torch.full((1, 6, 1, 1), 1e12), 1.5), TorchTransientError),
 ]  # fmt: skip

@@ -7,7 +7,7 @@ import multiprocessing
 import pytest
 import torch
 
-from torchtransient.sensing.draws import parallel_map
+from torchtransient.sensing.draws import in_threads
 
 
 @pytest.fixture(params=[1, 2, 3])
@@ -16,6 +16,10 @@ def threads(request):
     torch.set_num_threads(request.param)
     yield request.param
     torch.set_num_threads(before)
+
+
+def side_by_side(job, number):
+    return in_threads(lambda k, own: job(k), [(k,) for k in range(number)], None)
 
 
 def of_thread(_):
@@ -27,17 +31,17 @@ def test_what_fails_in_a_thread_fails_outside(threads):
         raise KeyError(k)
 
     with pytest.raises(KeyError):
-        parallel_map(fail, range(4))
-    assert parallel_map(of_thread, range(2)) == [1] * 2
+        side_by_side(fail, 4)
+    assert side_by_side(of_thread, 2) == [1] * 2
 
 
 def _in_child(queue):
-    queue.put(parallel_map(of_thread, range(2)))
+    queue.put(side_by_side(of_thread, 2))
 
 
 @pytest.mark.slow
 def test_forks_begin_anew(threads):
-    parallel_map(of_thread, range(4))
+    side_by_side(of_thread, 4)
     context = multiprocessing.get_context("fork")
     queue = context.SimpleQueue()
     child = context.Process(target=_in_child, args=(queue,))
@@ -55,9 +59,7 @@ def modes(_):
 
 
 def test_threads_are_in_the_mode_of_the_caller(threads):
-    assert parallel_map(modes, range(4)) == [(False, True)] * 4
-    with torch.no_grad():
-        assert parallel_map(modes, range(4)) == [(False, False)] * 4
+    assert side_by_side(modes, 4) == [(False, False)] * 4
     with torch.inference_mode():
-        assert parallel_map(modes, range(4)) == [(True, False)] * 4
-    assert parallel_map(modes, range(4)) == [(False, True)] * 4
+        assert side_by_side(modes, 4) == [(True, False)] * 4
+    assert side_by_side(modes, 4) == [(False, False)] * 4

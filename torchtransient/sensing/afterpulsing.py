@@ -11,9 +11,10 @@ Sources: several exponentials: Cova, Lacaita, Ripamonti, Trapping phenomena in a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,7 +29,6 @@ from torchtransient.sensing.checks import (
     check_number,
     check_seconds,
     check_transient,
-    numbers_of,
     one_number,
     reals,
 )
@@ -42,10 +42,7 @@ from torchtransient.sensing.time_convolution import filter_rows
 CountedFrom = Literal["dead_time", "avalanche"]
 
 _LONGEST_LAW = 1 << 23  # bins of a law of delays that ends
-_NODES, _WEIGHTS = (
-    (-0.9602898564975363, -0.7966664774136267, -0.5255324099163290, -0.1834346424956498),
-    (0.1012285362903763, 0.2223810344533745, 0.3137066458778873, 0.3626837833783620),
-)  # Gauss-Legendre, 8 points, the lower half
+_NODES, _WEIGHTS = (values.tolist() for values in np.polynomial.legendre.leggauss(8))  # on [-1, 1]
 _ENTRIES = 1 << 17  # at a time, so that temporaries stay in the cache
 _WORTH_TABLE = 1 << 16  # entries, above which the lags of afterpulses are looked up
 _FEW = 1 << 12  # places, below which one slow operation takes less time than several fast ones
@@ -155,9 +152,8 @@ class AfterpulseDelays(PhysicalModule):
         begin = torch.minimum(k.clamp_min(dead), k + 1)
         half, mean = (k + 1 - begin) / 2, torch.zeros_like(k)
         for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-            for side in (-1, 1):
-                delay = (begin + half * (1 + side * node)).clamp_min(dead)
-                mean = mean + 0.5 * weight * self.yet_to_come(delay, dead_time_s, bin_width_s)
+            delay = (begin + half * (1 + node)).clamp_min(dead)
+            mean = mean + 0.5 * weight * self.yet_to_come(delay, dead_time_s, bin_width_s)
         return begin - k + 2 * half * mean
 
     def draw(self, number: int, dead_time_s: float, generator: torch.Generator | None) -> Tensor:
@@ -330,16 +326,19 @@ class MeasuredDelays(AfterpulseDelays):
         return left
 
     def yet_to_come(self, delay: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
-        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
-        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        shares, yet, left = self._polygon(dead_time_s)
         inside = ((delay * bin_width_s - self.start_s) / self.own_width_s).clamp(0, shares.numel())
         whole = inside.floor().clamp_max(shares.numel() - 1).long()
         return (yet[whole] - (inside - whole) * shares[whole]) / left
 
+    def _polygon(self, dead_time_s: float) -> tuple[Tensor, Tensor, float]:
+        """Shares of bins (K,), shares yet to come at their edges (K + 1,), and the share after the dead time."""
+        shares = self.share_of_bins.double()
+        return shares, torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)]), self.released_after(dead_time_s)
+
     def mean_yet_to_come(self, k: Tensor, dead_time_s: float, bin_width_s: float) -> Tensor:
         # exact: what is yet to come is a polygon
-        shares, left = self.share_of_bins.double(), self.released_after(dead_time_s)
-        yet = torch.cat([shares.new_ones(1), 1 - shares.cumsum(0)])
+        shares, yet, left = self._polygon(dead_time_s)
         # integral over delays of what is yet to come, in own bins, a parabola in each
         sums = torch.cat([yet.new_zeros(1), (0.5 * (yet[:-1] + yet[1:])).cumsum(0)])
         dead = dead_time_s / bin_width_s
@@ -365,21 +364,12 @@ class MeasuredDelays(AfterpulseDelays):
         place = shares.numel() - 1 - later + (sums[later] - yet) / shares[later]
         return (self.start_s + place * self.own_width_s).clamp_min(dead_time_s)
 
-    def extra_repr(self) -> str:
-        return f"bins={self.share_of_bins.numel()}, bin_width_s={self.own_width_s:g}, start_s={self.start_s:g}"
-
 
 # ---------------------------------------------------------------------------------------------------------- afterpulses
 
 
 @in_single
-def add_afterpulses(
-    counts: Tensor,
-    probability: Tensor | float,
-    kernel: Tensor,
-    *,
-    only_added: bool = False,
-) -> Tensor:
+def add_afterpulses(counts: Tensor, probability: Tensor | float, kernel: Tensor) -> Tensor:
     """Mean histogram with afterpulses, and afterpulses of afterpulses: counts * (1 - probability kernel)^-1.
 
     The window is the first T bins of a period of P; afterpulses outside of it are lost. With P = T sums grow by 1/(1 -
@@ -390,7 +380,6 @@ def add_afterpulses(
         probability: afterpulses of a detection.
         kernel: (P,), P >= T, afterpulses k bins after their detection, up to the factor `probability`. That of
             `Afterpulsing.kernel` includes the probability.
-        only_added: return the afterpulses alone.
 
     Returns:
         Shape, dtype and device of `counts`.
@@ -406,8 +395,7 @@ def add_afterpulses(
     _check_period(kernel.shape[0], bins := counts.shape[TIME])
     p = one_number(probability, "probability", "add_afterpulses")
     p = torch.as_tensor(p, dtype=torch.float64, device=counts.device)
-    added = _filtered(counts, *_gain(p, kernel.to(counts.device, torch.float64), bins))
-    return added if only_added else counts + added
+    return counts + _filtered(counts, *_gain(p, kernel.to(counts.device, torch.float64), bins))
 
 
 def _gain(probability: Tensor | float, kernel: Tensor, bins: int) -> tuple[Tensor, int]:
@@ -486,8 +474,6 @@ class Afterpulsing(AddedCounts):
         where = "Afterpulsing"
         if dead_time_s is None or (tau_s is None) == (delays is None):
             raise UnitError(f"{where}: expected dead_time_s (0 for none), and either tau_s or delays, got others.")
-        if delays is not None and not isinstance(delays, AfterpulseDelays):
-            raise UnitError(f"{where}: expected delays to be an AfterpulseDelays (PowerLawDelays), got {delays!r}.")
         check_choice(counted_from, CountedFrom, "counted_from", where)
         self.dead_time_s = check_seconds(dead_time_s, "dead_time_s", where)
         self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, where)
@@ -508,24 +494,20 @@ class Afterpulsing(AddedCounts):
     def _keep(self, probability: float | Numbers, tau_s: float | Numbers, learnable: bool) -> None:
         """Check and register probabilities and delays."""
         where = "Afterpulsing"
-        chance, tau = numbers_of(probability, "probability", where), numbers_of(tau_s, "tau_s", where)
-        several = isinstance(chance, Sequence) and not isinstance(chance, str)
-        shares = list(chance) if isinstance(chance, Sequence) else [chance]
-        p = [check_number(v, "probability", where, high=_MOST, open_low=True) for v in shares]
+        chance, tau = (torch.as_tensor(value, dtype=torch.float64) for value in (probability, tau_s))
+        p = [check_number(v, "probability", where, high=_MOST, open_low=True) for v in chance.flatten().tolist()]
         if not p or sum(p) > _MOST:
-            raise UnitError(f"{where}: expected a sum of probability in (0, {_MOST:g}], got {chance!r}.")
+            raise UnitError(f"{where}: expected a sum of probability in (0, {_MOST:g}], got {p}.")
         numbers = {"logit_probability": [math.log(v / (1 - v)) for v in p]}
         if self.delays is None:
-            times = list(tau) if isinstance(tau, Sequence) else [tau]
+            times = tau.flatten().tolist()
             numbers["log_tau_s"] = [math.log(check_seconds(v, "tau_s", where, open_low=True)) for v in times]
             if len(times) != len(p):
                 raise ShapeError(f"{where}: expected as many tau_s as probability, got {len(times)} and {len(p)}.")
-        elif several:
+        elif chance.ndim:
             raise ShapeError(f"{where}: expected one probability of delays, got {len(p)}.")
         for name, values in numbers.items():
-            tensor = torch.tensor(values, dtype=torch.float64)
-            tensor = tensor if several else tensor[0].clone()
-            keep_number(self, name, tensor, learnable)
+            keep_number(self, name, torch.tensor(values, dtype=torch.float64).view(chance.shape), learnable)
 
     @property
     def probability(self) -> Tensor:
@@ -562,7 +544,9 @@ class Afterpulsing(AddedCounts):
         return p * torch.exp(-self.dead_time_s / self.tau_s.reshape(-1))
 
     def _period_bins(self, x: Tensor) -> int:
-        return self.period_bins or x.shape[TIME]
+        period = self.period_bins or x.shape[TIME]
+        _check_period(period, x.shape[TIME])
+        return period
 
     def kernel(self, period_bins: int) -> Tensor:
         """Return the afterpulses of one detection k bins after it, folded into one period.
@@ -596,7 +580,6 @@ class Afterpulsing(AddedCounts):
     def extra(self, x: Tensor) -> Tensor:
         check_transient(x, "Afterpulsing")
         bins, period = x.shape[TIME], self._period_bins(x)
-        _check_period(period, bins)
         gain, length = remembered(self, ("gain", period, bins), lambda: _gain(1.0, self._kernel(period), bins))
         added = _filtered(x, gain.to(x.device), length)
         beyond = self._from_background(x)
@@ -613,7 +596,7 @@ class Afterpulsing(AddedCounts):
             """Afterpulses (bins,) in the window of one count in every bin outside of it."""
             kernel = self._kernel(period)
             window = torch.ones(1, bins, 1, 1, dtype=torch.float64, device=kernel.device)
-            inside = add_afterpulses(window, 1.0, kernel, only_added=True)
+            inside = _filtered(window, *_gain(1.0, kernel, bins))
             return (kernel.sum() / (1 - kernel.sum()) - inside).clamp_min(0).flatten()
 
         share = remembered(self, ("missing", period, bins), missing).to(x.device).view(-1, 1, 1)
@@ -647,7 +630,6 @@ class Afterpulsing(AddedCounts):
         check_transient(counts, "Afterpulsing")
         p = float(self.seen().detach().sum())
         period, bins, pixels = self._period_bins(counts), counts.shape[TIME], counts.shape[-2] * counts.shape[-1]
-        _check_period(period, bins)
         draw = self._lags(period, counts)
 
         def follow(piece: Tensor, begin: int, own: torch.Generator | None) -> Tensor:

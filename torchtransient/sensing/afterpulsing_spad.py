@@ -20,10 +20,11 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.functional import jvp
 
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.floating import in_single
@@ -35,6 +36,7 @@ from torchtransient.sensing.dead_time.clocked import (
     armed_probabilities,
     response_series,
     series_degree,
+    solve_by_level,
     subdivision_levels,
 )
 from torchtransient.sensing.dead_time.free_running import DARK, detections_per_period, rows_by_contrast
@@ -56,7 +58,6 @@ from torchtransient.sensing.time_convolution import filter_rows
 
 _LEFT = 1e-5  # of a detection, where generations end: some ten times the error of counts that is left
 _SERIES = 2.0  # photons of a piece, up to which powers of them add up to all digits that count
-_PIECES_AT_ONCE = 1 << 15  # as many as stay in the cache
 _EXPONENT = 500.0  # of a stretch, inside float64
 _TOLERANCE = 1e-10  # of carriers on a ring; derivatives are compared to 1e-6
 _LARGEST_RESIDUAL = 1e-7  # of carriers on a ring, above which it is an error
@@ -65,6 +66,8 @@ _LEFT_INDEPENDENT = 1e-8  # of all counts, where generations of independent rele
 _FEW = 1e-5  # carriers of a detection, whose time inside a bin does not show
 _STEP, _MOST_STEPS = 1.2, 3  # mean delays that a part of a bin is wide, at most, and the logarithm of their number
 _Detector = SynchronousSPAD | FreeRunningSPAD
+# transfer functions of a period, and of two windows for what is to be left out, of the same cycle; period in bins
+_Transfers = tuple[Tensor, Tensor | None, int]
 
 
 # ------------------------------------------------------------------------------------------- carriers on a ring of bins
@@ -110,7 +113,12 @@ def _step(given: Sequence[Tensor], whole: int, x: Tensor) -> Tensor:
 
 
 class _Trapped(torch.autograd.Function):
-    """Lines of trapped carriers, with both modes by the implicit function theorem."""
+    """Stationary lines (R, 2 T) of the loss of an armed detector that holds trapped carriers.
+
+    Of the rate (R, T) > 0 at which the state is left while armed, the share (R, T) of the loss that returns after the
+    dead time, the lines (R, 2 T) that are put in after it, and the dead time in bins, split. Both modes by the implicit
+    function theorem.
+    """
 
     @staticmethod
     def forward(ctx: Any, loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
@@ -128,14 +136,9 @@ class _Trapped(torch.autograd.Function):
     def jvp(ctx: Any, *tangents: Any) -> Tensor:
         loss, kept, source, part, x = ctx.saved_tensors
         given = (loss, kept, source, part)
-        along = [torch.zeros_like(v) if t is None else t for v, t in zip(given, tangents, strict=False)]
-        with torch.enable_grad():
-            leaves = [v.detach().requires_grad_() for v in given]
-            value = _step(leaves, ctx.whole, x)
-            weights = torch.zeros_like(value, requires_grad=True)
-            gradients = torch.autograd.grad(value, leaves, weights, create_graph=True)
-            total = torch.stack([(g * t).sum() for g, t in zip(gradients, along, strict=True)]).sum()
-            right = torch.autograd.grad(total, weights)[0]
+        along = tuple(torch.zeros_like(v) if t is None else t for v, t in zip(given, tangents, strict=False))
+        # by two backward passes, which are the derivative of the gradient in its weights
+        right = jvp(lambda *v: _step(v, ctx.whole, x), given, along)[1]  # type: ignore[no-untyped-call]
         found = []
         for at in torch.split(torch.arange(loss.shape[0], device=loss.device), _ROWS_AT_ONCE):
             found.append(_LossyChain(loss[at], kept[at], part, ctx.whole).solve(right[at]))
@@ -155,43 +158,7 @@ class _Trapped(torch.autograd.Function):
         return *gradients, None
 
 
-def trapped_carrier_lines(loss: Tensor, kept: Tensor, source: Tensor, part: Tensor, whole: int) -> Tensor:
-    """Stationary lines of the loss of an armed detector that holds trapped carriers; differentiable once in all four
-    tensors.
-
-    Args:
-        loss: (R, T) > 0, rate at which the state is left while armed, float64.
-        kept: (R, T), share of the loss that returns after the dead time.
-        source: lines (R, 2 T) that are put in after the dead time.
-        part, whole: dead time in bins, split.
-
-    Returns:
-        Lines (R, 2 T).
-
-    Raises:
-        TorchTransientError: if the iteration does not converge.
-    """
-    x: Tensor = _Trapped.apply(loss, kept, source, part, whole)  # type: ignore[no-untyped-call]
-    return x
-
-
 # ----------------------------------------------------------------------------------------- carriers and armed detectors
-
-
-class Train(Protocol):
-    """Detector whose detections are on straight lines, in pieces of bins."""
-
-    def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Rates (R, N) -> time armed in each piece (R, N), lines of detections (R, 2, N)."""
-        ...
-
-    def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of a state with trapped carriers.
-
-        It is also left at the rate `lost` (R, 1), returns by the share `back` (R, 1) of detections and is put in by the
-        lines `source` (R, 2, N).
-        """
-        ...
 
 
 def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
@@ -215,16 +182,22 @@ def _response(loss: Tensor, part: Tensor, largest: float) -> BinResponse:
 
 @dataclass(frozen=True)
 class ClockedTrain:
-    """Detector armed at the start of a cycle, without carriers of this cycle."""
+    """Detector armed at the start of a cycle, without carriers of this cycle. Detections are on straight lines."""
 
     whole: int
     part: Tensor
     largest: float  # rates, but for those lost
 
     def bare(self, rate: Tensor) -> tuple[Tensor, Tensor]:
+        """Rates (R, N) -> time armed in each piece (R, N), lines of detections (R, 2, N)."""
         return self._solve(rate, rate, None, None, self.largest)
 
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
+        """The same of a state with trapped carriers.
+
+        It is also left at the rate `lost` (R, 1), returns by the share `back` (R, 1) of detections and is put in by the
+        lines `source` (R, 2, N).
+        """
         return self._solve(rate, rate + lost, back.unsqueeze(-1), source, self.largest + float(lost.detach().amax()))
 
     def _solve(
@@ -266,7 +239,7 @@ class ClockedTrain:
 
 @dataclass(frozen=True)
 class FreeRunningTrain:
-    """Free-running detector in its stationary state."""
+    """Free-running detector in its stationary state; methods as of `ClockedTrain`."""
 
     whole: int
     part: Tensor
@@ -281,7 +254,8 @@ class FreeRunningTrain:
     def trapped(self, rate: Tensor, lost: Tensor, back: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         loss = rate + lost
         kept = rate / loss
-        lines = trapped_carrier_lines(loss, kept * back, source.flatten(1), self.part, self.whole).view_as(source)
+        lines: Tensor = _Trapped.apply(loss, kept * back, source.flatten(1), self.part, self.whole)  # type: ignore[no-untyped-call]
+        lines = lines.view_as(source)
         return lines[:, 0] / loss, lines * kept.unsqueeze(1)
 
 
@@ -292,7 +266,7 @@ def _safe_ratio(part: Tensor, whole: Tensor) -> Tensor:
 
 
 def carrier_hazard(
-    train: Train,
+    train: ClockedTrain | FreeRunningTrain,
     photons: Callable[[Tensor], Tensor] | None,
     first: Tensor,
     gate: Tensor | None,
@@ -380,7 +354,7 @@ def clocked_hazard(
     gate: Tensor | None,
     seen: Tensor,
     tau: Tensor,
-    earlier: Callable[[Tensor, Tensor | slice], Tensor],
+    earlier: Callable[[Tensor, Tensor], Tensor],
     steps: int = 1,
 ) -> Tensor:
     """Rate of carriers that fire an armed detector that is armed at the start of cycles.
@@ -399,9 +373,8 @@ def clocked_hazard(
     """
     size = rate.shape[-1]
     least = max(steps, 1 if float(dead_bins) >= 1 - 1e-9 else 2)
-    level, present, hidden = subdivision_levels(rate + (seen / tau).sum(), least)
 
-    def solved(rows: Tensor, at: Tensor | slice, pieces: int) -> Tensor:
+    def solved(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
         def photons(detected: Tensor) -> Tensor:
             free = earlier(detected.view(rows.shape[0], size, pieces).sum(-1), at)
             last.append(free)
@@ -417,23 +390,7 @@ def clocked_hazard(
             own = _safe_ratio(own, gate.repeat_interleave(steps, -1).expand_as(own))
         return own + _subdivide(last[-1], steps)
 
-    def chunks(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
-        few = max(1, _PIECES_AT_ONCE // (size * pieces))
-        parts = [solved(r, i, pieces) for r, i in zip(torch.split(rows, few), torch.split(at, few), strict=True)]
-        return torch.cat(parts) if len(parts) > 1 else parts[0]
-
-    if len(present) == 1:
-        return chunks(rate, torch.arange(rate.shape[0], device=rate.device), least << present[0])
-    found = rate.new_zeros(rate.shape[0], steps * size)
-    for k in present:
-        if hidden:
-            here = (level == k).unsqueeze(-1)
-            own = solved(torch.where(here, rate, 0.0), slice(None), least << k)
-            found = found + torch.where(here, own, 0.0)
-        else:
-            rows = (level == k).nonzero().squeeze(-1)
-            found = found.index_copy(0, rows, chunks(rate[rows], rows, least << k))
-    return found
+    return solve_by_level(rate, subdivision_levels(rate + (seen / tau).sum(), least), least, solved)
 
 
 def free_running_hazard(rate: Tensor, dead_bins: Tensor, seen: Tensor, tau: Tensor, steps: int = 1) -> Tensor:
@@ -511,10 +468,6 @@ class AfterpulsingSPAD(WrappedDetector):
         grad: GradPolicy | None = None,
     ) -> None:
         where = "AfterpulsingSPAD"
-        if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD)):
-            raise UnitError(f"{where}: expected detector to be a SynchronousSPAD or FreeRunningSPAD, got {detector!r}.")
-        if not isinstance(afterpulsing, Afterpulsing):
-            raise UnitError(f"{where}: expected afterpulsing to be an Afterpulsing, got {afterpulsing!r}.")
         own = detector.dead_time_s
         own = float(own.detach()) if isinstance(own, Tensor) else own
         if own is not None and not math.isclose(own, afterpulsing.dead_time_s, rel_tol=1e-6):
@@ -530,8 +483,7 @@ class AfterpulsingSPAD(WrappedDetector):
         super().check_bins(x)
         self.afterpulsing.check_bins(x)
 
-    def _transfers(self, x: Tensor) -> tuple[Tensor, Tensor | None, int]:
-        """Transfer functions of a period, and of two windows for the part to be left out; period in bins."""
+    def _transfers(self, x: Tensor) -> _Transfers:
         check_transient(x, "AfterpulsingSPAD")
         bins = x.shape[TIME]
         period = self.afterpulsing.period_bins or bins
@@ -541,20 +493,10 @@ class AfterpulsingSPAD(WrappedDetector):
                 f"SynchronousSPAD), got {period} bins. Set period_s."
             )
         round_period = torch.fft.rfft(self.afterpulsing.kernel(period).to(x.device))
-        if self.detector.dead_time_s is not None:
+        if isinstance(self.detector, FreeRunningSPAD) or (self.detector.dead_bins and not self._follows_carriers):
             return round_period, None, period
         same_cycle = torch.fft.rfft(self.afterpulsing.first_kernel(bins).to(x.device), n=2 * bins)
         return round_period, same_cycle, period
-
-    def _released(self, detected: Tensor, transfers: tuple[Tensor, Tensor | None, int]) -> Tensor:
-        """Independent releases per cycle and bin, float64, without those in a dead cycle."""
-        bins = detected.shape[TIME]
-        round_period, same_cycle, period = transfers
-        rows = detected.movedim(TIME, -1).contiguous().double()
-        free = filter_rows(rows, round_period, period, 0, bins)
-        if same_cycle is not None:
-            free = (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
-        return free.movedim(-1, TIME)
 
     def _from_outside(self, x: Tensor, round_period: Tensor, period: int) -> Tensor | float:
         """Releases of the constant counts outside of the window, per cycle and bin, float64."""
@@ -575,9 +517,7 @@ class AfterpulsingSPAD(WrappedDetector):
         dead = spad.dead_bins is not None if isinstance(spad, SynchronousSPAD) else spad.kind == "non_paralyzable"
         return self.afterpulsing.delays is None and dead
 
-    def _of_armed(
-        self, x: Tensor, transfers: tuple[Tensor, Tensor | None, int], outside: Tensor | float, steps: int
-    ) -> Tensor:
+    def _of_armed(self, x: Tensor, transfers: _Transfers, outside: Tensor | float, steps: int) -> Tensor:
         """Releases per cycle, part of a bin and armed detector, float64."""
         module, spad, bins = self.afterpulsing, self.detector, x.shape[TIME]
         if x.numel() == 0:
@@ -588,14 +528,11 @@ class AfterpulsingSPAD(WrappedDetector):
         rows = wide.reshape(-1, bins)
         if isinstance(spad, SynchronousSPAD):
             dead = torch.as_tensor(spad.dead_bins, dtype=torch.float64, device=x.device)
-            round_period, _, period = transfers
-            same_cycle = torch.fft.rfft(module.first_kernel(bins).to(x.device), n=2 * bins)
             given = outside.expand(x.shape).movedim(TIME, -1).reshape(rows.shape) if isinstance(outside, Tensor) else 0
 
-            def earlier(detected: Tensor, at: Tensor | slice) -> Tensor:
+            def earlier(detected: Tensor, at: Tensor) -> Tensor:
                 """Releases of other cycles, which are independent of this one."""
-                free = filter_rows(detected, round_period, period, 0, bins)
-                free = (free - filter_rows(detected, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
+                free = _released(detected, transfers)
                 return free + given[at] if isinstance(given, Tensor) else free
 
             gate = None if spad.gate is None else spad.gate.to(x.device)
@@ -627,8 +564,8 @@ class AfterpulsingSPAD(WrappedDetector):
         # where all carriers are set free during the dead time, there is nothing to iterate
         rounds = max(1, math.ceil(math.log(_LEFT_INDEPENDENT) / math.log(most)) - 1) if most > _LEFT_INDEPENDENT else 1
         for _ in range(rounds):
-            inside = self._released(self.detector.probabilities(x + free), transfers)
-            free = (inside + outside).to(x.dtype)
+            rows = self.detector.probabilities(x + free).movedim(TIME, -1).contiguous().double()
+            free = (_released(rows, transfers).movedim(-1, TIME) + outside).to(x.dtype)
         return free
 
     @in_single
@@ -657,13 +594,17 @@ class AfterpulsingSPAD(WrappedDetector):
         found = measure(_in_parts(self.detector, steps), rate)
         return found.reshape(*x.shape[:TIME], x.shape[TIME], steps, *x.shape[TIME + 1 :]).sum(TIME)
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.probabilities(rate))
 
-    @in_single
     def expected(self, x: Tensor) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.expected(rate))
+
+    def variance(self, x: Tensor) -> Tensor:
+        return self.detector.variance(self.rate(x))
+
+    def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
+        return self.detector.log_prob(measurement, self.rate(x))
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad.gaussian(rate, generator))
@@ -674,6 +615,16 @@ class AfterpulsingSPAD(WrappedDetector):
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         return self._in_steps(x, lambda spad, rate: spad(rate, generator=generator))
+
+
+def _released(rows: Tensor, transfers: _Transfers) -> Tensor:
+    """Independent releases (..., T) per cycle and bin of detections, float64, without those left out."""
+    round_period, same_cycle, period = transfers
+    bins = rows.shape[-1]
+    free = filter_rows(rows, round_period, period, 0, bins)
+    if same_cycle is None:
+        return free
+    return (free - filter_rows(rows, same_cycle, 2 * bins, 0, bins)).clamp_min(0)
 
 
 def _in_parts(detector: _Detector, steps: int) -> _Detector:

@@ -16,20 +16,20 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import Numbers
 from torchtransient.errors import GradientError, UnitError
-from torchtransient.floating import in_single
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
 from torchtransient.sensing.checks import (
     TIME,
     bins_from,
     check_count,
-    check_generator,
     check_seconds,
     check_tensor,
     check_transient,
@@ -38,7 +38,7 @@ from torchtransient.sensing.dead_time.clocked import highest_level
 from torchtransient.sensing.dead_time.clocked_counts import binomial_log_prob, safe_xlogy
 from torchtransient.sensing.draws import check_rates
 from torchtransient.sensing.free_running import FreeRunningSPAD
-from torchtransient.sensing.macro_pixel import checked_detector, groups_of
+from torchtransient.sensing.macro_pixel import groups_of
 from torchtransient.sensing.sensor import (
     VARIANCE_FLOOR,
     GradPolicy,
@@ -161,9 +161,7 @@ def _detections(
     pixels, bins = rate.shape
     flux = _Flux(rate)
     end = float(length * bins)
-    owner = torch.arange(pixels * blocks * trains.number, device=rate.device).div(
-        trains.number, rounding_mode="floor"
-    )
+    owner = torch.arange(pixels * blocks * trains.number, device=rate.device).div(trains.number, rounding_mode="floor")
     armed = torch.zeros(owner.shape, dtype=torch.float64, device=rate.device)
     if lead:
         # A bright pulse keeps a detector of long dead time in step with every n-th period: all n have to be drawn.
@@ -247,11 +245,8 @@ def _look(seen: Seen, pixel: Tensor, begin: Tensor, fired: Tensor, end: float) -
 # ------------------------------------------------------------------------------------------------------ mean and sensor
 
 
-# Gauss-Legendre, 8 points on [0, 1]: the lower half, and the weights of both halves
-_HALF = (0.019855071751231884, 0.10166676129318664, 0.23723379504183550, 0.40828267875217510)
-_SIDES = (0.050614268145188130, 0.11119051722668724, 0.15685332293894363, 0.18134189168918100)
-_PLACES = (*_HALF, *(1 - place for place in reversed(_HALF)))
-_WEIGHTS = (*_SIDES, *reversed(_SIDES))
+_PLACES, _WEIGHTS = ((0.5 * values).tolist() for values in np.polynomial.legendre.leggauss(8))  # on [-1/2, 1/2]
+_Detector = SynchronousSPAD | FreeRunningSPAD
 _PHOTONS = 4.0  # of all SPADs in a piece, which 8 points integrate
 _ROUNDED = 1e-6  # of a probability
 _FLOOD = 1e8  # photons of a bin, from which on first ones are where it begins
@@ -363,7 +358,7 @@ class CoincidencePixel(RandomSensor):
     ) -> None:
         super().__init__(grad)
         where = "CoincidencePixel"
-        self.detector = checked_detector(detector, where)
+        self.detector = detector
         self.groups = groups_of(spads, weights, where)
         self.spads = int(spads)
         self.coincidence = check_count(coincidence, "coincidence", where)
@@ -384,7 +379,6 @@ class CoincidencePixel(RandomSensor):
         """Laser cycles of an exposure."""
         return cycles_of(self.detector)
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected coincidences per cycle and bin.
 
@@ -394,7 +388,7 @@ class CoincidencePixel(RandomSensor):
         check_transient(x, "CoincidencePixel")
         self._check_window(x)
         window = self.window_s / self.bin_width_s
-        parts = [self._one(x * share, share, number) for share, number in self.groups]
+        parts = [self._one(x, share, number) for share, number in self.groups]
         whole = math.floor(window)
         total = torch.zeros_like(x, dtype=torch.float64)
         photons = (x.double() / _PHOTONS).clamp(1, _FLOOD * self.spads)
@@ -403,7 +397,7 @@ class CoincidencePixel(RandomSensor):
         for low, high in ((0.0, window - whole), (window - whole, 1.0)):
             for begin, end in _pieces(low, high, halvings):
                 for place, weight in zip(_PLACES, _WEIGHTS, strict=True):
-                    at = begin + (end - begin) * place
+                    at = begin + (end - begin) * (0.5 + place)
                     total = total + (end - begin) * weight * self._reached(parts, at, window)
         return total.to(x.dtype)
 
@@ -425,15 +419,19 @@ class CoincidencePixel(RandomSensor):
             )
         return x
 
-    def _one(self, rate: Tensor, share: float, number: int) -> _Group:
-        """A SPAD at its rate (..., T, H, W), one of `number` with a `share` of the pixel."""
-        inner = several_of(self.detector, 1, share)
-        if isinstance(inner, AfterpulsingSPAD):
-            rate, inner = inner.rate(rate), inner.detector
-        detections: Tensor = inner.probabilities(rate)  # type: ignore[operator]
-        once = isinstance(inner, SynchronousSPAD) and inner.dead_time_s is None
-        seen = inner._gated(rate).double().clamp_max(_FLOOD) if once else None  # type: ignore[operator]
-        return _Group(detections.double(), seen, number)
+    def _spad(self, x: Tensor, share: float) -> tuple[_Detector, Tensor]:
+        """One SPAD with a `share` of the pixel, and its rate per cycle and bin."""
+        one = several_of(self.detector, 1, share)
+        if isinstance(one, AfterpulsingSPAD):
+            return one.detector, one.rate(x * share)
+        return cast("_Detector", one), x * share
+
+    def _one(self, x: Tensor, share: float, number: int) -> _Group:
+        """A SPAD in the light (..., T, H, W) of the pixel, one of `number` with a `share` of it."""
+        spad, rate = self._spad(x, share)
+        once = isinstance(spad, SynchronousSPAD) and spad.dead_time_s is None
+        seen = cast("SynchronousSPAD", spad)._gated(rate).double().clamp_max(_FLOOD) if once else None
+        return _Group(spad.probabilities(rate).double(), seen, number)
 
     def _reached(self, parts: list[_Group], at: float, window: float) -> Tensor:
         """Coincidences per bin and cycle at a share `at` of every bin."""
@@ -477,7 +475,12 @@ class CoincidencePixel(RandomSensor):
         if not self._paralyzable:
             return self._drawn(x, generator)
         with torch.no_grad():
-            p = self._chances(check_tensor(x, "CoincidencePixel").double())
+            p = self.probabilities(check_rates(check_tensor(x, "CoincidencePixel").double(), "CoincidencePixel"))
+            if p.numel() and float(p.max()) > 1 + _ROUNDED:
+                raise UnitError(
+                    f"CoincidencePixel: expected at most one coincidence per cycle in a bin, got {float(p.max()):g}. "
+                    "Use narrower bins to draw."
+                )
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def gaussian(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -502,19 +505,14 @@ class CoincidencePixel(RandomSensor):
 
     @property
     def _inner(self) -> SynchronousSPAD | FreeRunningSPAD:
-        inner = self.detector.detector if isinstance(self.detector, AfterpulsingSPAD) else self.detector
-        assert isinstance(inner, (SynchronousSPAD, FreeRunningSPAD))  # as was checked
-        return inner
+        return self.detector.detector if isinstance(self.detector, AfterpulsingSPAD) else self.detector
 
     def _lit(self, x: Tensor, share: float) -> tuple[Tensor, float]:
         """Rate of one SPAD with a `share` of the light, per cycle and bin, and its dead time in bins."""
-        inner = several_of(self.detector, 1, share)
-        rate = x * share
-        if isinstance(inner, AfterpulsingSPAD):
-            rate, inner = inner.rate(rate), inner.detector
-        if isinstance(inner, SynchronousSPAD):
-            return inner._gated(rate), math.inf if inner.dead_bins is None else inner.dead_bins
-        return rate, float(inner.dead_time_s.detach()) / self.bin_width_s  # type: ignore[operator]
+        spad, rate = self._spad(x, share)
+        if isinstance(spad, SynchronousSPAD):
+            return spad._gated(rate), math.inf if spad.dead_bins is None else spad.dead_bins
+        return rate, float(spad.dead_time_s.detach()) / self.bin_width_s
 
     def _drawn(
         self,
@@ -547,7 +545,6 @@ class CoincidencePixel(RandomSensor):
                 "CoincidencePixel: expected a dead time that is not learnt, whose score is not supported, got one. "
                 "Choose grad='expected', 'gaussian' or 'straight_through'."
             )
-        check_generator(generator, "CoincidencePixel")
         seen: list[Seen] = []
         measurement = self._drawn(x, generator, seen)
 
@@ -562,16 +559,6 @@ class CoincidencePixel(RandomSensor):
 
         record_score(log_prob, "CoincidencePixel")
         return measurement
-
-    def _chances(self, x: Tensor) -> Tensor:
-        """`probabilities` when they are some, else UnitError."""
-        p = self.probabilities(check_rates(x, "CoincidencePixel"))
-        if p.numel() and float(p.max()) > 1 + _ROUNDED:
-            raise UnitError(
-                f"CoincidencePixel: expected at most one coincidence per cycle in a bin, got {float(p.max()):g}. Use "
-                "narrower bins to draw."
-            )
-        return p
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         """Log-probability of bins as independent binomials, each of which is exact.

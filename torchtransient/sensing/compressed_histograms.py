@@ -11,6 +11,7 @@ from torchtransient.checks import MOST_MADE
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single, product
 from torchtransient.sensing.checks import TIME, check_bins, check_count, check_transient, reals
+from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.sensor import Sensor
 
 
@@ -115,43 +116,16 @@ class CodedHistogram(Sensor):
 
     def __init__(self, codes: Tensor, *, learnable: bool = False) -> None:
         super().__init__()
-        if not isinstance(codes, Tensor) or codes.ndim != 2:
-            shape = tuple(codes.shape) if isinstance(codes, Tensor) else type(codes).__name__
-            raise ShapeError(f"CodedHistogram: expected codes (K, T), got {shape}.")
+        if codes.ndim != 2:
+            raise ShapeError(f"CodedHistogram: expected codes (K, T), got {tuple(codes.shape)}.")
         values = reals("CodedHistogram", torch.float64, codes=codes)[0].detach().double().clone()
         if not bool(torch.isfinite(values).all()):
             raise UnitError("CodedHistogram: expected finite codes.")
-        if learnable:
-            self.codes = torch.nn.Parameter(values)
-        else:
-            self.register_buffer("codes", values)
-
-    @in_single
-    def _apply_matrix(self, matrix: Tensor, x: Tensor, name: str) -> Tensor:
-        check_transient(x, f"CodedHistogram.{name}")
-        if x.shape[TIME] != matrix.shape[1]:
-            raise ShapeError(f"CodedHistogram.{name}: expected dimension -3 of {matrix.shape[1]}, got {x.shape[TIME]}.")
-        sums = product(matrix.to(x.dtype), x.flatten(-2))
-        return sums.reshape(*sums.shape[:-1], *x.shape[-2:])
+        keep_number(self, "codes", values, learnable)
 
     def expected(self, x: Tensor) -> Tensor:
-        return self._apply_matrix(self.codes, x, "expected")
-
-    def adjoint(self, y: Tensor) -> Tensor:
-        """Apply the transpose: (..., C, K, H, W) to (..., C, T, H, W).
-
-        Args:
-            y: coded sums.
-        """
-        return self._apply_matrix(self.codes.T, y, "adjoint")
-
-    def pseudo_inverse(self, y: Tensor) -> Tensor:
-        """Histogram of least length with these coded sums.
-
-        Args:
-            y: coded sums (..., C, K, H, W).
-
-        Returns:
-            (..., C, T, H, W).
-        """
-        return self._apply_matrix(torch.linalg.pinv(self.codes.double()), y, "pseudo_inverse")
+        check_transient(x, "CodedHistogram")
+        if x.shape[TIME] != self.codes.shape[1]:
+            raise ShapeError(f"CodedHistogram: expected T = {self.codes.shape[1]} as in codes, got {x.shape[TIME]}.")
+        sums = product(self.codes.to(x.dtype), x.flatten(-2))
+        return sums.reshape(*sums.shape[:-1], *x.shape[-2:])

@@ -16,13 +16,10 @@ from torch import Tensor
 
 from torchtransient.errors import GradientError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.checks import TIME, check_generator, check_transient, going_together, reals
-from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces, fast_poisson, halve, parallel_map, thin
+from torchtransient.sensing.checks import TIME, check_transient, reals
+from torchtransient.sensing.draws import WHOLE_FLOAT32, by_pieces, check_rates, fast_poisson, halve, thin
 from torchtransient.sensing.sensor import RandomSensor, record_score, standard_normal, straight_through
 from torchtransient.sensing.time_convolution import Boundary
-
-# float32 counts whole numbers up to here; torch.poisson beyond it draws even numbers only.
-_EXACT_FLOAT32 = 2.0**24
 
 
 @in_single
@@ -42,14 +39,14 @@ def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
         UnitError: for negative or non-finite means: negative lobes of a filter have to be dealt with where they arise.
     """
     (mean,) = reals("poisson", mean=mean)
-    check_generator(generator, "poisson")
-    mean = mean.detach()
-    low, high = torch.aminmax(mean) if mean.numel() else (mean.new_zeros(()), mean.new_zeros(()))
-    if not bool(low >= 0) or not bool(torch.isfinite(high)):
-        raise UnitError(f"poisson: expected finite means >= 0, got values from {float(low):g} to {float(high):g}.")
-    if mean.dtype == torch.float32 and float(high) > _EXACT_FLOAT32 / 2:
-        return torch.poisson(mean.double(), generator=generator).to(mean.dtype)
-    return torch.poisson(mean, generator=generator)
+    mean = check_rates(mean.detach(), "poisson")
+    return torch.poisson(_room_for_counts(mean), generator=generator).to(mean.dtype)
+
+
+def _room_for_counts(mean: Tensor) -> Tensor:
+    """Means in a dtype that holds whole numbers of their size."""
+    bright = mean.dtype == torch.float32 and mean.numel() > 0 and float(mean.amax()) > WHOLE_FLOAT32 / 2
+    return mean.double() if bright else mean
 
 
 @in_single
@@ -62,11 +59,7 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
     Returns:
         Broadcast shape; -inf for a count above 0 where the mean is 0.
-
-    Raises:
-        ShapeError: for shapes that do not broadcast.
     """
-    counts, mean = going_together("poisson_log_prob", counts=counts, mean=mean)
     empty = counts == 0
     # where on the input: xlogy(0, 0) has a NaN gradient
     log_mean = torch.where(empty, torch.ones_like(mean), mean).log()
@@ -101,8 +94,6 @@ class ShotNoise(RandomSensor):
 # Events per entry, on average, above which following them one by one is given up for Poisson numbers.
 _MOST_EVENTS = 16
 _BLOCK = 1 << 16  # entries at a time, so that temporaries stay in the cache
-_PIECES = 4
-_WORTH_THREADS = 1 << 17  # entries, above which threads cost less than they save
 
 
 def look_at_items(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,36 +108,14 @@ def look_at_items(counts: Tensor) -> tuple[Tensor, Tensor]:
         Mask and float64 sums, both (..., 1, 1, 1, 1).
     """
     shape = (*counts.shape[:-4], 1, 1, 1, 1)
-    rows = counts.reshape(math.prod(shape), math.prod(counts.shape[-4:]))
-    large = counts.device.type == "cpu" and counts.numel() >= _WORTH_THREADS
-    found = parallel_map(_look_at_rows, rows.tensor_split(_PIECES, 1)) if large else [_look_at_rows(rows)]
-    whole, total = found[0]
-    for also, more in found[1:]:
-        whole, total = whole & also, total + more
-    return whole.view(shape), total.view(shape)
-
-
-def _look_at_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
+    rows = counts.detach().reshape(math.prod(shape), math.prod(counts.shape[-4:]))
     whole, total = rows.new_ones(rows.shape[0], dtype=torch.bool), rows.new_zeros(rows.shape[0], dtype=torch.float64)
-    with torch.no_grad():  # grad mode is per thread
-        for block in torch.split(rows, max(_BLOCK // max(rows.shape[0], 1), 1), 1):
-            total += block.sum(1)
-            nearest = block.round().clamp_min_(0)
-            if not torch.equal(nearest, block):
-                whole &= (nearest == block).all(1)
-    return whole, total
-
-
-def whole_items(counts: Tensor) -> Tensor:
-    """Mask of the items of a batch that hold whole numbers >= 0 alone.
-
-    Args:
-        counts: (..., C, T, H, W).
-
-    Returns:
-        Mask (..., 1, 1, 1, 1).
-    """
-    return look_at_items(counts)[0]
+    for block in torch.split(rows, max(_BLOCK // max(rows.shape[0], 1), 1), 1):
+        total += block.sum(1)
+        nearest = block.round().clamp_min_(0)
+        if not torch.equal(nearest, block):
+            whole &= (nearest == block).all(1)
+    return whole.view(shape), total.view(shape)
 
 
 class AddedCounts(RandomSensor):
@@ -221,10 +190,7 @@ class AddedCounts(RandomSensor):
 
     def _poisson(self, mean: Tensor, generator: torch.Generator | None) -> Tensor:
         self._check_total(float(mean.detach().sum()))
-        work = mean.detach().clamp_min(0)
-        if work.dtype == torch.float32 and work.numel() and float(work.amax()) > WHOLE_FLOAT32 / 2:
-            work = work.double()
-        return fast_poisson(work, generator).to(mean.dtype)
+        return fast_poisson(_room_for_counts(mean.detach().clamp_min(0)), generator).to(mean.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
         return poisson_log_prob((measurement - x).detach().clamp_min(0), self.extra(x)).sum(TIME)
@@ -422,10 +388,6 @@ def _by_blocks(data: Tensor, moves: Moves, generator: torch.Generator | None) ->
     return torch.cat([_Tree(moves, p.contiguous(), None).run(generator) for p in pieces], 2)
 
 
-def _binomial(counts: Tensor, share: Tensor, generator: torch.Generator | None) -> Tensor:
-    return torch.binomial(counts, share.contiguous(), generator=generator)
-
-
 class _Tree:
     """Splits counts (N, T, P) over lags, adding them up where they go."""
 
@@ -462,8 +424,10 @@ class _Tree:
             fewer = min(float(share.min()), 1 - highest) * level
             by_table = level < _MOST_BY_TABLE and fewer > _LEAST_BY_TABLE
             shares = self._of_entries(share, place, counts).to(counts.dtype).expand_as(counts)
-            draw = halve if by_table else _binomial
-            taken = draw(counts, shares, generator)
+            if by_table:
+                taken = halve(counts, shares, generator)
+            else:
+                taken = torch.binomial(counts, shares.contiguous(), generator=generator)
             parts = [(small, place, taken), (large, place, counts - taken)]
         for part, where, number in parts:
             occupied = int(torch.count_nonzero(number))
@@ -558,13 +522,13 @@ class MovedCounts(RandomSensor):
             return self._drawn(x, generator, tally=False)[0]
 
     def _drawn(self, x: Tensor, generator: torch.Generator | None, tally: bool) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Items moved, how many of the whole ones went each way, and which are whole; see `whole_items`."""
+        """Items moved, how many of the whole ones went each way, and which are whole; see `look_at_items`."""
         given = check_transient(x, type(self).__name__)
         counts = given.float() if x.dtype in (torch.float16, torch.bfloat16) else given
         highest = float(counts.abs().amax()) if counts.numel() else 0.0
         if not math.isfinite(highest):
             raise UnitError(f"{type(self).__name__}: expected finite counts, got NaN or infinity. Look upstream.")
-        whole = whole_items(counts)
+        whole, _ = look_at_items(counts)
         if whole.numel() and not bool(whole.any()):
             return self.expected(given), None, whole
         every = bool(whole.all())

@@ -22,9 +22,7 @@ _BLOCK = 1 << 17  # entries at a time, so that temporaries stay in the cache
 
 
 @in_single
-def add_crosstalk(
-    counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0, *, only_added: bool = False
-) -> Tensor:
+def add_crosstalk(counts: Tensor, probability: Tensor | float, diagonal: Tensor | float = 0.0) -> Tensor:
     """Mean histogram with optical crosstalk: each detection triggers each of its neighbours with a probability.
 
     Without delay: crosstalk takes less than a bin. Counts across the rim of the sensor are lost. First order: crosstalk
@@ -34,14 +32,18 @@ def add_crosstalk(
         counts: (..., C, T, H, W).
         probability: of each of the 4 neighbours across an edge.
         diagonal: of each of the 4 neighbours across a corner.
-        only_added: return the crosstalk alone.
 
     Returns:
         Shape and dtype of `counts`.
     """
+    near = one_number(probability, "probability", "add_crosstalk")
+    return counts + _crosstalk(counts, near, one_number(diagonal, "diagonal", "add_crosstalk"))
+
+
+@in_single
+def _crosstalk(counts: Tensor, probability: Tensor | float, diagonal: Tensor | float) -> Tensor:
+    """Mean of the counts added."""
     check_transient(counts, "add_crosstalk")
-    probability = one_number(probability, "probability", "add_crosstalk")
-    diagonal = one_number(diagonal, "diagonal", "add_crosstalk")
     near = torch.as_tensor(probability, device=counts.device).to(counts.dtype)
     far = torch.as_tensor(diagonal, device=counts.device).to(counts.dtype)
     padded = torch.nn.functional.pad(counts, (1, 1, 1, 1))
@@ -53,7 +55,7 @@ def add_crosstalk(
     added = near * (seen(-1, 0) + seen(1, 0) + seen(0, -1) + seen(0, 1))
     if far.requires_grad or bool(far != 0):
         added = added + far * (seen(-1, -1) + seen(-1, 1) + seen(1, -1) + seen(1, 1))
-    return added if only_added else counts + added
+    return added
 
 
 class Crosstalk(AddedCounts):
@@ -100,13 +102,12 @@ class Crosstalk(AddedCounts):
             )
         return p, p * self.diagonal_ratio if self.diagonal_ratio > 0 else 0.0
 
-    @in_single
     def extra(self, x: Tensor) -> Tensor:
-        return add_crosstalk(x, *self._probabilities(), only_added=True)
+        return _crosstalk(x, *self._probabilities())
 
     def variance(self, x: Tensor) -> Tensor:
         near, far = self._probabilities()
-        return add_crosstalk(x, near * (1 - near), far * (1 - far), only_added=True)
+        return _crosstalk(x, near * (1 - near), far * (1 - far))
 
     def share(self) -> float:
         return 4 * float(self.probability.detach()) * (1 + self.diagonal_ratio)

@@ -17,8 +17,8 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import KW_ONLY, asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from torch import nn
 from torchtransient.array_files.part_files import write_text
 from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_data
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_whole, short_errors, short_message, shown, some_of
+from torchtransient.checks import short_errors, short_message, shown, some_of
 from torchtransient.chirps import Chirps
 from torchtransient.errors import MissingPackageError, StorageError, TorchTransientError
 from torchtransient.sensing.afterpulsing import Afterpulsing, MeasuredDelays, PowerLawDelays
@@ -117,8 +117,6 @@ KINDS: Mapping[str, Callable[..., Any]] = {
     "tensor": _tensor,
 }  # fmt: skip
 
-_BY_VALUE = ("PixelGroups.by_value", "make")
-
 
 @dataclass(frozen=True)
 class Device:
@@ -145,17 +143,13 @@ class Device:
     num_bins: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("name", "description"):
-            text: Any = getattr(self, name)
-            if not isinstance(text, str):
-                raise StorageError(f"Device: expected {name} as a text, got {shown(text)}.")
         for name in ("sources", "stages"):
             given = getattr(self, name)
             if not isinstance(given, (list, tuple)):
                 raise StorageError(f"Device '{self.name}': expected {name} as a list, got {shown(given)}.")
-        for source in self.sources:
-            if not isinstance(source, str):
-                raise StorageError(f"Device '{self.name}': expected sources as texts, got {shown(source)}.")
+        for text in (self.name, self.description, *self.sources):
+            if not isinstance(text, str):
+                raise StorageError(f"Device: expected name, description and sources as texts, got {shown(text)}.")
         object.__setattr__(self, "sources", tuple(self.sources))
         object.__setattr__(self, "stages", tuple(copy.deepcopy(s) for s in self.stages))
         if not self.stages:
@@ -206,40 +200,18 @@ class Device:
         Raises:
             StorageError: for a stage that is missing or there twice.
         """
-        stages = [copy.deepcopy(s) for s in self.stages]
-        if isinstance(stage, str):
-            parts = [part for part in _parts(stages) if part["kind"] == stage]
-            if len(parts) != 1:
-                kinds = [part["kind"] for part in _parts(stages)]
-                raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
-            parts[0].update(arguments)
-        else:
-            number = as_whole(stage)
-            if number is None or not -len(stages) <= number < len(stages):
-                raise StorageError(
-                    f"Device '{self.name}': expected a stage by its kind or by a number from 0 to {len(stages) - 1}, "
-                    f"got {shown(stage)}."
-                )
-            stages[number].update(arguments)
-        return Device(
-            self.name,
-            description=self.description,
-            sources=self.sources,
-            stages=tuple(stages),
-            bin_width_s=self.bin_width_s,
-            num_bins=self.num_bins,
-        )
+        stages = copy.deepcopy(self.stages)
+        parts = [stages[stage]] if isinstance(stage, int) else [p for p in _parts(stages) if p["kind"] == stage]
+        if len(parts) != 1:
+            kinds = [part["kind"] for part in _parts(stages)]
+            raise StorageError(f"Device '{self.name}': expected one stage of kind '{stage}', got stages {kinds}.")
+        parts[0].update(arguments)
+        return replace(self, stages=stages)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, dictionaries, numbers and strings."""
-        return {
-            "name": self.name,
-            "description": self.description,
-            "sources": list(self.sources),
-            "stages": copy.deepcopy(list(self.stages)),
-            "bin_width_s": self.bin_width_s,
-            "num_bins": self.num_bins,
-        }
+        data = asdict(self)
+        return {**data, "sources": list(data["sources"]), "stages": list(data["stages"])}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Device:
@@ -252,19 +224,12 @@ class Device:
             StorageError: for missing or unknown entries.
         """
         with short_errors("Device"):
-            return cls._from_dict(data)
-
-    @classmethod
-    def _from_dict(cls, data: Mapping[str, Any]) -> Device:
-        wanted = {"name", "description", "sources", "stages"}
-        found = set(data) if isinstance(data, Mapping) else set()
-        if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
-            got = shown(data) if not found else some_of(sorted(shown(name) for name in found), 160)
-            raise StorageError(f"Device: expected the entries {', '.join(sorted(wanted))}, got {got}.")
-        return cls(
-            data["name"], description=data["description"], sources=data["sources"], stages=data["stages"],
-            bin_width_s=data.get("bin_width_s"), num_bins=data.get("num_bins"),
-        )  # fmt: skip
+            wanted = {"name", "description", "sources", "stages"}
+            found = set(data) if isinstance(data, Mapping) else set()
+            if not wanted <= found or found - wanted - {"bin_width_s", "num_bins"}:
+                got = shown(data) if not found else some_of(sorted(shown(name) for name in found), 160)
+                raise StorageError(f"Device: expected the entries {', '.join(sorted(wanted))}, got {got}.")
+            return cls(**data)
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Write JSON text.
@@ -338,18 +303,24 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
         StorageError: for an unknown kind, an argument that the kind does not take, or a placeholder without a value;
             errors of the values themselves (UnitError, ShapeError) pass.
     """
+    return _build(spec, axis, budget, None)
+
+
+def _build(spec: Any, axis: TimeAxis | None, budget: Mapping[str, Any] | None, pixel: float | None) -> Any:
+    """`build_stage` with the value of a pixel for "@value"."""
     if isinstance(spec, str) and spec.startswith("@"):
-        return _placeholder(spec, axis, budget)
+        return _placeholder(spec, axis, budget, pixel)
     if isinstance(spec, (list, tuple)):
-        return [build_stage(s, axis, budget) for s in spec]
+        return [_build(s, axis, budget, pixel) for s in spec]
     if not isinstance(spec, dict) or "kind" not in spec:
         return spec
     _check_spec(spec, "build_stage")
-    arguments = {
-        k: _maker(v, axis, budget) if (spec["kind"], k) == _BY_VALUE else build_stage(v, axis, budget)
-        for k, v in spec.items()
-        if k != "kind"
-    }
+    arguments = {k: _build(v, axis, budget, pixel) for k, v in spec.items() if k not in ("kind", "make")}
+    if "make" in spec:
+        made = spec["make"]
+        if not isinstance(made, dict) or "@value" not in _walk(made):
+            raise StorageError(f"build_stage: expected make as a stage with '@value' in it, got {shown(made)}.")
+        arguments["make"] = lambda value: _build(made, axis, budget, value)
     try:
         return KINDS[spec["kind"]](**arguments)
     except TorchTransientError:
@@ -361,24 +332,9 @@ def build_stage(spec: Any, axis: TimeAxis | None = None, budget: Mapping[str, An
         ) from error
 
 
-def _maker(spec: Any, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Callable[[float], Any]:
-    """Return a function that makes a stage of a value, "@value" in its description. StorageError without one."""
-    if not isinstance(spec, dict) or "@value" not in json.dumps(spec, default=str):
-        raise StorageError(
-            f"build_stage: expected make of PixelGroups.by_value as a stage with '@value' in it, got {shown(spec)}."
-        )
-    return lambda value: build_stage(_with_value(spec, value), axis, budget)
-
-
-def _with_value(spec: Any, value: float) -> Any:
-    if isinstance(spec, dict):
-        return {k: _with_value(v, value) for k, v in spec.items()}
-    if isinstance(spec, (list, tuple)):
-        return [_with_value(v, value) for v in spec]
-    return value if isinstance(spec, str) and spec == "@value" else spec
-
-
-def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | None) -> Any:
+def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | None, pixel: float | None) -> Any:
+    if name == "@value" and pixel is not None:
+        return pixel
     if name in ("@axis", "@num_bins"):
         if axis is None:
             raise StorageError("build_stage: expected a time axis for '@axis'. Give the renderer's, sensor(axis).")
@@ -397,39 +353,30 @@ def _placeholder(name: str, axis: TimeAxis | None, budget: Mapping[str, Any] | N
     return budget.get("cycles") if exposure_s is None else round(exposure_s * rate_hz)
 
 
-def _check_spec(spec: Any, where: str) -> None:
-    kind = spec.get("kind") if isinstance(spec, dict) else None
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise StorageError(
-            f"Device '{where}': expected a dictionary with a kind, one of {some_of(sorted(KINDS))}; got "
-            f"{shown(kind or spec)}."
-        )
-    for value in spec.values():
-        _check_value(value, kind, where)
-
-
-def _check_value(value: Any, kind: str, where: str) -> None:
-    """Raise StorageError for numbers that are not finite and unknown kinds, in lists and dictionaries too."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise StorageError(f"Device '{where}': expected finite numbers in {kind}; leave the argument out instead.")
-    if isinstance(value, dict) and "kind" in value:
-        _check_spec(value, where)
-    elif isinstance(value, dict):
-        for inner in value.values():
-            _check_value(inner, kind, where)
-    elif isinstance(value, (list, tuple)):
-        for inner in value:
-            _check_value(inner, kind, where)
+def _walk(spec: Any) -> Iterator[Any]:
+    """Yield a stage, or any other value, and all values in its dictionaries and lists."""
+    yield spec
+    inner = spec.values() if isinstance(spec, dict) else spec if isinstance(spec, (list, tuple)) else ()
+    for value in inner:
+        yield from _walk(value)
 
 
 def _parts(spec: Any) -> list[dict[str, Any]]:
     """Return every dictionary with a kind in a stage, or in a list of them: the stage, and its parts."""
-    if isinstance(spec, (list, tuple)):
-        return [part for entry in spec for part in _parts(entry)]
-    if not isinstance(spec, dict):
-        return []
-    own = [spec] if "kind" in spec else []
-    return own + [part for value in spec.values() for part in _parts(value)]
+    return [part for part in _walk(spec) if isinstance(part, dict) and "kind" in part]
+
+
+def _check_spec(spec: Any, where: str) -> None:
+    """Raise StorageError for a stage without a kind, and for unknown kinds and numbers that are not finite in it."""
+    for part in [spec, *_parts(spec)]:
+        kind = part.get("kind") if isinstance(part, dict) else None
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise StorageError(
+                f"Device '{where}': expected a dictionary with a kind, one of {some_of(sorted(KINDS))}; got "
+                f"{shown(kind or part)}."
+            )
+    if any(isinstance(value, float) and not math.isfinite(value) for value in _walk(spec)):
+        raise StorageError(f"Device '{where}': expected finite numbers; leave the argument out instead.")
 
 
 def _text(source: str | Path, mark: str, who: str) -> str:

@@ -10,6 +10,7 @@ most entries, and in double precision where those do not.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 import threading
@@ -90,6 +91,7 @@ def _forget() -> None:
     _POOLS.clear()
     _OWN.works_alone = False
 
+
 os.register_at_fork(after_in_child=_forget)
 
 
@@ -119,35 +121,34 @@ def _pool(threads: int) -> ThreadPoolExecutor:
         return _POOLS[threads]
 
 
-def parallel_map(job: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
-    """Apply `job` to the arguments side by side, with as many threads as `torch.get_num_threads()`.
+def in_threads(
+    job: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], generator: torch.Generator | None
+) -> list[Result]:
+    """Apply `job` to tuples of arguments side by side, without gradients, each with a generator of its own.
 
-    Operations of torch inside the threads take one thread each: more threads than cores wait for each other, at up to
-    four times the processor time. Jobs run in the inference and grad mode of the caller. Nested calls, and calls while
-    the interpreter ends, run in the caller's thread.
+    As many threads as `torch.get_num_threads()`; operations of torch inside of them take one thread each: more threads
+    than cores wait for each other, at up to four times the processor time. Nested calls run in the caller's thread.
 
     Args:
-        job: function of one element of each argument.
-        arguments: sequences of one length.
+        job: function of the elements of a tuple, and a generator.
+        arguments: the tuples.
+        generator: source of the seeds.
 
     Returns:
         Results in the order of the arguments.
     """
-    threads = min(torch.get_num_threads(), len(arguments[0]))
-    if threads < 2 or getattr(_OWN, "works_alone", False):
-        return list(map(job, *arguments))
-    inferring, watched = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+    seeds = torch.randint(0, 2**63 - 1, (len(arguments),), generator=generator).tolist()
+    inferring = torch.is_inference_mode_enabled()
 
-    def run(*given: Any) -> Result:
+    def run(given: tuple[Any, ...], seed: int) -> Result:
         # modes are per thread, and what was made in inference mode can only be written to in it
-        with torch.inference_mode(inferring), torch.set_grad_enabled(watched):
-            return job(*given)
+        with torch.inference_mode(inferring), torch.no_grad():
+            return job(*given, torch.Generator().manual_seed(seed))
 
-    try:
-        pending = [_pool(threads).submit(run, *given) for given in zip(*arguments, strict=True)]
-    except RuntimeError:
-        return list(map(job, *arguments))
-    return [one.result() for one in pending]
+    threads = min(torch.get_num_threads(), len(arguments))
+    if threads < 2 or getattr(_OWN, "works_alone", False):
+        return list(map(run, arguments, seeds))
+    return list(_pool(threads).map(run, arguments, seeds))
 
 
 def by_pieces(
@@ -166,24 +167,8 @@ def by_pieces(
     if data.device.type != "cpu" or data.numel() < _WORTH_THREADS or data.shape[0] < _PIECES:
         return [job(data, 0, generator)]
     pieces = data.tensor_split(_PIECES)
-    begins = [0]
-    for piece in pieces[:-1]:
-        begins.append(begins[-1] + piece.shape[0])
-    return _in_threads(job, list(zip(pieces, begins, strict=True)), generator)
-
-
-def _in_threads(
-    job: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], generator: torch.Generator | None
-) -> list[Result]:
-    """Apply `job` with a generator of its own for each tuple of arguments."""
-    seeds = torch.randint(0, 2**63 - 1, (len(arguments),), generator=generator).tolist()
-
-    def run(given: tuple[Any, ...], seed: int) -> Result:
-        own = torch.Generator().manual_seed(seed)
-        with torch.no_grad():  # grad mode is per thread
-            return job(*given, own)
-
-    return parallel_map(run, arguments, seeds)
+    begins = itertools.accumulate((piece.shape[0] for piece in pieces[:-1]), initial=0)
+    return in_threads(job, list(zip(pieces, begins, strict=True)), generator)
 
 
 def _in_columns(
@@ -194,7 +179,7 @@ def _in_columns(
         return draw(data, generator)
     result = torch.empty_like(data, memory_format=torch.contiguous_format)
     places = zip(data.tensor_split(_PIECES, dim=-1), result.tensor_split(_PIECES, dim=-1), strict=True)
-    _in_threads(lambda piece, into, own: into.copy_(draw(piece, own)), list(places), generator)
+    in_threads(lambda piece, into, own: into.copy_(draw(piece, own)), list(places), generator)
     return result
 
 
@@ -364,9 +349,7 @@ def _share_tables() -> tuple[tuple[BinomialTables, int], ...]:
     return (BinomialTables(coarse, _FEW_TRIALS, 4096), 32), (BinomialTables(fine, _FEW_TRIALS, 512), 1024)
 
 
-def draw_lower_share(
-    trials: Tensor, share: Tensor, generator: torch.Generator | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def draw_lower_share(trials: Tensor, share: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
     """Draw binomial numbers with a probability just below `share`, in steps of 1/32, then of 1/1024 of what is left.
 
     Args:

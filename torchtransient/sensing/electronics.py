@@ -18,10 +18,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import MOST, as_whole, several, shown
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.floating import in_single
-from torchtransient.sensing.checks import check_count, check_generator, check_number, check_transient, reals
+from torchtransient.sensing.checks import check_count, check_number, check_transient, reals
 from torchtransient.sensing.counts import poisson, poisson_log_prob
 from torchtransient.sensing.responses import normal_cdf, normal_integral
 from torchtransient.sensing.sensor import (
@@ -113,14 +112,7 @@ def fixed_pattern(
     Raises:
         UnitError: for a spread below zero.
     """
-    me = "fixed_pattern"
-    spread, center = check_number(spread, "spread", me), check_number(center, "center", me, low=-math.inf)
-    sizes = [shape] if as_whole(shape) is not None else several(f"{me}: shape", shape, "numbers of pixels")
-    shape = tuple(check_count(size, "shape", me, low=0) for size in sizes)  # type: ignore[arg-type]
-    check_generator(generator, me)
-    if math.prod(shape) > MOST:
-        raise UnitError(f"{me}: expected shape of at most 2^63 - 1 numbers, got {shown(shape)}.")
-    return center + spread * torch.randn(shape, generator=generator)
+    return center + check_number(spread, "spread", "fixed_pattern") * torch.randn(shape, generator=generator)
 
 
 class PixelElectronics(RandomSensor):
@@ -301,8 +293,7 @@ class PixelElectronics(RandomSensor):
 
     def _map(self, values: Tensor, name: str, x: Tensor) -> Tensor:
         missing = x.ndim - values.ndim
-        fits = missing >= 0 and all(v in (1, n) for v, n in zip(values.shape, x.shape[missing:], strict=True))
-        if not fits:
+        if missing < 0 or any(v not in (1, n) for v, n in zip(values.shape, x.shape[missing:], strict=True)):
             raise ShapeError(
                 f"{type(self).__name__}: expected {name} to broadcast to {tuple(x.shape)}, got {tuple(values.shape)}."
             )

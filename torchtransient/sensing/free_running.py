@@ -22,7 +22,6 @@ from torchtransient.floating import in_single
 from torchtransient.sensing.checks import (
     TIME,
     bins_from,
-    bins_of_period,
     check_bins,
     check_choice,
     check_count,
@@ -31,7 +30,12 @@ from torchtransient.sensing.checks import (
     one_number,
     reals,
 )
-from torchtransient.sensing.dead_time.clocked_counts import StepCounts, binomial_log_prob, draw_steps, steps_log_prob
+from torchtransient.sensing.dead_time.clocked_counts import (
+    StepProbabilities,
+    binomial_log_prob,
+    draw_steps,
+    steps_log_prob,
+)
 from torchtransient.sensing.dead_time.free_running import (
     FreeRunningState,
     sample_trains,
@@ -197,13 +201,12 @@ class FreeRunningSPAD(RandomSensor):
         dead_time_s: at least one bin ("paralyzable": any), also longer than the period.
         axis: time axis, or
         bin_width_s: bin width in seconds.
-        period_s: laser period, checked against axis and input.
         kind: "non_paralyzable" or "paralyzable".
         learnable: make log(dead time) a parameter `log_dead_time_s`.
         grad: gradient policy.
 
     Raises:
-        UnitError: for a dead time below one bin, or an axis that is not one period.
+        UnitError: for a dead time below one bin.
         ShapeError: for light with another T.
         TorchTransientError: for a phase that is remembered over more than four million detections.
     """
@@ -219,7 +222,6 @@ class FreeRunningSPAD(RandomSensor):
         *,
         axis: TimeAxis | None = None,
         bin_width_s: float | None = None,
-        period_s: float | None = None,
         kind: DeadTime = "non_paralyzable",
         learnable: bool = False,
         grad: GradPolicy = "expected",
@@ -230,8 +232,6 @@ class FreeRunningSPAD(RandomSensor):
         check_choice(kind, DeadTime, "kind", "FreeRunningSPAD")
         self.kind: DeadTime = kind
         self.bin_width_s, self.num_bins = bins_from(axis, bin_width_s, "FreeRunningSPAD")
-        if period_s is not None:
-            self.num_bins = bins_of_period(period_s, self.bin_width_s, self.num_bins, "FreeRunningSPAD")
         dead = check_seconds(dead_time_s, "dead_time_s", "FreeRunningSPAD", open_low=True)
         if kind == "non_paralyzable":
             self._check_dead_time(dead)
@@ -247,7 +247,6 @@ class FreeRunningSPAD(RandomSensor):
     def _dead_bins(self) -> Tensor:
         return self.dead_time_s / self.bin_width_s
 
-    @in_single
     def probabilities(self, x: Tensor) -> Tensor:
         """Expected detections per period and bin.
 
@@ -263,8 +262,7 @@ class FreeRunningSPAD(RandomSensor):
 
     def variance(self, x: Tensor) -> Tensor:
         p = self.probabilities(x)
-        variance: Tensor = self.cycles * p * (1 - p).clamp_min(0)  # rounding
-        return variance
+        return self.cycles * p * (1 - p).clamp_min(0)  # rounding
 
     def _check_dead_time(self, dead_time_s: float) -> None:
         if not dead_time_s / self.bin_width_s >= 1 - 1e-9:
@@ -273,18 +271,19 @@ class FreeRunningSPAD(RandomSensor):
                 f"{dead_time_s:g} s. Use narrower bins, or no dead time (ShotNoise) where it does not matter."
             )
 
-    def _path(self, x: Tensor, generator: torch.Generator | None) -> StepCounts:
+    def _rate(self, x: Tensor) -> Tensor:
+        """Light of draws, float64."""
+        return check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
+
+    def _steps(self, rate: Tensor) -> StepProbabilities:
         """Steps of independent periods of the non-paralyzable detector."""
-        with torch.no_grad():
-            self._check_dead_time(float(self.dead_time_s))
-            rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
-            return draw_steps(stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles, generator)
+        return stationary_steps(rate, state_image(rate, self._dead_bins))
 
     def _train(self, x: Tensor, generator: torch.Generator | None, normal: bool) -> Tensor:
         """Counts of the non-paralyzable detector over consecutive periods."""
         with torch.no_grad():
             self._check_dead_time(float(self.dead_time_s))
-            rate = check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD")
+            rate = self._rate(x)
             if rate.numel() == 0:
                 return x.clone()
             wide = rate.movedim(TIME, -1)
@@ -308,7 +307,7 @@ class FreeRunningSPAD(RandomSensor):
         if self.kind == "non_paralyzable":
             return self._train(x, generator, normal=False)
         with torch.no_grad():
-            p = self.probabilities(check_rates(check_tensor(x, "FreeRunningSPAD").double(), "FreeRunningSPAD"))
+            p = self.probabilities(self._rate(x))
             return torch.binomial(torch.full_like(p, float(self.cycles)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:
@@ -323,11 +322,8 @@ class FreeRunningSPAD(RandomSensor):
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.kind == "paralyzable":
             return super().forward(x, generator)
-        path = self._path(x, generator)
-
-        def log_prob() -> Tensor:
-            rate = x.double()
-            return steps_log_prob(path, stationary_steps(rate, state_image(rate, self._dead_bins)), self.cycles)
-
-        record_score(log_prob, type(self).__name__)
+        with torch.no_grad():
+            self._check_dead_time(float(self.dead_time_s))
+            path = draw_steps(self._steps(self._rate(x)), self.cycles, generator)
+        record_score(lambda: steps_log_prob(path, self._steps(x.double()), self.cycles), type(self).__name__)
         return path.counts.to(x.dtype)

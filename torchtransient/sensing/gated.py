@@ -10,16 +10,13 @@ Laurenzis et al., "Time-of-flight range gating" (2007).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import Numbers, several
-from torchtransient.errors import ShapeError, UnitError
-from torchtransient.sensing.checks import check_number, check_seconds, check_time_axis, numbers_of, reals
+from torchtransient.checks import Numbers
+from torchtransient.errors import ShapeError
+from torchtransient.sensing.checks import check_number, check_seconds, check_time_axis, reals
 from torchtransient.sensing.itof.correlation import correlate
 from torchtransient.sensing.parameters import keep_number
 from torchtransient.sensing.responses import normal_integral
@@ -116,31 +113,20 @@ class GatedIntegration(Sensor):
     ) -> None:
         super().__init__()
         me = type(self).__name__
-        given_s: list[Any] = several(f"{me}: delays_s", numbers_of(delays_s, "delays_s", me), "numbers of seconds")
-        delays = [check_seconds(d, "delays_s", me, signed=True) for d in given_s]
-        width = numbers_of(widths_s, "widths_s", me)
-        given = list(width) if isinstance(width, Sequence) else [width] * len(delays)
-        widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given]
-        if not delays or len(widths) != len(delays):
-            raise ShapeError(f"{me}: expected one width or one per delay, got {len(delays)} and {len(widths)}.")
+        given = [torch.as_tensor(seconds, dtype=torch.float64) for seconds in (delays_s, widths_s)]
+        if given[0].ndim != 1 or not len(given[0]) or given[1].shape not in ((), given[0].shape):
+            shapes = " and ".join(str(tuple(seconds.shape)) for seconds in given)
+            raise ShapeError(f"{me}: expected delays (G,) and one width or one per delay, got {shapes}.")
+        delays = [check_seconds(d, "delays_s", me, signed=True) for d in given[0].tolist()]
+        widths = [check_seconds(w, "widths_s", me, open_low=True) for w in given[1].expand_as(given[0]).tolist()]
         self.axis = check_time_axis(axis, me)
         self.num_bins = self.axis.num_bins
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
-        window_s = axis.num_bins * axis.bin_width_s
-        if max(self.rise_s, self.fall_s) > 10 * window_s:
-            raise UnitError(
-                f"{me}: expected edges in seconds that fit a window of {window_s:g} s, got {self.rise_s!r} and "
-                f"{self.fall_s!r}. Nanoseconds? 0.2 ns is 0.2e-9."
-            )
         self.leakage = check_number(leakage, "leakage", me, high=1.0)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
-        values = {
-            "delay_ps": torch.tensor(delays, dtype=torch.float64) * 1e12,
-            "log_width_s": torch.tensor(widths, dtype=torch.float64).log(),
-        }
-        for name, value in values.items():
-            keep_number(self, name, value, learnable)
+        keep_number(self, "delay_ps", torch.tensor(delays, dtype=torch.float64) * 1e12, learnable)
+        keep_number(self, "log_width_s", torch.tensor(widths, dtype=torch.float64).log(), learnable)
 
     @property
     def delays_s(self) -> Tensor:
@@ -155,12 +141,7 @@ class GatedIntegration(Sensor):
     def profiles(self) -> Tensor:
         """(G, T) float64: the gates as they are now."""
         return gate_profiles(
-            self.delays_s,
-            self.widths_s,
-            self.axis,
-            rise_s=self.rise_s,
-            fall_s=self.fall_s,
-            leakage=self.leakage,
+            self.delays_s, self.widths_s, self.axis, rise_s=self.rise_s, fall_s=self.fall_s, leakage=self.leakage
         )
 
     def outside(self) -> Tensor:

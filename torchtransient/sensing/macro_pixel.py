@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchtransient.checks import Numbers, several
+from torchtransient.checks import Numbers
 from torchtransient.errors import GradientError, ShapeError, UnitError
 from torchtransient.sensing.afterpulsing_spad import AfterpulsingSPAD
-from torchtransient.sensing.checks import check_count, check_number, check_transient, reals
+from torchtransient.sensing.checks import check_count, check_number, check_transient
 from torchtransient.sensing.free_running import FreeRunningSPAD
 from torchtransient.sensing.sensor import (
     GradPolicy,
@@ -45,34 +44,13 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
     number = check_count(spads, "spads", where)
     if weights is None:
         return [(1.0 / number, number)]
-    if isinstance(weights, Tensor):
-        weights = reals(where, torch.float64, weights=weights)[0].double().tolist()
-    given: list[Any] = several(f"{where}: weights", weights, "numbers")
-    values = [check_number(w, "weights", where) for w in given]
+    values = [check_number(w, "weights", where) for w in torch.as_tensor(weights, dtype=torch.float64).tolist()]
     if len(values) != number:
         raise ShapeError(f"{where}: expected weights of {number} SPADs, got {len(values)}.")
     total = math.fsum(values)
     if not total > 0:
-        raise UnitError(f"{where}: expected weights with a sum above 0, got {given!r}.")
+        raise UnitError(f"{where}: expected weights with a sum above 0, got {values}.")
     return [(w / total, values.count(w)) for w in sorted(set(values)) if w > 0]
-
-
-def checked_detector(detector: object, where: str) -> RandomSensor:
-    """Return `detector` if it is a SPAD.
-
-    Args:
-        detector: anything.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for anything else.
-    """
-    if not isinstance(detector, (SynchronousSPAD, FreeRunningSPAD, AfterpulsingSPAD)):
-        raise UnitError(
-            f"{where}: expected detector to be a SynchronousSPAD, FreeRunningSPAD or AfterpulsingSPAD, got "
-            f"{detector!r}."
-        )
-    return detector
 
 
 class MacroPixel(WrappedDetector):
@@ -93,7 +71,7 @@ class MacroPixel(WrappedDetector):
 
     Raises:
         ShapeError: for another number of weights.
-        UnitError: for weights below 0, and other detectors.
+        UnitError: for weights below 0.
     """
 
     takes, gives = ("rate",), "counts"
@@ -106,7 +84,7 @@ class MacroPixel(WrappedDetector):
         weights: Numbers | None = None,
         grad: GradPolicy | None = None,
     ) -> None:
-        super().__init__(checked_detector(detector, "MacroPixel"), grad)
+        super().__init__(detector, grad)
         self.groups = groups_of(spads, weights, "MacroPixel")
         self.spads = int(spads)
 

@@ -23,7 +23,6 @@ from torchtransient.sensing.checks import (
     check_bins,
     check_broadcast,
     check_count,
-    check_generator,
     check_seconds,
     check_transient,
     one_number,
@@ -259,9 +258,8 @@ class SynchronousSPAD(RandomSensor):
             self.dead_bins = self.dead_time_s / bin_width_of(axis, bin_width_s, "SynchronousSPAD")
             check_dead_bins(self.dead_bins)
         if gate is not None:
-            if not isinstance(gate, Tensor) or gate.ndim != 1 or gate.is_complex():
-                shape = tuple(gate.shape) if isinstance(gate, Tensor) else type(gate).__name__
-                raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {shape}.")
+            if gate.ndim != 1:
+                raise ShapeError(f"SynchronousSPAD: expected gate to be a tensor (T,), got {tuple(gate.shape)}.")
             if not bool(((gate >= 0) & (gate <= 1)).all()):
                 raise UnitError("SynchronousSPAD: expected gate values between 0 and 1.")
             gate = gate.detach().double()
@@ -316,7 +314,6 @@ class SynchronousSPAD(RandomSensor):
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         if self.grad != "score" or self.dead_bins is None:
             return super().forward(x, generator)
-        check_generator(generator, "SynchronousSPAD")
         with torch.no_grad():
             rate = check_rates(self._gated(x), "SynchronousSPAD")
             dead = torch.as_tensor(self.dead_bins, dtype=torch.float64, device=x.device)
@@ -486,20 +483,19 @@ class BinaryFrames(RandomSensor):
         self.frames = check_count(frames, "frames", "BinaryFrames")
 
     def expected(self, x: Tensor) -> Tensor:
-        return -torch.expm1(-check_rates(check_transient(x, "BinaryFrames"), "BinaryFrames")) * self.frames
+        return self._probability(x) * self.frames
+
+    def _probability(self, x: Tensor) -> Tensor:
+        return -torch.expm1(-check_rates(check_transient(x, "BinaryFrames"), "BinaryFrames"))
 
     def variance(self, x: Tensor) -> Tensor:
-        check_rates(x, "BinaryFrames")
-        variance: Tensor = -torch.expm1(-x) * torch.exp(-x) * self.frames
-        return variance
+        return self._probability(x) * torch.exp(-x) * self.frames
 
     def sample(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
         check_transient(x, "BinaryFrames")
-        check_rates(x, "BinaryFrames")
         # beyond 2^24 trials the variance of torch.binomial in float32 is 13 to 38 % too large
         exact = torch.float64 if self.frames > WHOLE_FLOAT32 or x.dtype == torch.float64 else torch.float32
-        work = x.detach().to(exact)
-        p = -torch.expm1(-work)
+        p = self._probability(x.detach().to(exact))
         return torch.binomial(torch.full_like(p, float(self.frames)), p, generator=generator).to(x.dtype)
 
     def log_prob(self, measurement: Tensor, x: Tensor) -> Tensor:

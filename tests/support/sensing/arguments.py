@@ -53,8 +53,7 @@ CALLS = {
     "DetectionJitter": ({"bin_width_s": number(1e-10)}, {"response": RESPONSE}),
     "DetectionSkew": ({"delay_s": 1e-10 * rand(2, 3), "bin_width_s": number(1e-10)}, {}),
     "FourierCode": ({}, {"num_taps": 4, "harmonics_of_one_tap": {1: (0.5, 0.1)}}),
-    "FreeRunningSPAD": (
-        {"dead_time_s": number(3e-10), "bin_width_s": number(1e-10), "period_s": number(12e-10)}, {"cycles": 10}),
+    "FreeRunningSPAD": ({"dead_time_s": number(3e-10), "bin_width_s": number(1e-10)}, {"cycles": 10}),
     "GatedIntegration": (
         {"delays_s": 1e-10 * rand(2), "widths_s": 4e-10 * rand(2), "rise_s": number(1e-11), "fall_s": number(1e-11),
          "leakage": number(0.1), "electrons_per_unit": number(2.0)}, TIMED),

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchtransient.errors import TorchTransientError
 from torchtransient.sensing.checks import is_dual
-from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, check_dead_bins, split_dead_time
+from torchtransient.sensing.dead_time.renewal import ROOT3, BinResponse, bin_response, split_dead_time
 
 PHOTONS = 0.25  # of the brightest piece, at most: the total variation of means is then below 1e-5
 MOST_PIECES = 1 << 14
@@ -37,35 +37,14 @@ _STATES = 1 << 24  # numbers that are held at a time while bins are cut
 # --------------------------------------------------------------------------------------------------- bins cut in pieces
 
 
-class _LevelCounts(torch.autograd.Function):
-    """Numbers of rows of levels 0, 1, 2, ..., and a flag of torch.func.vmap, under which rows cannot be told."""
-
-    @staticmethod
-    def forward(level: Tensor, mapped: bool) -> Tensor:
-        number = torch.bincount(level.reshape(-1), minlength=1)
-        return torch.cat([number.new_full((1,), int(mapped)), number])
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.mark_non_differentiable(output)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, None]:
-        return None, None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], level: Tensor, mapped: bool) -> tuple[Tensor, None]:
-        # of all that is mapped over: a number that can be looked at
-        return _LevelCounts.apply(level, True), None  # type: ignore[no-untyped-call]
-
-
-def _level_counts(level: Tensor) -> list[int]:
-    """List of `_LevelCounts`, without autograd where nothing is mapped over: it costs as much as small images."""
-    if torch._C._functorch.is_functorch_wrapped_tensor(level):
-        # One by one: torch 2.6 makes no list inside of torch.func.
-        hidden: Tensor = _LevelCounts.apply(level, False)  # type: ignore[no-untyped-call]
-        return [int(number) for number in hidden.unbind()]
-    return _LevelCounts.forward(level, False).tolist()
+def _level_counts(level: Tensor) -> tuple[list[int], bool]:
+    """Numbers of rows of levels 0, 1, 2, ..., of all that torch.func.vmap maps over; True inside of it."""
+    mapped = False
+    while torch._C._functorch.is_functorch_wrapped_tensor(level):
+        mapped = mapped or torch._C._functorch.is_batchedtensor(level)
+        level = torch._C._functorch.get_unwrapped(level)
+    # One by one: torch 2.6 makes no list inside of torch.func.
+    return [int(number) for number in torch.bincount(level.reshape(-1), minlength=1).unbind()], mapped
 
 
 def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tuple[Tensor, list[int], bool]:
@@ -84,14 +63,14 @@ def subdivision_levels(rate: Tensor, least: int, photons: float = PHOTONS) -> tu
     """
     peak = torch.nan_to_num(rate.detach().amax(-1), nan=0.0) / (photons * least)
     level = torch.ceil(torch.log2(peak.clamp(1, 2.0**40)) - 1e-9).long()
-    found = _level_counts(level)
-    present = [k for k, number in enumerate(found[1:]) if number]
+    found, hidden = _level_counts(level)
+    present = [k for k, number in enumerate(found) if number]
     if present and (least << present[-1]) > MOST_PIECES:
         raise TorchTransientError(
             f"detections_with_dead_time: expected at most {photons * MOST_PIECES:g} photons in a bin, got "
             f"{float(peak.amax()) * photons * least:g}. Use narrower bins, or less light."
         )
-    return level, present, bool(found[0])
+    return level, present, hidden
 
 
 def highest_level(level: Tensor) -> int:
@@ -100,7 +79,7 @@ def highest_level(level: Tensor) -> int:
     Args:
         level: integers.
     """
-    return len(_level_counts(level)) - 2
+    return len(_level_counts(level)[0]) - 1
 
 
 def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> Iterator[tuple[Tensor | None, int]]:
@@ -118,6 +97,48 @@ def rows_by_subdivision(rate: Tensor, dead: float, photons: float = PHOTONS) -> 
     level, present, _ = subdivision_levels(rate, least, photons)
     for k in present:
         yield (None if len(present) == 1 else (level == k).nonzero().squeeze(-1)), least << k
+
+
+def solve_by_level(
+    rate: Tensor,
+    levels: tuple[Tensor, list[int], bool],
+    least: int,
+    solve: Callable[[Tensor, Tensor, int], Tensor],
+) -> Tensor:
+    """Solve rows with their bins cut in pieces, as many rows at a time as stay in the cache.
+
+    Args:
+        rate: (P, T), per cycle and bin.
+        levels: of the rows, by `subdivision_levels`.
+        least: pieces of a bin at level 0.
+        solve: function of rates (K, T), indices (K,) of their rows, and pieces of a bin.
+
+    Returns:
+        Results of the rows, (P, N).
+    """
+    level, present, hidden = levels
+    every = torch.arange(rate.shape[0], device=rate.device)
+
+    def solved(rows: Tensor, at: Tensor, pieces: int) -> Tensor:
+        few = max(1, _PIECES_AT_ONCE // (rate.shape[-1] * pieces))
+        parts = [solve(r, i, pieces) for r, i in zip(torch.split(rows, few), torch.split(at, few), strict=True)]
+        return torch.cat(parts) if len(parts) > 1 else parts[0]
+
+    if len(present) == 1:
+        return solved(rate, every, least << present[0])
+    found: Tensor | None = None
+    for k in present:
+        if hidden:
+            here = (level == k).unsqueeze(-1)
+            # rows of other levels are dark here, and add nothing: no number of theirs can spoil a gradient
+            own = torch.where(here, solved(torch.where(here, rate, 0.0), every, least << k), 0.0)
+            found = own if found is None else found + own
+        else:
+            rows = (level == k).nonzero().squeeze(-1)
+            own = solved(rate[rows], rows, least << k)
+            found = rate.new_zeros(rate.shape[0], own.shape[-1]) if found is None else found
+            found = found.index_copy(0, rows, own)
+    return torch.zeros_like(rate) if found is None else found
 
 
 # -------------------------------------------------------------------------------- the recursion in differentiable steps
@@ -241,29 +262,12 @@ def mean_detections_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
     Returns:
         (P, T).
     """
-    dead, bins = check_dead_bins(dead_bins), rate.shape[-1]
-    least = 1 if dead >= 1 - 1e-9 else 2
-    level, present, hidden = subdivision_levels(rate, least)
+    least = 1 if float(dead_bins.detach()) >= 1 - 1e-9 else 2
 
-    def solved(rows: Tensor, k: int) -> Tensor:
-        # as many rows at a time as stay in the cache
-        found = []
-        for few in torch.split(rows, max(1, _PIECES_AT_ONCE // (bins << k))):
-            found.append(cycle_means(few, dead_bins, least << k).count.view(*few.shape, least << k).sum(-1))
-        return torch.cat(found) if len(found) > 1 else found[0]
+    def solve(rows: Tensor, _: Tensor, pieces: int) -> Tensor:
+        return cycle_means(rows, dead_bins, pieces).count.view(*rows.shape, pieces).sum(-1)
 
-    if len(present) == 1:
-        return solved(rate, present[0])
-    detected = torch.zeros_like(rate)
-    for k in present:
-        if hidden:
-            here = (level == k).unsqueeze(-1)
-            # rows of other levels are dark here, and add nothing: no number of theirs can spoil a gradient
-            detected = detected + solved(torch.where(here, rate, 0.0), k)
-        else:
-            rows = (level == k).nonzero().squeeze(-1)
-            detected = detected.index_copy(0, rows, solved(rate[rows], k))
-    return detected
+    return solve_by_level(rate, subdivision_levels(rate, least), least, solve)
 
 
 def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
@@ -277,7 +281,7 @@ def second_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
         (P, T).
     """
     twice = torch.zeros_like(rate)
-    for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+    for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
         own = rate if rows is None else rate[rows]
         cycle = cycle_means(own, dead_bins, pieces)
         lines = torch.stack([cycle.count, cycle.slope], 1).view(own.shape[0], 2, -1, pieces)
@@ -509,12 +513,7 @@ def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | 
     Yields:
         Columns, and the scan over them.
     """
-    dead = check_dead_bins(dead_bins)
-    least = 1 if dead >= 1 - 1e-9 else 2
-    level, present, _ = subdivision_levels(rate.T, least)
-    for k in present:
-        pieces = least << k
-        columns = None if len(present) == 1 else (level == k).nonzero().squeeze(-1)
+    for columns, pieces in rows_by_subdivision(rate.T, float(dead_bins.detach())):
         whole, part = split_dead_time(dead_bins.double() * pieces)
         number = rate.shape[1] if columns is None else columns.numel()
         few = max(1, _STATES // (3 * pieces * rate.shape[0]))
@@ -531,8 +530,8 @@ def detection_scans(rate: Tensor, dead_bins: Tensor) -> Iterator[tuple[Tensor | 
 def mean_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
     """Mean detections per cycle and bin, differentiable to any order.
 
-    First derivatives in the light take the adjoint of the scan; others (in the dead time, forward mode, higher orders)
-    the recursion in differentiable steps, which takes longer.
+    First derivatives in the light take the adjoint of the scan; others (in the dead time, forward mode, higher orders,
+    transforms of torch.func) the recursion in differentiable steps, which takes longer.
 
     Args:
         rate: (T, P) per cycle and bin, float64.
@@ -541,34 +540,19 @@ def mean_detections(rate: Tensor, dead_bins: Tensor) -> Tensor:
     Returns:
         (T, P) float64.
     """
+    if not torch.compiler.is_compiling():
+        wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+        if any(is_dual(x) or wrapped(x) for x in (rate, dead_bins)):
+            return _means_in_steps(rate, dead_bins)
+        if not torch.is_grad_enabled():
+            return _Detected.forward(rate, dead_bins, False)[0]  # calls of autograd take as long as small images
     keep = torch.is_grad_enabled() and rate.requires_grad
-    watched = torch.is_grad_enabled() or torch.compiler.is_compiling()
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    if not watched and not any(is_dual(x) or wrapped(x) for x in (rate, dead_bins)):
-        return _Detected.forward(rate, dead_bins, False)[0]  # calls of autograd take as long as small images
     found: Tensor = _Detected.apply(rate, dead_bins, keep)[0]  # type: ignore[no-untyped-call]
     return found
 
 
 def _means_in_steps(rate: Tensor, dead_bins: Tensor) -> Tensor:
     return mean_detections_in_steps(rate.T, dead_bins).T
-
-
-def _gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    found: tuple[Tensor, Tensor] = torch.func.vjp(_means_in_steps, rate, dead_bins)[1](weights)
-    return found
-
-
-def _light_gradient_in_steps(rate: Tensor, dead_bins: Tensor, weights: Tensor) -> Tensor:
-    return _gradient_in_steps(rate, dead_bins, weights)[0]
-
-
-def _jvp(of: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor | None, ...]) -> Tensor:
-    """Derivative along a direction, as the derivative of the (linear) gradient in its weights."""
-    value, pull, *_ = torch.func.vjp(of, *at)
-    along = tuple(torch.zeros_like(x) if t is None else t for x, t in zip(at, along, strict=True))
-    found: Tensor = torch.func.vjp(pull, torch.zeros_like(value))[1](along)[0]
-    return found
 
 
 class _Detected(torch.autograd.Function):
@@ -589,73 +573,24 @@ class _Detected(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(output[1])
         ctx.save_for_backward(inputs[0], inputs[1], output[1])
-        ctx.save_for_forward(inputs[0], inputs[1])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor | None, None]:
         rate, dead_bins, kept = ctx.saved_tensors
         # batches of torch.autograd (is_grads_batched) know no rule of ours
-        if ctx.needs_input_grad[1] or torch._C._functorch.is_legacy_batchedtensor(gradients[0]):
-            return *_gradient_in_steps(rate, dead_bins, gradients[0]), None
-        found: Tensor = _Adjoint.apply(rate, dead_bins, gradients[0], kept)  # type: ignore[no-untyped-call]
-        return found, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> tuple[Tensor, None]:
-        return _jvp(_means_in_steps, ctx.saved_tensors, tangents[:2]), None
-
-    @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[int | None, ...], rate: Tensor, dead_bins: Tensor, keep: bool
-    ) -> tuple[tuple[Tensor, Tensor], tuple[int, int | None]]:
-        given = _batch_as_columns(info.batch_size, in_dims, rate, dead_bins)
-        detected, kept = _Detected.apply(*given, keep)  # type: ignore[no-untyped-call]
-        detected = detected.view(detected.shape[0], info.batch_size, -1)
-        if kept.ndim == 1:
-            return (detected, kept), (1, None)
-        return (detected, kept.view(*kept.shape[:2], info.batch_size, -1)), (1, 2)
+        batched = torch._C._functorch.is_legacy_batchedtensor(gradients[0])
+        if ctx.needs_input_grad[1] or torch.is_grad_enabled() or batched:
+            return *torch.func.vjp(_means_in_steps, rate, dead_bins)[1](gradients[0]), None
+        return _light_gradient(rate, dead_bins, gradients[0], kept), None, None
 
 
-class _Adjoint(torch.autograd.Function):
+def _light_gradient(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
     """Derivatives (T, P) in the rates of the sum of detections with weights (T, P)."""
-
-    @staticmethod
-    def forward(rate: Tensor, dead_bins: Tensor, weights: Tensor, kept: Tensor) -> Tensor:
-        gradient = torch.empty_like(rate)
-        for columns, scan in detection_scans(rate, dead_bins):
-            states = kept if kept.ndim > 1 else scan.forward()
-            given = torch.zeros_like(states)
-            own = weights[:, columns]
-            given[1:, 1] = own.repeat_interleave(scan.pieces, 0) if scan.pieces > 1 else own
-            gradient[:, columns] = scan.adjoint(states, given)
-        return gradient
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:3])
-        ctx.save_for_forward(*inputs[:3])
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return *torch.func.vjp(_light_gradient_in_steps, *ctx.saved_tensors)[1](gradients[0]), None
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Tensor:
-        return _jvp(_light_gradient_in_steps, ctx.saved_tensors, tangents[:3])
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Tensor) -> tuple[Tensor, int]:
-        found: Tensor = _Adjoint.apply(*_batch_as_columns(info.batch_size, in_dims, *inputs))  # type: ignore[no-untyped-call]
-        return found.view(found.shape[0], info.batch_size, -1), 1
-
-
-def _batch_as_columns(batch: int, in_dims: tuple[int | None, ...], *inputs: Tensor) -> list[Tensor]:
-    """Columns of a batch beside one another, with one dead time for all of them."""
-    given = []
-    for place, x in zip(in_dims, inputs, strict=False):
-        if x.ndim < 2:
-            given.append(x)
-            continue
-        wide = x.unsqueeze(-2).expand(*x.shape[:-1], batch, -1) if place is None else x.movedim(place, -2)
-        given.append(wide.flatten(-2))
-    return given
+    gradient = torch.empty_like(rate)
+    for columns, scan in detection_scans(rate, dead_bins):
+        states = kept if kept.ndim > 1 else scan.forward()
+        given = torch.zeros_like(states)
+        own = weights[:, columns]
+        given[1:, 1] = own.repeat_interleave(scan.pieces, 0) if scan.pieces > 1 else own
+        gradient[:, columns] = scan.adjoint(states, given)
+    return gradient

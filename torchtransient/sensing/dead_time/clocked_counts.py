@@ -12,8 +12,9 @@ are corrected by the difference of that mean to the mean of cut bins.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -135,19 +136,8 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
     return torch.where(fits, fire, whole_chance), torch.where(fits, bounded_ratio(rest, back), whole_chance)
 
 
-def draw_binomial(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw binomial numbers.
-
-    Args:
-        number: trials.
-        chance: probability.
-        generator: source of randomness.
-    """
-    return torch.binomial(number, chance, generator=generator)
-
-
 def draw_normal(number: Tensor, chance: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Draw normal numbers with mean and variance of `draw_binomial`.
+    """Draw normal numbers with mean and variance of binomial ones.
 
     Args:
         number: trials.
@@ -162,7 +152,7 @@ def draw_steps(
     chances: StepProbabilities,
     periods: int,
     generator: torch.Generator | None,
-    draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = draw_binomial,
+    draw: Callable[[Tensor, Tensor, torch.Generator | None], Tensor] = torch.binomial,
 ) -> StepCounts:
     """Draw the steps of `periods` independent detectors, each run over one period.
 
@@ -170,7 +160,7 @@ def draw_steps(
         chances: step probabilities, (..., T, H, W).
         periods: number of detectors.
         generator: source of randomness.
-        draw: `draw_binomial` or `draw_normal`.
+        draw: of numbers and chances, `torch.binomial` or `draw_normal`.
     """
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
@@ -279,9 +269,13 @@ def _delay(x: Tensor, by: int) -> Tensor:
     return torch.nn.functional.pad(x, (by, 0))[..., : x.shape[-1]]
 
 
-def _columns(x: Tensor) -> Tensor:
-    """Rows (P, N) as columns (N, P, 1), with time as the third dimension from behind."""
-    return x.T.unsqueeze(-1)  # time is the third dimension from behind
+def columns_of(x: Tensor) -> Tensor:
+    """Return rows (P, N) as columns (N, P, 1), with time as the third dimension from behind.
+
+    Args:
+        x: the rows.
+    """
+    return x.T.unsqueeze(-1)
 
 
 def _merged_pieces(pieces: int, whole: int) -> int:
@@ -321,7 +315,7 @@ def _cycle_steps(rate: Tensor, dead_bins: Tensor, pieces: int) -> CycleSteps:
     count, armed, whole = cycle.count.view(shape).sum(-1), cycle.armed.view(shape)[..., 0], cycle.whole // wider
     flux = (rate * (wider / pieces)).repeat_interleave(pieces // wider, -1)
     back = _delay(count - late, whole) + _delay(late, whole + 1)
-    flux, count, armed, late, back = map(_columns, (flux, count, armed, late, back))
+    flux, count, armed, late, back = map(columns_of, (flux, count, armed, late, back))
     chances = step_probabilities(flux, count, armed, late, back, None, whole)
     return CycleSteps(armed, count, back, chances, pieces // wider)
 
@@ -427,7 +421,7 @@ def draw_cycle_steps(
     """
     counts, drawn = torch.zeros_like(rate), []
     with torch.no_grad():
-        for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+        for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
             own = rate if rows is None else rate[rows]
             steps = _cycle_steps(own, dead_bins, pieces)
             path = draw_steps(steps.chances, cycles, generator)
@@ -476,7 +470,7 @@ def normal_cycles(rate: Tensor, dead_bins: Tensor, cycles: int, generator: torch
         (P, T).
     """
     counts = torch.zeros_like(rate)
-    for rows, pieces in rows_by_subdivision(rate, check_dead_bins(dead_bins)):
+    for rows, pieces in rows_by_subdivision(rate, float(dead_bins)):
         own = rate if rows is None else rate[rows]
         steps = _cycle_steps(own, dead_bins, pieces)
         noisy = cycles * steps.count + _noise(steps, cycles, generator)
@@ -491,23 +485,14 @@ def _noise(steps: CycleSteps, cycles: int, generator: torch.Generator | None) ->
     def noise(number: Tensor, chance: Tensor) -> tuple[Tensor, ...]:
         return gaussian_noise(cycles * number * chance * (1 - chance), generator).unbind(0)
 
-    of_armed = noise(steps.armed, chances.fire)
-    of_back = noise(steps.back, chances.soon)
-    of_late = noise(steps.count, chances.late)
-    fire, soon, late = (c.unbind(0) for c in (chances.fire, chances.soon, chances.late))
-    pieces, whole = len(fire), chances.whole
-    armed = torch.zeros_like(fire[0])
-    returning = [armed] * pieces
-    found = []
-    for k in range(pieces):
-        hit = fire[k] * armed + of_armed[k] + soon[k] * returning[k] + of_back[k]
-        delayed = late[k] * hit + of_late[k]
-        for slot, amount in ((k + whole, hit - delayed), (k + whole + 1, delayed)):
-            if slot < pieces:
-                returning[slot] = returning[slot] + amount
-        armed = armed + returning[k] - hit
-        found.append(hit)
-    return torch.stack(found)
+    own = [noise(steps.armed, chances.fire), noise(steps.back, chances.soon), noise(steps.count, chances.late)]
+    # piece by piece, in the order of the steps
+    added: Iterator[Tensor] = itertools.chain.from_iterable(zip(*own, strict=True))
+
+    def draw(number: Tensor, chance: Tensor, _: torch.Generator | None) -> Tensor:
+        return chance * number + next(added)
+
+    return draw_steps(chances, 0, generator, draw).counts
 
 
 # --------------------------------------------------------------------------------------------- from counts to the light
@@ -622,8 +607,7 @@ def coates_of_rows(counts: Tensor, cycles: float, dead_bins: float) -> tuple[Ten
     """
     if check_dead_bins(dead_bins) < 1 - 1e-9:
         raise UnitError(
-            f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower "
-            "bins to undo it."
+            f"coates: expected a dead time of at least one bin, got {dead_bins:g} bins. Use narrower bins to undo it."
         )
     here, share, rate = _invert_rows(counts, cycles, dead_bins)
     dead = torch.as_tensor(dead_bins, dtype=torch.float64, device=counts.device)

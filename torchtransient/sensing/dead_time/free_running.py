@@ -25,7 +25,7 @@ from torchtransient.sensing.dead_time.clocked import rows_by_subdivision
 from torchtransient.sensing.dead_time.clocked_counts import (
     StepCounts,
     StepProbabilities,
-    draw_binomial,
+    columns_of,
     draw_normal,
     draw_steps,
     step_probabilities,
@@ -325,10 +325,6 @@ def event_by_event(
 # ---------------------------------------------------------------------------------------------- draws, period by period
 
 
-def _columns(x: Tensor) -> Tensor:
-    return x.T.unsqueeze(-1)  # time is the third dimension from behind
-
-
 def _rows(x: Tensor) -> Tensor:
     return x.squeeze(-1).T
 
@@ -370,8 +366,8 @@ def _stationary_train(rate: Tensor, dead_bins: Tensor, pieces: int) -> _Stationa
     chain = RenewalChain(fine, whole, part)
     phases = stationary_phases(fine, part, whole)
     state = clamped_state(chain, detections_per_period(chain, phases))
-    columns = FreeRunningState(_columns(state.detected), _columns(state.armed), _columns(state.late), whole)
-    return _StationaryTrain(chain, pieces, phases, state, stationary_steps(_columns(fine), columns))
+    columns = FreeRunningState(columns_of(state.detected), columns_of(state.armed), columns_of(state.late), whole)
+    return _StationaryTrain(chain, pieces, phases, state, stationary_steps(columns_of(fine), columns))
 
 
 def sample_trains(
@@ -409,7 +405,7 @@ def sample_trains(
         return counts
     # without light there is nothing to be dead after
     many = torch.full_like(rate[rows], float(periods))
-    alone = (draw_normal if normal else draw_binomial)(many, rate[rows], generator)
+    alone = (draw_normal if normal else torch.binomial)(many, rate[rows], generator)
     return counts.index_copy(0, rows, alone)
 
 
@@ -446,7 +442,7 @@ def _independent_periods(
     state: _StationaryTrain, periods: int, generator: torch.Generator | None, *, normal: bool
 ) -> tuple[Tensor, Tensor | None]:
     """Counts (P, T) of independent periods, and the correction that makes one train of them."""
-    path = draw_steps(state.chances, periods, generator, draw_normal if normal else draw_binomial)
+    path = draw_steps(state.chances, periods, generator, draw_normal if normal else torch.binomial)
     counts = _whole_bins(_rows(path.counts), state.pieces)
     if periods == 1:
         return counts, None

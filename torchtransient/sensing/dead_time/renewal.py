@@ -19,10 +19,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.functional import jvp
 
 from torchtransient.errors import TorchTransientError, UnitError
 from torchtransient.sensing.checks import one_number
@@ -42,17 +44,16 @@ _BLOCK = 6  # bins of a block at least: smaller ones cost more calls than they s
 _ROWS_OF_BLOCKS = 32
 
 
-def check_dead_bins(dead_bins: Tensor | float, where: str = "dead time") -> float:
+def check_dead_bins(dead_bins: Tensor | float) -> float:
     """Return a dead time in bins as a number.
 
     Args:
         dead_bins: number or scalar tensor, in bins.
-        where: name of the caller, for errors.
 
     Raises:
         UnitError: below half a bin, or not finite.
     """
-    given = one_number(dead_bins, "dead_bins", where)
+    given = one_number(dead_bins, "dead_bins", "dead time")
     value = float(given.detach()) if isinstance(given, Tensor) else given
     if not 0.5 - 1e-9 <= value < 1e9:
         raise UnitError(
@@ -636,18 +637,8 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
     return torch.cat(found)
 
 
-def _step_along(rate: Tensor, whole: int, part: Tensor, pi: Tensor, by_rate: Tensor, by_part: Tensor) -> Tensor:
-    """Derivative of one step from `pi` along changes of the rate and of the fraction of a bin.
-
-    By two backward passes: the gradient is linear in its weights, and its derivative in those is the one sought.
-    """
-    with torch.enable_grad():
-        leaves = rate.detach().requires_grad_(), part.detach().requires_grad_()
-        value = RenewalChain(leaves[0], whole, leaves[1]).step(pi)
-        weights = torch.zeros_like(value, requires_grad=True)
-        gradients = torch.autograd.grad(value, leaves, weights, create_graph=True)
-        along = (gradients[0] * by_rate).sum() + gradients[1] * by_part
-        return torch.autograd.grad(along, weights)[0]
+def _step(whole: int, lines: Tensor, rate: Tensor, part: Tensor) -> Tensor:
+    return RenewalChain(rate, whole, part).step(lines)
 
 
 class _StationaryPhases(torch.autograd.Function):
@@ -668,7 +659,8 @@ class _StationaryPhases(torch.autograd.Function):
         by_part = torch.zeros_like(part) if by_part is None else by_part
         found = []
         for r, p, d in zip(*(torch.split(rows, _ROWS_OF_GMRES) for rows in (rate, pi, by_rate)), strict=True):
-            right = _step_along(r, ctx.whole, part, p, d, by_part)
+            # by two backward passes, which are the derivative of the gradient in its weights
+            right = jvp(partial(_step, ctx.whole, p), (r, part), (d, by_part))[1]  # type: ignore[no-untyped-call]
             found.append(_solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=False))
         return torch.cat(found)
 
@@ -684,8 +676,7 @@ class _StationaryPhases(torch.autograd.Function):
             adjoint = _solve_singular(RenewalChain(r, ctx.whole, part), p, right, transposed=True)
             with torch.enable_grad():
                 leaves = r.detach().requires_grad_(), part.detach().requires_grad_()
-                value = RenewalChain(leaves[0], ctx.whole, leaves[1]).step(p)
-                found = torch.autograd.grad(value, leaves, adjoint)
+                found = torch.autograd.grad(_step(ctx.whole, p, *leaves), leaves, adjoint)
             by_rate.append(found[0])
             by_part = by_part + found[1]
         return torch.cat(by_rate), by_part, None
