@@ -20,7 +20,7 @@ from torchtransient.array_files.array_file import check_source, damage_said, pat
 from torchtransient.array_files.hdf5 import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import positive, shown
+from torchtransient.checks import shown
 from torchtransient.data.sample import outside_tensor
 from torchtransient.data.serialization import read_frequencies
 from torchtransient.data.shard_format import COUNTED, measured_names
@@ -32,6 +32,7 @@ from torchtransient.rendering.progress import with_bar
 
 _WHAT = "WebDataset"
 _LEVEL = 3
+_TAR_BYTES = 256e6
 _NPY, _PACKED, _JSON = ".npy", ".npy.zst", "sample.json"
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _TAL = "TAL export"
@@ -40,9 +41,9 @@ _MEASURED = ("transient", "phasor", "measurement")
 
 
 def export_web_dataset(
-    where: Any, folder: str | Path, *, megabytes: float = 256, progress: bool = True, **reading: Any
-) -> list[Path]:
-    """Write the samples of shards as ``samples-000000.tar``, ...
+    where: Any, folder: str | Path, *, progress: bool = True, **reading: Any
+) -> list[Path]:  # fmt: skip
+    """Write the samples of shards as ``samples-000000.tar``, ..., of about 256 MB each.
 
     ``about.json`` beside them has the description of the render and the time axis of what was written. Counts keep the
     type that they are stored in. A tar appears once it is whole; those that are there are replaced.
@@ -50,7 +51,6 @@ def export_web_dataset(
     Args:
         where: as of :class:`~torchtransient.data.TransientDataset`.
         folder: that exists.
-        megabytes: of a tar, about.
         progress: show a bar.
         reading: other arguments of :class:`~torchtransient.data.TransientDataset`, windows and transforms too.
 
@@ -61,7 +61,6 @@ def export_web_dataset(
         StorageError: as the data set, for a missing folder and a full disk.
         MissingPackageError: without the package zstandard.
     """
-    limit = positive(f"{_WHAT}: megabytes", megabytes) * 1e6
     place = path_of(folder, _WHAT)
     if not place.is_dir():
         raise StorageError(f"{_WHAT}: expected a folder to write to, got '{place}'. Create it first.")
@@ -78,7 +77,7 @@ def export_web_dataset(
             writing_said(target, _WHAT),
             tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
-            while left and tar.offset < limit:
+            while left and tar.offset < _TAR_BYTES:
                 _add(tar, data[next(numbers)], compressor, measured)
                 left -= 1
         written.append(target)

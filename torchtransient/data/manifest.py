@@ -322,7 +322,7 @@ def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
     if not entries:  # no shard is sound
         return {"format": FORMAT, "samples": 0, "failed": {}, "shards": {}}
     first = next((entry for entry in entries if entry.index), entries[0])
-    errors = sorted(e.header["standard_error"] for e in entries if _is_number(e.header.get("standard_error")))
+    errors = sorted(e.header["standard_error"] for e in entries if isinstance(e.header.get("standard_error"), float))
     return {
         "format": FORMAT,
         **{name: first.header.get(name) for name in ("recipe", "key", "about")},
@@ -359,17 +359,16 @@ def ranges(numbers: Iterable[int]) -> list[list[int]]:
     return found
 
 
-def ranges_text(numbers: Iterable[int], most: int = 8) -> str:
-    """Return whole numbers as text, "0 to 3, 7".
+def ranges_text(numbers: Iterable[int]) -> str:
+    """Return whole numbers as text, "0 to 3, 7", of 8 ranges at most.
 
     Args:
         numbers: in any order.
-        most: ranges that are written out.
 
     Returns:
         Text.
     """
-    parts = [str(a) if a == b else f"{a} to {b}" for a, b in ranges(numbers)]
+    parts, most = [str(a) if a == b else f"{a} to {b}" for a, b in ranges(numbers)], 8
     return ", ".join(parts[:most]) + (f" and {len(parts) - most} more ranges" if len(parts) > most else "")
 
 
@@ -381,7 +380,3 @@ def _text_of(path: Path) -> str | None:
         return None
     except (OSError, ValueError) as error:
         raise StorageError(f"{_WHAT}: '{path}' cannot be read: {error}.") from error
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -28,7 +28,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
 from torchtransient.data.processes import WorkerError, interrupts_blocked, registered_plugins
-from torchtransient.data.sample import OutsideLight, checked_transform, measurement, outside_tensor, value_tensors
+from torchtransient.data.sample import OutsideLight, measurement, outside_tensor, value_tensors
 from torchtransient.errors import (
     ShapeError,
     StorageError,
@@ -109,7 +109,7 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
             if (number := as_number(value)) is None or not number > 0:
                 raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
         a_recipe(WHAT, recipe, "maker")
-        self.transform = checked_transform(WHAT, transform)
+        self.transform = transform
         schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)
         self._producers = Producers(recipe, schedule, capacity, workers, float(timeout_s))
         # Also when the object is freed, and at the end of the interpreter.
