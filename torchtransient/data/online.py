@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import pickle
 import random
@@ -27,7 +26,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
-from torchtransient.data.processes import WorkerError, interrupts_blocked, registered_plugins
+from torchtransient.data.processes import WorkerError, registered_plugins, spawned
 from torchtransient.data.sample import OutsideLight, measurement, outside_tensor, value_tensors
 from torchtransient.errors import (
     ShapeError,
@@ -202,22 +201,8 @@ class Producers:
     def start(self) -> None:
         """Start the processes, and order the first samples."""
         for _ in range(self._count):
-            self._workers.append(self._started())
+            self._workers.append(_Worker(*spawned(produce, self._packed, WHAT)))
         self._give_orders()
-
-    def _started(self) -> _Worker:
-        context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe()
-        process = context.Process(target=produce, args=(there, self._packed), name=WHAT, daemon=True)
-        try:
-            with interrupts_blocked():
-                process.start()
-        except BaseException:
-            here.close()
-            raise
-        finally:
-            there.close()
-        return _Worker(process, here)
 
     # --------------------------------------------------------------------------------------------------- one draw
 
@@ -374,7 +359,7 @@ class Producers:
             f"{WHAT}: a producer ended {how} {doing}; another one takes its place.", TorchTransientWarning, stacklevel=6
         )
         self.schedule.lost(number)
-        return self._started()
+        return _Worker(*spawned(produce, self._packed, WHAT))
 
     def close(self) -> None:
         """End all processes and free the ring. Does nothing in a process that was forked from this one."""

@@ -255,7 +255,7 @@ def test_workers_that_never_start(ledger):
 @pytest.mark.parametrize(("own_fault", "deaths"), [(True, 3), (False, 6)])
 def test_a_sample_over_which_workers_die(ledger, own_fault, deaths):
     """Crashes count twice as much as kills, which may come from outside."""
-    ledger.add([0, 1])
+    ledger.waiting.extend([0, 1])
     for death in range(deaths):
         assert ledger.skip(0) == {} and ledger.suspects(0) == ([5] if death else [])
         assert ledger.take() == 0
@@ -265,7 +265,7 @@ def test_a_sample_over_which_workers_die(ledger, own_fault, deaths):
 
 
 def test_a_sample_that_is_made_is_not_to_blame(ledger):
-    ledger.add([0, 1])
+    ledger.waiting.extend([0, 1])
     for _ in range(10):
         for made, other in ((5, 6), (6, 5)):
             assert ledger.take() == 0
@@ -276,7 +276,7 @@ def test_a_sample_that_is_made_is_not_to_blame(ledger):
 
 def test_deaths_without_end(ledger):
     """Of one shard while its file is written, of workers without a shard, and before the first sample."""
-    ledger.add([0])
+    ledger.waiting.extend([0])
     for _ in range(MOST_OF_A_SHARD):
         ledger.take()
         ledger.ended(0, 5, None)
@@ -289,7 +289,7 @@ def test_deaths_without_end(ledger):
     with pytest.raises(TorchTransientError, match="one after another"):
         other.lost(None, None, "by test", own_fault=False)
     first = Ledger(2, ledger.log, ledger.bar)
-    first.add([MEASURING])
+    first.waiting.extend([MEASURING])
     for _ in range(2):
         first.take()
         first.lost(MEASURING, None, "by test", own_fault=True)
