@@ -67,7 +67,8 @@ class Shard:
         self._datasets: dict[str, Any] = {}
         self._values: dict[str, NDArray[Any]] = {}
         with damage_said(self.path, WHAT):
-            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0)
+            # Shards do not change: no lock, which their writer still holds for a moment when they appear.
+            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0, locking=False)
         try:
             with damage_said(self.path, WHAT):
                 self._read_about()
