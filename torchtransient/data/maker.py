@@ -30,7 +30,7 @@ from torchtransient.data.specification import (
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.files.plain_data import scan_data
 from torchtransient.plugins import versions_of_others
-from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
+from torchtransient.rendering.labels import first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.parameters import ParameterTable, unknown_key
@@ -131,7 +131,10 @@ class Maker:
         varied = kept.draw(index)
         seed = kept.seed(index)
         arrays, outside = kept.arrays(index, varied, seed)
-        self._check(index, arrays, expected.name)
+        # Labels are NaN where no surface is seen.
+        for name in (expected.name, "steady", "measurement"):
+            if name in arrays and not np.isfinite(arrays[name]).all():
+                raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
         return Sample(
             index,
             seed,
@@ -212,13 +215,6 @@ class Maker:
             found[key] = text if text else np.asarray(value, dtype=np.float32)
         return found
 
-    def _check(self, index: int, arrays: Mapping[str, NDArray[Any]], measured: str) -> None:
-        # Labels are NaN where no surface is seen.
-        for name in (measured, "steady", "measurement"):
-            if name in arrays and not np.isfinite(arrays[name]).all():
-                raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
-
-
 class Kept:
     """Scene of a structure with its renderer and the places of the values that vary in it.
 
@@ -232,7 +228,6 @@ class Kept:
 
     def __init__(self, recipe: Specification, structure: Structure) -> None:
         self.recipe, self.structure = recipe, structure
-        _check_label_names(recipe.settings.labels)
         self.keys = [key for key in recipe.vary if key not in recipe.exchanged and not recipe.is_of_device(key)]
         self.device_keys = [key for key in recipe.vary if recipe.is_of_device(key)]
         self.scan: Scan | None = None
@@ -240,7 +235,9 @@ class Kept:
             self.renderer = self._make()
         except TorchTransientError as error:
             raise _named(error, structure) from error
-        self._settle_filter()
+        # The scene's filter where a pose varies, too: no derivatives are asked for.
+        if self.renderer.film.has_bins and self.renderer.temporal_filter == "auto":
+            self.renderer.temporal_filter = self.renderer._scene_filter
         self._names(self._made())
         self.places = self._places()
         self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
@@ -299,12 +296,6 @@ class Kept:
                     f"recipe: vary: {key!r} cannot vary as a value: {table[key].reason}. Where a scene dictionary has "
                     "an entry for it, name that."
                 )
-
-    def _settle_filter(self) -> None:
-        """Keep the scene's filter where a pose varies: no derivatives are asked for."""
-        renderer = self.renderer
-        if renderer.film.has_bins and renderer.temporal_filter == "auto":
-            renderer.temporal_filter = renderer._scene_filter
 
     def _places(self) -> dict[str, Place]:
         found = {}
@@ -380,17 +371,18 @@ class Kept:
             Arrays by name, and the shares of light before and after the window.
         """
         values = self.values(drawn)
-        found = self._render(values, seed)
-        tensors = dict(found.tensors)
+        tensors, outside = self._render(values, seed)
         labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
         if labels:
             tensors |= scene_labels(self.renderer, values, labels)
         if FIRST_RETURN in self.recipe.settings.labels:
-            tensors[FIRST_RETURN] = self._first_return(tensors)
+            polarized = stokes_components(self.recipe.variant) > 1
+            axis = self._axis_of_first_return()
+            tensors[FIRST_RETURN] = first_return(tensors["transient"], axis, polarized=polarized)
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
         kept = self._names(tensors)
-        return {name: in_order(tensors[name]) for name in kept}, found.outside
+        return {name: in_order(tensors[name]) for name in kept}, outside
 
     def _names(self, there: Iterable[str]) -> list[str]:
         """Names of a sample's arrays that are kept. Raises ArgumentError."""
@@ -410,7 +402,7 @@ class Kept:
         Returns:
             Array of the film.
         """
-        return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
+        return self._render(self.values(drawn), seed)[0][self.renderer.film.measures].cpu().numpy()
 
     def outside(self, index: int) -> tuple[float, float]:
         """Return the shares of the light of a sample before and after the window, from 65536 camera paths at most.
@@ -423,7 +415,7 @@ class Kept:
         """
         rows, columns = self.measures.size[:2]
         spp = self.renderer.samples_drawn(min(self.measures.spp, max(1, _PATHS // (rows * columns))))
-        return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
+        return self._render(self.values(self.draw(index)), self.seed(index), spp)[1]
 
     def seed(self, index: int) -> int:
         """Return the seed of the render of a sample.
@@ -447,29 +439,25 @@ class Kept:
         """
         return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
 
-    def _render(self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None) -> _Measured:
+    def _render(
+        self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None
+    ) -> tuple[dict[str, torch.Tensor], tuple[float, float]]:
+        """Tensors by name, and shares of the light outside of the window."""
         measures = self.renderer.film.measures
         with torch.no_grad():
             out = self.renderer(values, seed=seed, spp=spp)
         light = out.others[measures] if measures in out.others else getattr(out, measures)
         tensors = {measures: light, "steady": out.steady}
-        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside)
-
-    def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        axis = self._axis_of_first_return()
-        polarized = stokes_components(self.recipe.variant) > 1
-        return first_return(tensors["transient"], axis, polarized=polarized)
+        return tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside
 
     def _axis_of_first_return(self) -> TimeAxis:
-        if self.renderer.axis is None or self.renderer.film.measures != "transient" or self._is_exhaustive():
+        exhaustive = self.scan is not None and self.scan.kind == "exhaustive"
+        if self.renderer.axis is None or self.renderer.film.measures != "transient" or exhaustive:
             raise SceneError(
                 f"recipe: labels: {FIRST_RETURN!r} is read off a transient of pixels; give time_axis=, and no "
                 "exhaustive scan."
             )
         return self.renderer.axis
-
-    def _is_exhaustive(self) -> bool:
-        return self.scan is not None and self.scan.kind == "exhaustive"
 
     # ------------------------------------------------------------------------------------------------- measurements
 
@@ -602,22 +590,6 @@ class Measures:
                     f"recipe: {mine} has {field.name} {here}, {others} has {there}. All need the same: give time_axis= "
                     "for bins of one kind, spp= for one number of samples, films of one size."
                 )
-
-
-@dataclass(frozen=True)
-class _Measured:
-    """Tensors of a render by name, and shares of the light outside of the window."""
-
-    tensors: dict[str, torch.Tensor]
-    outside: tuple[float, float]
-
-
-def _check_label_names(names: tuple[str, ...]) -> None:
-    """Raise SceneError for unknown labels."""
-    for name in names:
-        if name not in (*LABELS, FIRST_RETURN):
-            known = ", ".join((*LABELS, FIRST_RETURN))
-            raise SceneError(f"recipe: labels: unknown label {name!r}. Known ones are {known}.")
 
 
 def changed_device(device: Device, key: str, value: Any) -> Device:

@@ -22,7 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 import torch.multiprocessing  # lets connections carry shared tensors
-from torch.utils.data import IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset
 
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
@@ -120,11 +120,6 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
             raise
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        if get_worker_info() is not None:
-            raise TorchTransientError(
-                f"{WHAT}: it renders in processes of its own; use DataLoader(..., num_workers=0) and "
-                f"{WHAT}(workers=...)."
-            )
         while True:
             yield self.draw()
 
@@ -164,12 +159,6 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
 
     def __exit__(self, *raised: object) -> None:
         self.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise TorchTransientError(
-            f"{WHAT}: processes and shared memory cannot be pickled; make one in each process, or use num_workers=0."
-        )
-
 
 class Producers:
     """Processes that render, their ring, and their messages, which are read when a sample is drawn. A lock keeps

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from torchtransient.array_files.part_files import write_text
-from torchtransient.array_files.plain_texts import json_data, text_of_file
+from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_package
 from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.checks import count, path_of, short_errors, short_message, shown
 from torchtransient.chirps import Chirps
@@ -40,7 +40,7 @@ from torchtransient.data.serialization import (
     written_frequencies,
 )
 from torchtransient.data.specification import OneOf, Specification
-from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
+from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.gates import Gate
@@ -239,14 +239,7 @@ class Recipe(Specification):
         Returns:
             Text.
         """
-        try:
-            import yaml
-        except ImportError as error:
-            raise MissingPackageError(
-                "recipe: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]', or write "
-                "json.dumps(recipe.to_dict())."
-            ) from error
-        text: str = yaml.safe_dump(self.to_dict(), sort_keys=False, width=120)
+        text: str = yaml_package("recipe").safe_dump(self.to_dict(), sort_keys=False, width=120)
         if path is not None:
             write_text(path, text, "recipe")
         return text
