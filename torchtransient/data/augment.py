@@ -16,9 +16,8 @@ from torchtransient.array_files.array_file import tensor_in
 from torchtransient.checks import count, shown
 from torchtransient.data.augmented_values import check_values
 from torchtransient.data.operations import Operation, PixelMap
-from torchtransient.data.recipe_dataset import RecipeDataset
 from torchtransient.data.sample import Epochs, checked_seed, sample_generator, sample_number
-from torchtransient.data.transient_dataset import TransientDataset, TransientStream
+from torchtransient.data.transient_dataset import TransientStream
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
 from torchtransient.stokes import rotate_frame
@@ -217,9 +216,6 @@ class Augmented(Epochs, Dataset[Any]):
     def __len__(self) -> int:
         return len(self.dataset)
 
-    def __getitem__(self, number: int) -> Any:
-        return self.sample(number, self.epoch)
-
     def sample(self, number: int, epoch: int | None = None) -> Any:
         """Return a sample.
 
@@ -233,8 +229,7 @@ class Augmented(Epochs, Dataset[Any]):
         """
         place = sample_number("Augmented", number, len(self.dataset))
         generator = sample_generator("Augmented", self.seed, place, epoch)
-        has_epochs = isinstance(self.dataset, (Augmented, RecipeDataset, TransientDataset))
-        found = self.dataset.sample(place, epoch) if has_epochs else self.dataset[place]
+        found = self.dataset.sample(place, epoch) if isinstance(self.dataset, Epochs) else self.dataset[place]
         return self.augment(found, generator=generator)
 
 

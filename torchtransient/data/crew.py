@@ -214,7 +214,7 @@ class Crew(ABC, Generic[AnyMember]):
 
         Args:
             worker: its sender.
-            kind: first word, see ``Messages``, and "ready", "measured", "wrote", "fatal".
+            kind: first word, see ``ShardMaker``, and "ready", "measured", "wrote", "fatal".
             facts: its other entries.
 
         Raises:

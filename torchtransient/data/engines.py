@@ -5,6 +5,7 @@ alone, and tasks of Ray on a cluster, each of which is a run of its own with one
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import pickle
@@ -21,7 +22,7 @@ from torchtransient.array_files.part_files import remove_unfinished
 from torchtransient.data.crew import MOST_IN_A_ROW, POLL_S, Crew, Ledger, Member
 from torchtransient.data.processes import PluginNames, add_plugins, registered_plugins, spawned, unpacked
 from torchtransient.data.run_settings import RunSettings
-from torchtransient.data.shard_making import Messages, ShardMaker, execute, fatal
+from torchtransient.data.shard_making import ShardMaker, execute, fatal
 from torchtransient.errors import MissingPackageError, TorchTransientError
 from torchtransient.rendering.threads import threads
 
@@ -166,8 +167,7 @@ class InProcessCrew(Crew[InProcessWorker]):
             if not worker.ready:
                 self.receive(worker, "ready")
             elif task is not None:
-                messages = Messages(lambda message: self.receive(worker, *message))  # noqa: B023  done before the next
-                self.receive(worker, *execute(task, worker.maker, messages))
+                self.receive(worker, *execute(task, worker.maker, functools.partial(self.receive, worker)))
 
     def close(self, stopped: bool) -> None:
         """Free the scenes, and put back the numbers of threads.
@@ -205,7 +205,7 @@ def work(link: Connection, packed: bytes) -> None:
             if task[0] == "stop":
                 maker.close()
                 return
-            link.send(execute(task, maker, Messages(link.send)))
+            link.send(execute(task, maker, lambda *message: link.send(message)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         sys.exit(_GONE)
     except Exception as error:  # noqa: BLE001  sent, and raised by the supervisor

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +62,6 @@ class Maker:
     def __init__(self, recipe: Specification) -> None:
         self.recipe = recipe
         self._kept: OrderedDict[str, Kept] = OrderedDict()
-        self._measures: Measures | None = None
 
     def order(self, indices: Iterable[int]) -> list[int]:
         """Order samples by structure, in the order in which structures first come.
@@ -124,15 +124,15 @@ class Maker:
         """
         (index,) = samples_of([index])
         # Of sample 0 in every process: all refuse the same samples.
-        expected = self.measures()
+        expected = self.film
         structure = self.recipe.structure(index)
         kept = self.kept(structure)
-        kept.measures.check(expected, f"sample {index}", "sample 0")
+        check_film(kept.film, expected, f"sample {index}", "sample 0")
         varied = kept.draw(index)
         seed = kept.seed(index)
         arrays, outside = kept.arrays(index, varied, seed)
         # Labels are NaN where no surface is seen.
-        for name in (expected.name, "steady", "measurement"):
+        for name in (expected["measures"], "steady", "measurement"):
             if name in arrays and not np.isfinite(arrays[name]).all():
                 raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
         return Sample(
@@ -144,11 +144,10 @@ class Maker:
             structure=structure.text,
         )
 
-    def measures(self) -> Measures:
-        """Return the measurement of sample 0, which all samples share."""
-        if self._measures is None:
-            self._measures = self.kept(self.recipe.structure(0)).measures
-        return self._measures
+    @functools.cached_property
+    def film(self) -> dict[str, Any]:
+        """``Kept.film`` of sample 0, which all samples share."""
+        return self.kept(self.recipe.structure(0)).film
 
     def standard_error(self, index: int) -> float:
         """Return the relative standard error of a sample: root mean square of the errors over the cube, by that of the
@@ -311,14 +310,21 @@ class Kept:
         measured = () if self.recipe.device is None else ("measurement",)
         return [self.renderer.film.measures, *steady, *self.recipe.settings.labels, *measured]
 
-    @property
-    def measures(self) -> Measures:
-        """Measurement of the film."""
+    @functools.cached_property
+    def film(self) -> dict[str, Any]:
+        """Measurement of the film as plain data, and its size in rows, columns, bins."""
         renderer = self.renderer
-        return Measures(
-            renderer.film.measures, renderer._cube_shape[:-1], renderer.axis, renderer.frequencies, renderer.gates,
-            renderer.rates, renderer.chirps, renderer._channels, renderer.spp or renderer._scene_spp,
-        )  # fmt: skip
+        return {
+            "measures": renderer.film.measures,
+            "size": renderer._cube_shape[:-1],
+            "axis": None if renderer.axis is None else asdict(renderer.axis),
+            "frequencies": written_frequencies(renderer.frequencies),
+            "gates": None if renderer.gates is None else [record_fields(gate) for gate in renderer.gates],
+            "rates": None if renderer.rates is None else asdict(renderer.rates),
+            "chirps": None if renderer.chirps is None else asdict(renderer.chirps),
+            "channels": list(renderer._channels),
+            "spp": renderer.spp or renderer._scene_spp,
+        }
 
     def check_labels(self) -> None:
         """Raise the errors of labels, by one intersection without light."""
@@ -413,8 +419,8 @@ class Kept:
         Returns:
             Two shares.
         """
-        rows, columns = self.measures.size[:2]
-        spp = self.renderer.samples_drawn(min(self.measures.spp, max(1, _PATHS // (rows * columns))))
+        rows, columns = self.film["size"][:2]
+        spp = self.renderer.samples_drawn(min(self.film["spp"], max(1, _PATHS // (rows * columns))))
         return self._render(self.values(self.draw(index)), self.seed(index), spp)[1]
 
     def seed(self, index: int) -> int:
@@ -515,22 +521,13 @@ class Kept:
 
     def about(self) -> dict[str, Any]:
         """Return plain data, the same for all structures of a recipe."""
-        renderer = self.renderer
-        film = renderer.film
         found: dict[str, Any] = {
-            "measures": film.measures,
-            "axis": None if renderer.axis is None else asdict(renderer.axis),
-            "frequencies": written_frequencies(renderer.frequencies),
-            "gates": None if renderer.gates is None else [record_fields(gate) for gate in renderer.gates],
-            "rates": None if renderer.rates is None else asdict(renderer.rates),
-            "chirps": None if renderer.chirps is None else asdict(renderer.chirps),
-            "channels": list(renderer._channels),
+            **{name: entry for name, entry in self.film.items() if name != "size"},
             "behind_time": 2 if self.scan is None else len(self.scan.shape),
-            "spp": renderer.spp or renderer._scene_spp,
             "variant": self.recipe.variant,
-            "temporal_filter": renderer.effective_filter,
+            "temporal_filter": self.renderer.effective_filter,
             "versions": package_versions(),
-        }  # fmt: skip
+        }
         if self.scan is not None:
             found["scan"] = scan_data(self.scan)
         return found
@@ -546,50 +543,24 @@ class Kept:
         return found
 
 
-@dataclass(frozen=True)
-class Measures:
-    """Measurement of a scene's film, which all samples of a recipe share.
+def check_film(found: Mapping[str, Any], expected: Mapping[str, Any], mine: str, others: str) -> None:
+    """Check that samples go into one array.
 
     Args:
-        name: "transient", "phasor", ...
-        size: rows, columns, bins.
-        axis: time axis, or None.
-        frequencies: or None.
-        gates: or None.
-        rates: or None.
-        chirps: or None.
-        channels: names.
-        spp: samples per pixel.
+        found: ``Kept.film``.
+        expected: of other samples.
+        mine: name of the first for messages.
+        others: name of the others.
+
+    Raises:
+        ShapeError: for two measurements.
     """
-
-    name: str
-    size: tuple[int, ...]
-    axis: Any
-    frequencies: Any
-    gates: Any
-    rates: Any
-    chirps: Any
-    channels: tuple[str, ...]
-    spp: int
-
-    def check(self, other: Measures, mine: str, others: str) -> None:
-        """Check that samples go into one array.
-
-        Args:
-            other: another measurement.
-            mine: name of this one for messages.
-            others: name of the other one.
-
-        Raises:
-            ShapeError: for two measurements.
-        """
-        for field in fields(self):
-            here, there = getattr(self, field.name), getattr(other, field.name)
-            if here != there:
-                raise ShapeError(
-                    f"recipe: {mine} has {field.name} {here}, {others} has {there}. All need the same: give time_axis= "
-                    "for bins of one kind, spp= for one number of samples, films of one size."
-                )
+    for name, here in found.items():
+        if here != expected[name]:
+            raise ShapeError(
+                f"recipe: {mine} has {name} {here}, {others} has {expected[name]}. All need the same: give time_axis= "
+                "for bins of one kind, spp= for one number of samples, films of one size."
+            )
 
 
 def changed_device(device: Device, key: str, value: Any) -> Device:

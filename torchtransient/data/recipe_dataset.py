@@ -75,9 +75,6 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return self.size
 
-    def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number, self.epoch)
-
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
         """Render a sample.
 

@@ -147,6 +147,18 @@ class Epochs:
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
+    def sample(self, number: int, epoch: int | None = None) -> Any:
+        """Return a sample.
+
+        Args:
+            number: of the sample, negative from the end.
+            epoch: distinguishes the draws of epochs; None is 0.
+        """
+        raise NotImplementedError
+
+    def __getitem__(self, number: int) -> Any:
+        return self.sample(number, self.epoch)
+
     @property
     def epoch(self) -> int:
         """Epoch of samples that are read by number."""

@@ -109,9 +109,6 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return len(self._table)
 
-    def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number, self.epoch)
-
     @property
     def index(self) -> Tensor:
         """(N,) int64: the number of every sample in its recipe."""

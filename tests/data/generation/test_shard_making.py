@@ -14,7 +14,7 @@ import torchtransient as tt
 from torchtransient.data import Sample
 from torchtransient.data.crew import DIED, MEASURING, MOST_IN_A_ROW, MOST_OF_A_SHARD, Crew, Ledger, Member, SampleBar
 from torchtransient.data.run_settings import RunSettings, samples_per_shard
-from torchtransient.data.shard_making import Messages, ShardMaker, raised, reason_of
+from torchtransient.data.shard_making import ShardMaker, raised, reason_of
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 
 MB = 2**20
@@ -80,12 +80,15 @@ def made(tmp_path):
     def run(recipe, shard=0, retries=1, skip=(), first=(), about=None):
         settings = RunSettings(recipe, str(tmp_path), 5, "exact", "none", retries)
         sent = []
-        messages = Messages(sent.append, dict(skip))
+
+        def say(*message):
+            sent.append(message)
+
         maker = ShardMaker(settings)
         if shard is None:
-            return maker.measure(range(5), messages), sent
+            return maker.measure(range(5), say, dict(skip)), sent
         described = {"about": about or {"spp": 4}, "per_shard": 3, "recipe": {}}
-        return maker.make(shard, described, messages, first), sent
+        return maker.make(shard, described, say, dict(skip), first), sent
 
     with tt.threads(1):
         yield run
