@@ -6,7 +6,6 @@ import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from torchtransient.checks import real_array, shown
 from torchtransient.data.distributions import ANYTHING, NUMBERS, POSE, Choice, Draw, Place, Stream
 from torchtransient.data.sample import Sample, in_order
-from torchtransient.data.serialization import record_fields, written_frequencies
+from torchtransient.data.serialization import record_fields
 from torchtransient.data.specification import (
     NOISE,
     RENDER,
@@ -42,6 +41,8 @@ if TYPE_CHECKING:
     from torchtransient.axes import TimeAxis
     from torchtransient.capture import Scan
 
+# Records of a renderer that describe its film.
+_AXES = ("axis", "frequencies", "gates", "rates", "chirps")
 # Label that is computed from the transient.
 FIRST_RETURN = "first_return"
 # Most camera paths for the share of light outside of the window.
@@ -317,11 +318,7 @@ class Kept:
         return {
             "measures": renderer.film.measures,
             "size": renderer._cube_shape[:-1],
-            "axis": None if renderer.axis is None else asdict(renderer.axis),
-            "frequencies": written_frequencies(renderer.frequencies),
-            "gates": None if renderer.gates is None else [record_fields(gate) for gate in renderer.gates],
-            "rates": None if renderer.rates is None else asdict(renderer.rates),
-            "chirps": None if renderer.chirps is None else asdict(renderer.chirps),
+            **{name: record_fields(getattr(renderer, name)) for name in _AXES},
             "channels": list(renderer._channels),
             "spp": renderer.spp or renderer._scene_spp,
         }

@@ -37,7 +37,6 @@ from torchtransient.data.serialization import (
     record_fields,
     without_places,
     written,
-    written_frequencies,
 )
 from torchtransient.data.specification import OneOf, Specification
 from torchtransient.errors import SceneError, TorchTransientError
@@ -60,6 +59,7 @@ _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "rates",
     "chirps", "pulse", "irf", "device", *_PLAIN,
 )  # fmt: skip
+_RECORDS = ("time_axis", "frequencies", "gates", "pulse", "irf")
 _MOVING = {"rates": RateAxis, "chirps": Chirps}
 # Entries that samples do not depend on.
 _NO_NUMBERS = ("n", "format")
@@ -299,15 +299,11 @@ def _recipe_data(recipe: Specification) -> dict[str, Any]:
         "vary": {key: written(one) for key, one in recipe.vary.items()},
         "labels": list(settings.labels),
         "keep": None if settings.keep is None else list(settings.keep),
-        "time_axis": record_fields(settings.time_axis),
-        "frequencies": written_frequencies(settings.frequencies),
-        "gates": None if settings.gates is None else [record_fields(gate) for gate in settings.gates],
+        **{name: record_fields(getattr(settings, name)) for name in _RECORDS},
         "temporal_filter": settings.temporal_filter,
         "spp": settings.spp,
         "max_depth": settings.max_depth,
         "sensors": written(settings.sensors),
-        "pulse": record_fields(settings.pulse),
-        "irf": record_fields(settings.irf),
         "device": None if recipe.device is None else recipe.device.to_dict(),
         "physics": settings.physics,
         "variant": recipe.variant,
@@ -315,7 +311,7 @@ def _recipe_data(recipe: Specification) -> dict[str, Any]:
         "n": recipe.n,
     }
     # Left out where None, so that older recipes keep their keys.
-    found |= {name: asdict(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
+    found |= {name: record_fields(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
     if settings.sampler != OF_SCENE:
         found["sampler"] = settings.sampler
     if recipe.plugins:

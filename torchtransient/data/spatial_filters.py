@@ -35,7 +35,7 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor) -> Tenso
         raise UnitError(f"spatial_filter: expected a floating dtype, got {light.dtype}; convert it with .float().")
     images = light.reshape(-1, 1, *light.shape[-2:])
     found = []
-    for given in images.split(_AT_ONCE):
+    for given in torch.split(images, _AT_ONCE):
         made = function(given) if len(given) else given
         if made.ndim != 4 or made.shape[:2] != given.shape[:2]:
             raise ShapeError(
