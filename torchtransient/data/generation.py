@@ -17,7 +17,7 @@ from torchtransient.array_files.part_files import check_system, sweep_parts
 from torchtransient.checks import a_recipe, count, is_one_of, path_of, positive, shown
 from torchtransient.data.crew import Ledger, RunLog, SampleBar
 from torchtransient.data.engines import InProcessCrew, Supervisor, make_on_ray, ray_package
-from torchtransient.data.manifest import build_manifest, fault_of, manifest_of, named_shards, shards_of
+from torchtransient.data.manifest import build_manifest, fault_of, named_shards, shards_of
 from torchtransient.data.processes import registered_plugins
 from torchtransient.data.run_settings import (
     MANIFEST_FILE,
@@ -323,10 +323,8 @@ def _write_manifest(place: Path) -> None:
     seen: set[str] | None = None
     while (now := {path.name for path in place.glob(SHARD_FILES)}) != seen:
         seen = now
-        if now & damaged:
-            manifest_of(place, [path for path in shards_of(place) if path.name in now - damaged])
-        elif now:
-            build_manifest(place)
+        if now - damaged:
+            build_manifest(place, damaged)
 
 
 def _sweep(place: Path) -> None:

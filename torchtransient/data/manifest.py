@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,13 +83,14 @@ def shards_of(folder: str | Path) -> list[Path]:
     return sorted(path for path in place.glob(SHARD_FILES) if path.is_file())
 
 
-def build_manifest(folder: str | Path) -> dict[str, Any]:
+def build_manifest(folder: str | Path, without: Collection[str] = ()) -> dict[str, Any]:
     """Write ``manifest.json`` from the shards of a folder.
 
     Checksums are those that the shards carry, not compared with their bytes: :func:`verify` does.
 
     Args:
         folder: of a data set.
+        without: names of shards that are left out.
 
     Returns:
         The manifest.
@@ -97,22 +98,7 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     Raises:
         StorageError: for damaged shards, doubled samples, shards of several recipes, and no shard.
     """
-    return manifest_of(folder, shards_of(folder))
-
-
-def manifest_of(folder: str | Path, paths: Sequence[Path]) -> dict[str, Any]:
-    """Write ``manifest.json`` from some shards.
-
-    Args:
-        folder: of a data set.
-        paths: of its shards.
-
-    Returns:
-        The manifest.
-
-    Raises:
-        StorageError: as :func:`build_manifest`.
-    """
+    paths = [path for path in shards_of(folder) if path.name not in without]
     if not paths:
         raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({SHARD_FILES}).")
     entries = [_Entry.read(path) for path in paths]
