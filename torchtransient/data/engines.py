@@ -242,12 +242,15 @@ def _end_with_supervisor() -> None:
 # ----------------------------------------------------------------------------------------------- tasks of a cluster
 
 
-def make_on_ray(calls: Sequence[Mapping[str, Any]], address: str | None, tick: Callable[[], object]) -> int:
+def make_on_ray(
+    make: Callable[..., Any], calls: Sequence[Mapping[str, Any]], address: str | None, tick: Callable[[], object]
+) -> int:
     """Make shares of a data set as tasks of Ray with one processor each. Ray starts a task again where its process or
     machine is lost, and its run goes on with the shards that are missing.
 
     Args:
-        calls: arguments of ``generate`` for each share.
+        make: ``generate``.
+        calls: its arguments for each share.
         address: of a running cluster. None: the one that this process is connected to, or that RAY_ADDRESS names, or a
             new one on this machine.
         tick: called every half second.
@@ -267,7 +270,7 @@ def make_on_ray(calls: Sequence[Mapping[str, Any]], address: str | None, tick: C
             given = {} if address is None else {"address": address}
             ray.init(log_to_driver=False, logging_level="ERROR", **given)
         task = ray.remote(num_cpus=1, max_retries=MOST_IN_A_ROW)(make_share)
-        left = [task.remote(call, registered_plugins()) for call in calls]
+        left = [task.remote(make, call, registered_plugins()) for call in calls]
         while left:
             done, left = ray.wait(left, timeout=POLL_S)
             restarts += sum(ray.get(done))
@@ -284,20 +287,19 @@ def make_on_ray(calls: Sequence[Mapping[str, Any]], address: str | None, tick: C
     return restarts
 
 
-def make_share(call: Mapping[str, Any], plugins: PluginNames) -> int:
+def make_share(make: Callable[..., Any], call: Mapping[str, Any], plugins: PluginNames) -> int:
     """Make a share of a data set: the body of a task.
 
     Args:
-        call: arguments of ``generate``.
+        make: ``generate``.
+        call: its arguments.
         plugins: modules that were added in the calling process.
 
     Returns:
         Workers that were replaced.
     """
-    from torchtransient.data.generation import generate
-
     add_plugins(plugins, "generate")
-    return generate(**call, workers=1, progress=False).restarts
+    return int(make(**call, workers=1, progress=False).restarts)
 
 
 def ray_package() -> Any:

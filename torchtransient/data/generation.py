@@ -302,7 +302,7 @@ def _make_on_ray(
                 ledger.wrote(number, samples + failed, failed, path.stat().st_size)
                 del waiting[number]
 
-    ledger.restarts += make_on_ray(calls, address, add_up)
+    ledger.restarts += make_on_ray(generate, calls, address, add_up)
     if waiting:
         raise StorageError(
             f"{_WHAT}: shard {min(waiting)} was made, and is not in '{place}'. All machines of the cluster have to see "

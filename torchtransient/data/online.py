@@ -441,22 +441,17 @@ class Schedule:
         """
         self._free.append(self.orders.pop(index).slot)
 
-    def lost(self, producer: int) -> list[int]:
+    def lost(self, producer: int) -> None:
         """Record a producer that has ended: its samples are ordered again, from others.
 
         Args:
             producer: its number.
-
-        Returns:
-            Numbers of these samples.
         """
         orders = sorted((o for o in self.orders.values() if o.producer == producer), key=lambda order: order.index)
         for order in orders:
             del self.orders[order.index]
             self._free.append(order.slot)
-        found = [order.index for order in orders]
-        self._again.extendleft(reversed(found))
-        return found
+        self._again.extendleft(order.index for order in reversed(orders))
 
     def can_draw(self) -> bool:
         """Return True where a reader need not wait."""

@@ -11,7 +11,7 @@ import contextlib
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from dataclasses import fields as entries_of
 from pathlib import Path
 from typing import Any, TypeVar
@@ -172,7 +172,7 @@ def record_fields(record: Any) -> Any:
         return None
     if isinstance(record, FrequencyAxis):
         return {"per_metre": [float(number) for number in record.per_metre], "start_opl": record.start_opl}
-    return asdict(record) if is_dataclass(record) else [asdict(one) for one in record]
+    return [asdict(one) for one in record] if isinstance(record, list | tuple) else asdict(record)
 
 
 def read_record(kind: type[Record], data: Any) -> Record | None:

@@ -388,7 +388,6 @@ class ShardTable:
         self.failed: dict[int, str] = {}
         self.arrays: dict[str, tuple[int, ...]] = {}
         self.time_axes: dict[str, int | None] = {}
-        self.keys: tuple[str, ...] = ()
         self.about: dict[str, Any] = {}
         for number, path in enumerate(self.paths):
             with Shard(path) as shard:
@@ -404,7 +403,7 @@ class ShardTable:
                     first = kind
                     self.arrays = {name: shard.shape(name) for name in shard.names}
                     self.time_axes = {name: shard.time_axis(name) for name in shard.names}
-                    self.keys, self.about = shard.keys, kind["about"]
+                    self.about = kind["about"]
                 _check_alike(first, kind, self.paths[shards[0]], path)
         if not shards:
             raise StorageError(f"{WHAT}: expected samples, got none in {len(self.paths)} shards: all of them failed.")
