@@ -480,12 +480,12 @@ def _shard_paths(where: Any) -> list[Path]:
     """Shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards that are
     missing. Raises StorageError where there is none.
     """
-    if isinstance(where, str | os.PathLike):
+    if isinstance(where, list | tuple):
+        paths = [path for one in where for path in _shard_paths(one)]
+    else:
         path = path_of(where, WHAT)
         places = [path] if path.exists() else sorted(map(Path, glob.glob(str(path), recursive=True)))
         paths = [one.absolute() for place in places for one in (_of_folder(place) if place.is_dir() else [place])]
-    else:
-        paths = [path for one in where for path in _shard_paths(one)]
     if len(set(paths)) != len(paths):
         raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
     if not paths:
