@@ -15,7 +15,7 @@ START, LENGTH = 2.0, 10.0
 LETTER = "letter"
 
 
-def undisturbed(message: tuple[Any, ...]) -> None:
+def undisturbed(*message: Any) -> None:
     """Take the messages of a worker, and stop at a failure."""
     if message[0] == "retry" or (message[0] == "end" and message[3] is not None):
         raise RuntimeError(f"sample {message[2]} failed: {message[3]}")

@@ -30,7 +30,7 @@ import torch
 from _dataset_cases import captures, described, moving_boxes, several_views, undisturbed
 
 from torchtransient.data.run_settings import RunSettings
-from torchtransient.data.shard_making import Messages, ShardMaker
+from torchtransient.data.shard_making import ShardMaker
 from torchtransient.scene.variant import active_variant
 
 CPU = time.process_time
@@ -43,14 +43,14 @@ class Shards:
     def __init__(self, recipe: Any, folder: str, count: int) -> None:
         self.recipe, self.folder, self.count = recipe, Path(folder), count
         self.maker = ShardMaker(RunSettings(recipe, folder, 10**6, "exact", "blosc2", 0))
-        measured = self.maker.measure(range(1), Messages(undisturbed))
+        measured = self.maker.measure(range(1), undisturbed)
         self.megabytes = measured.sample_bytes / MB
         self.described = {"per_shard": count, "about": measured.about, "recipe": recipe.to_dict()}
         self._next = 0
 
     def make(self) -> Path:
         """One more."""
-        self.maker.make(self._next, self.described, Messages(undisturbed))
+        self.maker.make(self._next, self.described, undisturbed)
         self._next += 1
         return max(self.folder.glob("shard-*.h5"))
 

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 import torchtransient as tt
 from support.marks import long
-from torchtransient.errors import ArgumentError, DeviceError, StorageError, UnitError
+from torchtransient.errors import DeviceError, StorageError, UnitError
 from torchtransient.training import Batches, Seeds, ranks, worker_init
 
 
@@ -63,9 +63,8 @@ def test_a_state_of_another_order():
     for other in (Batches(11, 4), Batches(10, 5), Batches(10, 4, seed=1), Batches(10, 4, shuffle=False)):
         with pytest.raises(StorageError, match="repeat some samples"):
             other.load_state_dict(state)
-    for other in ({}, None):
-        with pytest.raises(StorageError, match=r"expected (the order|a state)"):
-            Batches(10, 4).load_state_dict(other)
+    with pytest.raises(StorageError, match="expected the order"):
+        Batches(10, 4).load_state_dict({})
 
 
 def test_its_loader_leaves_random_numbers_alone():
@@ -82,8 +81,6 @@ def test_its_loader_leaves_random_numbers_alone():
     assert (apart.worker_init_fn, apart.persistent_workers) == (worker_init, True)
     with pytest.raises(UnitError, match="of 3 samples, the data set has 2"):
         batches.loader([1.0, 2.0])
-    with pytest.raises(ArgumentError, match="expected workers=2"):
-        batches.loader([1.0, 2.0, 3.0], num_workers=2)
 
 
 def test_a_position_that_is_left_behind():
@@ -188,22 +185,16 @@ def test_broken_settings(monkeypatch):
     with pytest.raises(UnitError, match="'cpu' or 'cuda', got 'tpu'"), ranks("tpu"):
         pass
     monkeypatch.setenv("RANK", "0")
-    with pytest.raises(UnitError, match="RANK are set and WORLD_SIZE, LOCAL_RANK, LOCAL_WORLD_SIZE not"), ranks():
+    with pytest.raises(UnitError, match="variables of torchrun, got 'WORLD_SIZE'"), ranks():
         pass
-    wrong = {"WORLD_SIZE": ("two", 1), "RANK": (-1, 0), "LOCAL_RANK": (-1, 0), "LOCAL_WORLD_SIZE": (0, 1)}
-    for name, (value, least) in wrong.items():
-        torchrun(monkeypatch, 0, 1)
-        monkeypatch.setenv(name, str(value))
-        with pytest.raises(UnitError, match=f"^ranks: {name}: expected a whole number of at least {least}"), ranks():
-            pass
+    torchrun(monkeypatch, 0, 1)
+    monkeypatch.setenv("WORLD_SIZE", "two")
+    with pytest.raises(UnitError, match=r"variables of torchrun, got .*'two'"), ranks():
+        pass
 
 
 def test_groups_that_cannot_be_joined(monkeypatch):
     torchrun(monkeypatch, 0, 2)
-    for name in ("MASTER_ADDR", "MASTER_PORT"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(UnitError, match=r"cannot be joined.*torchrun"), ranks():
-        pass
     monkeypatch.setattr(dist, "is_initialized", lambda: True)
     with pytest.raises(DeviceError, match="in a group already"), ranks():
         pass

@@ -55,10 +55,9 @@ def test_generators():
     [
         (lambda: Seeds(-1), "seed: expected a whole number of at least 0, got -1"),
         (lambda: Seeds(0)(-1, [0]), "step: expected a whole number"),
-        (lambda: Seeds(0)(0, [2**32]), "below 2\\^32"),
-        (lambda: Seeds(0)(0, 3), r"write \[3\]"),
-        (lambda: Seeds(0)(0, torch.tensor([1.0])), "torch.float32"),
-        (lambda: Seeds(0)(0, torch.tensor(1)), r"shape \(B,\)"),
+        (lambda: Seeds(0)(0, [2**32]), "sample: expected"),
+        (lambda: Seeds(0)(0, torch.tensor([1.5])), "sample: expected a whole number"),
+        (lambda: Seeds(0)(0, torch.tensor([[1]])), "sample: expected a whole number"),
     ],
 )
 def test_what_they_do_not_take(call, message):

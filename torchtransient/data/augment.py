@@ -1,10 +1,7 @@
-"""Augmentation of samples: one map of the pixels for light, labels and camera, drawn for each sample of a data set; and
-the values of a sample that stay true when its image is mapped.
-"""
+"""Augmentation of samples: one map of the pixels for light, labels and camera, drawn for each sample of a data set."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
@@ -16,18 +13,15 @@ from torch.utils.data import Dataset, IterableDataset
 
 from torchtransient import geometry
 from torchtransient.array_files.array_file import tensor_in
-from torchtransient.checks import by_number, count, flag, shown
+from torchtransient.checks import count, shown
+from torchtransient.data.augmented_values import check_values
 from torchtransient.data.operations import Operation, PixelMap
-from torchtransient.data.recipe_dataset import RecipeDataset
 from torchtransient.data.sample import Epochs, checked_seed, sample_generator, sample_number
-from torchtransient.data.transient_dataset import TransientDataset, TransientStream
+from torchtransient.data.transient_dataset import TransientStream
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
-from torchtransient.plugins.mitsuba_compat import VERTEX_COLUMNS
 from torchtransient.stokes import rotate_frame
 
-# Depth of the search for images in nested entries.
-_DEEPEST = 4
 # The sensor's horizontal axis is cross(ray, up), and up in kornia's camera is -y (docs/polarization.md).
 _UP = (0.0, -1.0, 0.0)
 Kind = Literal["light", "label", "number", "point", "direction", "unchanged"]
@@ -42,7 +36,7 @@ KINDS: dict[str, Kind] = {
     "position": "point",
     **dict.fromkeys(("normals", "velocity"), "direction"),
 }
-# Entries besides images; `fields` cannot give these names another treatment.
+# Entries besides images.
 _NAMED = ("intrinsics", "to_world", "values", "outside")
 
 
@@ -101,21 +95,20 @@ class Augment:
         sensor: str | Sequence[str] = (),
         kept_values: Sequence[str] = (),
     ) -> None:
-        given = list(operations) if isinstance(operations, Sequence) else [operations]
-        for one in given:
-            if not isinstance(one, Operation):
-                raise ArgumentError(f"Augment: expected Flip, QuarterTurn, Crop or Affine, got {shown(one)}.")
-        self.operations = tuple(given)
+        self.operations = tuple(operations) if isinstance(operations, Sequence) else (operations,)
         # Copies: the caller may change its tensors afterwards.
         self.camera = {
             "intrinsics": None if intrinsics is None else camera_matrices(intrinsics, "Augment").clone(),
             "to_world": None if to_world is None else transforms(to_world, "Augment").clone(),
         }
-        self.polarized = flag("Augment: polarized", polarized)
-        self.kinds: dict[str, Kind] = {**KINDS, **_checked_fields(fields)}
-        self.names = None if names is None else _texts("names", names)
-        self.cameras = (sensor,) if isinstance(sensor, str) else _texts("sensor", sensor)
-        self.kept_values = _texts("kept_values", kept_values)
+        self.polarized = polarized
+        self.kinds: dict[str, Kind] = {**KINDS, **(fields or {})}
+        unknown = [kind for kind in self.kinds.values() if kind not in get_args(Kind)]
+        if unknown:
+            raise ArgumentError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(unknown[0])}.")
+        self.names = None if names is None else tuple(names)
+        self.cameras = (sensor,) if isinstance(sensor, str) else tuple(sensor)
+        self.kept_values = tuple(kept_values)
 
     def __call__(self, sample: Any, *, generator: torch.Generator | None = None) -> Any:
         """Return a new sample with one map drawn.
@@ -127,14 +120,11 @@ class Augment:
         Returns:
             Sample of the same kind.
         """
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise ArgumentError(f"Augment: expected generator as a torch.Generator, got {shown(generator)}.")
         if isinstance(sample, Mapping):
             return self._augmented(dict(sample), generator)
-        if self.names is None or not isinstance(sample, Sequence) or len(sample) != len(self.names):
+        if self.names is None:
             raise ArgumentError(
-                f"Augment: expected a dictionary, or with names= a tuple of as many, got {shown(sample)} with "
-                f"names={self.names}."
+                f"Augment: expected a dictionary, or names= for the entries of a tuple, got {shown(sample)}."
             )
         found = self._augmented(dict(zip(self.names, sample, strict=True)), generator)
         return tuple(found[name] for name in self.names)
@@ -149,41 +139,31 @@ class Augment:
         for name, check in (("intrinsics", camera_matrices), ("to_world", transforms)):
             if sample.get(name) is not None:
                 sample[name] = check(sample[name], "Augment")
-        names = [name for name in sample if self._kind(name) != "unchanged"]
-        sample |= {name: as_image(name, sample[name]) for name in names}
-        size = size_of({name: sample[name] for name in names}, tuple(KINDS))
+        names = [name for name in sample if self.kinds.get(name, "unchanged") != "unchanged"]
+        sample |= {name: _image(name, sample[name]) for name in names}
+        size = _size_of({name: sample[name] for name in names})
         for name, given in sample.items():
             if name not in self.kinds and name not in _NAMED:
-                check_unknown(name, given, size)
+                _check_unknown(name, given, size)
         for operation in self.operations:
             drawn = operation.draw(size, generator)
-            if drawn is None:
-                continue
-            if not isinstance(drawn, PixelMap) or drawn.size != size:
-                got = f"one of {drawn.size}" if isinstance(drawn, PixelMap) else shown(drawn)
-                raise SceneError(
-                    f"Augment: expected {type(operation).__name__}.draw to return a PixelMap of images of {size}, or "
-                    f"None, got {got}."
-                )
-            sample = self._mapped(sample, {name: sample[name] for name in names}, drawn)
-            size = drawn.new_size
+            if drawn is not None:
+                sample = self._mapped(sample, {name: sample[name] for name in names}, drawn)
+                size = drawn.new_size
         return sample
-
-    def _kind(self, name: str) -> Kind:
-        return self.kinds.get(name, "unchanged")
 
     def _mapped(self, sample: dict[str, Any], images: Mapping[str, Tensor], drawn: PixelMap) -> dict[str, Any]:
         check_values(sample.get("values"), drawn, self.cameras, self.kept_values)
         found = dict(sample)
         for name, image in images.items():
-            kind = self._kind(name)
+            kind = self.kinds[name]
             if kind == "light":
                 moved = drawn.smooth(image, name)
                 found[name] = self._stokes(name, moved, drawn, sample) if self.polarized else moved
             elif kind in ("point", "direction"):
                 found[name] = _in_the_world(name, kind, image, drawn, sample.get("to_world"))
             else:
-                found[name] = drawn.nearest(image, self._fill(name, image), name)
+                found[name] = drawn.nearest(image, _fill(name, kind, image), name)
         if self.polarized and "measurement" in images and (drawn.turns or drawn.mirror is not None):
             raise SceneError(
                 "Augment: a measurement of polarized light does not tell what the turned or mirrored scene would give; "
@@ -194,11 +174,6 @@ class Augment:
         if sample.get("to_world") is not None:
             found["to_world"] = drawn.to_world(sample["to_world"])
         return found
-
-    def _fill(self, name: str, image: Tensor) -> float:
-        if image.dtype == torch.bool or (name == "measurement" and self._kind(name) == "label"):
-            return 0
-        return -1 if self._kind(name) == "number" else torch.nan
 
     def _stokes(self, name: str, light: Tensor, drawn: PixelMap, sample: Mapping[str, Any]) -> Tensor:
         dim = {"steady": -4, **dict.fromkeys(_ROWS, -6)}.get(name, -5)
@@ -227,7 +202,7 @@ class Augmented(Epochs, Dataset[Any]):
             :meth:`set_epoch`; None draws from torch's, anew each time.
 
     Raises:
-        ArgumentError: for streams and other objects.
+        ArgumentError: for streams.
         UnitError: for a seed or an epoch below zero.
         IndexError: beyond the samples.
     """
@@ -236,14 +211,10 @@ class Augmented(Epochs, Dataset[Any]):
         super().__init__()
         if isinstance(dataset, IterableDataset):
             raise ArgumentError(f"Augmented: {shown(dataset)} is a stream; use AugmentedStream.")
-        self.dataset, self.augment = by_number("Augmented", dataset), _checked(augment, "Augmented")
-        self.seed = checked_seed("Augmented", seed)
+        self.dataset, self.augment, self.seed = dataset, augment, checked_seed("Augmented", seed)
 
     def __len__(self) -> int:
         return len(self.dataset)
-
-    def __getitem__(self, number: int) -> Any:
-        return self.sample(number, self.epoch)
 
     def sample(self, number: int, epoch: int | None = None) -> Any:
         """Return a sample.
@@ -258,8 +229,7 @@ class Augmented(Epochs, Dataset[Any]):
         """
         place = sample_number("Augmented", number, len(self.dataset))
         generator = sample_generator("Augmented", self.seed, place, epoch)
-        has_epochs = isinstance(self.dataset, (Augmented, RecipeDataset, TransientDataset))
-        found = self.dataset.sample(place, epoch) if has_epochs else self.dataset[place]
+        found = self.dataset.sample(place, epoch) if isinstance(self.dataset, Epochs) else self.dataset[place]
         return self.augment(found, generator=generator)
 
 
@@ -276,16 +246,12 @@ class AugmentedStream(IterableDataset[Any]):
             torch's generator.
 
     Raises:
-        ArgumentError: for other data sets.
         UnitError: for a seed below zero.
         SceneError: for samples without an ``index`` with a seed.
     """
 
     def __init__(self, dataset: Any, augment: Augment, seed: int | None = None) -> None:
-        if not isinstance(dataset, IterableDataset):
-            raise ArgumentError(f"AugmentedStream: expected a stream, got {shown(dataset)}; use Augmented.")
-        self.dataset = dataset
-        self.augment, self.seed = _checked(augment, "AugmentedStream"), checked_seed("AugmentedStream", seed)
+        self.dataset, self.augment, self.seed = dataset, augment, checked_seed("AugmentedStream", seed)
 
     def __iter__(self) -> Iterator[Any]:
         epoch = int(getattr(self.dataset, "epoch", 0))
@@ -324,95 +290,44 @@ class AugmentedStream(IterableDataset[Any]):
         return getattr(self.dataset, name)
 
 
-def as_image(name: str, given: Any) -> Tensor:
-    """Convert an image of a sample to a tensor.
-
-    Args:
-        name: of the entry.
-        given: tensor (..., H, W), kept, or an array, copied.
-
-    Returns:
-        Tensor (..., H, W).
-
-    Raises:
-        ShapeError: for other things.
-    """
-    if isinstance(given, np.ndarray):
-        try:
-            given = tensor_in(given.copy())
-        except TypeError:
-            raise ShapeError(f"Augment: expected {name!r} as numbers, got an array of {given.dtype}.") from None
-    if not isinstance(given, Tensor) or given.ndim < 2:
-        got = tuple(given.shape) if isinstance(given, Tensor) else type(given).__name__
-        raise ShapeError(f"Augment: expected {name!r} as an image (..., H, W), got {got}.")
-    return given
+def _image(name: str, given: Any) -> Tensor:
+    """Image (..., H, W) as a tensor; arrays are copied."""
+    image: Tensor = tensor_in(given.copy()) if isinstance(given, np.ndarray) else given
+    if image.ndim < 2:
+        raise ShapeError(f"Augment: expected {name!r} as an image (..., H, W), got {tuple(image.shape)}.")
+    return image
 
 
-def size_of(images: Mapping[str, Tensor], known: Sequence[str]) -> tuple[int, int]:
-    """Return the height and width that all images share.
-
-    Args:
-        images: tensors (..., H, W) by name.
-        known: names of images, for the message.
-
-    Returns:
-        (height, width).
-
-    Raises:
-        SceneError: without images.
-        ShapeError: for several sizes.
-    """
+def _size_of(images: Mapping[str, Tensor]) -> tuple[int, int]:
+    """Height and width that all images share. Raises SceneError, ShapeError."""
     sizes = {name: (int(image.shape[-2]), int(image.shape[-1])) for name, image in images.items()}
     if not sizes:
-        raise SceneError(f"Augment: expected images among {', '.join(known)}, got none; name others in fields=.")
+        raise SceneError(f"Augment: expected images among {', '.join(KINDS)}, got none; name others in fields=.")
     if len(set(sizes.values())) > 1:
         raise ShapeError(f"Augment: expected images of one size, got {sizes}. Leave out those of other sizes.")
     return next(iter(sizes.values()))
 
 
-def check_unknown(name: str, given: Any, size: tuple[int, int]) -> None:
-    """Refuse an entry that might be an image: tensors, arrays, pictures and nested lists with two neighbouring
-    dimensions of the image's size, dictionaries and records that hold one.
-
-    Args:
-        name: of the entry.
-        given: its value.
-        size: (height, width).
-
-    Raises:
-        SceneError: for such an entry.
+def _check_unknown(name: str, given: Any, size: tuple[int, int]) -> None:
+    """Refuse an entry that might be an image: tensors and arrays with two neighbouring dimensions of the image's size,
+    mappings and lists that hold one.
     """
-    for shape in _shapes(given, _DEEPEST):
-        if any(shape[k : k + 2] == size for k in range(len(shape) - 1)):
-            raise SceneError(
-                f"Augment: {name!r} has the size of an image, {shape}, and nothing says what it is; give "
-                f'fields={{"{name}": "label"}}, "number", "light", "point", "direction" or "unchanged".'
-            )
-
-
-def _shapes(given: Any, deepest: int) -> Iterator[tuple[int, ...]]:
-    if deepest == 0 or given is None or isinstance(given, (str, bytes)):
-        return
-    if isinstance(given, Mapping):
-        inside: Any = given.values()
-    elif dataclasses.is_dataclass(given):
-        inside = vars(given).values() if hasattr(given, "__dict__") else ()
-    else:
-        inside = given if isinstance(given, (list, tuple)) else ()
-        yield _shape(given)
+    shape = tuple(getattr(given, "shape", ()))
+    if any(shape[k : k + 2] == size for k in range(len(shape) - 1)):
+        raise SceneError(
+            f"Augment: {name!r} has the size of an image, {shape}, and nothing says what it is; give "
+            f'fields={{"{name}": "label"}}, "number", "light", "point", "direction" or "unchanged".'
+        )
+    inside = given.values() if isinstance(given, Mapping) else given if isinstance(given, (list, tuple)) else ()
     for one in inside:
-        yield from _shapes(one, deepest - 1)
+        _check_unknown(name, one, size)
 
 
-def _shape(given: Any) -> tuple[int, ...]:
-    if isinstance(given, (list, tuple)) and any(isinstance(one, Tensor) for one in given):
-        return ()
-    try:
-        shape = given.shape if hasattr(given, "shape") else np.shape(given)
-        return tuple(int(one) for one in shape)
-    except (TypeError, ValueError, RuntimeError):
-        # Ragged lists and other objects.
-        return ()
+def _fill(name: str, kind: Kind, image: Tensor) -> float:
+    """Value beyond the rim."""
+    if image.dtype == torch.bool or (name == "measurement" and kind == "label"):
+        return 0
+    return -1 if kind == "number" else torch.nan
 
 
 def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tensor | None) -> Tensor:
@@ -464,27 +379,6 @@ def _across(rays: Tensor, up: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.linalg.cross(rays, up, dim=-3), dim=-3)
 
 
-def _checked_fields(fields: Any) -> dict[str, Kind]:
-    if fields is None:
-        return {}
-    if not isinstance(fields, Mapping):
-        raise ArgumentError(f'Augment: expected fields as a dictionary, {{"mask": "number"}}, got {shown(fields)}.')
-    for name, kind in fields.items():
-        if kind not in get_args(Kind):
-            raise ArgumentError(f"Augment: expected fields among {', '.join(get_args(Kind))}, got {shown(kind)}.")
-        if name in _NAMED:
-            raise ArgumentError(
-                f"Augment: {name!r} is no image: expected other names than {', '.join(_NAMED)} in fields."
-            )
-    return dict(fields)
-
-
-def _texts(what: str, given: Any) -> tuple[str, ...]:
-    if isinstance(given, str) or not isinstance(given, Sequence) or not all(isinstance(one, str) for one in given):
-        raise ArgumentError(f"Augment: expected {what} as a sequence of names, got {shown(given)}.")
-    return tuple(given)
-
-
 def _in_the_world(name: str, kind: Kind, image: Tensor, drawn: PixelMap, to_world: Tensor | None) -> Tensor:
     if image.ndim < 3 or image.shape[-3] != 3:
         raise ShapeError(f"Augment: expected {name!r} as (..., 3, H, W), got {tuple(image.shape)}.")
@@ -504,130 +398,3 @@ def _in_the_world(name: str, kind: Kind, image: Tensor, drawn: PixelMap, to_worl
     mirror = drawn.mirrored_world(to_world).to(image.device, image.dtype)
     moved = torch.matmul(mirror[..., :3, :3], image.flatten(-2)).reshape(image.shape)
     return moved if kind == "direction" else moved + mirror[..., :3, 3, None, None]
-
-
-def _checked(augment: Any, what: str) -> Augment:
-    if not isinstance(augment, Augment):
-        raise ArgumentError(f"{what}: expected an Augment, got {shown(augment)}.")
-    return augment
-
-
-# -------------------------------------------------------------------------------- values that stay true
-
-# By their keys alone: a stored sample has no plugins to ask. Tests compare these names with the table of parameters
-# (plugins/parameter_effect.py).
-# True in a mirror and for every camera, textures of surfaces too, which follow the coordinates `uv`.
-UNAFFECTED = frozenset(
-    (
-        "reflectance", "transmittance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
-        "base_color", "opacity", "weight", "quantum_yield", "elastic_fraction", "metallic", "spec_trans", "spec_tint",
-        "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "anisotropic", "flatness", "diff_trans", "specular",
-        "alpha", "alpha_u", "alpha_v", "roughness", "longitudinal_roughness", "azimuthal_roughness", "eumelanin",
-        "pheomelanin", "sigma_a", "eta", "k", "int_ior", "ext_ior", "material", "delta", "lifetime", "albedo",
-        "sigma_t", "scale", "g", "radiance", "intensity", "irradiance", "energy", "sky_scale", "sun_scale", "turbidity",
-        "temperature", "wavelengths", "cutoff_angle", "beam_width", "radius", "aperture_radius", "focus_distance",
-        "near_clip", "far_clip", "share",
-    )
-)  # fmt: skip
-# Textures of projectors, in the projector's frame.
-_THROWN = frozenset(("intensity", "irradiance", "energy"))
-# Of the world: false in a mirror, true for another camera.
-OF_THE_WORLD = frozenset(
-    (
-        "position", "positions", "direction", "center", "linear", "angular", "p0", "p1", "control_points", "data",
-        "grid", "extent",
-        "opacities", "value", "values", "sun_direction", "theta", "left_handed", "normalmap", "nested_texture",
-        "texture", "S", "to_uv", "filename", "bsdf", "scale_tilt", "volume", "color0", "color1", "latitude",
-        "longitude", "timezone", "year", "month", "day", "hour", "minute", "second", *VERTEX_COLUMNS, *_THROWN,
-    )
-)  # fmt: skip
-# Of cameras and of other objects.
-POSES = frozenset(("to_world", "origin", "target", "up"))
-ANGLES_OF_VIEW = frozenset(("x_fov", "fov", "focal_length"))
-PRINCIPAL_POINT = frozenset(("principal_point_offset_x", "principal_point_offset_y"))
-# Arguments of the stages of a device without pixels and directions.
-OF_DEVICES = frozenset(
-    (
-        "probability", "tau_s", "dead_time_s", "period_s", "frames", "depth", "cycles", "kind", "gate", "delays_s",
-        "widths_s", "rise_s", "fall_s", "leakage", "electrons_per_unit", "fwhm_s", "delay_s", "width_s", "tails_s",
-        "fractions", "frequencies_hz", "contrast", "background_e", "floor", "pulse_energy_j", "wavelength_m",
-        "repetition_rate_hz", "exposure_s", "quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz",
-        "full_well_e", "read_noise_e", "ktc_noise_e", "excess_noise", "dark_e", "gain_e_per_dn", "bits",
-        "black_level_dn", "shot_noise", "signed", "time_fwhm_s", "jitter_fwhm_s", "sweeps", "dnl_std", "offset_bins",
-        "f_number", "filter_bandwidth_m", "spectral_irradiance_w_m2_nm",
-        "light_duty", "transmission", "pixel_area_m2", "solid_angle_sr", "gate_duty", "extinction_ratio",
-        "spads", "coincidence", "photons_per_unit", "looks", "window_s", "exponent", "longest_s", "counted_from",
-        "background", "bandwidth_hz", "duration_s",
-    )
-)  # fmt: skip
-# Those that may be maps of pixels.
-_MAPS_OF_DEVICES = frozenset(("quantum_efficiency", "ambient_rate_hz", "dark_count_rate_hz", "delay_s", "background"))
-# Last parts of the keys of textures, spectra and volumes.
-_LEAVES = frozenset(("value", "values", "data", "color0", "color1"))
-
-
-def check_values(values: Any, drawn: PixelMap, cameras: Sequence[str], kept: Sequence[str]) -> None:
-    """Check that a map leaves the values of a sample true.
-
-    Args:
-        values: by key, or None.
-        drawn: map of the pixels.
-        cameras: names of the camera in keys, () for unknown.
-        kept: keys that are known to stay true.
-
-    Raises:
-        SceneError: for a value that becomes false, or is not known to stay true.
-    """
-    if values is None:
-        return
-    if not isinstance(values, Mapping):
-        raise SceneError(f"Augment: expected values as a dictionary by key, got {shown(values)}.")
-    for key, value in values.items():
-        is_map = str(key).split(".")[-1] in _MAPS_OF_DEVICES and getattr(value, "ndim", 0) >= 2
-        if key not in kept and (is_map or not stays_true(str(key), drawn, cameras)):
-            named = "" if cameras else ', say what the camera is called, sensor="sensor",'
-            raise SceneError(
-                f"Augment: the value {key!r} is not true of the augmented sample, or is not known to be. Read the "
-                f"data set without values, TransientDataset(..., fields=[...]){named} or name it in kept_values= if "
-                "it stays true."
-            )
-
-
-def stays_true(key: str, drawn: PixelMap, cameras: Sequence[str]) -> bool:
-    """Return True for a value that is known to stay true.
-
-    Args:
-        key: of the value.
-        drawn: map of the pixels.
-        cameras: names of the camera in keys.
-
-    Returns:
-        Truth value.
-    """
-    parts = key.split(".")
-    if len(parts) < 2:
-        # A scene, a scan, a whole node, a $name.
-        return False
-    last, name = parts[-1], _slot(parts)
-    if parts[0] == "device":
-        return len(parts) > 2 and last in OF_DEVICES
-    if last in ANGLES_OF_VIEW or last in PRINCIPAL_POINT:
-        return not (drawn.changes_scale if last in ANGLES_OF_VIEW else drawn.changes_intrinsics)
-    if name in UNAFFECTED and not (last == "data" and name in _THROWN):
-        return True
-    if any(key.startswith(f"{camera}.") for camera in cameras):
-        return last == "to_world" and not drawn.turns
-    if drawn.mirror is not None:
-        return False
-    if last in POSES:
-        return bool(cameras) or not drawn.turns
-    return name in OF_THE_WORLD or (bool(cameras) and "film" not in parts)
-
-
-def _slot(parts: Sequence[str]) -> str:
-    """Name of the texture, spectrum or volume that a key's number belongs to, else the last part."""
-    end = len(parts)
-    # The first part is a name of the scene.
-    while end > 2 and parts[end - 1] in _LEAVES:
-        end -= 1
-    return parts[end - 1]

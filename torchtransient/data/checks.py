@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from torchtransient.checks import count
 from torchtransient.data.distributions import POSE, Choice, Draw, Extreme, Fixed, Stream
-from torchtransient.data.maker import Kept, Maker
+from torchtransient.data.maker import Kept, Maker, check_film
 from torchtransient.data.run_settings import bytes_text
 from torchtransient.data.sample import OutsideLight, Sample
 from torchtransient.data.specification import Specification, Structure
@@ -55,11 +55,10 @@ def check_recipe(recipe: Specification, maker: Maker) -> None:
         SceneError: and ShapeError, UnitError and other errors of this library for a recipe that cannot be rendered.
     """
     _warn_of_many_scenes(recipe)
-    expected = maker.measures()
     named: dict[str, dict[str, list[str]]] = {}
     for structure, indices in structures_of(recipe, range(SAMPLES)):
         kept = maker.kept(structure)
-        kept.measures.check(expected, f"structure '{structure.text}'", "sample 0")
+        check_film(kept.film, maker.film, f"structure '{structure.text}'", "sample 0")
         kept.check_labels()
         _check_names(named.setdefault(structure.name, kept.named()), kept)
         draws = list(_draws(recipe, kept, indices))
@@ -88,7 +87,7 @@ def light_outside(recipe: Specification, maker: Maker, progress: bool = False) -
     """
     shares: list[tuple[float, float]] = []
     failed: list[str] = []
-    found = structures_of(recipe, range(SAMPLES)) if maker.measures().axis is not None else []
+    found = structures_of(recipe, range(SAMPLES)) if maker.film["axis"] is not None else []
     pairs = [(structure, index) for structure, indices in found for index in indices]
     for structure, index in with_bar(pairs, "check", progress):
         # A sample that raises is a failed one of the data set, not a wrong recipe.

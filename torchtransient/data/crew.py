@@ -10,10 +10,10 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
 
 from torchtransient.data.processes import WorkerError
@@ -93,9 +93,6 @@ class Crew(ABC, Generic[AnyMember]):
         self._polled = time.monotonic()
         self._measured: Measured | None = None
 
-    # Advice where workers do not start.
-    hint = ""
-
     @abstractmethod
     def start(self) -> AnyMember:
         """Start a worker."""
@@ -116,9 +113,7 @@ class Crew(ABC, Generic[AnyMember]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *raised: object) -> None:
         self.close(kind is not None)
 
     def measure(self, indices: range) -> Measured:
@@ -133,7 +128,7 @@ class Crew(ABC, Generic[AnyMember]):
         Raises:
             TorchTransientError: without a measurement, or as :meth:`receive`.
         """
-        self.ledger.add([MEASURING])
+        self.ledger.waiting.append(MEASURING)
         self._run(lambda shard: ("measure", indices, self.ledger.skip(shard)))
         if self._measured is None:
             raise TorchTransientError("generate: no sample was measured.")
@@ -149,8 +144,8 @@ class Crew(ABC, Generic[AnyMember]):
         Raises:
             TorchTransientError: where workers die without end, or the error of a worker.
         """
-        self.ledger.add(shards)
         ledger = self.ledger
+        ledger.waiting.extend(shards)
         self._run(lambda shard: ("shard", shard, described, ledger.skip(shard), ledger.suspects(shard)))
 
     def _run(self, task: Callable[[int], tuple[Any, ...]]) -> None:
@@ -183,7 +178,10 @@ class Crew(ABC, Generic[AnyMember]):
         if not worker.ready:
             self._starts += 1
             if for_good or self._starts >= MOST_STARTS:
-                raise TorchTransientError(f"generate: a worker ended {reason} while it started. {self.hint}")
+                raise TorchTransientError(
+                    f"generate: a worker ended {reason} while it started. Its own output stands above. Workers import "
+                    "a script that calls generate: put the call under if __name__ == '__main__'."
+                )
         self.ledger.lost(worker.shard, worker.sample, reason, own_fault)
 
     def _end_hung(self) -> None:
@@ -195,13 +193,9 @@ class Crew(ABC, Generic[AnyMember]):
             if away:
                 worker.last_message = now
             silent = now - worker.last_message
-            limit = self._limit(worker) if worker.ready else self.patience_to_start()
+            limit = self._limit(worker) if worker.ready else PATIENCE_S
             if (worker.shard is not None or not worker.ready) and silent > limit:
                 self.remove(worker, f"by no sign of life for {silent:.0f} s", own_fault=True)
-
-    def patience_to_start(self) -> float:
-        """Return the seconds until a worker has to be ready."""
-        return PATIENCE_S
 
     def _limit(self, worker: AnyMember) -> float:
         if worker.sample is None:
@@ -217,7 +211,7 @@ class Crew(ABC, Generic[AnyMember]):
 
         Args:
             worker: its sender.
-            kind: first word, see ``Messages``, and "ready", "measured", "wrote", "fatal".
+            kind: first word, see ``ShardMaker``, and "ready", "measured", "wrote", "fatal".
             facts: its other entries.
 
         Raises:
@@ -274,33 +268,23 @@ class RunLog:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._handle: int | None = None
-        with contextlib.suppress(OSError):
-            self._handle = os.open(folder / LOG_FILE, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
-            size = os.fstat(self._handle).st_size
+        self._path = folder / LOG_FILE
+        with contextlib.suppress(OSError), self._path.open("ab+") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 1))
             # A killed run may have left a part of a line.
-            if size and os.pread(self._handle, 1, size - 1) != b"\n":
-                os.write(self._handle, b"\n")
+            if size and file.read() != b"\n":
+                file.write(b"\n")
 
     def __call__(self, event: str, **facts: Any) -> None:
-        if self._handle is None:
-            return
-        now = time.time()
-        stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now)) + f".{int(now * 1000) % 1000:03d}Z"
+        stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
         line = json.dumps({"time": stamp, "event": event, "run": os.getpid(), **facts}, default=str) + "\n"
-        with contextlib.suppress(OSError):
-            os.write(self._handle, line.encode())
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._handle is not None:
-            os.close(self._handle)
-            self._handle = None
+        with contextlib.suppress(OSError), self._path.open("ab") as file:
+            file.write(line.encode())
 
 
 class SampleBar:
-    """Progress bar over samples, with numbers of failures and of replaced workers. tqdm is imported where the bar is
-    shown.
+    """Progress bar over samples, with numbers of failures and of replaced workers.
 
     Args:
         total: samples.
@@ -309,12 +293,12 @@ class SampleBar:
     """
 
     def __init__(self, total: int, done: int, shown: bool) -> None:
-        self._bar: Any = None
-        self.failed = self.restarts = 0
-        if shown:
-            from tqdm.auto import tqdm
+        from tqdm.auto import tqdm
 
-            self._bar = tqdm(total=total, initial=done, desc="samples", unit="sample", dynamic_ncols=True)
+        self.failed = self.restarts = 0
+        self._bar: Any = tqdm(
+            total=total, initial=done, desc="samples", unit="sample", dynamic_ncols=True, disable=not shown
+        )
 
     def __call__(self, samples: int, failed: int = 0, restarts: int = 0) -> None:
         """Move the bar.
@@ -326,34 +310,16 @@ class SampleBar:
         """
         self.failed += failed
         self.restarts += restarts
-        if self._bar is None:
-            return
-        try:
+        # The terminal may be closed; the run goes on.
+        with contextlib.suppress(OSError, ValueError):
             if failed or restarts:
                 self._bar.set_postfix({"failed": self.failed, "restarts": self.restarts}, refresh=False)
             self._bar.update(samples)
-        except (OSError, ValueError):
-            # The terminal is closed; the run goes on.
-            self._bar = None
 
     def close(self) -> None:
         """End the bar."""
-        if self._bar is not None:
-            with contextlib.suppress(OSError, ValueError):
-                self._bar.close()
-
-
-@dataclass
-class UnderWay:
-    """Shard in work.
-
-    Args:
-        ended: samples that are done.
-        failed: failures among them.
-    """
-
-    ended: int = 0
-    failed: int = 0
+        with contextlib.suppress(OSError, ValueError):
+            self._bar.close()
 
 
 @dataclass
@@ -386,26 +352,16 @@ class Ledger:
     bytes: int = 0
     restarts: int = 0
     shards: int = 0
-    _under_way: dict[int, UnderWay] = field(default_factory=dict)
+    # Samples of shards in work, and failures among them.
+    _ended: Counter[int] = field(default_factory=Counter)
+    _failed: Counter[int] = field(default_factory=Counter)
     _blame: Counter[tuple[int, int]] = field(default_factory=Counter)
     _deaths: Counter[int] = field(default_factory=Counter)
     _in_a_row: int = 0
 
-    def add(self, shards: Iterable[int]) -> None:
-        """Add shards.
-
-        Args:
-            shards: their numbers.
-        """
-        self.waiting.extend(shards)
-
     def take(self) -> int | None:
         """Take the next shard, None where there is none."""
-        if not self.waiting:
-            return None
-        shard = self.waiting.popleft()
-        self._under_way[shard] = UnderWay()
-        return shard
+        return self.waiting.popleft() if self.waiting else None
 
     def skip(self, shard: int) -> dict[int, str]:
         """Return the samples of a shard that are given up, with the reason.
@@ -443,9 +399,8 @@ class Ledger:
         self._blame.pop((shard, index), None)
         if shard == MEASURING:
             return
-        now = self._under_way.setdefault(shard, UnderWay())
-        now.ended += 1
-        now.failed += failed is not None
+        self._ended[shard] += 1
+        self._failed[shard] += failed is not None
         self.bar(1, failed=int(failed is not None))
         if failed is not None:
             self.log("failed", shard=shard, sample=index, reason=failed)
@@ -459,8 +414,8 @@ class Ledger:
             failed: among them.
             size: bytes of the file.
         """
-        self._under_way.pop(shard, None)
-        self._deaths.pop(shard, None)
+        for counted in (self._ended, self._failed, self._deaths):
+            counted.pop(shard, None)
         self.samples += samples - failed
         self.failed += failed
         self.bytes += size
@@ -481,10 +436,11 @@ class Ledger:
         """
         self.restarts += 1
         self.log("death", shard=shard, sample=index, how=reason)
-        now = self._under_way.pop(shard, UnderWay()) if shard is not None else UnderWay()
-        self.bar(-now.ended, failed=-now.failed, restarts=1)
         self._in_a_row += 1
-        if shard is not None:
+        if shard is None:
+            self.bar(0, restarts=1)
+        else:
+            self.bar(-self._ended.pop(shard, 0), failed=-self._failed.pop(shard, 0), restarts=1)
             self.waiting.appendleft(shard)
             self._deaths[shard] += 1
             if index is not None:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchtransient.checks import Numbers, as_number, flag, index, positive, real_array, shown, transform
+from torchtransient.checks import Numbers, finite, numbers, positive, real_array, shown, transform
 from torchtransient.errors import SceneError, ShapeError, UnitError
 
 # Seeds of renders, as Mitsuba takes them.
@@ -266,9 +266,6 @@ def bounds(who: str, low: Any, high: Any, *, least: float = -np.inf) -> tuple[An
         raise ShapeError(
             f"{who}: expected low and high of one shape, got {first.shape} and {second.shape}."
         ) from None
-    with np.errstate(over="ignore"):
-        if not np.isfinite(second - first).all():
-            raise UnitError(f"{who}: between low={shown(low)} and high={shown(high)} lies more than floats hold.")
     if wrong.any():
         raise UnitError(f"{who}: expected low <= high, got low={shown(low)} and high={shown(high)}.")
     if (first < least).any():
@@ -276,7 +273,7 @@ def bounds(who: str, low: Any, high: Any, *, least: float = -np.inf) -> tuple[An
     return first.tolist(), second.tolist()
 
 
-def spread(who: str, place: Place, random: Draw, same: bool, *numbers: Any) -> tuple[NDArray[np.float64], ...]:
+def spread(who: str, place: Place, random: Draw, same: bool, *values: Any) -> tuple[NDArray[np.float64], ...]:
     """Draw numbers of a place's shape.
 
     Args:
@@ -284,15 +281,15 @@ def spread(who: str, place: Place, random: Draw, same: bool, *numbers: Any) -> t
         place: for which they are drawn.
         random: source of numbers.
         same: one number for all entries.
-        numbers: arrays that are broadcast to the shape.
+        values: arrays that are broadcast to the shape.
 
     Returns:
-        Numbers in [0, 1), and ``numbers`` as float64 arrays.
+        Numbers in [0, 1), and ``values`` as float64 arrays.
 
     Raises:
         ShapeError: for arrays that do not fit.
     """
-    arrays = [np.asarray(number, dtype=np.float64) for number in numbers]
+    arrays = [np.asarray(value, dtype=np.float64) for value in values]
     shape = np.broadcast_shapes(*(array.shape for array in arrays)) if place.kind == ANYTHING else place.shape
     for array in arrays:
         try:
@@ -339,8 +336,8 @@ class Uniform(Distribution):
     same: bool = False
 
     def __post_init__(self) -> None:
-        low, high = bounds("Uniform", self.low, self.high)
-        self._keep(low=low, high=high, same=flag("Uniform: same", self.same))
+        low, high = bounds(type(self).__name__, self.low, self.high)
+        self._keep(low=low, high=high)
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -358,7 +355,7 @@ class Uniform(Distribution):
 
 
 @dataclass(frozen=True, eq=False)
-class LogUniform(Distribution):
+class LogUniform(Uniform):
     """Even distribution of the logarithm, for numbers of unknown size (extinctions, intensities).
 
     Args:
@@ -371,17 +368,11 @@ class LogUniform(Distribution):
     """
 
     name: ClassVar[str] = "log_uniform"
-    short: ClassVar[tuple[str, ...]] = ("low", "high")
-
-    low: Any
-    high: Any
-    same: bool = False
 
     def __post_init__(self) -> None:
-        low, high = bounds("LogUniform", self.low, self.high)
-        if (np.asarray(low) <= 0).any():
+        super().__post_init__()
+        if (np.asarray(self.low) <= 0).any():
             raise UnitError(f"LogUniform: expected low greater than zero, got {shown(self.low)}. Use Uniform.")
-        self._keep(low=low, high=high, same=flag("LogUniform: same", self.same))
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -426,29 +417,20 @@ class Normal(Distribution):
     same: bool = False
 
     def __post_init__(self) -> None:
-        flag("Normal: same", self.same)
-        for name, least in (("mean", -math.inf), ("std", 0.0)):
-            given = getattr(self, name)
-            array = real_array(given)
-            if array is None or not np.isfinite(array).all() or (array < least).any():
-                wanted = "finite numbers" if name == "mean" else "finite numbers of at least 0"
-                raise UnitError(f"Normal: expected {name} as {wanted}, got {shown(given)}.")
-            self._keep(**{name: array.tolist()})
+        mean, std = numbers("Normal: mean", self.mean), numbers("Normal: std", self.std)
+        if not (np.isfinite(mean).all() and np.isfinite(std).all() and (std >= 0).all()):
+            raise UnitError(
+                f"Normal: expected mean and std as finite numbers, std of at least 0, got {shown(self.mean)} and "
+                f"{shown(self.std)}."
+            )
+        self._keep(mean=mean.tolist(), std=std.tolist())
         for name in ("low", "high"):
-            given = getattr(self, name)
-            number = None if given is None else as_number(given)
-            if given is not None and (number is None or math.isnan(number)):
-                raise UnitError(f"Normal: expected {name} as a number or None, got {shown(given)}.")
+            end = getattr(self, name)
             # An end at infinity is none.
-            self._keep(**{name: number if number is not None and math.isfinite(number) else None})
-        low, high = self._ends()
-        means, stds = np.broadcast_arrays(np.asarray(self.mean, np.float64), np.asarray(self.std, np.float64))
-        if ((stds == 0) & ((means < low) | (means > high))).any():
-            raise UnitError(f"Normal: the mean {shown(self.mean)} is outside of [{low:g}, {high:g}], and std is 0.")
-        if low > high:
-            raise UnitError(f"Normal: expected low <= high, got {low:g} and {high:g}.")
-        first, last = self._shares(np.asarray(self.mean, np.float64), np.asarray(self.std, np.float64))
-        if ((last - first < _LEAST_MASS) & (np.asarray(self.std) > 0)).any():
+            self._keep(**{name: None if end is None or math.isinf(end) else finite(f"Normal: {name}", end)})
+        first, last = self._shares(mean, std)
+        if (last - first < _LEAST_MASS).any():
+            low, high = self._ends()
             raise UnitError(
                 f"Normal: next to nothing of the distribution lies between low={low:g} and high={high:g}, at a mean of "
                 f"{shown(self.mean)} and a deviation of {shown(self.std)}. Use Uniform, or move the ends."
@@ -509,7 +491,7 @@ class Scale(Distribution):
 
     def __post_init__(self) -> None:
         low, high = bounds("Scale", self.low, self.high, least=0.0)
-        self._keep(low=low, high=high, same=flag("Scale: same", self.same))
+        self._keep(low=low, high=high)
 
     def draw(self, random: Draw, place: Place) -> NDArray[np.float64]:
         """Draw a value.
@@ -563,7 +545,6 @@ class Choice(Distribution):
         Returns:
             The number.
         """
-        number = index("Choice.share: number", number, len(self.values))
         weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=np.float64)
         return float((weights[:number].sum() + weights[number] / 2) / weights.sum())
 

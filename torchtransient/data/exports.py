@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchtransient.array_files.array_file import check_source, damage_said, path_of
 from torchtransient.array_files.hdf5 import check_memory
 from torchtransient.array_files.part_files import whole_file, writing_said
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import positive, shown
+from torchtransient.checks import shown
 from torchtransient.data.sample import outside_tensor
 from torchtransient.data.serialization import read_frequencies
 from torchtransient.data.shard_format import COUNTED, measured_names
@@ -32,17 +31,17 @@ from torchtransient.rendering.progress import with_bar
 
 _WHAT = "WebDataset"
 _LEVEL = 3
+_TAR_BYTES = 256e6
 _NPY, _PACKED, _JSON = ".npy", ".npy.zst", "sample.json"
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _TAL = "TAL export"
 # Arrays that captures can hold.
 _MEASURED = ("transient", "phasor", "measurement")
 
 
 def export_web_dataset(
-    where: Any, folder: str | Path, *, megabytes: float = 256, progress: bool = True, **reading: Any
-) -> list[Path]:
-    """Write the samples of shards as ``samples-000000.tar``, ...
+    where: Any, folder: str | Path, *, progress: bool = True, **reading: Any
+) -> list[Path]:  # fmt: skip
+    """Write the samples of shards as ``samples-000000.tar``, ..., of about 256 MB each.
 
     ``about.json`` beside them has the description of the render and the time axis of what was written. Counts keep the
     type that they are stored in. A tar appears once it is whole; those that are there are replaced.
@@ -50,7 +49,6 @@ def export_web_dataset(
     Args:
         where: as of :class:`~torchtransient.data.TransientDataset`.
         folder: that exists.
-        megabytes: of a tar, about.
         progress: show a bar.
         reading: other arguments of :class:`~torchtransient.data.TransientDataset`, windows and transforms too.
 
@@ -61,7 +59,6 @@ def export_web_dataset(
         StorageError: as the data set, for a missing folder and a full disk.
         MissingPackageError: without the package zstandard.
     """
-    limit = positive(f"{_WHAT}: megabytes", megabytes) * 1e6
     place = path_of(folder, _WHAT)
     if not place.is_dir():
         raise StorageError(f"{_WHAT}: expected a folder to write to, got '{place}'. Create it first.")
@@ -78,7 +75,7 @@ def export_web_dataset(
             writing_said(target, _WHAT),
             tarfile.open(unfinished, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
-            while left and tar.offset < limit:
+            while left and tar.offset < _TAR_BYTES:
                 _add(tar, data[next(numbers)], compressor, measured)
                 left -= 1
         written.append(target)
@@ -111,7 +108,8 @@ def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) ->
             if suffix is None:
                 raise StorageError(f"{_WHAT}: expected members that end in {_NPY}, {_PACKED} or {_JSON}, got {ending}.")
             name = ending.removesuffix(suffix)
-            array = _array(_unpacked(members[ending]) if suffix == _PACKED else members[ending], name)
+            content = _unpacked(members[ending]) if suffix == _PACKED else members[ending]
+            array = np.load(io.BytesIO(content), allow_pickle=False)
             counts = name == COUNTED and array.dtype.kind == "u" and not as_stored
             found[name] = torch.from_numpy(array.astype(np.float32) if counts else array)
     return found
@@ -230,7 +228,7 @@ def _values(content: bytes) -> dict[str, Any]:
     plain = json.loads(content)
     dtypes = plain["dtypes"]
     values = {
-        name: value if name not in dtypes else torch.from_numpy(np.array(value, _number_type(dtypes[name])))
+        name: value if name not in dtypes else torch.from_numpy(np.array(value, dtypes[name]))
         for name, value in plain["values"].items()
     }
     # Tars of earlier versions have no shares.
@@ -238,36 +236,14 @@ def _values(content: bytes) -> dict[str, Any]:
     return {"index": int(plain["index"]), **outside, **({"values": values} if values else {})}
 
 
-def _number_type(name: str) -> np.dtype[Any]:
-    dtype = np.dtype(name)
-    if dtype.kind not in "biufc":
-        raise ValueError(f"expected a type of numbers, got {name}")
-    return dtype
-
-
 def _unpacked(content: bytes) -> bytes:
     zstandard = _zstandard()
     try:
-        size = zstandard.get_frame_parameters(content).content_size
-        if size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR):
-            raise ValueError("its size is not known")
-        check_memory(size, _WHAT)
-        found: bytes = zstandard.ZstdDecompressor().decompress(content, max_output_size=size)
+        check_memory(zstandard.get_frame_parameters(content).content_size, _WHAT)
+        found: bytes = zstandard.ZstdDecompressor().decompress(content)
     except zstandard.ZstdError as error:
         raise ValueError(str(error)) from error
     return found
-
-
-def _array(content: bytes, name: str) -> NDArray[Any]:
-    """An array of a `.npy`, in memory that may be written to, which no header makes larger than its bytes."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"'{name}' is an array of version {version}")
-    shape, fortran, dtype = _HEADERS[version](stream)
-    if dtype.kind not in "biufc" or fortran:
-        raise ValueError(f"'{name}' is an array of {dtype}")
-    return np.frombuffer(bytearray(memoryview(content)[stream.tell() :]), dtype).reshape(shape)
 
 
 @contextmanager

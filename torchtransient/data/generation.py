@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import multiprocessing
-import os
-import pickle
 import platform
 import time
 import warnings
@@ -14,9 +12,12 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
-from torchtransient.array_files.part_files import check_system
-from torchtransient.checks import a_recipe, as_number, count, is_one_of, shown
+from torchtransient.array_files.hdf5 import hdf5_package
+from torchtransient.array_files.part_files import check_system, sweep_parts
+from torchtransient.checks import a_recipe, count, is_one_of, path_of, positive, shown
 from torchtransient.data.crew import Ledger, RunLog, SampleBar
+from torchtransient.data.engines import InProcessCrew, Supervisor, make_on_ray, ray_package
+from torchtransient.data.manifest import build_manifest, fault_of, named_shards, shards_of
 from torchtransient.data.processes import registered_plugins
 from torchtransient.data.run_settings import (
     MANIFEST_FILE,
@@ -34,6 +35,8 @@ from torchtransient.data.run_settings import (
     shard_header,
     write_description,
 )
+from torchtransient.data.shard_format import check_compression, check_store
+from torchtransient.data.shards import Shard
 from torchtransient.errors import ArgumentError, SceneError, StorageError, TorchTransientError, UnitError, level_of_user
 
 ENGINES = ("local", "ray")
@@ -122,7 +125,8 @@ def generate(
         store: "exact", "rounded" or "counts", see :class:`ShardWriter`.
         compression: "blosc2", "gzip" or "none".
         resume: False raises where the folder has a data set.
-        engine: "local" (processes) or "ray" (actors on a cluster whose machines all see ``folder``).
+        engine: "local" (processes) or "ray" (tasks on a cluster whose machines all see ``folder``; each makes an even
+            share of the shards).
         shard: (i, k) makes every k-th shard from the i-th on: k machines that see one folder divide the work.
         per_shard: samples in a file; by default 64 to 256 MB before compression, and 64 files at least.
         timeout_s: seconds for one sample, the compilation of a new scene included; by default 30 times the slowest so
@@ -145,15 +149,16 @@ def generate(
     start = time.monotonic()
     check_system(_WHAT)
     _check_process()
-    _check_recipe(recipe, folder)
+    a_recipe(_WHAT, recipe, "maker", "key", "to_dict")
     n = getattr(recipe, "n", None) if n is None else n
     if n is None:
         raise ArgumentError(f"{_WHAT}: neither the call nor the recipe says how many samples. Give n=.")
     n, retries = _whole("n", n, 1), _whole("retries", retries, 0)
     workers = _whole("workers", workers, int(is_one_of(engine, ("ray",))))
     per_shard = None if per_shard is None else _whole("per_shard", per_shard, 1)
-    shard = None if shard is None else _whole_pair(shard)
-    _check_timeout(timeout_s)
+    timeout_s = None if timeout_s is None else positive(f"{_WHAT}: timeout_s", timeout_s)
+    if shard is not None and not 0 <= shard[0] < shard[1]:
+        raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
     _check_choices(store, compression, engine, address, recipe)
     place = _folder(folder)
     settings = RunSettings(recipe, str(place), n, store, compression, retries, registered_plugins())
@@ -167,7 +172,7 @@ def generate(
     log("begin", n=n, workers=workers, engine=engine, shard=shard, host=platform.node())
     kept = 0
     try:
-        with _engine(engine, settings, workers, ledger, timeout_s, address) as crew:
+        with (Supervisor if workers else InProcessCrew)(settings, workers, ledger, timeout_s) as crew:
             if found is None:
                 found = _begin(crew, settings, per_shard, wanted)
             plan = Plan(n, found["per_shard"])
@@ -175,8 +180,17 @@ def generate(
             left, kept = _survey(place, settings, found, share, log)
             total = sum(len(plan.indices(k)) for k in share)
             ledger.bar = SampleBar(total, total - sum(len(plan.indices(k)) for k in left), shown=progress)
-            crew.make(left, found)
-        _check_made(place, left, engine)
+            if engine == "local":
+                crew.make(left, found)
+            else:
+                crew.close(stopped=False)
+                call = {
+                    "recipe": recipe, "folder": place, "n": n, "store": store, "compression": compression,
+                    "per_shard": plan.per_shard, "timeout_s": timeout_s, "retries": retries,
+                }  # fmt: skip
+                first, step, tasks = *(shard or (0, 1)), min(workers, len(left))
+                calls = [{**call, "shard": (first + step * task, step * tasks)} for task in range(tasks)]
+                _make_on_ray(calls, address, place, left, ledger)
         _write_manifest(place)
     except BaseException as error:
         log("stopped", error=f"{type(error).__name__}: {error}")
@@ -185,7 +199,6 @@ def generate(
         log("end", seconds=round(time.monotonic() - start, 3), **ledger.totals())
     finally:
         ledger.bar.close()
-        log.close()
         _sweep(place)
     done = ledger.totals()
     return Generated(place, kept=kept, seconds=time.monotonic() - start, **done)
@@ -207,8 +220,6 @@ def _begin(crew: Any, settings: RunSettings, per_shard: int | None, wanted: dict
 
 def _there(place: Path, wanted: dict[str, Any], resume: bool) -> dict[str, Any] | None:
     """Description in the folder, checked; None for a new folder."""
-    from torchtransient.data.shards import Shard
-
     found = read_description(place)
     first = next(iter(sorted(place.glob(SHARD_FILES))), None)
     if not resume and (found is not None or first is not None):
@@ -232,9 +243,6 @@ def _survey(
     """Shards that are missing or damaged, and the number of samples in the others. Raises StorageError for shards of
     another data set.
     """
-    from torchtransient.data.manifest import fault_of, named_shards
-    from torchtransient.data.shards import Shard
-
     left, kept, named = [], 0, named_shards(place)
     for number in share:
         path = place / shard_file_name(number)
@@ -277,20 +285,35 @@ def _fault_of_header(header: dict[str, Any], expected: dict[str, Any], path: Pat
     return None
 
 
-def _check_made(place: Path, made: list[int], engine: str) -> None:
-    missing = next((k for k in made if not (place / shard_file_name(k)).exists()), None)
-    if missing is not None:
-        more = " All machines of the cluster have to see this folder under this name." if engine == "ray" else ""
-        path = place / shard_file_name(missing)
-        raise StorageError(f"{_WHAT}: shard {missing} was written, and '{path}' is not there.{more}")
+def _make_on_ray(
+    calls: list[dict[str, Any]], address: str | None, place: Path, left: list[int], ledger: Ledger
+) -> None:
+    """Make shards by tasks of Ray, and add up what they hold."""
+    waiting = {number: place / shard_file_name(number) for number in left}
+    for damaged in waiting.values():
+        damaged.unlink(missing_ok=True)
+
+    def add_up() -> None:
+        for number, path in list(waiting.items()):
+            if path.exists():
+                with Shard(path) as made:
+                    samples, failed = len(made.index), len(made.failed)
+                ledger.bar(samples + failed, failed=failed)
+                ledger.wrote(number, samples + failed, failed, path.stat().st_size)
+                del waiting[number]
+
+    ledger.restarts += make_on_ray(generate, calls, address, add_up)
+    if waiting:
+        raise StorageError(
+            f"{_WHAT}: shard {min(waiting)} was made, and is not in '{place}'. All machines of the cluster have to see "
+            "this folder under this name."
+        )
 
 
 def _write_manifest(place: Path) -> None:
     """Write the manifest, again where another run on this folder has finished shards meanwhile: the last run to look
     has seen all. Shards of other runs that ``verify`` found damaged are left out.
     """
-    from torchtransient.data.manifest import build_manifest, fault_of, manifest_of, named_shards, shards_of
-
     named, damaged = named_shards(place), set[str]()
     if (place / MANIFEST_FILE).exists():
         written = (place / MANIFEST_FILE).stat().st_mtime_ns
@@ -300,25 +323,11 @@ def _write_manifest(place: Path) -> None:
     seen: set[str] | None = None
     while (now := {path.name for path in place.glob(SHARD_FILES)}) != seen:
         seen = now
-        if now & damaged:
-            manifest_of(place, [path for path in shards_of(place) if path.name in now - damaged])
-        elif now:
-            build_manifest(place)
-
-
-def _engine(
-    name: str, settings: RunSettings, workers: int, ledger: Ledger, timeout_s: float | None, address: str | None
-) -> Any:
-    from torchtransient.data.engines import InProcessCrew, RayCrew, Supervisor
-
-    if name == "ray":
-        return RayCrew(settings, workers, ledger, timeout_s, address)
-    return (Supervisor if workers else InProcessCrew)(settings, workers, ledger, timeout_s)
+        if now - damaged:
+            build_manifest(place, damaged)
 
 
 def _sweep(place: Path) -> None:
-    from torchtransient.array_files.part_files import sweep_parts
-
     with contextlib.suppress(OSError):
         sweep_parts(place)
 
@@ -337,54 +346,24 @@ def _whole(name: str, value: Any, least: int) -> int:
     return count(f"{_WHAT}: {name}", value, least, UnitError)
 
 
-def _whole_pair(shard: Any) -> tuple[int, int]:
-    pair = shard if isinstance(shard, tuple | list) and len(shard) == 2 else (None, None)
-    with contextlib.suppress(UnitError):
-        part, parts = _whole("shard", pair[0], 0), _whole("shard", pair[1], 1)
-        if part < parts:
-            return part, parts
-    raise UnitError(f"{_WHAT}: expected shard=(i, k) with 0 <= i < k, got {shown(shard)}.")
-
-
-def _check_timeout(timeout_s: Any) -> None:
-    number = as_number(timeout_s)
-    if timeout_s is not None and (number is None or not number > 0):
-        raise UnitError(f"{_WHAT}: expected timeout_s to be a number above 0, or None, got {shown(timeout_s)}.")
-
-
-def _check_recipe(recipe: Any, folder: Any) -> None:
-    if callable(getattr(folder, "maker", None)) and not callable(getattr(recipe, "maker", None)):
-        raise ArgumentError(f"{_WHAT}: expected a recipe and then a folder, got the recipe behind {shown(recipe)}.")
-    a_recipe(_WHAT, recipe, "maker", "key", "to_dict")
-
-
 def _check_choices(store: Any, compression: Any, engine: Any, address: Any, recipe: Any) -> None:
-    from torchtransient.array_files.hdf5 import hdf5_package
-    from torchtransient.data.shard_format import check_compression, check_store
-
     hdf5_package(_WHAT)
     check_store(store, _WHAT)
     check_compression(compression, _WHAT)
     if not is_one_of(engine, ENGINES):
         raise ArgumentError(f"{_WHAT}: expected engine to be one of {', '.join(ENGINES)}, got {shown(engine)}.")
-    if address is not None and engine != "ray":
+    if engine == "ray":
+        ray_package()
+    elif address is not None:
         raise UnitError(f"{_WHAT}: address={shown(address)} is for engine='ray', got engine={engine!r}.")
     if store == "counts" and getattr(recipe, "device", ...) is None:
         raise SceneError(f"{_WHAT}: store='counts' stores the measurement of recipes with a device; give one.")
-    try:
-        pickle.dumps(recipe)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise SceneError(f"{_WHAT}: expected a recipe that pickles, since workers get it: {error}.") from error
 
 
 def _folder(folder: Any) -> Path:
-    from torchtransient.array_files.array_file import path_of
-
     place = path_of(folder, _WHAT).absolute()
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"{_WHAT}: the folder '{place}' cannot be made: {error}.") from error
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise StorageError(f"{_WHAT}: no permission to write into '{place}'. Choose another folder.")
     return place

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torchtransient.checks import real_array, shown
 from torchtransient.data.distributions import ANYTHING, NUMBERS, POSE, Choice, Draw, Place, Stream
 from torchtransient.data.sample import Sample, in_order
-from torchtransient.data.serialization import record_fields, written_frequencies
+from torchtransient.data.serialization import record_fields
 from torchtransient.data.specification import (
     NOISE,
     RENDER,
@@ -30,7 +30,7 @@ from torchtransient.data.specification import (
 from torchtransient.errors import ArgumentError, GradientError, SceneError, ShapeError, TorchTransientError, UnitError
 from torchtransient.files.plain_data import scan_data
 from torchtransient.plugins import versions_of_others
-from torchtransient.rendering.labels import LABELS, first_return, label_names, material_names, scene_labels
+from torchtransient.rendering.labels import first_return, label_names, material_names, scene_labels
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.load import Scene, load
 from torchtransient.scene.parameters import ParameterTable, unknown_key
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from torchtransient.axes import TimeAxis
     from torchtransient.capture import Scan
 
+# Records of a renderer that describe its film.
+_AXES = ("axis", "frequencies", "gates", "rates", "chirps")
 # Label that is computed from the transient.
 FIRST_RETURN = "first_return"
 # Most camera paths for the share of light outside of the window.
@@ -61,7 +63,6 @@ class Maker:
     def __init__(self, recipe: Specification) -> None:
         self.recipe = recipe
         self._kept: OrderedDict[str, Kept] = OrderedDict()
-        self._measures: Measures | None = None
 
     def order(self, indices: Iterable[int]) -> list[int]:
         """Order samples by structure, in the order in which structures first come.
@@ -124,14 +125,17 @@ class Maker:
         """
         (index,) = samples_of([index])
         # Of sample 0 in every process: all refuse the same samples.
-        expected = self.measures()
+        expected = self.film
         structure = self.recipe.structure(index)
         kept = self.kept(structure)
-        kept.measures.check(expected, f"sample {index}", "sample 0")
+        check_film(kept.film, expected, f"sample {index}", "sample 0")
         varied = kept.draw(index)
         seed = kept.seed(index)
         arrays, outside = kept.arrays(index, varied, seed)
-        self._check(index, arrays, expected.name)
+        # Labels are NaN where no surface is seen.
+        for name in (expected["measures"], "steady", "measurement"):
+            if name in arrays and not np.isfinite(arrays[name]).all():
+                raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
         return Sample(
             index,
             seed,
@@ -141,11 +145,10 @@ class Maker:
             structure=structure.text,
         )
 
-    def measures(self) -> Measures:
-        """Return the measurement of sample 0, which all samples share."""
-        if self._measures is None:
-            self._measures = self.kept(self.recipe.structure(0)).measures
-        return self._measures
+    @functools.cached_property
+    def film(self) -> dict[str, Any]:
+        """``Kept.film`` of sample 0, which all samples share."""
+        return self.kept(self.recipe.structure(0)).film
 
     def standard_error(self, index: int) -> float:
         """Return the relative standard error of a sample: root mean square of the errors over the cube, by that of the
@@ -212,13 +215,6 @@ class Maker:
             found[key] = text if text else np.asarray(value, dtype=np.float32)
         return found
 
-    def _check(self, index: int, arrays: Mapping[str, NDArray[Any]], measured: str) -> None:
-        # Labels are NaN where no surface is seen.
-        for name in (measured, "steady", "measurement"):
-            if name in arrays and not np.isfinite(arrays[name]).all():
-                raise UnitError(f"recipe: sample {index}: {name} has numbers that are not finite.")
-
-
 class Kept:
     """Scene of a structure with its renderer and the places of the values that vary in it.
 
@@ -232,7 +228,6 @@ class Kept:
 
     def __init__(self, recipe: Specification, structure: Structure) -> None:
         self.recipe, self.structure = recipe, structure
-        _check_label_names(recipe.settings.labels)
         self.keys = [key for key in recipe.vary if key not in recipe.exchanged and not recipe.is_of_device(key)]
         self.device_keys = [key for key in recipe.vary if recipe.is_of_device(key)]
         self.scan: Scan | None = None
@@ -240,7 +235,9 @@ class Kept:
             self.renderer = self._make()
         except TorchTransientError as error:
             raise _named(error, structure) from error
-        self._settle_filter()
+        # The scene's filter where a pose varies, too: no derivatives are asked for.
+        if self.renderer.film.has_bins and self.renderer.temporal_filter == "auto":
+            self.renderer.temporal_filter = self.renderer._scene_filter
         self._names(self._made())
         self.places = self._places()
         self._chain = None if recipe.device is None or self.device_keys else self._chain_of(recipe.device)
@@ -300,12 +297,6 @@ class Kept:
                     "an entry for it, name that."
                 )
 
-    def _settle_filter(self) -> None:
-        """Keep the scene's filter where a pose varies: no derivatives are asked for."""
-        renderer = self.renderer
-        if renderer.film.has_bins and renderer.temporal_filter == "auto":
-            renderer.temporal_filter = renderer._scene_filter
-
     def _places(self) -> dict[str, Place]:
         found = {}
         for key in self.keys:
@@ -320,14 +311,17 @@ class Kept:
         measured = () if self.recipe.device is None else ("measurement",)
         return [self.renderer.film.measures, *steady, *self.recipe.settings.labels, *measured]
 
-    @property
-    def measures(self) -> Measures:
-        """Measurement of the film."""
+    @functools.cached_property
+    def film(self) -> dict[str, Any]:
+        """Measurement of the film as plain data, and its size in rows, columns, bins."""
         renderer = self.renderer
-        return Measures(
-            renderer.film.measures, renderer._cube_shape[:-1], renderer.axis, renderer.frequencies, renderer.gates,
-            renderer.rates, renderer.chirps, renderer._channels, renderer.spp or renderer._scene_spp,
-        )  # fmt: skip
+        return {
+            "measures": renderer.film.measures,
+            "size": renderer._cube_shape[:-1],
+            **{name: record_fields(getattr(renderer, name)) for name in _AXES},
+            "channels": list(renderer._channels),
+            "spp": renderer.spp or renderer._scene_spp,
+        }
 
     def check_labels(self) -> None:
         """Raise the errors of labels, by one intersection without light."""
@@ -380,17 +374,18 @@ class Kept:
             Arrays by name, and the shares of light before and after the window.
         """
         values = self.values(drawn)
-        found = self._render(values, seed)
-        tensors = dict(found.tensors)
+        tensors, outside = self._render(values, seed)
         labels = [name for name in self.recipe.settings.labels if name != FIRST_RETURN]
         if labels:
             tensors |= scene_labels(self.renderer, values, labels)
         if FIRST_RETURN in self.recipe.settings.labels:
-            tensors[FIRST_RETURN] = self._first_return(tensors)
+            polarized = stokes_components(self.recipe.variant) > 1
+            axis = self._axis_of_first_return()
+            tensors[FIRST_RETURN] = first_return(tensors["transient"], axis, polarized=polarized)
         if self.recipe.device is not None:
             tensors["measurement"] = self._measured(index, drawn, tensors)
         kept = self._names(tensors)
-        return {name: in_order(tensors[name]) for name in kept}, found.outside
+        return {name: in_order(tensors[name]) for name in kept}, outside
 
     def _names(self, there: Iterable[str]) -> list[str]:
         """Names of a sample's arrays that are kept. Raises ArgumentError."""
@@ -410,7 +405,7 @@ class Kept:
         Returns:
             Array of the film.
         """
-        return self._render(self.values(drawn), seed).tensors[self.renderer.film.measures].cpu().numpy()
+        return self._render(self.values(drawn), seed)[0][self.renderer.film.measures].cpu().numpy()
 
     def outside(self, index: int) -> tuple[float, float]:
         """Return the shares of the light of a sample before and after the window, from 65536 camera paths at most.
@@ -421,9 +416,9 @@ class Kept:
         Returns:
             Two shares.
         """
-        rows, columns = self.measures.size[:2]
-        spp = self.renderer.samples_drawn(min(self.measures.spp, max(1, _PATHS // (rows * columns))))
-        return self._render(self.values(self.draw(index)), self.seed(index), spp).outside
+        rows, columns = self.film["size"][:2]
+        spp = self.renderer.samples_drawn(min(self.film["spp"], max(1, _PATHS // (rows * columns))))
+        return self._render(self.values(self.draw(index)), self.seed(index), spp)[1]
 
     def seed(self, index: int) -> int:
         """Return the seed of the render of a sample.
@@ -447,29 +442,25 @@ class Kept:
         """
         return {key: torch.as_tensor(np.asarray(drawn[key]), dtype=torch.float32) for key in self.keys}
 
-    def _render(self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None) -> _Measured:
+    def _render(
+        self, values: Mapping[str, torch.Tensor], seed: int, spp: int | None = None
+    ) -> tuple[dict[str, torch.Tensor], tuple[float, float]]:
+        """Tensors by name, and shares of the light outside of the window."""
         measures = self.renderer.film.measures
         with torch.no_grad():
             out = self.renderer(values, seed=seed, spp=spp)
         light = out.others[measures] if measures in out.others else getattr(out, measures)
         tensors = {measures: light, "steady": out.steady}
-        return _Measured(tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside)
-
-    def _first_return(self, tensors: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        axis = self._axis_of_first_return()
-        polarized = stokes_components(self.recipe.variant) > 1
-        return first_return(tensors["transient"], axis, polarized=polarized)
+        return tensors if self.scan is None else _of_scan(tensors, self.scan), out.outside
 
     def _axis_of_first_return(self) -> TimeAxis:
-        if self.renderer.axis is None or self.renderer.film.measures != "transient" or self._is_exhaustive():
+        exhaustive = self.scan is not None and self.scan.kind == "exhaustive"
+        if self.renderer.axis is None or self.renderer.film.measures != "transient" or exhaustive:
             raise SceneError(
                 f"recipe: labels: {FIRST_RETURN!r} is read off a transient of pixels; give time_axis=, and no "
                 "exhaustive scan."
             )
         return self.renderer.axis
-
-    def _is_exhaustive(self) -> bool:
-        return self.scan is not None and self.scan.kind == "exhaustive"
 
     # ------------------------------------------------------------------------------------------------- measurements
 
@@ -527,22 +518,13 @@ class Kept:
 
     def about(self) -> dict[str, Any]:
         """Return plain data, the same for all structures of a recipe."""
-        renderer = self.renderer
-        film = renderer.film
         found: dict[str, Any] = {
-            "measures": film.measures,
-            "axis": None if renderer.axis is None else asdict(renderer.axis),
-            "frequencies": written_frequencies(renderer.frequencies),
-            "gates": None if renderer.gates is None else [record_fields(gate) for gate in renderer.gates],
-            "rates": None if renderer.rates is None else asdict(renderer.rates),
-            "chirps": None if renderer.chirps is None else asdict(renderer.chirps),
-            "channels": list(renderer._channels),
+            **{name: entry for name, entry in self.film.items() if name != "size"},
             "behind_time": 2 if self.scan is None else len(self.scan.shape),
-            "spp": renderer.spp or renderer._scene_spp,
             "variant": self.recipe.variant,
-            "temporal_filter": renderer.effective_filter,
+            "temporal_filter": self.renderer.effective_filter,
             "versions": package_versions(),
-        }  # fmt: skip
+        }
         if self.scan is not None:
             found["scan"] = scan_data(self.scan)
         return found
@@ -558,66 +540,24 @@ class Kept:
         return found
 
 
-@dataclass(frozen=True)
-class Measures:
-    """Measurement of a scene's film, which all samples of a recipe share.
+def check_film(found: Mapping[str, Any], expected: Mapping[str, Any], mine: str, others: str) -> None:
+    """Check that samples go into one array.
 
     Args:
-        name: "transient", "phasor", ...
-        size: rows, columns, bins.
-        axis: time axis, or None.
-        frequencies: or None.
-        gates: or None.
-        rates: or None.
-        chirps: or None.
-        channels: names.
-        spp: samples per pixel.
+        found: ``Kept.film``.
+        expected: of other samples.
+        mine: name of the first for messages.
+        others: name of the others.
+
+    Raises:
+        ShapeError: for two measurements.
     """
-
-    name: str
-    size: tuple[int, ...]
-    axis: Any
-    frequencies: Any
-    gates: Any
-    rates: Any
-    chirps: Any
-    channels: tuple[str, ...]
-    spp: int
-
-    def check(self, other: Measures, mine: str, others: str) -> None:
-        """Check that samples go into one array.
-
-        Args:
-            other: another measurement.
-            mine: name of this one for messages.
-            others: name of the other one.
-
-        Raises:
-            ShapeError: for two measurements.
-        """
-        for field in fields(self):
-            here, there = getattr(self, field.name), getattr(other, field.name)
-            if here != there:
-                raise ShapeError(
-                    f"recipe: {mine} has {field.name} {here}, {others} has {there}. All need the same: give time_axis= "
-                    "for bins of one kind, spp= for one number of samples, films of one size."
-                )
-
-
-@dataclass(frozen=True)
-class _Measured:
-    """Tensors of a render by name, and shares of the light outside of the window."""
-
-    tensors: dict[str, torch.Tensor]
-    outside: tuple[float, float]
-
-
-def _check_label_names(names: tuple[str, ...]) -> None:
-    """Raise SceneError for unknown labels."""
-    for name in names:
-        if name not in (*LABELS, FIRST_RETURN):
-            known = ", ".join((*LABELS, FIRST_RETURN))
-            raise SceneError(f"recipe: labels: unknown label {name!r}. Known ones are {known}.")
+    for name, here in found.items():
+        if here != expected[name]:
+            raise ShapeError(
+                f"recipe: {mine} has {name} {here}, {others} has {expected[name]}. All need the same: give time_axis= "
+                "for bins of one kind, spp= for one number of samples, films of one size."
+            )
 
 
 def changed_device(device: Device, key: str, value: Any) -> Device:

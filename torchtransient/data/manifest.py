@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,13 +83,14 @@ def shards_of(folder: str | Path) -> list[Path]:
     return sorted(path for path in place.glob(SHARD_FILES) if path.is_file())
 
 
-def build_manifest(folder: str | Path) -> dict[str, Any]:
+def build_manifest(folder: str | Path, without: Collection[str] = ()) -> dict[str, Any]:
     """Write ``manifest.json`` from the shards of a folder.
 
     Checksums are those that the shards carry, not compared with their bytes: :func:`verify` does.
 
     Args:
         folder: of a data set.
+        without: names of shards that are left out.
 
     Returns:
         The manifest.
@@ -97,22 +98,7 @@ def build_manifest(folder: str | Path) -> dict[str, Any]:
     Raises:
         StorageError: for damaged shards, doubled samples, shards of several recipes, and no shard.
     """
-    return manifest_of(folder, shards_of(folder))
-
-
-def manifest_of(folder: str | Path, paths: Sequence[Path]) -> dict[str, Any]:
-    """Write ``manifest.json`` from some shards.
-
-    Args:
-        folder: of a data set.
-        paths: of its shards.
-
-    Returns:
-        The manifest.
-
-    Raises:
-        StorageError: as :func:`build_manifest`.
-    """
+    paths = [path for path in shards_of(folder) if path.name not in without]
     if not paths:
         raise StorageError(f"{_WHAT}: '{folder}' holds no shard ({SHARD_FILES}).")
     entries = [_Entry.read(path) for path in paths]
@@ -322,7 +308,7 @@ def _manifest(entries: Sequence[_Entry]) -> dict[str, Any]:
     if not entries:  # no shard is sound
         return {"format": FORMAT, "samples": 0, "failed": {}, "shards": {}}
     first = next((entry for entry in entries if entry.index), entries[0])
-    errors = sorted(e.header["standard_error"] for e in entries if _is_number(e.header.get("standard_error")))
+    errors = sorted(e.header["standard_error"] for e in entries if isinstance(e.header.get("standard_error"), float))
     return {
         "format": FORMAT,
         **{name: first.header.get(name) for name in ("recipe", "key", "about")},
@@ -359,17 +345,16 @@ def ranges(numbers: Iterable[int]) -> list[list[int]]:
     return found
 
 
-def ranges_text(numbers: Iterable[int], most: int = 8) -> str:
-    """Return whole numbers as text, "0 to 3, 7".
+def ranges_text(numbers: Iterable[int]) -> str:
+    """Return whole numbers as text, "0 to 3, 7", of 8 ranges at most.
 
     Args:
         numbers: in any order.
-        most: ranges that are written out.
 
     Returns:
         Text.
     """
-    parts = [str(a) if a == b else f"{a} to {b}" for a, b in ranges(numbers)]
+    parts, most = [str(a) if a == b else f"{a} to {b}" for a, b in ranges(numbers)], 8
     return ", ".join(parts[:most]) + (f" and {len(parts) - most} more ranges" if len(parts) > most else "")
 
 
@@ -381,7 +366,3 @@ def _text_of(path: Path) -> str | None:
         return None
     except (OSError, ValueError) as error:
         raise StorageError(f"{_WHAT}: '{path}' cannot be read: {error}.") from error
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

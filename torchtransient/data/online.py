@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import pickle
 import random
@@ -23,12 +22,12 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 import torch.multiprocessing  # lets connections carry shared tensors
-from torch.utils.data import IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset
 
 from torchtransient.checks import MOST, a_recipe, as_number, count, shown
 from torchtransient.data.online_worker import Layout, empty_ring, layout_text, produce
-from torchtransient.data.processes import WorkerError, interrupts_blocked, registered_plugins
-from torchtransient.data.sample import OutsideLight, checked_transform, measurement, outside_tensor, value_tensors
+from torchtransient.data.processes import WorkerError, registered_plugins, spawned
+from torchtransient.data.sample import OutsideLight, measurement, outside_tensor, value_tensors
 from torchtransient.errors import (
     ShapeError,
     StorageError,
@@ -109,7 +108,7 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
             if (number := as_number(value)) is None or not number > 0:
                 raise UnitError(f"{WHAT}: expected {name} as a number above zero, got {shown(value)}.")
         a_recipe(WHAT, recipe, "maker")
-        self.transform = checked_transform(WHAT, transform)
+        self.transform = transform
         schedule = Schedule(capacity, workers, float(uses), min(warm, capacity), first, seed)
         self._producers = Producers(recipe, schedule, capacity, workers, float(timeout_s))
         # Also when the object is freed, and at the end of the interpreter.
@@ -121,11 +120,6 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
             raise
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        if get_worker_info() is not None:
-            raise TorchTransientError(
-                f"{WHAT}: it renders in processes of its own; use DataLoader(..., num_workers=0) and "
-                f"{WHAT}(workers=...)."
-            )
         while True:
             yield self.draw()
 
@@ -166,12 +160,6 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def __getstate__(self) -> dict[str, Any]:
-        raise TorchTransientError(
-            f"{WHAT}: processes and shared memory cannot be pickled; make one in each process, or use num_workers=0."
-        )
-
-
 class Producers:
     """Processes that render, their ring, and their messages, which are read when a sample is drawn. A lock keeps
     threads apart.
@@ -202,22 +190,8 @@ class Producers:
     def start(self) -> None:
         """Start the processes, and order the first samples."""
         for _ in range(self._count):
-            self._workers.append(self._started())
+            self._workers.append(_Worker(*spawned(produce, self._packed, WHAT)))
         self._give_orders()
-
-    def _started(self) -> _Worker:
-        context = multiprocessing.get_context("spawn")
-        here, there = context.Pipe()
-        process = context.Process(target=produce, args=(there, self._packed), name=WHAT, daemon=True)
-        try:
-            with interrupts_blocked():
-                process.start()
-        except BaseException:
-            here.close()
-            raise
-        finally:
-            there.close()
-        return _Worker(process, here)
 
     # --------------------------------------------------------------------------------------------------- one draw
 
@@ -374,7 +348,7 @@ class Producers:
             f"{WHAT}: a producer ended {how} {doing}; another one takes its place.", TorchTransientWarning, stacklevel=6
         )
         self.schedule.lost(number)
-        return self._started()
+        return _Worker(*spawned(produce, self._packed, WHAT))
 
     def close(self) -> None:
         """End all processes and free the ring. Does nothing in a process that was forked from this one."""
@@ -467,22 +441,17 @@ class Schedule:
         """
         self._free.append(self.orders.pop(index).slot)
 
-    def lost(self, producer: int) -> list[int]:
+    def lost(self, producer: int) -> None:
         """Record a producer that has ended: its samples are ordered again, from others.
 
         Args:
             producer: its number.
-
-        Returns:
-            Numbers of these samples.
         """
         orders = sorted((o for o in self.orders.values() if o.producer == producer), key=lambda order: order.index)
         for order in orders:
             del self.orders[order.index]
             self._free.append(order.slot)
-        found = [order.index for order in orders]
-        self._again.extendleft(reversed(found))
-        return found
+        self._again.extendleft(order.index for order in reversed(orders))
 
     def can_draw(self) -> bool:
         """Return True where a reader need not wait."""

@@ -23,10 +23,6 @@ from torchtransient.errors import ShapeError, TorchTransientError
 Layout = dict[str, tuple[tuple[int, ...], str]]
 
 
-class _NobodyListensError(Exception):
-    pass
-
-
 def produce(connection: Connection, packed: bytes) -> None:
     """Render samples until the connection closes: the body of the process.
 
@@ -44,10 +40,10 @@ def produce(connection: Connection, packed: bytes) -> None:
         threads(1)
         add_plugins(plugins, "OnlineDataset")
         maker = recipe.maker()
-        line = _Line(connection)
-        line.say("ready")
-        _Producer(line, maker).run()
-    except _NobodyListensError:
+        connection.send(("ready",))
+        _Producer(connection, maker).run()
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        # The trainer has ended.
         pass
     except BaseException as error:  # noqa: BLE001 (whatever it is, the trainer has to hear of it)
         _report(connection, error)
@@ -67,33 +63,9 @@ def _report(connection: Connection, error: BaseException) -> None:
         connection.send(("error", sent, text))
 
 
-class _Line:
-    """Connection; raises _NobodyListensError where its other end is closed."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-
-    def say(self, *message: Any) -> None:
-        """Send a message."""
-        try:
-            self._connection.send(message)
-        except OSError:
-            raise _NobodyListensError from None
-
-    def hear(self, wait: bool) -> tuple[Any, ...] | None:
-        """Next message; None where there is none and ``wait`` is False."""
-        try:
-            if not wait and not self._connection.poll(0):
-                return None
-            message: tuple[Any, ...] = self._connection.recv()
-            return message
-        except (EOFError, OSError):
-            raise _NobodyListensError from None
-
-
 class _Producer:
-    def __init__(self, line: _Line, maker: Any) -> None:
-        self._line, self._maker = line, maker
+    def __init__(self, connection: Connection, maker: Any) -> None:
+        self._connection, self._maker = connection, maker
         self._ring: dict[str, np.ndarray] | None = None
         self._layout: Layout = {}
         self._asked: dict[int, int] = {}
@@ -104,25 +76,24 @@ class _Producer:
             self._listen()
             # All of them before new orders, so that every structure has its turn.
             for index in self._maker.order(list(self._asked)):
-                self._line.say("start", index)
+                self._connection.send(("start", index))
                 try:
                     sample = self._maker.sample(index)
                 except TorchTransientError as error:
                     # A sample that fails does not end the run; a bug does.
                     self._asked.pop(index)
-                    self._line.say("failed", index, f"{type(error).__name__}: {error}")
+                    self._connection.send(("failed", index, f"{type(error).__name__}: {error}"))
                     continue
                 self._write(sample.arrays, index, self._asked.pop(index))
-                self._line.say("done", index, dict(sample.values), tuple(sample.outside))
+                self._connection.send(("done", index, dict(sample.values), tuple(sample.outside)))
 
     def _listen(self) -> None:
         """Read messages; waits where no sample is ordered."""
-        message = self._line.hear(wait=not self._asked)
-        while message is not None:
-            self._take(message)
-            message = self._line.hear(wait=not self._asked)
+        while not self._asked or self._connection.poll(0):
+            self._take()
 
-    def _take(self, message: tuple[Any, ...]) -> None:
+    def _take(self) -> None:
+        message = self._connection.recv()
         if message[0] == "make":
             self._asked[message[1]] = message[2]
         else:
@@ -132,11 +103,9 @@ class _Producer:
         found = layout_of(arrays)
         if self._ring is None:
             self._layout = found
-            self._line.say("layout", found)
+            self._connection.send(("layout", found))
             while self._ring is None:
-                message = self._line.hear(wait=True)
-                assert message is not None
-                self._take(message)
+                self._take()
         if found != self._layout:
             raise ShapeError(
                 f"OnlineDataset: the samples of a recipe have the same names, shapes and types, expected "

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.checks import as_number, count, is_one_of, of_class, real_array, share, shown
+from torchtransient.checks import count, is_one_of, real_array, share, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.geometry.pinhole import camera_matrices, transforms
 
@@ -70,7 +70,7 @@ class Flip(Operation):
         Returns:
             Map, or None.
         """
-        if not _happens(self.p, generator):
+        if torch.rand((), generator=generator, device=_device(generator)) >= self.p:
             return None
         matrix = np.eye(3)
         axis = 0 if self.direction == "horizontal" else 1
@@ -89,9 +89,7 @@ class QuarterTurn(Operation):
     turns: Sequence[int] = (0, 1, 2, 3)
 
     def __post_init__(self) -> None:
-        given = list(self.turns) if isinstance(self.turns, Sequence) else [self.turns]
-        if not given:
-            raise ArgumentError("QuarterTurn: expected numbers of quarter turns, got none.")
+        given = self.turns if isinstance(self.turns, Sequence) else [self.turns]
         object.__setattr__(self, "turns", tuple(count("QuarterTurn: turns", one, -3) % 4 for one in given))
 
     def draw(self, size: tuple[int, int], generator: torch.Generator | None) -> PixelMap | None:
@@ -131,12 +129,8 @@ class Crop(Operation):
 
     def __post_init__(self) -> None:
         for name, least in (("size", 1), ("offset", 0)):
-            given = getattr(self, name)
-            if given is None and name == "offset":
-                continue
-            if not isinstance(given, Sequence) or len(given) != 2:
-                raise ShapeError(f"Crop: expected {name} as two numbers of pixels, got {shown(given)}.")
-            object.__setattr__(self, name, tuple(count(f"Crop: {name}", one, least, ShapeError) for one in given))
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, tuple(count(f"Crop: {name}", one, least, ShapeError) for one in given))
 
     def draw(self, size: tuple[int, int], generator: torch.Generator | None) -> PixelMap | None:
         """Draw a map, exact: pixels come to lie on pixels.
@@ -261,11 +255,8 @@ class PixelMap:
             raise UnitError(f"PixelMap: expected a matrix with an inverse, got {matrix.tolist()}.")
         object.__setattr__(self, "matrix", matrix)
         for name in ("size", "new_size"):
-            given = getattr(self, name)
-            if not isinstance(given, Sequence) or len(given) != 2:
-                raise ShapeError(f"PixelMap: expected {name} as (height, width), got {shown(given)}.")
-            whole = tuple(count(f"PixelMap: {name}", one, 1, ShapeError) for one in given)
-            object.__setattr__(self, name, whole)
+            height, width = (count(f"PixelMap: {name}", one, 1, ShapeError) for one in getattr(self, name))
+            object.__setattr__(self, name, (height, width))
 
     # ----------------------------------------------------------------------------------------------- of the camera
 
@@ -385,10 +376,7 @@ class PixelMap:
             UnitError: for a type that cannot hold ``fill``, NaN in whole numbers or -1 in unsigned ones; exact maps
                 without a rim take every type.
         """
-        if (number := as_number(fill)) is None:
-            raise UnitError(f"PixelMap.nearest: expected fill as one number, got {shown(fill)}.")
         self._check_image(image, name)
-        fill = number
         rows, columns, inside = (one.to(image.device) for one in self._sources)
         # As signed bits: torch 2.6 does not index these unsigned types.
         signed = _SIGNED.get(image.dtype)
@@ -434,11 +422,10 @@ class PixelMap:
         moved: Any = warp_affine(whole, matrix, self.new_size, mode="bilinear", align_corners=True)
         return torch.as_tensor(moved, dtype=image.dtype).reshape(*image.shape[:-2], *self.new_size)
 
-
-    def _check_image(self, image: Any, name: str) -> None:
-        size = tuple(of_class(f"PixelMap: {name}", image, Tensor).shape)
-        if size[-2:] != self.size:
-            raise ShapeError(f"PixelMap: expected {name!r} as (..., {self.size[0]}, {self.size[1]}), got {size}.")
+    def _check_image(self, image: Tensor, name: str) -> None:
+        if image.shape[-2:] != self.size:
+            height, width = self.size
+            raise ShapeError(f"PixelMap: expected {name!r} as (..., {height}, {width}), got {tuple(image.shape)}.")
 
 
 def _holds(dtype: torch.dtype, fill: float) -> bool:
@@ -454,10 +441,6 @@ def _like(matrix: Matrix, tensor: Tensor) -> Tensor:
 
 def _whole(number: int, generator: torch.Generator | None) -> int:
     return int(torch.randint(number, (), generator=generator, device=_device(generator)))
-
-
-def _happens(p: float, generator: torch.Generator | None) -> bool:
-    return bool(torch.rand((), generator=generator, device=_device(generator)) < p)
 
 
 def _device(generator: torch.Generator | None) -> torch.device | None:

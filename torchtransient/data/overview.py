@@ -24,6 +24,7 @@ from torchtransient.errors import StorageError
 from torchtransient.rendering.progress import with_bar
 from torchtransient.vis.contact_sheet import Cell
 from torchtransient.vis.contact_sheet import contact_sheet as draw
+from torchtransient.vis.files import enlarge, pillow, to_bytes
 from torchtransient.vis.tone_mapping import tone_map
 
 # Most values in a title, and letters of each.
@@ -177,15 +178,12 @@ def cell_of(sample: Sample, behind: int = 2) -> Cell:
     Returns:
         Cell of a contact sheet.
     """
-    words = [f"{_name(key)} {_short(value)}" for key, value in sample.values.items() if _fits(value)]
+    values = {key: value for key, value in sample.values.items() if isinstance(value, str) or np.size(value) <= 3}
+    words = [f"{_name(key)} {_short(value)}" for key, value in values.items()]
     names = ", ".join(words[:_MOST_VALUES])
     images = {"light": _picture(sample.arrays, behind)}
     images |= {name: image for name, array in sample.arrays.items() if (image := _label(name, array)) is not None}
     return Cell(f"{sample.index}  {names}", images, _curve(sample.arrays, behind))
-
-
-def _fits(value: Any) -> bool:
-    return isinstance(value, str) or np.size(value) <= 3
 
 
 def _name(key: str) -> str:
@@ -285,7 +283,7 @@ class LatestPicture:
                     return
             pixels = picture_of(sample)
             with whole_file(self._path, "generate", synchronized=False) as part:
-                _save(pixels, part)
+                pillow().fromarray(pixels).save(part, format="PNG")
         except Exception:  # noqa: BLE001  a picture is never a reason to fail
             self._next = now + 60 * EVERY_S
 
@@ -299,21 +297,8 @@ def picture_of(sample: Any) -> NDArray[np.uint8]:
     Returns:
         uint8 (H, W, 3).
     """
-    from torchtransient.vis.files import enlarge, to_bytes
-
     pixels = to_bytes(cell_of(sample).images["light"])
     return enlarge(pixels, max(1, SIDE // max(pixels.shape[:2])))
-
-
-def _save(pixels: NDArray[np.uint8], path: Path) -> None:
-    try:
-        from PIL import Image
-    except ImportError:
-        from matplotlib.image import imsave
-
-        imsave(path, pixels, format="png")
-    else:
-        Image.fromarray(pixels).save(path, format="PNG")
 
 
 def _samples(owners: dict[int, Shard], drawn: list[int]) -> Iterator[Sample]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import pickle
 import signal
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 from torchtransient.errors import PluginRegistrationError, SceneError, TorchTransientError
@@ -94,9 +97,34 @@ def add_plugins(modules: PluginNames, what: str) -> None:
             ) from error
 
 
+def spawned(body: Callable[[Connection, bytes], None], packed: bytes, name: str) -> tuple[BaseProcess, Connection]:
+    """Start a process without Ctrl-C, from its first instruction on, which ends with this one. It is spawned: a forked
+    one has no threads of Dr.Jit.
+
+    Args:
+        body: function of the other end of the pipe and ``packed``.
+        packed: what the process is given.
+        name: of the process.
+
+    Returns:
+        Process, and this end of the pipe.
+    """
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=body, args=(there, packed), name=name, daemon=True)
+    try:
+        with _interrupts_blocked():
+            process.start()
+    except BaseException:
+        here.close()
+        raise
+    finally:
+        there.close()
+    return process, here
+
+
 @contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Start processes without Ctrl-C, from their first instruction on."""
+def _interrupts_blocked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

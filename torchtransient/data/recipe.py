@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from torchtransient.array_files.part_files import write_text
-from torchtransient.array_files.plain_texts import json_data, text_of_file
+from torchtransient.array_files.plain_texts import json_data, text_of_file, yaml_package
 from torchtransient.axes import RateAxis, TimeAxis
 from torchtransient.checks import count, path_of, short_errors, short_message, shown
 from torchtransient.chirps import Chirps
@@ -37,10 +37,9 @@ from torchtransient.data.serialization import (
     record_fields,
     without_places,
     written,
-    written_frequencies,
 )
 from torchtransient.data.specification import OneOf, Specification
-from torchtransient.errors import MissingPackageError, SceneError, TorchTransientError
+from torchtransient.errors import SceneError, TorchTransientError
 from torchtransient.files.plain_data import scan_data, scan_from_data
 from torchtransient.files.yaml_files import Section, read_yaml
 from torchtransient.gates import Gate
@@ -60,6 +59,7 @@ _ENTRIES = (
     "format", "scene", "parameters", "hidden", "wall", "scan", "vary", "time_axis", "frequencies", "gates", "rates",
     "chirps", "pulse", "irf", "device", *_PLAIN,
 )  # fmt: skip
+_RECORDS = ("time_axis", "frequencies", "gates", "pulse", "irf")
 _MOVING = {"rates": RateAxis, "chirps": Chirps}
 # Entries that samples do not depend on.
 _NO_NUMBERS = ("n", "format")
@@ -239,14 +239,7 @@ class Recipe(Specification):
         Returns:
             Text.
         """
-        try:
-            import yaml
-        except ImportError as error:
-            raise MissingPackageError(
-                "recipe: YAML needs PyYAML. Install it with pip install 'torchtransient[yaml]', or write "
-                "json.dumps(recipe.to_dict())."
-            ) from error
-        text: str = yaml.safe_dump(self.to_dict(), sort_keys=False, width=120)
+        text: str = yaml_package("recipe").safe_dump(self.to_dict(), sort_keys=False, width=120)
         if path is not None:
             write_text(path, text, "recipe")
         return text
@@ -306,15 +299,11 @@ def _recipe_data(recipe: Specification) -> dict[str, Any]:
         "vary": {key: written(one) for key, one in recipe.vary.items()},
         "labels": list(settings.labels),
         "keep": None if settings.keep is None else list(settings.keep),
-        "time_axis": record_fields(settings.time_axis),
-        "frequencies": written_frequencies(settings.frequencies),
-        "gates": None if settings.gates is None else [record_fields(gate) for gate in settings.gates],
+        **{name: record_fields(getattr(settings, name)) for name in _RECORDS},
         "temporal_filter": settings.temporal_filter,
         "spp": settings.spp,
         "max_depth": settings.max_depth,
         "sensors": written(settings.sensors),
-        "pulse": record_fields(settings.pulse),
-        "irf": record_fields(settings.irf),
         "device": None if recipe.device is None else recipe.device.to_dict(),
         "physics": settings.physics,
         "variant": recipe.variant,
@@ -322,7 +311,7 @@ def _recipe_data(recipe: Specification) -> dict[str, Any]:
         "n": recipe.n,
     }
     # Left out where None, so that older recipes keep their keys.
-    found |= {name: asdict(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
+    found |= {name: record_fields(one) for name in _MOVING if (one := getattr(settings, name)) is not None}
     if settings.sampler != OF_SCENE:
         found["sampler"] = settings.sampler
     if recipe.plugins:

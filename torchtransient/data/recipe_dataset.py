@@ -9,19 +9,17 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from torchtransient.checks import a_recipe, count, shown
+from torchtransient.checks import a_recipe, count
 from torchtransient.data.sample import (
     Epochs,
     checked_seed,
-    checked_transform,
     measurement,
     outside_tensor,
     sample_generator,
     sample_number,
-    takes_generator,
     value_tensors,
 )
-from torchtransient.errors import ArgumentError, UnitError
+from torchtransient.errors import UnitError
 
 _WHAT = "RecipeDataset"
 
@@ -50,7 +48,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
 
     Raises:
         UnitError: for sizes, seeds and epochs.
-        ArgumentError: for other recipes and functions, and a seed that the transform cannot take.
+        ArgumentError: for other recipes.
         IndexError: beyond the sizes. Errors of the renderer pass.
     """
 
@@ -65,14 +63,10 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     ) -> None:
         super().__init__()
         self.recipe = a_recipe(_WHAT, recipe, "maker")
-        self.transform = checked_transform(_WHAT, transform)
+        self.transform = transform
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.first = count(f"{_WHAT}: first", first, 0, UnitError)
         self.seed = checked_seed(_WHAT, seed)
-        if seed is not None and not takes_generator(transform):
-            raise ArgumentError(
-                f"{_WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
-            )
         self._maker: Any = None
         if (check := getattr(recipe, "check", None)) is not None:
             self._maker = recipe.maker()
@@ -80,9 +74,6 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
 
     def __len__(self) -> int:
         return self.size
-
-    def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number, self.epoch)
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
         """Render a sample.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchtransient.checks import count, function, shown
+from torchtransient.checks import count, shown
 from torchtransient.errors import PhysicsWarning, ShapeError, TorchTransientWarning, UnitError, level_of_user
 
 # Least size of arrays that are copied in blocks, and pixels of a block.
@@ -148,6 +147,18 @@ class Epochs:
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
+    def sample(self, number: int, epoch: int | None = None) -> Any:
+        """Return a sample.
+
+        Args:
+            number: of the sample, negative from the end.
+            epoch: distinguishes the draws of epochs; None is 0.
+        """
+        raise NotImplementedError
+
+    def __getitem__(self, number: int) -> Any:
+        return self.sample(number, self.epoch)
+
     @property
     def epoch(self) -> int:
         """Epoch of samples that are read by number."""
@@ -264,38 +275,6 @@ def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None
         return None
     key = np.random.SeedSequence([seed, number, *places, *more])
     return torch.Generator().manual_seed(int(key.generate_state(1, np.uint64)[0] >> np.uint64(1)))
-
-
-def checked_transform(what: str, transform: Any) -> Callable[..., Any] | None:
-    """Check a transform.
-
-    Args:
-        what: caller for messages.
-        transform: function of transients, or None.
-
-    Returns:
-        The transform.
-
-    Raises:
-        ArgumentError: for other objects.
-    """
-    return None if transform is None else function(f"{what}: transform", transform, "transients, as sensors are")
-
-
-def takes_generator(transform: Any) -> bool:
-    """Return True where a transform has an argument ``generator``.
-
-    Args:
-        transform: function or module.
-
-    Returns:
-        Truth value.
-    """
-    called = transform.forward if isinstance(transform, torch.nn.Module) else transform
-    try:
-        return "generator" in inspect.signature(called).parameters
-    except (TypeError, ValueError):
-        return False
 
 
 def value_tensors(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from torchtransient.axes import FrequencyAxis, TimeAxis
+from torchtransient.axes import FrequencyAxis
 from torchtransient.capture import Scan
 from torchtransient.checks import short_message, shown
 from torchtransient.data import poses as poses
@@ -159,16 +159,20 @@ def _nested(where: str, content: Any) -> Any:
     return read(content)
 
 
-def record_fields(record: TimeAxis | Gate | Pulse | None) -> dict[str, Any] | None:
-    """Return the fields of an axis, a gate or a pulse.
+def record_fields(record: Any) -> Any:
+    """Return the fields of an axis, a pulse, chirps, or of each of several gates.
 
     Args:
-        record: dataclass, or None.
+        record: dataclass, a row of such, or None.
 
     Returns:
-        Fields by name, or None.
+        Fields by name, a list of such, or None.
     """
-    return None if record is None else asdict(record)
+    if record is None:
+        return None
+    if isinstance(record, FrequencyAxis):
+        return {"per_metre": [float(number) for number in record.per_metre], "start_opl": record.start_opl}
+    return [asdict(one) for one in record] if isinstance(record, list | tuple) else asdict(record)
 
 
 def read_record(kind: type[Record], data: Any) -> Record | None:
@@ -187,25 +191,11 @@ def read_record(kind: type[Record], data: Any) -> Record | None:
     return kind(**fields)
 
 
-def written_frequencies(axis: FrequencyAxis | None) -> dict[str, Any] | None:
-    """Return plain data for frequencies.
-
-    Args:
-        axis: frequencies, or None.
-
-    Returns:
-        Cycles per metre and their start, or None.
-    """
-    if axis is None:
-        return None
-    return {"per_metre": [float(number) for number in axis.per_metre], "start_opl": axis.start_opl}
-
-
 def read_frequencies(data: Any) -> FrequencyAxis | None:
     """Restore frequencies.
 
     Args:
-        data: result of :func:`written_frequencies`, or a list of cycles per metre.
+        data: result of :func:`record_fields`, or a list of cycles per metre.
 
     Returns:
         Frequencies, or None.

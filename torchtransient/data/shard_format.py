@@ -65,29 +65,22 @@ def check_store(store: Any, what: str) -> str:
     return str(store)
 
 
-def rounded_mantissa(array: NDArray[Any], bits: int = MANTISSA_BITS) -> NDArray[Any]:
-    """Round the mantissa half to even, of real and imaginary part apart. Infinities and signs stay, NaN stays NaN;
-    numbers that round above the largest become infinite. Numbers below the smallest normal one keep the digits at the
-    same places.
+def rounded_mantissa(array: NDArray[Any]) -> NDArray[Any]:
+    """Round the mantissa to 10 bits, half to even, of real and imaginary part apart. Infinities and signs stay, NaN
+    stays NaN; numbers that round above the largest become infinite. Numbers below the smallest normal one keep the
+    digits at the same places.
 
     Args:
         array: floating point, any shape.
-        bits: of the mantissa.
 
     Returns:
         Array of the same dtype; float16 as it is.
-
-    Raises:
-        StorageError: for other dtypes.
     """
     if array.dtype == np.float16:
         return array
     kinds = {"f4": (np.uint32, 23), "f8": (np.uint64, 52), "c8": (np.uint32, 23), "c16": (np.uint64, 52)}
-    kind = kinds.get(array.dtype.str[1:])
-    if kind is None:
-        raise StorageError(f"rounding: expected floating point numbers, got {array.dtype}.")
-    whole, mantissa = kind
-    cut = mantissa - bits
+    whole, mantissa = kinds[array.dtype.str[1:]]
+    cut = mantissa - MANTISSA_BITS
     # A copy in memory order; complex numbers are pairs.
     found = np.array(array, dtype=array.dtype.newbyteorder("="), order="C")
     parts = found.reshape(-1).view(whole)
@@ -117,24 +110,15 @@ def counts_of(array: NDArray[Any], what: str) -> NDArray[Any]:
     Raises:
         StorageError: for other numbers.
     """
-    if array.dtype.kind == "c":
-        raise StorageError(f"{what}: expected counts, whole numbers from 0 on, got {array.dtype}. Use store='rounded'.")
-    largest = array.max() if array.size else 0
     # Comparisons with NaN are false.
-    if not (array.size == 0 or (array.min() >= 0 and largest < 2.0**64)):
+    wrong = array[~((array.real >= 0) & (array.real < 2.0**64) & (np.floor(array.real) == array))]
+    if wrong.size:
         raise StorageError(
-            f"{what}: expected counts, whole numbers from 0 on, got numbers from {array.min()} to {largest}. Store "
-            "other measurements with store='rounded' or 'exact'."
-        )
-    dtype = next(kind for kind in _UNSIGNED if int(largest) <= np.iinfo(kind).max)
-    found = array.astype(dtype)
-    if array.dtype.kind == "f" and not np.array_equal(found, array):
-        odd = array[found != array].reshape(-1)[0]
-        raise StorageError(
-            f"{what}: expected counts, whole numbers from 0 on, got {odd}. Store other measurements with "
+            f"{what}: expected counts, whole numbers from 0 on, got {wrong[0]}. Store other measurements with "
             "store='rounded' or 'exact'."
         )
-    return found
+    largest = int(array.real.max(initial=0))
+    return array.real.astype(next(kind for kind in _UNSIGNED if largest <= np.iinfo(kind).max))
 
 
 def encoding_of(name: str, dtype: np.dtype[Any], store: str, measured: Sequence[str]) -> str:

@@ -9,13 +9,18 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from torchtransient.data.overview import LatestPicture
 from torchtransient.data.processes import add_plugins, traced
 from torchtransient.data.run_settings import Plan, RunSettings, check_same, plain, shard_file_name, shard_header
+from torchtransient.data.shards import ShardWriter
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, TorchTransientWarning
+from torchtransient.rendering.threads import threads
 
+Say = Callable[..., object]
+NONE: Mapping[int, str] = MappingProxyType({})
 # Most letters of a reason, which is stored for every sample that failed.
 MOST_CHARACTERS = 500
 _FOLDERS = re.compile(r"(?<![\w.])(?:/[^/\s'\":,;()]+)+/(?=[^/\s])")
@@ -26,13 +31,15 @@ class ShardMaker:
     """Maker of shards of one recipe. The process computes with one thread from here on: with more of them sums are
     added up in the order in which threads come, and bytes differ.
 
+    Its methods report their progress by ``say``, each message a sign of life: ("begin", shard, index), ("end", shard,
+    index, reason of a failure or None), ("retry", shard, index, reason), ("traced", shard, index, traceback),
+    ("closing", shard).
+
     Args:
         settings: of the run.
     """
 
     def __init__(self, settings: RunSettings) -> None:
-        from torchtransient.rendering.threads import threads
-
         threads(1)
         add_plugins(settings.plugins, "generate")
         self.settings = settings
@@ -52,12 +59,13 @@ class ShardMaker:
         if made is not None:
             made.close()
 
-    def measure(self, indices: range, messages: Messages) -> Measured:
+    def measure(self, indices: range, say: Say, skip: Mapping[int, str] = NONE) -> Measured:
         """Check the recipe, and make samples until one can be made.
 
         Args:
             indices: samples to try.
-            messages: progress.
+            say: function of the entries of a message.
+            skip: samples that are not tried, with the reason.
 
         Returns:
             Figures of the sample.
@@ -78,13 +86,14 @@ class ShardMaker:
                     warnings.showwarning(one.message, one.category, one.filename, one.lineno)
         reason = ""
         for index in indices:
-            reason = messages.begin(-1, index) or ""
+            reason = skip.get(index, "")
             if not reason:
-                found = self._sample(-1, index, messages)
-                messages("end", -1, index, found if isinstance(found, str) else None)
+                say("begin", -1, index)
+                found = self._sample(-1, index, say)
+                say("end", -1, index, found if isinstance(found, str) else None)
                 if not isinstance(found, str):
                     size = sum(array.nbytes for array in found.arrays.values())
-                    error = self._standard_error(index, messages)
+                    error = self._standard_error(index, say)
                     return Measured(size, plain(self._maker.about()), error, tuple(warned))
                 reason = found
         raise SceneError(
@@ -92,14 +101,16 @@ class ShardMaker:
         )
 
     def make(
-        self, shard: int, described: Mapping[str, Any], messages: Messages, first: Sequence[int] = ()
-    ) -> tuple[int, int, int]:
+        self, shard: int, described: Mapping[str, Any], say: Say, skip: Mapping[int, str] = NONE,
+        first: Sequence[int] = (),
+    ) -> tuple[int, int, int]:  # fmt: skip
         """Write one shard.
 
         Args:
             shard: its number.
             described: content of ``recipe.json``.
-            messages: progress.
+            say: function of the entries of a message.
+            skip: samples that are not tried, with the reason.
             first: samples that are made before the others.
 
         Returns:
@@ -108,8 +119,6 @@ class ShardMaker:
         Raises:
             StorageError: for a full disk for instance; nothing half-written is left.
         """
-        from torchtransient.data.shards import ShardWriter
-
         settings = self.settings
         if not self._compared:
             about = plain(self._maker.about())
@@ -124,23 +133,23 @@ class ShardMaker:
         ) as writer:
             others = [index for index in indices if index not in first]
             for index in (*first, *self._maker.order(others)):
-                reason = messages.begin(shard, index)
-                if reason is None:
-                    found = self._sample(shard, index, messages)
-                    if isinstance(found, str):
-                        reason = found
-                    else:
-                        writer.put(index - indices.start, found)
-                if reason is not None:
-                    writer.fail(index - indices.start, index, reason)
+                if index in skip:
+                    found = skip[index]
+                else:
+                    say("begin", shard, index)
+                    found = self._sample(shard, index, say)
+                if isinstance(found, str):
+                    writer.fail(index - indices.start, index, found)
                     failed += 1
-                messages("end", shard, index, reason)
-                if reason is None:
+                    say("end", shard, index, found)
+                else:
+                    writer.put(index - indices.start, found)
+                    say("end", shard, index, None)
                     self._picture(found)
-            messages("closing", shard)
+            say("closing", shard)
         return len(indices), failed, path.stat().st_size
 
-    def _sample(self, shard: int, index: int, messages: Messages) -> Any:
+    def _sample(self, shard: int, index: int, say: Say) -> Any:
         """Make a sample, or return the reason why it cannot be made."""
         for attempt in range(self.settings.retries + 1):
             try:
@@ -150,59 +159,25 @@ class ShardMaker:
             except Exception as error:  # noqa: BLE001  one sample that fails must not end the night
                 reason = reason_of(error)
                 if attempt == 0:
-                    messages("traced", shard, index, traced(error))
+                    say("traced", shard, index, traced(error))
                 # Its traces in kept scenes must not change other samples.
                 with contextlib.suppress(Exception):
                     self.close()
                 if attempt < self.settings.retries:
-                    messages("retry", shard, index, reason)
+                    say("retry", shard, index, reason)
             else:
                 return found
         return reason
 
-    def _standard_error(self, index: int, messages: Messages) -> float | None:
-        messages.begin(-1, index)
+    def _standard_error(self, index: int, say: Say) -> float | None:
+        say("begin", -1, index)
         value: float | None = None
         try:
             value = float(self._maker.standard_error(index))
         except TorchTransientError as error:
-            messages("retry", -1, index, f"no standard error: {reason_of(error)}")
-        messages("end", -1, index, None)
+            say("retry", -1, index, f"no standard error: {reason_of(error)}")
+        say("end", -1, index, None)
         return value if value is not None and math.isfinite(value) else None
-
-
-class Messages:
-    """Progress messages of a worker, each of them a sign of life.
-
-    ("begin", shard, index), ("end", shard, index, reason of a failure or None), ("retry", shard, index, reason),
-    ("traced", shard, index, traceback), ("closing", shard).
-
-    Args:
-        send: function that takes one message.
-        skip: samples that are not tried, with the reason.
-    """
-
-    def __init__(self, send: Callable[[tuple[Any, ...]], object], skip: Mapping[int, str] | None = None) -> None:
-        self._send = send
-        self.skip = skip or {}
-
-    def __call__(self, *message: Any) -> None:
-        self._send(message)
-
-    def begin(self, shard: int, index: int) -> str | None:
-        """Announce a sample.
-
-        Args:
-            shard: its number.
-            index: number of the sample.
-
-        Returns:
-            The reason where the sample is not to be tried.
-        """
-        if index in self.skip:
-            return self.skip[index]
-        self("begin", shard, index)
-        return None
 
 
 @dataclass(frozen=True)
@@ -222,23 +197,23 @@ class Measured:
     warned: tuple[tuple[str, type[Warning]], ...] = ()
 
 
-def execute(task: tuple[Any, ...], maker: ShardMaker, messages: Messages) -> tuple[Any, ...]:
+def execute(task: tuple[Any, ...], maker: ShardMaker, say: Say) -> tuple[Any, ...]:
     """Execute a task of a worker.
 
     Args:
         task: ("measure", indices, skip) or ("shard", number, description, skip, first).
         maker: of the worker.
-        messages: of the worker; takes over ``skip``.
+        say: function of the entries of a message.
 
     Returns:
         The last message, ("measured", Measured) or ("wrote", number, samples, failed, bytes).
     """
     kind, *rest = task
     if kind == "measure":
-        indices, messages.skip = rest
-        return "measured", maker.measure(indices, messages)
-    shard, described, messages.skip, first = rest
-    return "wrote", shard, *maker.make(shard, described, messages, first)
+        indices, skip = rest
+        return "measured", maker.measure(indices, say, skip)
+    shard, described, skip, first = rest
+    return "wrote", shard, *maker.make(shard, described, say, skip, first)
 
 
 def reason_of(error: BaseException) -> str:

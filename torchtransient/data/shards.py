@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torchtransient.array_files.array_file import check_folder, check_source, damage_said, path_of
 from torchtransient.array_files.hdf5 import check_memory, dataset_of, hdf5_package, is_number, new_hdf5, read_dataset
 from torchtransient.array_files.part_files import whole_file, writing_said
-from torchtransient.checks import as_whole, count, mapping, shown
+from torchtransient.checks import count, shown
 from torchtransient.data.sample import Sample
 from torchtransient.data.shard_format import (
     ENCODINGS,
@@ -67,7 +67,8 @@ class Shard:
         self._datasets: dict[str, Any] = {}
         self._values: dict[str, NDArray[Any]] = {}
         with damage_said(self.path, WHAT):
-            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0)
+            # Shards do not change: no lock, which their writer still holds for a moment when they appear.
+            self._file = hdf5_package(WHAT).File(self.path, "r", rdcc_nbytes=0, locking=False)
         try:
             with damage_said(self.path, WHAT):
                 self._read_about()
@@ -78,9 +79,7 @@ class Shard:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -105,7 +104,25 @@ class Shard:
             Array.
         """
         with damage_said(self.path, WHAT):
-            return self._read(name, row, window, pixels, as_stored)
+            self._check_row(row)
+            dataset = self._dataset(name)
+            shape = dataset.shape[1:]
+            part = [slice(0, n) for n in shape]
+            if window is not None:
+                time = self.time_axis(name)
+                if time is None:
+                    raise StorageError(f"{WHAT}: '{name}' {shape} has no time axis; read all of it.")
+                part[time] = part_of(window, shape[time], "window")
+            if pixels is not None:
+                if len(shape) < 2:
+                    raise StorageError(f"{WHAT}: '{name}' {shape} has no rows and columns; read all of it.")
+                part[-2:] = (part_of(one, n, "pixels") for one, n in zip(pixels, shape[-2:], strict=True))
+            size = tuple(cut.stop - cut.start for cut in part)
+            check_memory(math.prod(size) * dataset.dtype.itemsize, f"{WHAT}: '{name}' {size}")
+            # Into memory of its own: h5py would fill what it allocates with zeros first.
+            array: NDArray[Any] = np.empty(size, dataset.dtype)
+            _read_into(array, dataset, (row, *(cut.start for cut in part)))
+            return array if as_stored else decoded(array, self.encoding(name))
 
     def values(self, row: int) -> dict[str, NDArray[Any] | str]:
         """Return drawn values of a row.
@@ -141,7 +158,8 @@ class Shard:
             return tuple(self._dataset(name).shape[1:])
 
     def time_axis(self, name: str) -> int | None:
-        """Return the axis of the bins of an array.
+        """Return the axis of the bins of an array: as the header says of measured arrays; else second, behind channels,
+        or third, behind the Stokes components, in polarized variants.
 
         Args:
             name: of the array.
@@ -149,14 +167,7 @@ class Shard:
         Returns:
             Axis, None for an array without bins.
         """
-        with damage_said(self.path, WHAT):
-            return self._time_axis(name)
-
-    def _time_axis(self, name: str) -> int | None:
-        """As the header says of measured arrays; else second, behind channels, or third, behind the Stokes components,
-        in polarized variants.
-        """
-        shape = tuple(self._dataset(name).shape[1:])
+        shape = self.shape(name)
         about = self.header.get("about")
         about = about if isinstance(about, dict) else {}
         axis = about.get("axis")
@@ -257,30 +268,8 @@ class Shard:
         self._datasets[name] = dataset
         return dataset
 
-    def _read(self, name: str, row: int, window: Any, pixels: Any, as_stored: bool) -> NDArray[Any]:
-        self._check_row(row)
-        dataset = self._dataset(name)
-        shape = dataset.shape[1:]
-        part = [slice(0, n) for n in shape]
-        if window is not None:
-            time = self._time_axis(name)
-            if time is None:
-                raise StorageError(f"{WHAT}: '{name}' {shape} has no time axis; read all of it.")
-            part[time] = _slice(window, shape[time], "window")
-        if pixels is not None:
-            if len(shape) < 2:
-                raise StorageError(f"{WHAT}: '{name}' {shape} has no rows and columns; read all of it.")
-            rows, columns = pixels
-            part[-2], part[-1] = _slice(rows, shape[-2], "pixels"), _slice(columns, shape[-1], "pixels")
-        size = tuple(cut.stop - cut.start for cut in part)
-        check_memory(math.prod(size) * dataset.dtype.itemsize, f"{WHAT}: '{name}' {size}")
-        # Into memory of its own: h5py would fill what it allocates with zeros first.
-        array: NDArray[Any] = np.empty(size, dataset.dtype)
-        _read_into(array, dataset, (row, *(cut.start for cut in part)))
-        return array if as_stored else decoded(array, self.encoding(name))
-
     def _check_row(self, row: int) -> None:
-        if (number := as_whole(row)) is None or not 0 <= number < self.rows:
+        if row not in range(self.rows):
             raise StorageError(f"{WHAT}: '{self.path}': expected a row from 0 to {self.rows - 1}, got {shown(row)}.")
         if not self._there[row]:
             reason = next((text for number, _, text in self._about["failed"] if number == row), "no reason")
@@ -317,9 +306,9 @@ class ShardWriter:
         check_folder(self.path, WHAT)
         self.store, self.compression = check_store(store, WHAT), check_compression(compression, WHAT)
         self.rows = count(f"{WHAT}: rows", rows, 1, StorageError)
-        plain = dict(mapping(f"{WHAT}: header", header, "of plain data", StorageError))
-        self._header = json.loads(_json(plain, "header"))
-        self._samples: dict[int, _Row] = {}
+        self._header = json.loads(_json(dict(header)))
+        # Without their arrays.
+        self._samples: dict[int, Sample] = {}
         self._failed: dict[int, tuple[int, str]] = {}
         self._arrays: dict[str, _Column] = {}
         self._values: dict[str, tuple[tuple[int, ...], np.dtype[Any]] | None] = {}
@@ -369,18 +358,19 @@ class ShardWriter:
                 self._arrays[name] = _Column(array, name, encoding, self.compression)
             self._values = kinds
         what = f"{WHAT}: sample {sample.index}"
-        _check_same("arrays", list(self._arrays), list(arrays), what)
-        if self._values != kinds:
-            raise StorageError(
-                f"{what}: expected values as those of the samples before, {_kinds_text(self._values)}, got "
-                f"{_kinds_text(kinds)}. All samples of a recipe have the same."
-            )
+        for name, before, here in (("arrays", [*self._arrays], [*arrays]), ("values", self._values, kinds)):
+            if before != here:
+                raise StorageError(
+                    f"{what}: expected {name} as those of the samples before, {before}, got {here}. All samples of a "
+                    "recipe have the same."
+                )
         chunks = {name: self._arrays[name].compressed(row, array, what) for name, array in arrays.items()}
-        before, after = sample.outside
-        entry = _Row(int(sample.index), int(sample.seed), (float(before), float(after)), sample.structure, values)
         for name, column in self._arrays.items():
             column.rows[row] = chunks[name]
-        self._samples[row] = entry
+        self._samples[row] = Sample(
+            int(sample.index), int(sample.seed), arrays={}, values=values, outside=sample.outside,
+            structure=sample.structure,
+        )  # fmt: skip
 
     def fail(self, row: int, index: int, reason: str) -> None:
         """Record a sample that could not be made.
@@ -393,9 +383,8 @@ class ShardWriter:
         self._failed[self._free(row)] = (int(index), str(reason))
 
     def _free(self, row: int) -> int:
-        row = count(f"{WHAT}: row", row, 0, StorageError)
-        if row >= self.rows:
-            raise StorageError(f"{WHAT}: expected a row below {self.rows}, got {row}.")
+        if row not in range(self.rows):
+            raise StorageError(f"{WHAT}: expected a row from 0 to {self.rows - 1}, got {shown(row)}.")
         if row in self._samples or row in self._failed:
             raise StorageError(f"{WHAT}: row {row} was put before.")
         return row
@@ -418,7 +407,7 @@ class ShardWriter:
             about = np.frombuffer(self._about(columns).encode("utf-8"), np.uint8)
             file.create_dataset("about", data=about)
             file.create_dataset("index", data=np.array(index, np.int64))
-            nothing = _Row(0, 0, (0.0, 0.0), "", {})
+            nothing = Sample(0, 0, arrays={})
             rows = [self._samples.get(row, nothing) for row in range(self.rows)]
             file.create_dataset("seed", data=np.array([row.seed for row in rows], np.uint32))
             file.create_dataset("outside", data=np.array([row.outside for row in rows], np.float64))
@@ -444,18 +433,8 @@ class ShardWriter:
                 "texts": {key: [there[r].values[key] if r in there else "" for r in range(self.rows)] for key in texts},
                 "structure": [there[r].structure if r in there else "" for r in range(self.rows)],
                 "failed": [[row, *self._failed[row]] for row in sorted(self._failed)],
-            },
-            "header",
+            }
         )  # fmt: skip
-
-
-class _Row:
-    """Entries of a sample beside its arrays."""
-
-    def __init__(
-        self, index: int, seed: int, outside: tuple[float, float], structure: str, values: dict[str, Any]
-    ) -> None:
-        self.index, self.seed, self.outside, self.structure, self.values = index, seed, outside, structure, values
 
 
 class _Column:
@@ -557,24 +536,11 @@ def _value(value: Any, key: str) -> NDArray[Any] | str:
     return value if isinstance(value, str) else _array(value, f"{WHAT}: the value '{key}'")
 
 
-def _check_same(what: str, expected: list[str], found: list[str], where: str) -> None:
-    if expected != found:
-        raise StorageError(
-            f"{where}: expected the {what} {', '.join(expected)}, as the samples before have them, got "
-            f"{', '.join(found)}. All samples of a recipe have the same."
-        )
-
-
-def _kinds_text(kinds: Mapping[str, Any]) -> str:
-    each = (f"{key} {'text' if kind is None else f'{kind[1]} {kind[0]}'}" for key, kind in kinds.items())
-    return ", ".join(each) or "none"
-
-
-def _json(value: Any, what: str) -> str:
+def _json(value: Any) -> str:
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False)
     except (TypeError, ValueError) as error:
-        raise StorageError(f"{WHAT}: expected {what} as plain data that JSON can hold: {error}.") from error
+        raise StorageError(f"{WHAT}: expected a header of plain data that JSON can hold: {error}.") from error
 
 
 def stored_checksum(path: Path) -> str:
@@ -621,14 +587,21 @@ def _check_about(about: Mapping[str, Any], rows: int) -> None:
         raise ValueError("'about' does not describe the arrays")
 
 
-def _slice(given: Any, size: int, name: str) -> slice:
-    """A slice with its bounds. Raises StorageError for steps, and for nothing."""
-    if not isinstance(given, slice):
-        raise StorageError(f"{WHAT}: expected {name} as slices, got {shown(given)}.")
-    try:
-        start, stop, step = given.indices(size)
-    except (TypeError, ValueError):
-        raise StorageError(f"{WHAT}: expected {name} as slices of whole numbers, got {shown(given)}.") from None
+def part_of(given: slice, size: int, name: str) -> slice:
+    """Return a slice with its bounds.
+
+    Args:
+        given: slice.
+        size: of the whole.
+        name: for messages.
+
+    Returns:
+        Slice.
+
+    Raises:
+        StorageError: for steps, and for nothing.
+    """
+    start, stop, step = given.indices(size)
     if step != 1 or stop <= start:
         raise StorageError(f"{WHAT}: expected {name} to be some of {size} without steps, got {shown(given)}.")
     return slice(start, stop)

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from torchtransient.checks import count
-from torchtransient.checks import function as given_function
 from torchtransient.errors import ShapeError, UnitError
 
+# Images that the function takes at once: bounds the memory.
+_AT_ONCE = 4096
 
-def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_at_once: int = 4096) -> Tensor:
+
+def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor) -> Tensor:
     """Apply a filter of images, such as kornia's, to every bin and channel by itself: ``spatial_filter(lambda x:
     kornia.filters.median_blur(x, (3, 3)), transient)``.
 
@@ -22,7 +23,6 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_a
     Args:
         function: of images (N, 1, H, W).
         light: (..., H, W), (B, C, T, H, W) for instance, floating point.
-        images_at_once: bounds the memory that the function takes.
 
     Returns:
         (..., H', W').
@@ -31,21 +31,16 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor, images_a
         ShapeError: for other images.
         UnitError: for other dtypes; filter real and imaginary parts of phasors.
     """
-    given_function("spatial_filter", function, "images (N, 1, H, W)")
-    if not isinstance(light, Tensor) or light.ndim < 2:
-        got = tuple(light.shape) if isinstance(light, Tensor) else type(light).__name__
-        raise ShapeError(f"spatial_filter: expected images (..., H, W), got {got}.")
     if not light.is_floating_point():
         raise UnitError(f"spatial_filter: expected a floating dtype, got {light.dtype}; convert it with .float().")
-    at_once = count("spatial_filter: images_at_once", images_at_once)
     images = light.reshape(-1, 1, *light.shape[-2:])
     found = []
-    for first in range(0, max(len(images), 1), at_once):
-        given = images[first : first + at_once]
+    for given in torch.split(images, _AT_ONCE):
         made = function(given) if len(given) else given
-        if not isinstance(made, Tensor) or made.ndim != 4 or made.shape[:2] != given.shape[:2]:
-            got = tuple(made.shape) if isinstance(made, Tensor) else type(made).__name__
-            raise ShapeError(f"spatial_filter: expected the function to make images {tuple(given.shape)}, got {got}.")
+        if made.ndim != 4 or made.shape[:2] != given.shape[:2]:
+            raise ShapeError(
+                f"spatial_filter: expected the function to make images {tuple(given.shape)}, got {tuple(made.shape)}."
+            )
         found.append(made)
     together = torch.cat(found)
     return together.reshape(*light.shape[:-2], *together.shape[-2:])
@@ -56,13 +51,11 @@ class SpatialFilter(nn.Module):
 
     Args:
         function: of images (N, 1, H, W).
-        images_at_once: bounds the memory that the function takes.
     """
 
-    def __init__(self, function: Callable[[Tensor], Tensor], images_at_once: int = 4096) -> None:
+    def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
-        self.function = given_function("SpatialFilter", function, "images (N, 1, H, W)")
-        self.images_at_once = count("SpatialFilter: images_at_once", images_at_once)
+        self.function = function
 
     def forward(self, light: Tensor) -> Tensor:
         """Filter images.
@@ -73,4 +66,4 @@ class SpatialFilter(nn.Module):
         Returns:
             (..., H', W').
         """
-        return spatial_filter(self.function, light, self.images_at_once)
+        return spatial_filter(self.function, light)

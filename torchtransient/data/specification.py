@@ -22,14 +22,10 @@ import numpy as np
 from torchtransient.axes import FrequencyAxis, RateAxis, TimeAxis
 from torchtransient.capture import Scan
 from torchtransient.checks import (
-    MOST,
     Numbers,
-    as_whole,
     count,
     is_one_of,
-    mapping,
-    of_class,
-    real_array,
+    numbers,
     several,
     shown,
 )
@@ -47,7 +43,7 @@ from torchtransient.scene.load import Scene, load
 from torchtransient.scene.objects import LoadedScene
 from torchtransient.scene.samplers import OF_SCENE, sampler_for, sampler_for_all
 from torchtransient.scene.variant import resolve_variant
-from torchtransient.sensing import DEVICES, Device
+from torchtransient.sensing import Device
 from torchtransient.sensing import device as device_by_name
 
 # Key of the scan of a capture.
@@ -171,7 +167,7 @@ class Scenes:
         # Nodes before their entries.
         for key, value in sorted(structure.entries, key=lambda entry: entry[0].count(".")):
             if key == SCAN and self.scan is not None:
-                scan = _checked_scan(value)
+                scan = value
             else:
                 description = _exchanged(description, key, value)
         if scan is not None:
@@ -240,12 +236,6 @@ def _plain(value: Any) -> Any:
         return value.item()
     if not isinstance(value, str | int | float):
         raise SceneError(f"recipe: $names of XML files take texts and numbers, got {shown(value)}.")
-    return value
-
-
-def _checked_scan(value: Any) -> Scan:
-    if not isinstance(value, Scan):
-        raise SceneError(f"recipe: expected tt.nlos.Scan as choices of 'scan', got {shown(value)}.")
     return value
 
 
@@ -322,39 +312,21 @@ class Specification:
     ) -> None:
         # Before the scene, which may use them.
         self.plugins = _checked_plugins(plugins)
-        labels, keep = _names("labels", labels), None if keep is None else _names("keep", keep)
         if not is_one_of(physics, ("ignore", "error")):
             raise ArgumentError(f"recipe: physics: expected 'ignore' or 'error', got {shown(physics)}.")
-        if parameters is not None:
-            mapping("recipe: parameters", parameters, "{name: value}")
-        if scan is not None:
-            of_class("recipe: scan", scan, Scan)
-        for name, given, kind in (
-            ("time_axis", time_axis, TimeAxis), ("pulse", pulse, Pulse), ("irf", irf, Pulse), ("vary", vary, Mapping),
-            ("rates", rates, RateAxis), ("chirps", chirps, Chirps),
-        ):  # fmt: skip
-            if given is not None and not isinstance(given, kind):
-                what = "dictionary {key: distribution}" if name == "vary" else kind.__name__
-                raise ArgumentError(f"recipe: {name}: expected a {what}, got {shown(given)}.")
         if frequencies is not None and not isinstance(frequencies, FrequencyAxis):
-            numbers = real_array(frequencies)
-            if numbers is None or numbers.ndim != 1:
-                raise ArgumentError(
-                    f"recipe: frequencies: expected cycles per metre in a list, got {shown(frequencies)}."
-                )
-            frequencies = FrequencyAxis(tuple(numbers.tolist()))
-        if gates is not None and (isinstance(gates, Gate) or not all(isinstance(g, Gate) for g in _listed(gates))):
-            raise ArgumentError(f"recipe: gates: expected a list of tt.Gate, got {shown(gates)}.")
+            frequencies = FrequencyAxis(tuple(numbers("recipe: frequencies", frequencies)))
         self.seed = count("recipe: seed", seed, 0, most=None)
         self.n = None if n is None else count("recipe: n", n)
         self.variant = resolve_variant(variant)
         self.settings = Settings(
-            labels=labels, keep=keep, time_axis=time_axis, frequencies=frequencies,
+            labels=tuple(labels), keep=None if keep is None else tuple(keep), time_axis=time_axis,
+            frequencies=frequencies,
             gates=None if gates is None else tuple(gates), rates=rates, chirps=chirps,
             temporal_filter=checked_filter(temporal_filter),
             spp=None if spp is None else count("recipe: spp", spp),
             max_depth=None if max_depth is None else count("recipe: max_depth", max_depth, -1),
-            sensors=_counts("sensors", sensors, 0, "all"), bounces=_counts("bounces", bounces, 1, "all"),
+            sensors=_hashable(sensors), bounces=_hashable(bounces),
             pulse=pulse, irf=irf, energy=energy, physics=physics,
         )  # fmt: skip
         self.scan = scan
@@ -435,31 +407,11 @@ class Specification:
         return self.scenes.parameters(self.settings.bounces, self.settings.energy)
 
 
-def _listed(given: Any) -> list[Any]:
-    """List of a sequence's entries, or of a single value."""
-    is_row = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) and getattr(given, "ndim", 1) > 0
-    return list(given) if is_row else [given]
-
-
-def _names(what: str, given: Any) -> tuple[str, ...]:
-    if isinstance(given, str) or not all(isinstance(one, str) for one in _listed(given)):
-        hint = f"; write [{given!r}]" if isinstance(given, str) else ""
-        raise SceneError(f"recipe: {what}: expected a list of names, got {shown(given)}{hint}.")
-    found = tuple(given)
-    if len(set(found)) < len(found):
-        raise SceneError(f"recipe: {what}: expected each once, got {list(found)}.")
-    return found
-
-
-def _counts(what: str, given: Any, least: int, text: str) -> Any:
-    """A number, a text, or a tuple of one or more numbers."""
-    if isinstance(given, str) and given == text:
+def _hashable(given: Any) -> Any:
+    """A number, a text, or a tuple of numbers."""
+    if np.ndim(given) == 0:
         return given
-    several = (isinstance(given, Sequence) and not isinstance(given, (str, bytes))) or bool(getattr(given, "ndim", 0))
-    whole = tuple(count(f"recipe: {what}", one, least) for one in (given if several else [given]))
-    if not whole:
-        raise SceneError(f"recipe: {what}: expected one or more whole numbers, or {text!r}, got {shown(given)}.")
-    return whole if several else whole[0]
+    return tuple(np.asarray(given).tolist())
 
 
 def _device(given: Any) -> Device | None:
@@ -467,17 +419,10 @@ def _device(given: Any) -> Device | None:
         return given
     if isinstance(given, Mapping):
         return Device.from_dict(given)
-    if isinstance(given, str) and given in DEVICES:
+    path = Path(given)
+    if not path.is_file():
         return device_by_name(given)
-    if isinstance(given, str | Path):
-        if not Path(given).is_file():
-            known = ", ".join(sorted(DEVICES))
-            raise SceneError(f"recipe: device: expected a device, its file, or one of {known}; got {str(given)!r}.")
-        return Device.from_json(Path(given)) if Path(given).suffix == ".json" else Device.from_yaml(Path(given))
-    raise SceneError(
-        f"recipe: device: expected a device, its name or its file, got {shown(given)}. "
-        "sensing.Device(..., stages=[...]) describes a chain of one's own."
-    )
+    return Device.from_json(path) if path.suffix == ".json" else Device.from_yaml(path)
 
 
 def is_entry(value: Any) -> bool:
@@ -524,13 +469,7 @@ def samples_of(indices: Iterable[int]) -> list[int]:
     Raises:
         ShapeError: for other numbers.
     """
-    found = []
-    for index in indices:
-        number = as_whole(index)
-        if number is None or not 0 <= number <= MOST:
-            raise ShapeError(f"recipe: expected whole numbers of samples of at least 0, got {shown(index)}.")
-        found.append(number)
-    return found
+    return [count("recipe: sample", index, 0, ShapeError) for index in indices]
 
 
 def _checked_plugins(modules: Sequence[str]) -> tuple[str, ...]:

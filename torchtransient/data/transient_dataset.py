@@ -21,20 +21,18 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchtransient.array_files.array_file import tensor_in
 from torchtransient.axes import TimeAxis
-from torchtransient.checks import as_number, count, flag, path_of, several, shown
+from torchtransient.checks import count, path_of, shown
 from torchtransient.data.manifest import named_shards, shards_of
 from torchtransient.data.sample import (
     Epochs,
     checked_seed,
-    checked_transform,
     measurement,
     outside_tensor,
     sample_generator,
     sample_number,
-    takes_generator,
 )
 from torchtransient.data.shard_format import measured_names
-from torchtransient.data.shards import Shard
+from torchtransient.data.shards import Shard, part_of
 from torchtransient.errors import (
     ArgumentError,
     StorageError,
@@ -48,6 +46,8 @@ from torchtransient.errors import (
 _SAME_EDGE = 1e-6
 WHAT = "data set"
 _OPEN = 32
+# Samples of a stream that are shuffled once more.
+_BUFFER = 1024
 _MEASURED = "measurement"
 _VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient"
 
@@ -89,26 +89,25 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         self._table = ShardTable(where)
         self.about: dict[str, Any] = self._table.about
         shapes = self._table.arrays
-        whole = axis_of(self.about)
-        self._bins = bins_of(window, whole)
-        self.axis: TimeAxis | None = cut_axis(whole, self._bins)
+        whole = _axis_of(self.about)
+        self._bins = _bins_of(window, whole)
+        self.axis: TimeAxis | None = whole
+        if whole is not None and self._bins is not None:
+            start_opl, bins = whole.start_opl + self._bins.start * whole.bin_width_opl, self._bins
+            self.axis = TimeAxis(start_opl, whole.bin_width_opl, bins.stop - bins.start)
         # Measured arrays are on the time axis of the film if they have as many bins.
         self._timed = measured_names(self.about)
-        self._size = image_size(shapes, self._timed)
-        self._pixels = pixels_of(pixels, self._size)
-        self.transform, self.seed = checked_transform(WHAT, transform), checked_seed(WHAT, seed)
-        self.as_stored = bool(as_stored)
+        # Rows and columns of the steady image and labels, else of measured arrays.
+        order = ["steady", *(name for name in shapes if name not in self._timed), *self._timed]
+        self._size = next((shapes[name][-2:] for name in order if len(shapes.get(name, ())) >= 2), ())
+        self._pixels = pixels
+        if pixels is not None:
+            self._pixels = tuple(part_of(one, size, "pixels") for one, size in zip(pixels, self._size, strict=True))
+        self.transform, self.seed, self.as_stored = transform, checked_seed(WHAT, seed), as_stored
         self._fields = self._read_fields(fields, shapes)
-        if seed is not None and not takes_generator(transform):
-            raise StorageError(
-                f"{WHAT}: seed= is for a transform that takes generator=, as sensors do, got {shown(transform)}."
-            )
 
     def __len__(self) -> int:
         return len(self._table)
-
-    def __getitem__(self, number: int) -> dict[str, Any]:
-        return self.sample(number, self.epoch)
 
     @property
     def index(self) -> Tensor:
@@ -130,16 +129,6 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         """Names of a sample's entries, beside its index."""
         made = () if self.transform is None else (_MEASURED,)
         return tuple(dict.fromkeys((*self._fields, *made)))
-
-    @property
-    def repeats(self) -> Tensor:
-        """(N,) int64: number of samples before it that have the same ``index``, those of other folders."""
-        return torch.from_numpy(self._table.repeat.copy())
-
-    @property
-    def shards(self) -> Tensor:
-        """(N,) int64: the file of every sample, by its place among them."""
-        return torch.from_numpy(self._table.shard.copy())
 
     def sample(self, number: int, epoch: int | None = None) -> dict[str, Any]:
         """Read a sample.
@@ -176,20 +165,17 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     # -------------------------------------------------------------------------------------------------------- reading
 
     def _read_fields(self, fields: Sequence[str] | None, shapes: dict[str, Any]) -> tuple[str, ...]:
-        known = (*shapes, _VALUES)
+        known, made = (*shapes, _VALUES), (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
         if fields is None:
             names = known
         else:
-            listed = [fields] if isinstance(fields, str) else several(f"{WHAT}: fields", fields, "names", str)
-            names = tuple(listed)
-            made = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
+            names = (fields,) if isinstance(fields, str) else tuple(fields)
             unknown = [name for name in names if name not in (*known, *made)]
             if unknown:
                 raise ArgumentError(f"{WHAT}: expected fields among {', '.join(known)}, got {shown(unknown[0])}.")
         if self.transform is not None and _TRANSIENT not in shapes:
             raise StorageError(f"{WHAT}: transform= is for transients, and the samples have {', '.join(shapes)}.")
-        left_out = (_INDEX,) if self.transform is None else (_INDEX, _MEASURED)
-        return tuple(name for name in names if name not in left_out)
+        return tuple(name for name in names if name not in made)
 
     def _read(self, shard: Shard, name: str, row: int) -> Tensor:
         shape = self._table.arrays[name]
@@ -202,17 +188,15 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
 class TransientStream(IterableDataset[dict[str, Any]]):
     """Stream of the samples of shards, each once in an epoch, over all ranks and workers together.
 
-    Files come in a shuffled order, and so do the samples of a file; ``buffer`` samples that follow each other are
-    shuffled once more. Only their places are kept, so that a large buffer takes no memory, and a reader goes back and
-    forth between as many files as it spans. The order depends on ``seed``, the epoch (:meth:`set_epoch`; without it,
-    every epoch is the first one), and the number of ranks and workers. Workers of a DataLoader divide the share of
-    their rank.
+    Files come in a shuffled order, and so do the samples of a file; 1024 samples that follow each other are shuffled
+    once more, by their places, so that a reader goes back and forth between as many files as they span. The order
+    depends on ``seed``, the epoch (:meth:`set_epoch`; without it, every epoch is the first one), and the number of
+    ranks and workers. Workers of a DataLoader divide the share of their rank.
 
     Args:
         where: as of :class:`TransientDataset`.
         shuffle: False for files and rows in order.
         seed: of the order.
-        buffer: samples that are shuffled once more.
         rank: share of the samples that this process reads; by default that of torch.distributed, or of RANK.
         world_size: number of shares, likewise. Shares differ by one sample where samples cannot be divided evenly.
         even: leave out the last samples of an epoch's order, so that no rank waits for another one.
@@ -221,19 +205,15 @@ class TransientStream(IterableDataset[dict[str, Any]]):
 
     Raises:
         StorageError: as :class:`TransientDataset`.
-        ArgumentError: for a rank without a world size.
     """
 
     def __init__(
-        self, where: Any, *, shuffle: bool = True, seed: int = 0, buffer: int = 1024, rank: int | None = None,
+        self, where: Any, *, shuffle: bool = True, seed: int = 0, rank: int | None = None,
         world_size: int | None = None, even: bool = False, noise_seed: int | None = None, **reading: Any,
     ) -> None:  # fmt: skip
         self.dataset = TransientDataset(where, **reading, seed=noise_seed)
-        self.shuffle, self.even = flag(f"{WHAT}: shuffle", shuffle), flag(f"{WHAT}: even", even)
-        self.seed, self.buffer = count(f"{WHAT}: seed", seed, 0, most=None), count(f"{WHAT}: buffer", buffer)
-        if (rank is None) != (world_size is None):
-            raise ArgumentError(f"{WHAT}: expected rank and world_size both or neither, got {rank} and {world_size}.")
-        self._rank = None if rank is None or world_size is None else _checked_rank(rank, world_size)
+        self.shuffle, self.even, self.seed = shuffle, even, count(f"{WHAT}: seed", seed, 0, most=None)
+        self._rank = None if rank is None and world_size is None else _checked_rank(rank, world_size)
         # In shared memory, for workers that stay for several epochs. Epoch, batches that are left out, their size.
         self._place = torch.tensor([0, 0, 1]).share_memory_()  # type: ignore[no-untyped-call]
 
@@ -281,24 +261,13 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     def repeated(self) -> Iterator[tuple[dict[str, Any], int]]:
         """Yield samples, each with the number of samples of other folders before it that have its ``index``."""
         epoch, batches, size = self._place.tolist()
-        repeats = self.dataset.repeats
+        repeats = self.dataset._table.repeat
         part, parts = _worker()
         given, turn = self._given(batches, size, parts)
         # Loaders begin with their first worker: it takes the share of the one whose turn it is.
         part = (part + turn) % parts
         for number in self._order(epoch, part, parts)[given[part] :]:
             yield self.dataset.sample(int(number), epoch), int(repeats[number])
-
-    def order(self, epoch: int) -> NDArray[np.int64]:
-        """Return the numbers of the samples that this process, or worker of a DataLoader, reads in an epoch.
-
-        Args:
-            epoch: from 0 on.
-
-        Returns:
-            int64 (n,).
-        """
-        return self._order(count(f"{WHAT}: epoch", epoch, 0), *_worker())
 
     def _order(self, epoch: int, part: int, parts: int) -> NDArray[np.int64]:
         rank, ranks = self._ranks()
@@ -307,7 +276,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         found = self._everything(epoch)[start + first : start + last]
         if not self.shuffle:
             return found
-        return _buffered(found, self.buffer, np.random.default_rng([self.seed, epoch, 1, rank, part]))
+        return _buffered(found, _BUFFER, np.random.default_rng([self.seed, epoch, 1, rank, part]))
 
     def _given(self, batches: int, size: int, parts: int) -> tuple[list[int], int]:
         """Samples that each worker has given when its loader has given so many batches, and the worker whose turn it
@@ -326,7 +295,7 @@ class TransientStream(IterableDataset[dict[str, Any]]):
 
     def _everything(self, epoch: int) -> NDArray[np.int64]:
         """All samples, file by file: the same order in all ranks and workers."""
-        files = self.dataset.shards.numpy()
+        files = self.dataset._table.shard
         numbers = np.arange(len(files), dtype=np.int64)
         if not self.shuffle:
             return numbers
@@ -385,11 +354,11 @@ def _found_rank() -> tuple[int, int]:
     return 0, 1
 
 
-def _checked_rank(rank: int, world_size: int) -> tuple[int, int]:
+def _checked_rank(rank: int | None, world_size: int | None) -> tuple[int, int]:
     size = count(f"{WHAT}: world_size", world_size)
-    if count(f"{WHAT}: rank", rank, 0) >= size:
+    if (place := count(f"{WHAT}: rank", rank, 0)) >= size:
         raise StorageError(f"{WHAT}: expected rank below world_size = {size}, got {rank}.")
-    return int(rank), size
+    return place, size
 
 
 # ------------------------------------------------------------------------------------------------ files
@@ -410,7 +379,7 @@ class ShardTable:
     """
 
     def __init__(self, where: Any) -> None:
-        self.paths = shard_paths(where)
+        self.paths = _shard_paths(where)
         self._open: OrderedDict[int, Shard] = OrderedDict()
         self._process = os.getpid()
         shards, rows, index = [], [], []
@@ -419,7 +388,6 @@ class ShardTable:
         self.failed: dict[int, str] = {}
         self.arrays: dict[str, tuple[int, ...]] = {}
         self.time_axes: dict[str, int | None] = {}
-        self.keys: tuple[str, ...] = ()
         self.about: dict[str, Any] = {}
         for number, path in enumerate(self.paths):
             with Shard(path) as shard:
@@ -435,7 +403,7 @@ class ShardTable:
                     first = kind
                     self.arrays = {name: shard.shape(name) for name in shard.names}
                     self.time_axes = {name: shard.time_axis(name) for name in shard.names}
-                    self.keys, self.about = shard.keys, kind["about"]
+                    self.about = kind["about"]
                 _check_alike(first, kind, self.paths[shards[0]], path)
         if not shards:
             raise StorageError(f"{WHAT}: expected samples, got none in {len(self.paths)} shards: all of them failed.")
@@ -476,18 +444,8 @@ class ShardTable:
         return {**self.__dict__, "_open": OrderedDict()}
 
 
-def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
-    """Return the time axis of a render.
-
-    Args:
-        about: entry ``about`` of a header.
-
-    Returns:
-        Axis, None for films without one.
-
-    Raises:
-        StorageError: for an entry that is no axis.
-    """
+def _axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
+    """Time axis of a render, None for films without one."""
     given = about.get("axis")
     if not isinstance(given, Mapping) or "num_bins" not in given:
         return None
@@ -497,39 +455,18 @@ def axis_of(about: Mapping[str, Any]) -> TimeAxis | None:
         raise StorageError(f"{WHAT}: the time axis of the shards is none: {error}") from None
 
 
-def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
-    """Return the bins of a window.
-
-    Args:
-        window: ``(start_opl, end_opl)`` in metres, all bins that it touches, None for an open end; or a slice of bins;
-            or None.
-        axis: time axis, or None.
-
-    Returns:
-        Slice, or None.
-
-    Raises:
-        StorageError: for a window that is not all on the axis, and without an axis.
-    """
+def _bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
+    """Bins of a window, all that it touches. Raises StorageError for one that is not all on the axis."""
     if window is None:
         return None
     if axis is None:
         raise StorageError(f"{WHAT}: window= is for transients, and these samples have no time axis.")
     if isinstance(window, slice):
-        start, stop, step = window.indices(axis.num_bins)
-        if step != 1 or stop <= start:
-            raise StorageError(f"{WHAT}: expected window to be some of {axis.num_bins} bins, got {shown(window)}.")
-        return slice(start, stop)
-    ends = list(window) if isinstance(window, tuple | list) and len(window) == 2 else [object()]
-    metres = [
-        default if end is None else as_number(end)
-        for end, default in zip(ends, (axis.start_opl, axis.end_opl), strict=False)
-    ]
-    if len(metres) != 2 or None in metres:
-        raise StorageError(
-            f"{WHAT}: expected window as (start_opl, end_opl) in metres or a slice of bins, got {shown(window)}."
-        )
-    first, last = ((float(end) - axis.start_opl) / axis.bin_width_opl for end in metres if end is not None)
+        return part_of(window, axis.num_bins, "window")
+    start_opl, end_opl = window
+    start_opl = axis.start_opl if start_opl is None else start_opl
+    end_opl = axis.end_opl if end_opl is None else end_opl
+    first, last = ((float(end) - axis.start_opl) / axis.bin_width_opl for end in (start_opl, end_opl))
     if not (-_SAME_EDGE <= first < last <= axis.num_bins + _SAME_EDGE):
         raise StorageError(
             f"{WHAT}: expected window to lie between {axis.start_opl:g} m and {axis.end_opl:g} m, got "
@@ -539,101 +476,23 @@ def bins_of(window: Any, axis: TimeAxis | None) -> slice | None:
     return slice(start, min(axis.num_bins, max(start + 1, math.ceil(last - _SAME_EDGE))))
 
 
-def cut_axis(axis: TimeAxis | None, bins: slice | None) -> TimeAxis | None:
-    """Return the axis of some of its bins.
-
-    Args:
-        axis: time axis, or None.
-        bins: slice, or None.
-
-    Returns:
-        Axis, or None.
+def _shard_paths(where: Any) -> list[Path]:
+    """Shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards that are
+    missing. Raises StorageError where there is none.
     """
-    if axis is None or bins is None:
-        return axis
-    return TimeAxis(axis.start_opl + bins.start * axis.bin_width_opl, axis.bin_width_opl, bins.stop - bins.start)
-
-
-def image_size(shapes: Mapping[str, tuple[int, ...]], measured: Sequence[str]) -> tuple[int, ...]:
-    """Return the rows and columns of the images of samples: of the steady image and labels, else of measured arrays.
-
-    Args:
-        shapes: of the arrays by name.
-        measured: names of measured arrays, in order.
-
-    Returns:
-        (rows, columns), or ().
-    """
-    order = ["steady", *(name for name in shapes if name not in measured), *measured]
-    return next((shapes[name][-2:] for name in order if len(shapes.get(name, ())) >= 2), ())
-
-
-def pixels_of(pixels: Any, size: tuple[int, ...]) -> tuple[slice, slice] | None:
-    """Check a rectangle of pixels.
-
-    Args:
-        pixels: slices (rows, columns), or None.
-        size: of the image.
-
-    Returns:
-        Slices with their bounds, or None.
-
-    Raises:
-        StorageError: for other rectangles, and empty ones.
-    """
-    if pixels is None:
-        return None
-    fits = isinstance(pixels, tuple | list) and len(pixels) == 2 and all(isinstance(one, slice) for one in pixels)
-    if not fits or len(size) != 2:
-        raise StorageError(f"{WHAT}: expected pixels as slices (rows, columns) of an image, got {shown(pixels)}.")
-    cuts = []
-    for one, length in zip(pixels, size, strict=True):
-        start, stop, step = one.indices(length)
-        if step != 1 or stop <= start:
-            raise StorageError(f"{WHAT}: expected pixels to be some of {size} without steps, got {shown(pixels)}.")
-        cuts.append(slice(start, stop))
-    return cuts[0], cuts[1]
-
-
-def shard_paths(where: Any) -> list[Path]:
-    """Return the shards of a folder, a pattern, a file, or a list of them. Warns where a folder's manifest names shards
-    that are missing.
-
-    Args:
-        where: as of :class:`TransientDataset`.
-
-    Returns:
-        Paths.
-
-    Raises:
-        StorageError: where there is none.
-    """
-    if isinstance(where, str | os.PathLike):
-        text = os.fspath(where)
-        path = path_of(text, WHAT)
-        if path.is_dir():
-            found = _of_folder(path)
-        elif path.is_file():
-            found = [path]
-        else:
-            found = sorted(Path(name) for name in glob.glob(str(text), recursive=True))
-            if any(place.is_dir() for place in found):
-                found = [shard for place in found for shard in (_of_folder(place) if place.is_dir() else [place])]
-        if not found:
-            raise StorageError(
-                f"{WHAT}: expected a folder with shards, or a pattern of their names, got '{text}', where there is "
-                "none."
-            )
-        return [path.absolute() for path in found]
-    try:
-        places: list[Any] = several(WHAT, where, "folders", error=StorageError)
-    except StorageError:
-        places = []
-    paths = [path for one in places for path in shard_paths(one)]
+    if isinstance(where, list | tuple):
+        paths = [path for one in where for path in _shard_paths(one)]
+    else:
+        path = path_of(where, WHAT)
+        places = [path] if path.exists() else sorted(map(Path, glob.glob(str(path), recursive=True)))
+        paths = [one.absolute() for place in places for one in (_of_folder(place) if place.is_dir() else [place])]
     if len(set(paths)) != len(paths):
         raise StorageError(f"{WHAT}: expected every shard once, got some of them twice.")
     if not paths:
-        raise StorageError(f"{WHAT}: expected a folder, a pattern, or a list of them, got {shown(where)}.")
+        raise StorageError(
+            f"{WHAT}: expected a folder with shards, a pattern of their names, or a list of them, got {shown(where)}, "
+            "where there is none."
+        )
     return paths
 
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from torchtransient.checks import Numbers, as_number
-from torchtransient.errors import ArgumentError, GradientError, ShapeError, UnitError
+from torchtransient.checks import Numbers, finite
+from torchtransient.errors import GradientError, ShapeError
 
 Part = TypeVar("Part")
 
@@ -51,11 +50,10 @@ def accumulate(
     listed = list(parts)
     if not listed:
         raise ShapeError("accumulate: expected at least one part, got none.")
-    shares = [1.0 / len(listed)] * len(listed) if weights is None else [_weight(w) for w in weights]
+    given = [1.0 / len(listed)] * len(listed) if weights is None else weights
+    shares = [finite("accumulate: weight", weight) for weight in given]
     if len(shares) != len(listed):
         raise ShapeError(f"accumulate: expected a weight for each of {len(listed)} parts, got {len(shares)}.")
-    if model is not None and not isinstance(model, nn.Module):
-        raise ArgumentError(f"accumulate: expected model as a module, got {type(model).__name__}.")
     values = []
     for n, (part, share) in enumerate(zip(listed, shares, strict=True)):
         waits = isinstance(model, DistributedDataParallel) and n + 1 < len(listed)
@@ -76,10 +74,3 @@ def accumulate(
             values.append(scaled.detach())
             del loss, scaled
     return sum(float(value) for value in values)
-
-
-def _weight(value: Any) -> float:
-    number = as_number(value)
-    if number is None or not math.isfinite(number):
-        raise UnitError(f"accumulate: expected weights as finite numbers, got {value!r}.")
-    return number

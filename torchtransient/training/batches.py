@@ -14,10 +14,10 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset, IterableDataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
-from torchtransient.checks import as_number, by_number, count, flag, is_one_of, positive, shown
-from torchtransient.errors import ArgumentError, DeviceError, StorageError, UnitError
+from torchtransient.checks import count, is_one_of, shown
+from torchtransient.errors import DeviceError, StorageError, UnitError
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
 
@@ -56,16 +56,10 @@ class Ranks:
 
         Args:
             value: of this rank.
-
-        Raises:
-            UnitError: for other values than one number.
         """
-        number = as_number(value)
-        if number is None:
-            raise UnitError(f"ranks: expected one number to take the mean of, got {shown(value)}.")
         if self.size == 1:
-            return number
-        total = torch.tensor(number, dtype=torch.float64, device=self.device)
+            return float(value)
+        total = torch.tensor(float(value), dtype=torch.float64, device=self.device)
         dist.all_reduce(total)
         return float(total) / self.size
 
@@ -76,9 +70,7 @@ class Ranks:
 
 
 @contextmanager
-def ranks(
-    device: str = "cpu", *, threads: int | None = None, backend: str | None = None, timeout_s: float = 1800.0
-) -> Iterator[Ranks]:
+def ranks(device: str = "cpu", *, threads: int | None = None, timeout_s: float = 1800.0) -> Iterator[Ranks]:
     """Join the process group of `torchrun`, and leave it at the end; without torchrun, one rank and no group. ::
 
         with tt.training.ranks() as ranks:                    # torchrun --nproc-per-node 2 train.py
@@ -90,7 +82,6 @@ def ranks(
             (CUDA_VISIBLE_DEVICES): call this before anything has used CUDA, in torch or in a variant of Mitsuba.
         threads: of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares the cores of the
             machine among its ranks. They come back to their number before.
-        backend: instead of gloo and nccl.
         timeout_s: seconds that a rank waits for the others.
 
     Raises:
@@ -101,15 +92,15 @@ def ranks(
 
     if not is_one_of(device, ("cpu", "cuda")):
         raise UnitError(f"ranks: expected device 'cpu' or 'cuda', got {shown(device)}.")
-    timeout_s = positive("ranks: timeout_s", timeout_s)
     found = _found(device)
     if device == "cuda":
         _take_device(found)
     several = found.size > 1
     with set_threads(threads if threads is not None else max(1, _cores() // found.local_size)):
         if several:
-            kind = backend or ("nccl" if device == "cuda" else "gloo")
-            _join(kind, timeout_s)
+            if dist.is_initialized():
+                raise DeviceError("ranks: this process is in a group already, and would leave it; open one.")
+            dist.init_process_group("nccl" if device == "cuda" else "gloo", timeout=timedelta(seconds=timeout_s))
         try:
             yield found
         finally:
@@ -131,32 +122,13 @@ def worker_init(worker: int) -> None:
     set_threads(1)
 
 
-def _join(kind: str, timeout_s: float) -> None:
-    if dist.is_initialized():
-        raise DeviceError("ranks: this process is in a group already, which it would leave at the end; open one.")
-    try:
-        dist.init_process_group(kind, timeout=timedelta(seconds=timeout_s))
-    except ValueError as error:
-        raise UnitError(f"ranks: the group cannot be joined: {error}. Start the script with torchrun.") from error
-
-
 def _found(device: str) -> Ranks:
-    given = {name: os.environ[name] for name in _TORCHRUN if name in os.environ}
-    if not given:
+    if not any(name in os.environ for name in _TORCHRUN):
         return Ranks(device=torch.device(device))
-    if len(given) < len(_TORCHRUN):
-        missing = ", ".join(name for name in _TORCHRUN if name not in given)
-        raise UnitError(f"ranks: {', '.join(given)} are set and {missing} not; start the script with torchrun.")
-    least = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
-    rank, size, local, local_size = (
-        count(f"ranks: {name}", int(text) if (text := given[name]).isdecimal() else text, least[name], UnitError)
-        for name in _TORCHRUN
-    )
-    if rank >= size or local >= local_size:
-        raise UnitError(
-            f"ranks: expected RANK below WORLD_SIZE and LOCAL_RANK below LOCAL_WORLD_SIZE, got {rank} of {size} and "
-            f"{local} of {local_size}; start the script with torchrun."
-        )
+    try:
+        rank, size, local, local_size = (int(os.environ[name]) for name in _TORCHRUN)
+    except (KeyError, ValueError) as error:
+        raise UnitError(f"ranks: expected the variables of torchrun, got {error}; start the script with it.") from error
     return Ranks(rank, size, local=local, local_size=local_size, device=torch.device(device))
 
 
@@ -225,7 +197,7 @@ class Batches(Sampler[list[int]]):
     ) -> None:  # fmt: skip
         self.size = count(f"{_WHAT}: size", size, 1, UnitError)
         self.batch_size = count(f"{_WHAT}: batch_size", batch_size, 1, UnitError)
-        self.seed, self.shuffle = count(f"{_WHAT}: seed", seed, 0, UnitError, None), flag(f"{_WHAT}: shuffle", shuffle)
+        self.seed, self.shuffle = count(f"{_WHAT}: seed", seed, 0, UnitError, None), shuffle
         self.world_size = count(f"{_WHAT}: world_size", world_size, 1, UnitError)
         self.rank = count(f"{_WHAT}: rank", rank, 0, UnitError)
         if self.rank >= self.world_size:
@@ -289,26 +261,16 @@ class Batches(Sampler[list[int]]):
             options: others of the DataLoader.
 
         Raises:
-            UnitError: for streams and data sets of another size.
-            ArgumentError: for other objects than data sets, and for ``num_workers``.
+            UnitError: for data sets of another size.
         """
-        if "num_workers" in options:
-            raise ArgumentError(f"{_WHAT}: expected workers={shown(options['num_workers'])} in place of num_workers=.")
-        processes = count(f"{_WHAT}: workers", workers, 0, UnitError)
-        if isinstance(data, IterableDataset):
-            raise UnitError(
-                f"{_WHAT}: expected a map-style data set, got {shown(data)}, which has an order of its own; use "
-                "DataLoader(stream, batch_size=..., generator=torch.Generator())."
-            )
-        if not isinstance(data, Dataset):  # one of torch's need not know its length
-            by_number(_WHAT, data)
+        # One of torch's need not know its length.
         size = len(data) if hasattr(data, "__len__") else self.size
         if size != self.size:
             raise UnitError(f"{_WHAT}: they are of {self.size} samples, the data set has {size}.")
         own: dict[str, Any] = {"generator": self._of_workers()}
-        if processes and renders:
+        if workers and renders:
             own |= {"multiprocessing_context": "spawn", "persistent_workers": True, "worker_init_fn": worker_init}
-        return DataLoader(data, batch_sampler=self, num_workers=processes, **{**own, **options})
+        return DataLoader(data, batch_sampler=self, num_workers=workers, **{**own, **options})
 
     def epoch(self, step: int) -> float:
         """Return the number of passes over the data set before a step.
@@ -349,8 +311,6 @@ class Batches(Sampler[list[int]]):
         Args:
             state: of :meth:`state_dict`.
         """
-        if not isinstance(state, dict):
-            raise StorageError(f"{_WHAT}: expected a state as of state_dict(), got {shown(state)}.")
         order = {name: value for name, value in state.items() if name != "step"}
         if order != self._order() or "step" not in state:
             raise StorageError(

@@ -9,7 +9,6 @@ import warnings
 import zipfile
 from collections import OrderedDict
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +21,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.parameter import is_lazy
 
+from torchtransient.array_files.part_files import sweep_parts, whole_file
 from torchtransient.checks import check_folder, check_special, count, path_of, shown
 from torchtransient.errors import (
     ArgumentError,
@@ -33,12 +33,6 @@ from torchtransient.errors import (
 )
 
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, torch.Size, torch.dtype, torch.device)
-
-# Kinds of numbers that torch has, in any order of their bytes.
-_ARRAYS = [np.dtype(kind) for kind in ("?", "i1", "u1")]
-_ARRAYS += [np.dtype(order + kind + size) for order in "<>" for kind in "iu" for size in "248"]
-_ARRAYS += [np.dtype(order + kind) for order in "<>" for kind in ("f2", "f4", "f8", "c8", "c16")]
-
 
 def plain(value: Any, where: str) -> Any:
     """Return a state as plain data: mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch.
@@ -52,32 +46,26 @@ def plain(value: Any, where: str) -> Any:
     """
     if type(value) in _PLAIN:
         return value
-    if isinstance(value, torch.Tensor) and is_lazy(value):
-        raise StorageError(f"save_checkpoint: {where} has no shape yet: run the lazy module once before.")
     if isinstance(value, torch.Tensor):
         return value.detach()
     if isinstance(value, np.generic) and type(value.item()) in _PLAIN:
         return value.item()
-    if isinstance(value, np.ndarray) and value.dtype in _ARRAYS:
+    if isinstance(value, np.ndarray):
         return torch.from_numpy(value.astype(value.dtype.newbyteorder("="), copy=True))
     if isinstance(value, Mapping):
         items = {_key(key, where): plain(entry, f"{where}[{key!r}]") for key, entry in value.items()}
-        return _ordered(value, items, where) if isinstance(value, OrderedDict) else items
-    if type(value) in (list, tuple, set, frozenset):
-        entries = [plain(entry, f"{where}[{n}]") for n, entry in enumerate(value)]
-        return entries if type(value) is list else set(entries) if type(value) in (set, frozenset) else tuple(entries)
+        if not hasattr(value, "_metadata"):
+            return items
+        # The versions of modules, by which they convert what older ones have written.
+        made = OrderedDict(items)
+        made._metadata = plain(value._metadata, f"{where}._metadata")  # type: ignore[attr-defined]
+        return made
+    if type(value) in (list, tuple, set):
+        return type(value)(plain(entry, f"{where}[{n}]") for n, entry in enumerate(value))
     raise StorageError(
         f"save_checkpoint: {where} is a {type(value).__name__}, expected data: numbers, texts, tensors, lists, "
         "dictionaries. Anything else would have to be executed when it is read."
     )
-
-
-def _ordered(value: OrderedDict[Any, Any], items: dict[Any, Any], where: str) -> OrderedDict[Any, Any]:
-    """With the versions of modules, by which they convert what older ones have written."""
-    made = OrderedDict(items)
-    if hasattr(value, "_metadata"):
-        made._metadata = plain(value._metadata, f"{where}._metadata")  # type: ignore[attr-defined]
-    return made
 
 
 def _key(key: Any, where: str) -> Any:
@@ -138,10 +126,8 @@ def set_random_state(state: dict[str, Any]) -> None:
         state: of :func:`random_state`.
 
     Raises:
-        StorageError: as `check_random_state`, and for broken states.
+        StorageError: for broken states.
     """
-    check_random_state(state)
-    devices = len(state.get("cuda", ()))
     try:
         python, numpy = state["python"], state["numpy"]
         words = tuple(python["words"])
@@ -150,7 +136,7 @@ def set_random_state(state: dict[str, Any]) -> None:
         legacy = (numpy["bit_generator"], key, numpy["pos"], numpy["has_gauss"], numpy["gauss"])
         np.random.set_state(legacy)  # noqa: NPY002
         torch.set_rng_state(state["torch"])
-        if devices:
+        if state.get("cuda"):
             torch.cuda.set_rng_state_all(state["cuda"])
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise StorageError(f"load_checkpoint: its random numbers cannot be used: {error}") from error
@@ -163,55 +149,27 @@ _OF_SHAPE = (
 )  # fmt: skip
 
 
-def kind_of(optimizer: torch.optim.Optimizer) -> str:
-    """Return the name of an optimiser's class, with the module.
-
-    Args:
-        optimizer: of torch.
-    """
-    return f"{type(optimizer).__module__}.{type(optimizer).__qualname__}"
-
-
-def put_back_optimizer(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Load a state that was checked.
-
-    Entries that schedules and callers keep in groups, and the state lacks, stay as they are here: torch would delete
-    them, and some schedules fail without them at their next step.
-
-    Args:
-        optimizer: of torch.
-        state: of its ``state_dict``.
-    """
-    groups = [
-        {**{key: value for key, value in own.items() if key not in group and _is_added(optimizer, key)}, **group}
-        for own, group in zip(optimizer.param_groups, state["param_groups"], strict=True)
-    ]
-    optimizer.load_state_dict({**state, "param_groups": groups})
-
-
-def check_optimizer(
-    name: str, optimizer: torch.optim.Optimizer, state: Any, kind: Any, is_same_torch: bool
-) -> None:  # fmt: skip
+def check_optimizer(name: str, optimizer: torch.optim.Optimizer, state: Any, kind: str | None) -> None:
     """Check a state of an optimiser, and change nothing.
 
     Args:
         name: of the part.
         optimizer: of torch.
         state: to be loaded.
-        kind: :func:`kind_of` the optimiser that has written it, None if unknown.
-        is_same_torch: True for a state of the same torch; others may have other settings.
+        kind: name of the class that has written it, None if unknown.
 
     Raises:
-        StorageError, ShapeError: for a state of another kind, or of other groups, settings or shapes.
+        StorageError, ShapeError: for a state of another kind, or of other groups or shapes.
     """
     groups = state.get("param_groups") if isinstance(state, dict) else None
     entries = state.get("state") if isinstance(state, dict) else None
     if not isinstance(groups, list) or not isinstance(entries, dict):
         raise StorageError(f"load_checkpoint: the part {name!r} is no state of an optimiser.")
-    if kind is not None and not _is_same_kind(kind, kind_of(optimizer)):
+    # Files of earlier versions have the module before the name.
+    if kind is not None and str(kind).rpartition(".")[2] != type(optimizer).__name__:
         raise StorageError(
             f"load_checkpoint: the state of {name!r} is of another kind of optimiser, {shown(kind)}; here is "
-            f"{kind_of(optimizer)!r}."
+            f"{type(optimizer).__name__!r}."
         )
     here = [len(group["params"]) for group in optimizer.param_groups]
     there = [len(group["params"]) for group in groups]
@@ -221,38 +179,15 @@ def check_optimizer(
             "optimiser of the same parameters, in the same order."
         )
     for own, group in zip(optimizer.param_groups, groups, strict=True):
-        lacks = sorted(key for key in own.keys() - group.keys() if not _is_added(optimizer, key))
-        if is_same_torch and lacks:
-            raise StorageError(
-                f"load_checkpoint: the state of {name!r} is of another kind of optimiser, it lacks {', '.join(lacks)}; "
-                f"here is {type(optimizer).__name__}."
-            )
         for parameter, number in zip(own["params"], group["params"], strict=True):
             for entry, value in entries.get(number, {}).items():
                 wrong = isinstance(value, torch.Tensor) and entry in _OF_SHAPE and value.shape != parameter.shape
-                # Of what torch keeps of complex numbers as pairs, and of lazy parameters, nothing is known yet.
-                if wrong and not parameter.is_complex() and not torch.nn.parameter.is_lazy(parameter):
+                # Complex numbers are kept as pairs.
+                if wrong and not parameter.is_complex():
                     raise ShapeError(
                         f"load_checkpoint: {entry!r} of parameter {number} of {name!r}: expected shape "
                         f"{tuple(parameter.shape)}, the file has {tuple(value.shape)}."
                     )
-
-
-def _is_same_kind(there: Any, here: str) -> bool:
-    """Modules count by their package: within it they move from version to version. A script's own class is of the
-    module `__main__` when it is run, and of another one when it is imported.
-    """
-    if not isinstance(there, str):
-        return False
-    packages = {kind.partition(".")[0] for kind in (there, here)}
-    return there.rpartition(".")[2] == here.rpartition(".")[2] and (len(packages) == 1 or "__main__" in packages)
-
-
-def _is_added(optimizer: torch.optim.Optimizer, key: str) -> bool:
-    """Return True for an entry of groups that is none of the optimiser's own settings, such as a schedule's
-    ``initial_lr``.
-    """
-    return key != "params" and key not in optimizer.defaults
 
 
 _FORMAT, _VERSION = "torchtransient checkpoint", 1
@@ -286,9 +221,10 @@ def save_checkpoint(
         tt.training.save_checkpoint("run.pt", parts, step=step + 1, values={"losses": losses})
 
     Beside parts and values it holds the random numbers of Python, NumPy, torch and CUDA of this process, and versions
-    of libraries. Written beside ``path`` (``.part``), synchronised to the disk, and then put in its place: whenever a
-    run is killed, ``path`` is the last checkpoint that was finished, whole. In a process group all ranks call this, and
-    the first one writes; parts are its own, random numbers and generators those of every rank.
+    of libraries. Written beside ``path``, synchronised to the disk, and then put in its place: whenever a run is
+    killed, ``path`` is the last checkpoint that was finished, whole, and the next one removes what was half written. In
+    a process group all ranks call this, and the first one writes; parts are its own, random numbers and generators
+    those of every rank.
 
     Args:
         path: of the file.
@@ -306,6 +242,7 @@ def save_checkpoint(
     and attributes.
     """
     place = path_of(path, "save_checkpoint")
+    parts = dict(parts)
     failure: str | None = "its parts or values are no state; see its own error."
     # All ranks learn what went wrong in one of them: none is left waiting for the others.
     try:
@@ -323,9 +260,7 @@ def save_checkpoint(
     own = _written(place, content) if _rank() == 0 else None
     failure = _told_by_first(None if own is None else str(own))
     if failure is not None:
-        # What check_folder says begins with the same words.
-        reason = failure.removeprefix("save_checkpoint: ").removeprefix(f"'{place}' cannot be written: ")
-        raise StorageError(f"save_checkpoint: {place} cannot be written: {reason}") from own
+        raise StorageError(f"save_checkpoint: {place} cannot be written: {failure}") from own
 
 
 def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, random: bool = True) -> Checkpoint:
@@ -351,19 +286,17 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
         ShapeError: for tensors of other shapes.
     """
     source = path_of(path, "load_checkpoint")
-    given, where = _named(parts, "load_checkpoint"), str(source)
+    given, where = dict(parts), str(source)
     content = _read(source)
     states, ranks = content["parts"], len(content["random"])
     if states.keys() != given.keys():
         raise StorageError(
             f"load_checkpoint: {where} has the parts {', '.join(states) or '(none)'}, expected {', '.join(given)}."
         )
-    kinds = content.get("optimizers")
-    kinds = kinds if isinstance(kinds, dict) else {}  # older files have none
+    kinds = content.get("optimizers", {})  # older files have none
     for name, part in given.items():
         if isinstance(part, torch.optim.Optimizer):
-            is_same_torch = content["libraries"].get("torch") == torch.__version__
-            check_optimizer(name, part, states[name], kinds.get(name), is_same_torch)
+            check_optimizer(name, part, states[name], kinds.get(name))
         else:
             _check(name, part, states[name])
     if random and ranks != _size():
@@ -385,32 +318,17 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
 # ------------------------------------------------------------------------------------------------------------ parts
 
 
-def _content(parts: Any, step: Any, values: Mapping[str, Any] | None) -> dict[str, Any]:
+def _content(parts: Mapping[str, Any], step: int, values: Mapping[str, Any] | None) -> dict[str, Any]:
     """All of a checkpoint but the random numbers."""
     return {
         "format": _FORMAT,
         "version": _VERSION,
         "step": count("save_checkpoint: step", step, 0, UnitError),
-        "parts": {name: _state_of(name, part) for name, part in _named(parts, "save_checkpoint").items()},
-        "optimizers": {name: kind_of(one) for name, one in parts.items() if isinstance(one, torch.optim.Optimizer)},
-        "values": _plain_values(values),
+        "parts": {name: _state_of(name, part) for name, part in parts.items()},
+        "optimizers": {n: type(one).__name__ for n, one in parts.items() if isinstance(one, torch.optim.Optimizer)},
+        "values": plain(dict(values or {}), "values"),
         "libraries": _libraries(),
     }
-
-
-def _plain_values(values: Any) -> Any:
-    if values is not None and not isinstance(values, Mapping):
-        raise ArgumentError(f"save_checkpoint: expected values as a dictionary from names, got {shown(values)}.")
-    try:
-        return plain(dict(values or {}), "values")
-    except RecursionError:
-        raise StorageError("save_checkpoint: values hold themselves, or are nested too deeply.") from None
-
-
-def _named(parts: Any, who: str) -> dict[str, Any]:
-    if not isinstance(parts, Mapping) or not all(isinstance(name, str) for name in parts):
-        raise ArgumentError(f"{who}: expected parts as a dictionary from names, got {shown(parts)}.")
-    return dict(parts)
 
 
 def _inner(part: Any) -> Any:
@@ -424,9 +342,8 @@ def _inner(part: Any) -> Any:
             return part
 
 
-def _generators(parts: Any) -> dict[str, torch.Generator]:
-    found = parts.items() if isinstance(parts, Mapping) else ()
-    return {name: part for name, part in found if isinstance(part, torch.Generator)}
+def _generators(parts: Mapping[str, Any]) -> dict[str, torch.Generator]:
+    return {name: part for name, part in parts.items() if isinstance(part, torch.Generator)}
 
 
 def _state_of(name: str, part: Any) -> Any:
@@ -483,8 +400,6 @@ def _put_back(name: str, part: Any, state: Any) -> None:
     try:
         if isinstance(part, torch.Generator):
             part.set_state(state["generators"][_rank()])
-        elif isinstance(part, torch.optim.Optimizer):
-            put_back_optimizer(part, state)
         else:
             part.load_state_dict(state)
     except TorchTransientError:
@@ -503,34 +418,14 @@ def _written(path: Path, content: dict[str, Any]) -> Exception | None:
     """Write a checkpoint and return the error, None without one. A full disk is an OSError, or a RuntimeError of
     torch's.
     """
-    if not path.name:
-        return OSError(f"{os.fspath(path)!r} is no name of a file")
     try:
         check_folder(path, "save_checkpoint")
-    except StorageError as error:
-        return error
-    part = path.with_name(path.name + ".part")
-    try:
-        _write(path, part, content)
-    except (OSError, RuntimeError) as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+        sweep_parts(path.parent)
+        with whole_file(path, "save_checkpoint") as unfinished, unfinished.open("wb") as file:
+            torch.save(content, file)
+    except (StorageError, OSError, RuntimeError) as error:
         return error
     return None
-
-
-def _write(path: Path, part: Path, content: dict[str, Any]) -> None:
-    with open(part, "wb") as file:
-        torch.save(content, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
-    # The name, too, has to reach the disk.
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from kornia.augmentation import RandomAffine, RandomRotation
 
 from support.sweeps import together
 from torchtransient.data import Affine, Augment, Crop, Flip, QuarterTurn
-from torchtransient.data.augment import OF_THE_WORLD, UNAFFECTED
+from torchtransient.data.augmented_values import OF_THE_WORLD, UNAFFECTED
 from torchtransient.errors import SceneError
 from torchtransient.plugins.parameter_effect import ANY_KEY, all_rows
 
@@ -87,8 +87,6 @@ def test_where_the_camera_is_named(key, stays):
 def test_values_that_are_none():
     augment = Augment(Flip(p=1.0))
     assert augment({"depth": torch.ones(2, 2), "values": None})["values"] is None
-    with pytest.raises(SceneError, match="values as a dictionary"):
-        augment({"depth": torch.ones(2, 2), "values": [3.0]})
     # Nothing is drawn: nothing is false.
     assert augmented(Flip(p=0.0), "box.to_world")["values"]["box.to_world"].tolist() == [1, 1, 1]
 

@@ -14,7 +14,7 @@ import torchtransient as tt
 from torchtransient.data import Sample
 from torchtransient.data.crew import DIED, MEASURING, MOST_IN_A_ROW, MOST_OF_A_SHARD, Crew, Ledger, Member, SampleBar
 from torchtransient.data.run_settings import RunSettings, samples_per_shard
-from torchtransient.data.shard_making import Messages, ShardMaker, raised, reason_of
+from torchtransient.data.shard_making import ShardMaker, raised, reason_of
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 
 MB = 2**20
@@ -80,12 +80,15 @@ def made(tmp_path):
     def run(recipe, shard=0, retries=1, skip=(), first=(), about=None):
         settings = RunSettings(recipe, str(tmp_path), 5, "exact", "none", retries)
         sent = []
-        messages = Messages(sent.append, dict(skip))
+
+        def say(*message):
+            sent.append(message)
+
         maker = ShardMaker(settings)
         if shard is None:
-            return maker.measure(range(5), messages), sent
+            return maker.measure(range(5), say, dict(skip)), sent
         described = {"about": about or {"spp": 4}, "per_shard": 3, "recipe": {}}
-        return maker.make(shard, described, messages, first), sent
+        return maker.make(shard, described, say, dict(skip), first), sent
 
     with tt.threads(1):
         yield run
@@ -255,7 +258,7 @@ def test_workers_that_never_start(ledger):
 @pytest.mark.parametrize(("own_fault", "deaths"), [(True, 3), (False, 6)])
 def test_a_sample_over_which_workers_die(ledger, own_fault, deaths):
     """Crashes count twice as much as kills, which may come from outside."""
-    ledger.add([0, 1])
+    ledger.waiting.extend([0, 1])
     for death in range(deaths):
         assert ledger.skip(0) == {} and ledger.suspects(0) == ([5] if death else [])
         assert ledger.take() == 0
@@ -265,7 +268,7 @@ def test_a_sample_over_which_workers_die(ledger, own_fault, deaths):
 
 
 def test_a_sample_that_is_made_is_not_to_blame(ledger):
-    ledger.add([0, 1])
+    ledger.waiting.extend([0, 1])
     for _ in range(10):
         for made, other in ((5, 6), (6, 5)):
             assert ledger.take() == 0
@@ -276,7 +279,7 @@ def test_a_sample_that_is_made_is_not_to_blame(ledger):
 
 def test_deaths_without_end(ledger):
     """Of one shard while its file is written, of workers without a shard, and before the first sample."""
-    ledger.add([0])
+    ledger.waiting.extend([0])
     for _ in range(MOST_OF_A_SHARD):
         ledger.take()
         ledger.ended(0, 5, None)
@@ -289,7 +292,7 @@ def test_deaths_without_end(ledger):
     with pytest.raises(TorchTransientError, match="one after another"):
         other.lost(None, None, "by test", own_fault=False)
     first = Ledger(2, ledger.log, ledger.bar)
-    first.add([MEASURING])
+    first.waiting.extend([MEASURING])
     for _ in range(2):
         first.take()
         first.lost(MEASURING, None, "by test", own_fault=True)

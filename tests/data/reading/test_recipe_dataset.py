@@ -11,7 +11,7 @@ import torch
 
 import torchtransient as tt
 from tools.small_room import COLOUR, VARIANT, make_room
-from torchtransient.errors import ArgumentError, ShapeError
+from torchtransient.errors import ShapeError
 from torchtransient.training import Batches
 
 
@@ -109,8 +109,5 @@ def test_what_it_does_not_take(data, recipe):
         with pytest.raises(IndexError, match="from 0 to 5"):
             data[number]
     assert data[np.int64(2)]["index"] == data[torch.tensor(2)]["index"] == 12
-    for transform in (None, lambda x: x):
-        with pytest.raises(ArgumentError, match="takes generator="):
-            tt.data.RecipeDataset(recipe, 1, transform=transform, seed=0)
     with pytest.raises(ShapeError, match="transform= is for transients"):
         tt.data.RecipeDataset(Stored({"steady": np.zeros((1, 2, 2))}), 1, transform=noisy)[0]

@@ -241,7 +241,7 @@ def test_captures_are_the_same_elsewhere(tmp_path):
     "text, error, words",
     [
         ("scene: {builtin: cornell_box}\ngates: 3\n", SceneError, "not what it should be"),
-        ("scene: {builtin: cornell_box}\nlabels: 3\n", SceneError, "list of names"),
+        ("scene: {builtin: cornell_box}\nlabels: 3\n", SceneError, "not what it should be"),
         ("scene: {one_of: 3}\nspp: 3\n", SceneError, "not what it should be"),
         ("scene: {builtin: cornell_box}\nfrequencies: {a: 3}\n", SceneError, "not what it should be"),
         ("scene: {a: 3}\nspp: 3\n", SceneError, "'type', 'builtin'"),

@@ -33,8 +33,9 @@ def export(data, place, **options):
     return export_web_dataset(data, place, progress=False, **options)
 
 
-def test_our_decoder(data, tmp_path):
-    paths = export(data, tmp_path / "a", megabytes=0.3)
+def test_our_decoder(data, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchtransient.data.exports._TAR_BYTES", 0.3e6)
+    paths = export(data, tmp_path / "a")
     assert len(paths) > 2 and [path.name for path in paths][:2] == ["samples-000000.tar", "samples-000001.tar"]
     found = [item for path in paths for item in read_web_dataset(path)]
     assert [item["index"] for item in found] == list(range(10))
@@ -43,7 +44,7 @@ def test_our_decoder(data, tmp_path):
         assert same(dict(sorted(item.items())), dict(sorted(source[i].items())))
     about = json.loads((tmp_path / "a" / "about.json").read_text())
     assert about["axis"] == AXIS and about["about"]["spp"] == 16
-    again = export(data, tmp_path / "b", megabytes=0.3)
+    again = export(data, tmp_path / "b")
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in paths]
 
 
@@ -102,7 +103,7 @@ def test_damaged_tars(tmp_path):
         ("0.depth.npy.zst", unsized), ("0.depth.npy", whole[:-1]), ("0.depth.npy", b"x"),
         ("0.depth.npy", whole.replace(b"(3,)", b"(9,)")), ("0.depth.npy", npy(np.array(["a"]))),
         ("0.depth.npy", whole.replace(b"NUMPY\x01\x00", b"NUMPY\x03\x00")),
-        ("0.depth.npy", npy(np.zeros((2, 3), order="F"))), ("0.sample.json", b"{"),
+        ("0.sample.json", b"{"),
         ("0.sample.json", b'{"index": 0, "values": {"a": 1}, "dtypes": {"a": "O"}}'),
         ("0.code.pickle", b"cos\nsystem\n(S'true'\ntR."),
     ):  # fmt: skip

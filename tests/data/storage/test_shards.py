@@ -98,7 +98,7 @@ def test_failures_are_named(tmp_path):
     [
         ({"transient": cube(1)[:, :-1]}, {}, "'transient' as in"),
         ({"depth": np.zeros((16, 16))}, {}, "'depth' as in"),
-        ({"another": np.zeros((16, 16))}, {}, "expected the arrays"),
+        ({"another": np.zeros((16, 16))}, {}, "expected arrays"),
         ({}, {"new": 1}, "expected values"),
         ({}, {"count": "many"}, "expected values"),
         ({"depth": np.array(["a"])}, {}, "array of numbers"),
@@ -134,7 +134,7 @@ def test_rows_come_once(tmp_path):
             for row in rows:
                 shard.put(row, sample(row))
 
-    for rows, message in (([0, 0], "was put before"), ([0], r"\[1\] were neither"), ([0, 2], "below 2")):
+    for rows, message in (([0, 0], "was put before"), ([0], r"\[1\] were neither"), ([0, 2], "from 0 to 1, got 2")):
         with pytest.raises(StorageError, match=message):
             put(rows)
     with pytest.raises(StorageError, match="every sample once"):
