@@ -56,8 +56,6 @@ def coincidence(detector=SPAD, spads=2, window_s=1e-10, k=2):
     return sensing.CoincidencePixel(detector, spads, coincidence=k, window_s=window_s, **WIDTH)
 
 
-
-
 def calibrated(**numbers):
     return sensing.ItofCorrelation(SINE, F, AXIS, calibration=sensing.ItofCalibration(**numbers))
 
