@@ -14,7 +14,6 @@ from torchtransient.checks import count, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
 from torchtransient.nlos.simulation import size_in_words
 from torchtransient.reconstruction import VoxelGrid
-from torchtransient.reconstruction.capture_checks import not_a_capture
 from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.rendering.memory import available_bytes
 from torchtransient.volume_methods import METHODS as METHODS
@@ -40,12 +39,7 @@ def choose_method(capture: Capture) -> Choice:
 
     Returns:
         Name of the method, and the reason for it.
-
-    Raises:
-        ArgumentError: for other objects.
     """
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
     this = with_article(kind)
     if kind == "pairs":

@@ -47,7 +47,6 @@ from torchtransient.reconstruction.capture_checks import (
     check_reach,
     check_wavelength,
     checked_capture,
-    not_a_capture,
 )
 from torchtransient.volume_methods import FILTERS, Method
 
@@ -188,10 +187,7 @@ def reconstruct(
         StorageError: for a volume beyond the memory.
         ShapeError, UnitError, DeviceError: as the operators.
     """
-    if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
-    if capture.transient is None:
-        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    checked_capture(capture, "reconstruct")
     choice = choose_method(capture) if method is None else Choice(method, "asked for")
     entry = check_method(choice.name, capture)
     options = {name: value for name, value in options.items() if value is not None}
@@ -242,11 +238,7 @@ def default_grid(
         ShapeError, UnitError: as `VoxelGrid.before`, and for phasors alone.
         SceneError: for other numbers of planes, and where sensor points on one line say nothing of an ``extent``.
     """
-    if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
-    axis = capture.axis
-    if axis is None:
-        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    _, axis = checked_capture(capture, "default_grid")
     legs = float(capture.scan.legs.detach().min()) if capture.scan.first_and_last_leg else 0.0
     far = (axis.end_opl - legs) / 2
     if depths is None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import as_whole, finite, positive, shown
+from torchtransient.checks import finite, positive
 from torchtransient.errors import UnitError
 from torchtransient.reconstruction.capture_checks import SNR, check_thickness, within
 from torchtransient.reconstruction.linear import each
@@ -49,7 +49,6 @@ class DiffusionDeconvolution(ConfocalOperator):
         thickness: metres.
         properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
             which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.
-        passes: crossings of the slab, 2 of confocal captures.
         snr: power of the light over that of the noise where nothing is lost, at frequency zero; light that the slab
             takes beyond that cannot come back.
         dtype: float32 or float64.
@@ -75,19 +74,20 @@ class DiffusionDeconvolution(ConfocalOperator):
         time_axis: TimeAxis,
         thickness: float = FOAM_THICKNESS,
         properties: tuple[float, float, float, float] = FOAM,
-        passes: int = 2,
         snr: float = SLAB_SNR,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        check_thickness(positive("DiffusionDeconvolution: thickness", thickness), scan, "DiffusionDeconvolution")
-        who = type(self).__name__
+        who = "DiffusionDeconvolution"
         self.thickness = positive(f"{who}: thickness", thickness)
-        self.properties = _slab_properties(properties, who)
-        number = as_whole(passes)
-        if number not in (1, 2):
-            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={shown(passes)}.")
-        self.passes, self.snr = number, within(f"{who}: snr", snr, *SNR)
+        check_thickness(self.thickness, scan, who)
+        scattering, absorption, index, extrapolation = properties
+        positive(f"{who}: reduced scattering", scattering)
+        if finite(f"{who}: absorption", absorption) < 0:
+            raise UnitError(f"{who}: expected an absorption of zero or more per metre, got {absorption!r}.")
+        positive(f"{who}: index", index)
+        positive(f"{who}: extrapolation length", extrapolation)
+        self.properties, self.snr = tuple(properties), within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
@@ -98,8 +98,8 @@ class DiffusionDeconvolution(ConfocalOperator):
             _gaussians(spread, torch.arange(self._reach(n, pitch, spread), dtype=torch.float64, device="cpu") * pitch)
             for n, pitch in zip((rows, columns), self.grid.pitch, strict=True)
         ]
-        kernel = _crossed(light, *along, passes=self.passes, size=(rows + 1, columns + 1)).clamp_min_(0)
-        kernel /= max(self._total(), 1e-300) ** self.passes
+        kernel = _crossed_twice(light, *along, size=(rows + 1, columns + 1)).clamp_min_(0)
+        kernel /= max(self._total(), 1e-300) ** 2
         if not float(kernel.sum()) > SHARE_OF_LIGHT:
             raise UnitError(
                 f"DiffusionDeconvolution: expected a slab whose light falls into the record, got none within "
@@ -149,8 +149,6 @@ class DiffusionDeconvolution(ConfocalOperator):
         """Displacements on one side that light between two crossings of the slab may have: so many that what strays
         farther is less than 1e-12 of what comes to the scan.
         """
-        if self.passes == 1:
-            return points + 1
         strays = 28 * float(spread.amax()) / pitch**2
         return max(2 * points, math.ceil((points + math.sqrt(points**2 + strays)) / 2)) + 1
 
@@ -175,7 +173,7 @@ class DiffusionDeconvolution(ConfocalOperator):
             (..., T, Y, X), of a capture (C, T, Y, X).
 
         Raises:
-            ShapeError, DeviceError: for other transients and captures.
+            ShapeError: for other transients and captures.
         """
         found: Tensor = self.inverse(self.transients(transient))
         return found
@@ -215,25 +213,6 @@ class SlabInverse(InverseOperator):
         return each(lambda item: self.operator._filtered(item, wiener), y, 3)
 
 
-def _slab_properties(properties: tuple[float, float, float, float], who: str) -> tuple[float, float, float, float]:
-    several = isinstance(properties, (list, tuple)) or getattr(properties, "ndim", 0) == 1
-    if not several or len(properties) != len(FOAM):
-        raise UnitError(
-            f"{who}: expected properties as (reduced scattering 1/m, absorption 1/m, index, extrapolation length m), "
-            f"got {shown(properties)}."
-        )
-    scattering, absorption, index, extrapolation = properties
-    absorption = finite(f"{who}: absorption", absorption)
-    if absorption < 0:
-        raise UnitError(f"{who}: expected an absorption of zero or more per metre, got {absorption!r}.")
-    return (
-        positive(f"{who}: reduced scattering", scattering),
-        absorption,
-        positive(f"{who}: index", index),
-        positive(f"{who}: extrapolation length", extrapolation),
-    )
-
-
 def _gaussians(spread: Tensor, at: Tensor) -> Tensor:
     """exp(-x^2 / spread), (D, N)."""
     return torch.exp(-at.square() / spread[:, None])
@@ -246,12 +225,10 @@ def _sum_of_gaussians(spread: Tensor, pitch: float) -> Tensor:
     return torch.where(wide, torch.sqrt(math.pi * spread) / pitch, _gaussians(spread, k * pitch).sum(1))
 
 
-def _crossed(light: Tensor, along_y: Tensor, along_x: Tensor, *, passes: int, size: tuple[int, int]) -> Tensor:
+def _crossed_twice(light: Tensor, along_y: Tensor, along_x: Tensor, *, size: tuple[int, int]) -> Tensor:
     """(D, *size): ``light`` (D,) times Gaussians (D, Ny) and (D, Nx) of displacements from zero on, which are the same
-    to both sides; ``passes=2``: convolved with itself in time and along the slab.
+    to both sides, convolved with itself in time and along the slab.
     """
-    if passes == 1:
-        return light[:, None, None] * along_y[:, : size[0], None] * along_x[:, None, : size[1]]
     # Cosine transforms, in which places are multiplied while delays are convolved.
     (to_y, from_y), (to_x, from_x) = (_cosines(a.shape[1]) for a in (along_y, along_x))
     of_y, of_x = along_y @ to_y, (along_x @ to_x) * light[:, None]
