@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shown
+from torchtransient.checks import Numbers, as_whole, positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.tensor_record import same
 
@@ -63,16 +63,14 @@ class Scan:
     wall: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        _check_kind(self.kind)
+        if self.kind not in KINDS:
+            raise ArgumentError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(self.kind)}.")
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
         for name in _TENSORS[:4]:
             object.__setattr__(self, name, _float64_points(name, getattr(self, name), device))
         for name in _TENSORS[4:]:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _unit_normals(name, _float64_points(name, getattr(self, name), device)))
-        if self.wall is not None and not isinstance(self.wall, Mapping):
-            raise ArgumentError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
-        flag("Scan: first_and_last_leg", self.first_and_last_leg)
         _check_shapes(self)
         _check_sides(self)
 
@@ -113,11 +111,10 @@ class Scan:
                 exhaustive scan of one pair, which is a single one.
             ArgumentError: for pairs, which :meth:`points` takes; otherwise as the class and :meth:`Wall.grid`.
         """
-        _check_kind(kind)
         if kind not in GRID_KINDS:
             raise ArgumentError(
-                "Scan.grid: pairs of spots and sensor points are lists. Use Scan.points(sensor_points, kind='pairs', "
-                "laser_points=...)."
+                f"Scan.grid: expected kind to be one of {', '.join(GRID_KINDS)}, got {shown(kind)}. Scan.points takes "
+                "pairs."
             )
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
@@ -142,9 +139,9 @@ class Scan:
         return cls(
             kind=kind,
             sensor_points=torch.from_numpy(points),
-            laser_points=spots if isinstance(spots, Tensor) else torch.from_numpy(spots),
-            sensor_origin=_float64_points("sensor_origin", aside if sensor_origin is None else sensor_origin),
-            laser_origin=_float64_points("laser_origin", aside if laser_origin is None else laser_origin),
+            laser_points=spots,
+            sensor_origin=aside if sensor_origin is None else sensor_origin,
+            laser_origin=aside if laser_origin is None else laser_origin,
             sensor_normals=torch.from_numpy(normals),
             laser_normals=torch.from_numpy(spot_normals),
             first_and_last_leg=first_and_last_leg,
@@ -182,38 +179,28 @@ class Scan:
         Raises:
             ShapeError, UnitError, SceneError, ArgumentError: as the class.
         """
-        _check_kind(kind)
-        sensor = _float64_points("sensor_points", sensor_points)
-        if wall is not None:
-            for name, given in (("normals", normals), ("laser_normals", laser_normals)):
-                if given is not None:
-                    raise ArgumentError(f"Scan.points: {name} and wall= both say how the wall is turned; give one.")
+        sensor, shape = _float64_points("sensor_points", sensor_points), None
+        if wall is not None and not (normals is None and laser_normals is None):
+            raise ArgumentError("Scan.points: normals and wall= both say how the wall is turned; give one of them.")
         if kind == "confocal":
             _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
             _refuse("laser_normals", laser_normals, kind, "its spots are its sensor points")
-            laser = sensor
+            laser, laser_normals = sensor, normals
         elif laser_points is None:
             raise SceneError(f"Scan.points: expected laser_points for kind={kind!r}, got None. Give the laser's spots.")
         else:
             laser = _float64_points("laser_points", laser_points, sensor.device)
-        sensor_normals = None if normals is None else _float64_points("normals", normals, sensor.device)
-        if kind == "confocal":
-            laser_normals = sensor_normals
-        elif laser_normals is not None:
-            laser_normals = _float64_points("laser_normals", laser_normals, sensor.device)
-        shape = None
         if wall is not None:
             surface = Wall.of(wall)
-            sensor_normals = _normals_on(surface, sensor, "Scan.points sensor_points")
-            laser_normals = _normals_on(surface, laser, "Scan.points laser_points")
-            shape = surface.shape
+            normals = _normals_on(surface, sensor, "Scan.points sensor_points")
+            laser_normals, shape = _normals_on(surface, laser, "Scan.points laser_points"), surface.shape
         return cls(
             kind,
             sensor,
             laser,
             sensor_origin=sensor_origin,
             laser_origin=laser_origin,
-            sensor_normals=sensor_normals,
+            sensor_normals=normals,
             laser_normals=laser_normals,
             first_and_last_leg=first_and_last_leg,
             wall=shape,
@@ -240,37 +227,6 @@ class Scan:
     def pairs(self) -> int:
         """Number of histograms in a capture: pairs of a laser spot and a sensor point."""
         return math.prod(self.shape)
-
-    @property
-    def is_planar(self) -> bool:
-        """True if all laser and sensor points lie in one plane, to 1e-6 of their extent."""
-        points = torch.cat([self.sensor_points.reshape(-1, 3), self.laser_points.reshape(-1, 3)])
-        spread = torch.linalg.svdvals((points - points.mean(0)).cpu())
-        return bool(len(spread) < 3 or spread[2] <= 1e-6 * spread[0])
-
-    @property
-    def spacing(self) -> tuple[float, float]:
-        """Distances (along a row, along a column) between neighbours of a regular sensor grid, metres.
-
-        Raises:
-            ShapeError: for a list of points, for a grid that is not regular to 1e-6 of its extent, and for rows or
-                columns of one point.
-        """
-        if self.sensor_points.ndim != 3 or min(self.sensor_shape) < 2:
-            raise ShapeError(f"Scan.spacing: expected a grid of at least 2 x 2 sensor points, got {self.sensor_shape}.")
-        points = self.sensor_points.detach()
-        (rows, columns), first = self.sensor_shape, points[0, 0]
-        across = (points[0, -1] - first) / (columns - 1)
-        down = (points[-1, 0] - first) / (rows - 1)
-        i = torch.arange(rows, dtype=torch.float64, device=points.device)[:, None, None]
-        j = torch.arange(columns, dtype=torch.float64, device=points.device)[None, :, None]
-        error = (points - (first + i * down + j * across)).norm(dim=-1).max()
-        if bool(error > 1e-6 * (points[-1, -1] - first).norm()):
-            raise ShapeError(
-                f"Scan.spacing: expected a regular grid, got points up to {float(error):.3g} m off it. Use the points "
-                "themselves."
-            )
-        return float(across.norm()), float(down.norm())
 
     @property
     def sensor_legs(self) -> Tensor:
@@ -378,11 +334,6 @@ class Scan:
         return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
 
 
-def _check_kind(kind: Any) -> None:
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ArgumentError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
-
-
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """Return an index into the spots of a scan.
 
@@ -410,8 +361,7 @@ def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:
     if plain.shape == (2,):
         return surface.at(plain[0], plain[1])
     point = triple("Scan.grid laser", laser)
-    normal = surface.normals_at(point[None], "Scan.grid laser")[0]
-    return (laser if isinstance(laser, Tensor) else point), normal
+    return laser, surface.normals_at(point[None], "Scan.grid laser")[0]
 
 
 def _normals_on(surface: Wall, points: Tensor, what: str) -> Tensor:
@@ -426,17 +376,13 @@ def _refuse(name: str, value: Any, kind: str, instead: str) -> None:
 
 def _float64_points(name: str, values: Any, device: torch.device | None = None) -> Tensor:
     """Return points (..., 3) as float64, with their gradients. Raises ShapeError and UnitError."""
-    plain = values if isinstance(values, Tensor) else real_array(values)
-    if plain is None:
-        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
-    tensor = plain if isinstance(plain, Tensor) else torch.from_numpy(plain)
-    if (
-        tensor.is_complex()
-        or tensor.dtype == torch.bool
-        or tensor.ndim == 0
-        or tensor.shape[-1] != 3
-        or tensor.numel() == 0
-    ):
+    tensor = values
+    if not isinstance(values, Tensor):
+        plain = real_array(values)
+        if plain is None:
+            raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
+        tensor = torch.from_numpy(plain)
+    if tensor.is_complex() or tensor.ndim == 0 or tensor.shape[-1] != 3 or tensor.numel() == 0:
         raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
     tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
     if not bool(torch.isfinite(tensor).all()):
@@ -461,15 +407,9 @@ def _check_shapes(scan: Scan) -> None:
     sensor, laser = scan.sensor_points, scan.laser_points
     if sensor.ndim not in (2, 3):
         raise ShapeError(f"Scan: expected sensor_points (Sy, Sx, 3) or (N, 3), got {tuple(sensor.shape)}.")
-    each = scan.kind in ("confocal", "pairs")
-    allowed = {"single": (1,), "exhaustive": (2, 3)}.get(scan.kind, (sensor.ndim,))
-    words = {
-        "single": "(3,), the one spot",
-        "confocal": f"{tuple(sensor.shape)}, the sensor points",
-        "exhaustive": "(Ly, Lx, 3) or (M, 3)",
-        "pairs": f"{tuple(sensor.shape)}, one for each sensor point",
-    }[scan.kind]
-    if laser.ndim not in allowed or (each and laser.shape != sensor.shape):
+    expected = (3,) if scan.kind == "single" else tuple(sensor.shape)
+    if laser.ndim not in (2, 3) if scan.kind == "exhaustive" else laser.shape != expected:
+        words = "(Ly, Lx, 3) or (M, 3)" if scan.kind == "exhaustive" else expected
         raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
     if scan.kind == "confocal" and not bool(torch.equal(laser, sensor)):
         raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")
@@ -491,17 +431,16 @@ def _check_sides(scan: Scan) -> None:
         heights = ((origin - points) * normals).sum(-1).detach()
         behind = int((heights <= 0).sum())
         if behind:
-            lowest = float(heights.min())
-            place = f"behind them by up to {-lowest:.4g} m" if lowest < 0 else "in the wall itself"
             raise SceneError(
                 f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
-                f"{heights.numel()} points do not see: it is {place}. Move "
-                "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
+                f"{heights.numel()} points do not see, {-float(heights.min()):.4g} m behind them at most. Move it to "
+                "the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
             )
 
 
 # ------------------------------------------------------------------------------
 # Shortest and longest path from spots over a box to sensor points: the span of a time axis.
+
 
 def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     """Return the corners (3,) of a box of lowest and highest coordinates, float64.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import Numbers, as_whole, checked_mesh, flag, positive, real_array, shares, shown, transform
+from torchtransient.checks import Numbers, checked_mesh, count, positive, real_array, shares, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 Array = NDArray[np.float64]
@@ -194,11 +194,6 @@ class Wall:
         a, b = self.half_u + self.half_v, self.half_u - self.half_v
         return float(2 * max(np.linalg.norm(a), np.linalg.norm(b)))
 
-    @property
-    def is_planar(self) -> bool:
-        """True for a parallelogram; a mesh counts as curved, however flat it is."""
-        return self.vertices is None
-
     def at(self, u: Any, v: Any) -> tuple[Array, Array]:
         """Return points and unit normals (..., 3) at coordinates.
 
@@ -209,16 +204,8 @@ class Wall:
 
         Raises:
             SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.
-            ShapeError: for anything but numbers that broadcast.
         """
-        places = [real_array(u), real_array(v)]
-        if places[0] is None or places[1] is None:
-            raise ShapeError(f"Wall.at: expected coordinates (u, v) as numbers, got {shown(u)} and {shown(v)}.")
-        try:
-            u, v = np.broadcast_arrays(places[0], places[1])
-        except ValueError:
-            shapes = f"{places[0].shape} and {places[1].shape}"
-            raise ShapeError(f"Wall.at: expected coordinates (u, v) that broadcast, got shapes {shapes}.") from None
+        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         if not (np.all((u >= 0) & (u <= 1)) and np.all((v >= 0) & (v <= 1))):
             raise SceneError("Wall.at: expected coordinates (u, v) between 0 and 1, got some outside of the wall.")
         u, v = (self._inside(x, half)[..., None] for x, half in ((u, self.half_u), (v, self.half_v)))
@@ -259,7 +246,6 @@ class Wall:
             SceneError: for an extent without an area or outside of the wall, and as :meth:`at`.
         """
         nx, ny = grid_size(size, "Wall.grid")
-        flag("cell_centers", cell_centers)
         u0, v0, u1, v1 = _extent(extent)
         u, v = _places(nx, u0, u1, cell_centers), _places(ny, v0, v1, cell_centers)
         return self.at(u[None, :], v[:, None])
@@ -335,10 +321,8 @@ def triple(what: str, values: Any) -> Array:
         ShapeError, UnitError: for anything else.
     """
     array = real_array(values)
-    if array is None:
+    if array is None or array.shape != (3,):
         raise ShapeError(f"{what}: expected three numbers [x, y, z], got {shown(values)}.")
-    if array.shape != (3,):
-        raise ShapeError(f"{what}: expected three numbers [x, y, z], got shape {array.shape}.")
     if not np.isfinite(array).all():
         raise UnitError(f"{what}: expected finite metres, got {array.tolist()}.")
     return array
@@ -354,12 +338,10 @@ def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     Raises:
         ShapeError: for anything else.
     """
-    given: Any = size
-    several = isinstance(given, Sequence) or getattr(given, "ndim", 0) == 1
-    pair = [as_whole(n) for n in (given if several else (given, given))]
-    nx, ny = pair if len(pair) == 2 else (None, None)
-    if nx is None or ny is None or min(nx, ny) < 1:
-        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {shown(size)}.")
+    pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
+    if len(pair) != 2:
+        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, got {shown(size)}.")
+    nx, ny = (count(f"{who}: size", n, 1, ShapeError) for n in pair)
     if nx * ny > _MOST_POINTS:
         raise ShapeError(f"{who}: expected at most {_MOST_POINTS} points in all, got {shown(size)}.")
     return nx, ny

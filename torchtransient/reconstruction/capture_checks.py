@@ -18,7 +18,7 @@ from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import positive, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, UnitError
-from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid, check_real
+from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid
 
 # Signal-to-noise ratios that a Wiener filter in single precision tells from none and from infinite ones.
 SNR = (1e-20, 1e20)
@@ -69,9 +69,8 @@ def checked_points(points: Any, who: str) -> Tensor:
         ShapeError: for other shapes and types.
         UnitError: for points that are not finite.
     """
-    if not isinstance(points, Tensor) or points.ndim < 2 or points.shape[-1] != 3:
-        raise ShapeError(f"{who}: expected a VoxelGrid or points (..., 3) as a tensor, got {shown(points)}.")
-    check_real(points, f"{who}: points")
+    if not isinstance(points, Tensor) or points.ndim < 2 or points.shape[-1] != 3 or points.is_complex():
+        raise ShapeError(f"{who}: expected a VoxelGrid or points (..., 3) as a real tensor, got {shown(points)}.")
     plain = points.detach().to("cpu", torch.float64, copy=True)
     if not bool(torch.isfinite(plain).all()):
         raise UnitError(f"{who}: expected finite points in metres, got some that are not.")
@@ -93,8 +92,8 @@ def confocal_wall(scan: Scan | PlanarScan, who: str) -> PlanarScan:
     if scan.kind != "confocal":
         raise ShapeError(
             f"{who}: expected a confocal scan, got {with_article(scan.kind)} one. Take the diagonal of an exhaustive "
-            "capture with capture.confocal(), bring others to midpoints with MidpointFK, or use Backprojection or "
-            "PhasorField."
+            "capture with capture.confocal(), bring others to midpoints with MidpointFK, or use "
+            "FilteredBackprojection, which takes all."
         )
     refuse_legs(scan, who)
     return PlanarScan.of_scan(scan, who)

@@ -268,10 +268,10 @@ class PhasorField(ScanOperator):
         rows, columns = self.grid.size
         dy, dx = self.grid.pitch
         ends = itertools.product((0, columns - 1), (0, rows - 1), self.heights[[0, -1]].tolist())
-        corners = [[float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h] for i, j, h in ends]
-        ends = itertools.product((0, self.wall.size[1] - 1), (0, self.wall.size[0] - 1))
-        edge = [[i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0] for i, j in ends]
-        corners, sensors = (torch.tensor(places, dtype=torch.float64, device="cpu") for places in (corners, edge))
+        of_planes = [[float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h] for i, j, h in ends]
+        edges = itertools.product((0, self.wall.size[1] - 1), (0, self.wall.size[0] - 1))
+        of_wall = [[i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0] for i, j in edges]
+        corners, sensors = (torch.tensor(x, dtype=torch.float64, device="cpu") for x in (of_planes, of_wall))
         # Distances are convex: the longest ends at corners. None is shorter than the way along the normal.
         far, near = float(torch.cdist(corners, sensors).max()), float(self.heights.abs().min())
         if self.scan.kind == "confocal":
