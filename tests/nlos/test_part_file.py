@@ -120,7 +120,7 @@ def test_a_full_disk_loses_nothing(path, monkeypatch):
         for number, fails_at in ((1, 1), (2, 2)):  # while rows are written, while the list of parts is
             calls = iter(range(1, 9))
             monkeypatch.setattr(os, "fsync", lambda f: full(f) if next(calls) == fails_at else real(f))  # noqa: B023
-            with pytest.raises(StorageError, match=r"No space left.*the same call goes on"):
+            with pytest.raises(StorageError, match="No space left"):
                 keep(kept, number)
             assert not kept.has(number)
         monkeypatch.setattr(os, "fsync", real)

@@ -12,7 +12,7 @@ import torch
 from torchtransient import scenes
 from torchtransient.array_files.array_file import read_some
 from torchtransient.capture import Scan
-from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, of_class, shown
+from torchtransient.checks import checked_mesh, shown
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
@@ -60,9 +60,7 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     if not path.is_file():
         raise SceneError(f"{where}: no file {str(path)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
     if suffix == ".npz":
-        shape = mesh_arrays_shape(*mesh_of_npz(path, where), where)
-        del shape["bsdf"]
-        return shape
+        return _mesh(*mesh_of_npz(path, where), where)
     return {"type": _PLUGINS[suffix], "filename": str(path), "face_normals": True}
 
 
@@ -131,7 +129,6 @@ def capture_scene(
             and for a scan without a wall.
         UnitError: for an energy below zero.
     """
-    of_class("capture: scan", scan, Scan)
     if scan.wall is None:
         raise SceneError(
             "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
@@ -198,9 +195,9 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
             return shapes
         return {"hidden": dict(hidden)}
     if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
-        return {"hidden": _mesh(*hidden)}
+        return {"hidden": _mesh(*hidden, "hidden")}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
-        return {"hidden": _mesh(hidden.vertices, hidden.faces)}
+        return {"hidden": _mesh(hidden.vertices, hidden.faces, "hidden")}
     raise SceneError(
         "hidden: expected a Mitsuba shape dictionary, a dictionary of them, (vertices, faces), an object with vertices "
         f"and faces, or a mesh file, got {type(hidden).__name__}."
@@ -233,9 +230,8 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
     for name, node in shapes.items():
         if not isinstance(node, Mapping) or "type" not in node:
             raise SceneError(f"hidden: expected {name!r} as a dictionary with a type, got {shown(node)}.")
-        found = [key for key in ("sensor", "integrator") if key == name]
         kind = str(node["type"])
-        if found or kind.startswith("transient_") or kind.endswith("_capture_meter"):
+        if name in ("sensor", "integrator") or kind.startswith("transient_") or kind.endswith("_capture_meter"):
             raise SceneError(
                 f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
                 "it out, or render a complete scene with tt.TransientRenderer."
@@ -256,18 +252,13 @@ def _check_dark(node: Mapping[str, Any], where: str) -> None:
 
 
 def _check_energy(energy: Any) -> None:
-    """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
-    if isinstance(energy, Mapping):
-        return
-    joules = as_number(energy)
-    if joules is None:
-        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
-    if not 0 <= joules < _MOST_ENERGY:
+    """Raise UnitError for numbers that no laser brings."""
+    if not isinstance(energy, Mapping) and not 0 <= energy < _MOST_ENERGY:
         raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {_MOST_ENERGY:g} at most).")
 
 
-def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
-    points, triangles = checked_mesh("hidden", vertices, faces)
+def _mesh(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
+    points, triangles = checked_mesh(where, vertices, faces)
     return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
@@ -275,22 +266,17 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     """The first and the last number that counts; -1 for no limit."""
     if isinstance(bounces, str) and bounces == ALL_BOUNCES:
         return 0, -1
-    several = isinstance(bounces, (tuple, list, range)) or getattr(bounces, "ndim", 0) == 1
-    given = [as_whole(n) for n in (bounces if several else [bounces])]
-    numbers = sorted(n for n in given if n is not None and 2 <= n < MOST)
-    numbers = numbers if len(numbers) == len(given) else []
-    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+    numbers = sorted(bounces)
+    if not numbers or numbers != list(range(int(numbers[0]), int(numbers[0]) + len(numbers))) or numbers[0] < 2:
         raise SceneError(
             "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
             f"got {shown(bounces)}. The laser's spot is the first bounce, so light around one corner has 3."
         )
-    return numbers[0], numbers[-1]
+    return int(numbers[0]), int(numbers[-1])
 
 
-def _numbers(values: Any) -> np.ndarray:
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().numpy()
-    return np.asarray(values, dtype=np.float64)
+def _numbers(points: torch.Tensor) -> np.ndarray:
+    return points.detach().cpu().numpy()
 
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:

@@ -44,7 +44,7 @@ class Ends:
         return Ends(points, normals, [self.shapes[i] for i in which], origins, directions)
 
 
-def scan_of_scene(scene: Any, number: int = 0) -> Scan:
+def scan_of_scene(scene: Any) -> Scan:
     """Return the scan that a built scene's sensor, laser and integrator ``transient_nlos_path`` make, without a wall.
 
     Points are the ends of the rays of pixel centres, rows as the film has them; where some look past the wall, a
@@ -52,17 +52,15 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
 
     Args:
         scene: a built Mitsuba scene.
-        number: of the sensor.
 
     Raises:
         SceneError: for another integrator, a laser that has no spot, rays that meet nothing or the back of a wall, and
             spots of a confocal capture that are no sensor points.
     """
-    integrator, sensor = scene.integrator(), scene.sensors()[number]
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
     if not hasattr(integrator, "capture"):
         raise SceneError(
-            f"simulate: expected a scene with the integrator transient_nlos_path, got {class_of(integrator)}. "
-            f"{_REMEDY}"
+            f"simulate: expected a scene with the integrator transient_nlos_path, got {class_of(integrator)}. {_REMEDY}"
         )
     sensor, film = integrator.resolve(scene, sensor)
     kind = integrator.capture.name.lower()

@@ -25,7 +25,7 @@ import torch
 from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import Numbers, count, of_class
+from torchtransient.checks import Numbers, count
 from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
 from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
@@ -35,7 +35,6 @@ from torchtransient.nlos.renderer import (
     CaptureRenderer,
     as_capture,
     check_scan,
-    check_sensor,
     checked_module,
     checked_seed,
     in_film_shape,
@@ -432,7 +431,6 @@ def simulate(
             to another simulation, is damaged, or is worked on by another process.
     """
     seed, path = checked_seed("simulate", seed), None if part is None else path_of(part, "simulate: part")
-    check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
     chain = None if sensor is None else _chain(sensor, work.axes()[0])
     part_file = nullcontext() if path is None else PartFile(path, work.key(seed))
@@ -505,7 +503,6 @@ def _work(
     spp = checked_samples("simulate: spp", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    of_class("simulate: scan", scan, Scan)
     if isinstance(hidden, Scene):
         raise ArgumentError(
             "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
@@ -627,4 +624,3 @@ def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.
         raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
     # Counts as they are drawn: nothing of a simulation has gradients.
     return checked_module(sensor, axis, "straight_through")
-
