@@ -185,7 +185,7 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"time_axis": {"num_bins": 4}, "frequencies": [1.0]}, SceneError, "exclude each other"),
         ({"frequencies": {"first": 1.0}}, SceneError, "an entry 'step'"),
         ({"spp": 0}, SceneError, "spp: expected a whole number of at least 1"),
-        ({"bounces": [2.5]}, SceneError, "bounces: expected"),
+        ({"bounces": [2.5]}, SceneError, "bounces: .*expected a whole number"),
         ({"seed": -1}, SceneError, "at least 0"),
         ({"sensor": "none.yaml"}, SceneError, "^sensor: no file 'none.yaml'"),
         ({"sensor": DEVICE | {"stages": 3}}, StorageError, "sensor: Device 'd': expected stages as a list, got 3"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
@@ -263,7 +262,8 @@ class Scan:
         """
         low, high = bounds_of(hidden_bounds, "Scan.default_axis")
         width = positive("Scan.default_axis: bin_width_opl", bin_width_opl)
-        first, last = math.floor(shortest(self, low, high) / width), math.ceil(longest(self, low, high) / width)
+        shortest, longest = _span(self, low, high)
+        first, last = math.floor(shortest / width), math.ceil(longest / width)
         return TimeAxis(first * width, width, max(1, last - first))
 
     # ------------------------------------------------------------------------------------------------- other scans
@@ -461,55 +461,19 @@ def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     return box[0], box[1]
 
 
-def shortest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Return a lower bound of the lengths of three-bounce paths over a box, metres.
+def _span(scan: Scan, low: Tensor, high: Tensor) -> tuple[float, float]:
+    """Bounds of the lengths of three-bounce paths over a box, metres.
 
-    The sum of the distances of spot and sensor point to the box, each to its own nearest point: exact for confocal
-    scans, at most too short otherwise.
-
-    Args:
-        scan: the scan.
-        low: lowest corner (3,).
-        high: highest corner (3,).
+    From below: the sum of the distances of spot and sensor point to the box, each to its own nearest point, exact for
+    confocal scans. From above: sums of distances are convex, the longest path goes over a corner.
     """
-    first, last = _legs(scan)
-    near = [torch.linalg.vector_norm(p - p.clamp(low, high), dim=-1) for p in _points(scan)]
-    return _combined(scan, near[0] + first, near[1] + last, longest=False)
-
-
-def longest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Return an upper bound of the lengths of three-bounce paths over a box, metres.
-
-    Sums of distances are convex: the longest path goes over a corner.
-
-    Args:
-        scan: the scan.
-        low: lowest corner (3,).
-        high: highest corner (3,).
-    """
-    laser, sensor = _points(scan)
-    first, last = _legs(scan)
-    found = 0.0
-    for corner in itertools.product(*zip(low.tolist(), high.tolist(), strict=True)):
-        point = torch.tensor(corner, dtype=torch.float64, device="cpu")
-        to_spot, to_sensor = (torch.linalg.vector_norm(p - point, dim=-1) for p in (laser, sensor))
-        found = max(found, _combined(scan, to_spot + first, to_sensor + last, longest=True))
-    return found
-
-
-def _points(scan: Scan) -> tuple[Tensor, Tensor]:
-    return scan.laser_points.detach().cpu().reshape(-1, 3), scan.sensor_points.detach().cpu().reshape(-1, 3)
-
-
-def _legs(scan: Scan) -> tuple[Tensor, Tensor]:
-    if not scan.first_and_last_leg:
-        zero = torch.zeros((), dtype=torch.float64, device="cpu")
-        return zero, zero
-    return scan.laser_legs.detach().cpu().reshape(-1), scan.sensor_legs.detach().cpu().reshape(-1)
-
-
-def _combined(scan: Scan, first: Tensor, last: Tensor, *, longest: bool) -> float:
+    corners = torch.cartesian_prod(*torch.stack([low, high], 1))
+    near, far = [], []
+    for points, legs in ((scan.laser_points, scan.laser_legs), (scan.sensor_points, scan.sensor_legs)):
+        flat = points.detach().cpu().reshape(-1, 3)
+        leg = legs.detach().cpu().reshape(-1) * scan.first_and_last_leg
+        near.append(torch.linalg.vector_norm(flat - flat.clamp(low, high), dim=-1) + leg)
+        far.append(torch.linalg.vector_norm(flat[:, None] - corners, dim=-1) + leg[:, None])
     if scan.kind in ("confocal", "pairs"):
-        both = first + last
-        return float(both.max() if longest else both.min())
-    return float(first.max() + last.max()) if longest else float(first.min() + last.min())
+        return float((near[0] + near[1]).min()), float((far[0] + far[1]).max())
+    return float(near[0].min() + near[1].min()), float((far[0].amax(0) + far[1].amax(0)).max())

@@ -14,7 +14,7 @@ import math
 import os
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -61,13 +61,9 @@ class RowLayout:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> RowLayout:
-        """Return the layout that :meth:`plain` described."""
+        """Return the layout of its fields, as JSON has them."""
         given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
         return cls(**given)
-
-    def plain(self) -> dict[str, Any]:
-        """Return the layout as data for JSON."""
-        return asdict(self)
 
     @property
     def split(self) -> int:

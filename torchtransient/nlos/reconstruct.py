@@ -429,8 +429,9 @@ def camera_of(name: str, times: tuple[float, float, int] | None) -> DirectLight 
     Raises:
         UnitError: for times that are not finite.
     """
-    if times is None:
+    if name == "direct":
         return DirectLight()
+    assert times is not None  # the command has asked for them
     start, stop, frames = times
     moments = torch.linspace(start, stop, count("reconstruct: times", frames), dtype=torch.float64, device="cpu")
     return ConfocalCamera(moments) if name == "confocal" else TransientCamera(moments)

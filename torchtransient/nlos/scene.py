@@ -12,7 +12,7 @@ import torch
 from torchtransient import scenes
 from torchtransient.array_files.array_file import read_some
 from torchtransient.capture import Scan
-from torchtransient.checks import checked_mesh, shown
+from torchtransient.checks import as_whole, checked_mesh, shown
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
@@ -266,13 +266,14 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     """The first and the last number that counts; -1 for no limit."""
     if isinstance(bounces, str) and bounces == ALL_BOUNCES:
         return 0, -1
-    numbers = sorted(bounces)
-    if not numbers or numbers != list(range(int(numbers[0]), int(numbers[0]) + len(numbers))) or numbers[0] < 2:
+    given = [bounces] if np.ndim(bounces) == 0 else list(bounces)
+    numbers = sorted(n for n in map(as_whole, given) if n is not None)
+    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(given))) or numbers[0] < 2:
         raise SceneError(
             "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
             f"got {shown(bounces)}. The laser's spot is the first bounce, so light around one corner has 3."
         )
-    return int(numbers[0]), int(numbers[-1])
+    return numbers[0], numbers[-1]
 
 
 def _numbers(points: torch.Tensor) -> np.ndarray:

@@ -17,6 +17,7 @@ Only `hidden` and `scan` must be there.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -129,20 +130,13 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
         shape["to_world"] = place
     if section.flag("flip_normals", False):
         shape["flip_normals"] = True
-    if "bsdf" in section and "albedo" in section:
+    bsdf = section.get("bsdf", None)
+    if bsdf is not None and "albedo" in section:
         raise SceneError(f"{where}: albedo and bsdf exclude each other; give one.")
-    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(_albedo(section))
+    if bsdf is not None and not (isinstance(bsdf, Mapping) and isinstance(bsdf.get("type"), str)):
+        raise SceneError(f"{where}: bsdf: expected a dictionary of Mitsuba with a type, got {shown(bsdf)}.")
+    shape["bsdf"] = diffuse(_albedo(section)) if bsdf is None else dict(bsdf)
     return shape
-
-
-def _bsdf(section: Section) -> dict[str, Any]:
-    given = section.get("bsdf")
-    if not isinstance(given, Mapping) or not isinstance(given.get("type"), str):
-        raise SceneError(
-            f"{section.where}: bsdf: expected a dictionary of Mitsuba, {{type: conductor}} for instance, got "
-            f"{shown(given)}."
-        )
-    return dict(given)
 
 
 def _albedo(section: Section, default: float = 0.5) -> Any:
@@ -160,16 +154,14 @@ def _place(section: Section) -> Matrix | None:
         if not isinstance(rows, list) or len(rows) != 4:
             raise SceneError(f"{section.where}: to_world: expected four rows of four numbers, got {shown(rows)}.")
         return np.array([Section({"row": row}, section.where, ("row",)).numbers("row", (4,)) for row in rows])
-    matrix = None
+    steps = []
     if "scale" in section:
         size = section.get("scale")
-        matrix = scale(section.numbers("scale", (3,)) if isinstance(size, list) else section.number("scale"))
-    for turn in _turns(section):
-        matrix = turn if matrix is None else turn @ matrix
+        steps.append(scale(section.numbers("scale", (3,)) if isinstance(size, list) else section.number("scale")))
+    steps += _turns(section)
     if "translate" in section:
-        moved = translate(section.numbers("translate", (3,)))
-        matrix = moved if matrix is None else moved @ matrix
-    return matrix
+        steps.append(translate(section.numbers("translate", (3,))))
+    return functools.reduce(lambda before, step: step @ before, steps) if steps else None
 
 
 def _turns(section: Section) -> list[Matrix]:
@@ -321,13 +313,8 @@ def _bounces(section: Section) -> tuple[int, ...] | str:
     given = section.get("bounces", list(DEFAULT_BOUNCES))
     if given == ALL_BOUNCES:
         return ALL_BOUNCES
-    wanted = given if isinstance(given, list) else [given]
-    numbers = [as_number(value, "bounces") for value in wanted]
-    if not numbers or any(number != round(number) or number < 1 for number in numbers):
-        raise SceneError(
-            f"bounces: expected whole numbers of at least 1, [3] for instance, or 'all', got {shown(given)}."
-        )
-    return tuple(sorted({int(number) for number in numbers}))
+    several = given if isinstance(given, list) else [given]
+    return tuple(sorted({Section({"a number": n}, "bounces", ("a number",)).whole("a number") for n in several}))
 
 
 def _sensor(given: Any, folder: Path) -> Device | None:
@@ -335,10 +322,9 @@ def _sensor(given: Any, folder: Path) -> Device | None:
         return None
     if not isinstance(given, Mapping | str):
         raise SceneError(f"sensor: expected the file of a device or its entries, got {shown(given)}.")
-    if isinstance(given, str):
-        path = file_beside(given, (folder,), "sensor")
+    path = file_beside(given, (folder,), "sensor") if isinstance(given, str) else None
     try:
-        if isinstance(given, Mapping):
+        if path is None:
             return Device.from_dict(given)
         return Device.from_json(path) if path.suffix.lower() == ".json" else Device.from_yaml(path)
     except TorchTransientError as error:

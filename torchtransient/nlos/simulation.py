@@ -8,6 +8,7 @@ that were done keep their bits.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 import os
 import sys
@@ -15,7 +16,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -432,7 +433,14 @@ def simulate(
     """
     seed, path = checked_seed("simulate", seed), None if part is None else path_of(part, "simulate: part")
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
-    chain = None if sensor is None else _chain(sensor, work.axes()[0])
+    chain, axis = None, work.axes()[0]
+    if sensor is not None:
+        if axis is None:
+            raise ArgumentError(
+                "simulate: a sensor takes transients, and phasors are asked for; leave out one of them."
+            )
+        # Counts as they are drawn: nothing of a simulation has gradients.
+        chain = checked_module(sensor, axis, "straight_through")
     part_file = nullcontext() if path is None else PartFile(path, work.key(seed))
     with part_file as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
@@ -477,16 +485,13 @@ def forecast(
         ArgumentError: for unknown arguments; others as :func:`simulate`.
     """
     checked_seed("forecast", settings.get("seed", DEFAULT_SEED))
-    time_axis, frequencies, spp, *of_light = (
-        settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")
-    )
-    unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
+    unknown = sorted(settings.keys() - inspect.signature(simulate).parameters.keys())
     if unknown:
         raise ArgumentError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
+    time_axis, frequencies, spp = (settings.get(name) for name in ("time_axis", "frequencies", "spp"))
+    of_light = settings.get("bounces"), settings.get("energy")
     path = None if part is None else path_of(part, "simulate: part")
-    work = _work(
-        hidden, scan, time_axis, frequencies, spp, (of_light[0], of_light[1]), variant, _parts(scan, path, tiles)
-    )
+    work = _work(hidden, scan, time_axis, frequencies, spp, of_light, variant, _parts(scan, path, tiles))
     with active_variant(work.variant.name):
         return _forecast_of(work, timed=True)
 
@@ -543,10 +548,9 @@ def _scene_work(
             f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
         )
     loaded = load(scene)
-    given = variant
-    if given is None and isinstance(scene, Scene):
-        given = scene._requested_variant
-    chosen = _choose_variant(loaded, given)
+    if variant is None and isinstance(scene, Scene):
+        variant = scene._requested_variant
+    chosen = _choose_variant(loaded, variant)
     return SceneWork(load(loaded, variant=chosen.name), time_axis, frequencies, spp, chosen, parts)
 
 
@@ -595,8 +599,8 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 rows = np.empty((points, layout.columns), np.float32) if rows is None else rows
                 rows[slice(*work.run(number))] = part
             if kept is not None:
-                about = layout.plain()
-                kept.keep(number, first, part, total=total, seconds=seconds, about=about, instead_of=before)
+                settings = {"seconds": seconds, "about": asdict(layout), "instead_of": before}
+                kept.keep(number, first, part, total=total, **settings)
             bar.update(1)
     assert layout is not None
     if kept is not None:
@@ -614,13 +618,3 @@ def _slot(number: int, points: int) -> int:
 
 def _has(kept: PartFile, work: Work, number: int) -> bool:
     return kept.last is not None and number <= kept.last if isinstance(work, SceneWork) else kept.has(number)
-
-
-# -------------------------------------------------------------------------------------------------------------- results
-
-
-def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.Module:
-    if axis is None:
-        raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
-    # Counts as they are drawn: nothing of a simulation has gradients.
-    return checked_module(sensor, axis, "straight_through")

@@ -289,7 +289,10 @@ def _scan(section: Section, wall: Wall) -> Scan:
     if kind == "single":
         laser = _looked_at(section, "x", size[0]), _looked_at(section, "y", size[1])
         return Scan.grid(wall, size, kind=kind, laser=laser, first_and_last_leg=legs, **origins)
-    aperture, laser_size = _aperture(section), _laser_size(section)
+    names = (("start_x", 0.0), ("start_y", 0.0), ("end_x", 1.0), ("end_y", 1.0))
+    aperture = tuple(float(section.number(f"laser_aperture_{name}", default)) for name, default in names)
+    given = "laser_width" in section or "laser_height" in section
+    laser_size = (section.whole("laser_width", 32), section.whole("laser_height", 32)) if given else None
     if kind == "confocal" or _equal_grids(section):
         if aperture != (0.0, 0.0, 1.0, 1.0) or (laser_size and laser_size != size):
             raise SceneError(
@@ -316,18 +319,6 @@ def _looked_at(section: Section, axis: str, pixels: int) -> float:
             "takes 0 for null)."
         )
     return float(value / pixels)
-
-
-def _laser_size(section: Section) -> tuple[int, int] | None:
-    if "laser_width" not in section and "laser_height" not in section:
-        return None
-    return section.whole("laser_width", 32), section.whole("laser_height", 32)
-
-
-def _aperture(section: Section) -> tuple[float, float, float, float]:
-    names = (("start_x", 0.0), ("start_y", 0.0), ("end_x", 1.0), ("end_y", 1.0))
-    u0, v0, u1, v1 = (float(section.number(f"laser_aperture_{name}", default)) for name, default in names)
-    return u0, v0, u1, v1
 
 
 def _equal_grids(section: Section) -> bool:

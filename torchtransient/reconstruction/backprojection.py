@@ -183,22 +183,16 @@ class EllipsoidOperator(ScanOperator):
         for a in range(0, self.voxels.shape[1], size):
             tile = slice(a, min(a + size, self.voxels.shape[1]))
             voxels = self.voxels[:, tile]
-            first = None if confocal or pairs else _distances(self.lasers[:, group.lasers], voxels)
+            to_spots = None if confocal or pairs else _distances(self.lasers[:, group.lasers], voxels)
             for b in range(0, points, step):
                 part = slice(b, min(b + step, points))
                 last = _distances(sensors[:, part], voxels)
-                to_spot = _distances(self.lasers[:, group.sensors][:, part], voxels) if pairs else None
+                if pairs:
+                    to_spots = _distances(self.lasers[:, group.sensors][:, part], voxels)[None]
                 for spot in range(spots):
-                    if to_spot is not None:
-                        position = (last + to_spot).add_(bins[part, None])
-                        weight = self._weight(last, to_spot)
-                    elif first is None:
-                        position = (last + last).add_(bins[part, None])
-                        weight = self._weight(last, last)
-                    else:
-                        offset = bins[part, None] + self.laser_bins[group.lasers.start + spot]
-                        position = (last + first[spot]).add_(offset)
-                        weight = self._weight(last, first[spot])
+                    first = last if to_spots is None else to_spots[spot]
+                    position = (last + first).add_(bins[part, None] + self.laser_bins[group.lasers.start + spot])
+                    weight = self._weight(last, first)
                     # Lengths before the record read the zero in front of a row, those behind it the ones at its end.
                     position.clamp_(0, length - 2)
                     index = position.to(torch.int32)

@@ -116,13 +116,11 @@ def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
     Raises:
         UnitError: for numbers below zero or below the smallest number of ``dtype``.
     """
-    floor = finite("stabilized_root: floor", value)
-    if floor < 0:
-        raise UnitError(f"stabilized_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
+    floor, least = finite("stabilized_root: floor", value), torch.finfo(dtype).tiny
     # Smaller ones vanish or have few digits, and empty bins would be zero over zero.
-    if 0 < floor < (least := torch.finfo(dtype).tiny):
+    if floor < 0 or 0 < floor < least:
         raise UnitError(
-            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. Scale "
-            "the transient, or take double precision."
+            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. For "
+            "counts take 0.25."
         )
     return floor
