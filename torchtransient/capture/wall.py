@@ -396,28 +396,37 @@ def first_hits(origins: Array, direction: Array, corners: Array) -> tuple[Array,
     Returns:
         Distance (N,) and index (N,) of the triangle; infinity and -1 for rays that meet none.
 
-    Source: Moeller and Trumbore (1997), for the triangles alone that share a cell with a ray on a grid across the rays.
+    Source: Moeller and Trumbore (1997), for pairs alone whose ray is within the box of the triangle across the rays.
     """
-    cells = _Cells(corners, direction)
+    first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    first /= np.linalg.norm(first)
+    frame = np.stack([first, np.cross(direction, first)], axis=1)
+    places, flat = origins @ frame, corners @ frame
+    slack = 1e-6 * np.ptp(flat.reshape(-1, 2), axis=0)
+    low, high = flat.min(1) - slack, flat.max(1) + slack
+    order = np.argsort(places[:, 0], kind="stable")
+    x, y = places[order].T.copy()
+    begin = np.searchsorted(x, low[:, 0])
+    counts = np.searchsorted(x, high[:, 0]) - begin
+    total = np.cumsum(counts)
     distances, indices = np.full(len(origins), np.inf), np.full(len(origins), -1, dtype=np.int64)
-    rows, counts = cells.candidates(origins)
-    ends = np.cumsum(counts)
     start = 0
-    while start < len(origins):
-        # As many rays as fit, and one at least.
-        base = ends[start] - counts[start]
-        stop = max(start + 1, int(np.searchsorted(ends, base + _PAIRS_AT_ONCE, side="right")))
+    while start < len(corners):
+        # As many triangles as fit, and one at least.
+        stop = max(start + 1, int(np.searchsorted(total, total[start] - counts[start] + _PAIRS_AT_ONCE, side="right")))
         here = counts[start:stop]
-        ray = np.repeat(np.arange(start, stop), here)
-        within = np.arange(len(ray)) - np.repeat(np.cumsum(here) - here, here)
-        triangle = cells.triangles[np.repeat(rows[start:stop], here) + within]
+        place = np.arange(here.sum()) + np.repeat(begin[start:stop] - (np.cumsum(here) - here), here)
+        beside = y[place]
+        near = np.flatnonzero(
+            (beside >= np.repeat(low[start:stop, 1], here)) & (beside <= np.repeat(high[start:stop, 1], here))
+        )
+        ray, triangle = order[place[near]], np.repeat(np.arange(start, stop), here)[near]
         t = _distances(origins[ray], direction, corners[triangle])
         # Of equally near ones the first in the mesh, as a search over all triangles would have it.
-        order = np.lexsort((triangle, t, ray))
-        rays, first = np.unique(ray[order], return_index=True)
-        nearest = t[order][first]
-        distances[rays] = nearest
-        indices[rays] = np.where(np.isfinite(nearest), triangle[order][first], -1)
+        nearest = np.lexsort((triangle, t, ray))
+        nearest = nearest[np.unique(ray[nearest], return_index=True)[1]]
+        nearest = nearest[t[nearest] < distances[ray[nearest]]]
+        distances[ray[nearest]], indices[ray[nearest]] = t[nearest], triangle[nearest]
         start = stop
     return distances, indices
 
@@ -438,54 +447,6 @@ def _distances(origins: Array, direction: Array, corners: Array) -> Array:
     t = (other * second).sum(1) * inverse
     met = open_to_ray & (u >= -_BARY_SLACK) & (v >= -_BARY_SLACK) & (u + v <= 1 + _BARY_SLACK) & (t > 0)
     return np.where(met, t, np.inf)
-
-
-class _Cells:
-    """Lists of triangles that reach into each cell of a grid across a direction."""
-
-    def __init__(self, corners: Array, direction: Array):
-        helper = np.eye(3)[np.abs(direction).argmin()]
-        first = np.cross(direction, helper)
-        first /= np.linalg.norm(first)
-        self._frame = np.stack([first, np.cross(direction, first)], axis=1)
-        flat = corners @ self._frame
-        low, high = flat.min(1), flat.max(1)
-        self._low = low.min(0)
-        self._size = np.maximum(high.max(0) - self._low, 1e-300)
-        # A triangle that reaches into many cells is listed in each: fewer cells until the lists stay short.
-        self._count = max(1, int(np.sqrt(len(corners))))
-        while self._count > 1 and self._spans(low, high)[2].sum() > 16 * len(corners):
-            self._count = (self._count + 1) // 2
-        begin, width, number = self._spans(low, high)
-        triangle = np.repeat(np.arange(len(corners)), number)
-        within = np.arange(len(triangle)) - np.repeat(np.cumsum(number) - number, number)
-        wide = np.repeat(width[:, 0], number)
-        cell = self._index(np.repeat(begin, number, axis=0) + np.stack([within % wide, within // wide], axis=1))
-        order = np.argsort(cell, kind="stable")
-        self.triangles = triangle[order]
-        self._starts = np.searchsorted(cell[order], np.arange(self._count**2 + 1))
-
-    def candidates(self, origins: Array) -> tuple[Indices, Indices]:
-        """Return the start in `triangles` and the length of each ray's list; length 0 beside the grid."""
-        place = origins @ self._frame
-        slack = 1e-9 * self._size
-        inside = ((place >= self._low - slack) & (place <= self._low + self._size + slack)).all(1)
-        cell = self._index(self._cell(place))
-        return self._starts[cell], np.where(inside, self._starts[cell + 1] - self._starts[cell], 0)
-
-    def _cell(self, places: Array) -> Indices:
-        scaled = np.floor((places - self._low) / self._size * self._count)
-        return np.asarray(np.clip(scaled, 0, self._count - 1), dtype=np.int64)
-
-    def _spans(self, low: Array, high: Array) -> tuple[Indices, Indices, Indices]:
-        """First cells (F, 2) of triangles, numbers of cells along both axes, and in all."""
-        slack = 1e-6 * self._size / self._count
-        begin, end = self._cell(low - slack), self._cell(high + slack)
-        width = end - begin + 1
-        return begin, width, width.prod(1)
-
-    def _index(self, cells: Indices) -> Indices:
-        return np.asarray(cells[..., 1] * self._count + cells[..., 0])
 
 
 def _triangle_normals(corners: Array) -> Array:
