@@ -101,7 +101,7 @@ def test_pictures_are_sums_over_channels_and_the_highest_of_a_film():
 
 
 @together("change, error, words", [
-    ({"values": torch.ones(2, 3, 4)}, ShapeError, r"expected values \(\.\.\., C, 2, 3, 4\) .* got \(2, 3, 4\)"),
+    ({"values": torch.ones(2, 3, 4)}, ShapeError, r"expected values \(\.\.\., C, 2, 3, 4\), real, got \(2, 3, 4\)"),
     ({"values": torch.ones(1, 2, 3, 4, dtype=torch.complex64)}, ShapeError, "torch.complex64"),
     ({"times": torch.tensor([0.1, float("inf")])}, UnitError, "expected finite times"),
     ({"times": torch.ones(2)}, ShapeError, r"expected values \(\.\.\., C, 2, 2, 3, 4\)"),

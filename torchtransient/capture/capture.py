@@ -200,10 +200,7 @@ class Capture(TensorRecord):
         first = max(0, math.floor((start_opl - axis.start_opl) / axis.bin_width_opl + 1e-6))
         last = min(axis.num_bins, math.ceil((end_opl - axis.start_opl) / axis.bin_width_opl - 1e-6))
         if last <= first:
-            raise UnitError(
-                f"Capture.crop: expected lengths between {axis.start_opl:.6g} and {axis.end_opl:.6g} m, got "
-                f"{start_opl:.6g} to {end_opl:.6g} m, which hold no bin."
-            )
+            raise UnitError(f"Capture.crop: no bin of {axis} is within {start_opl:.6g} to {end_opl:.6g} m.")
         start = axis.start_opl + first * axis.bin_width_opl
         start = start_opl if abs(start - start_opl) < 1e-6 * axis.bin_width_opl else start
         kept = TimeAxis(start, axis.bin_width_opl, last - first)

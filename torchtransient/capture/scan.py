@@ -112,8 +112,7 @@ class Scan:
         """
         if kind not in GRID_KINDS:
             raise ArgumentError(
-                f"Scan.grid: expected kind to be one of {', '.join(GRID_KINDS)}, got {shown(kind)}. Scan.points takes "
-                "pairs."
+                f"Scan.grid: expected kind single, confocal or exhaustive, got {shown(kind)}. Scan.points takes pairs."
             )
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
@@ -131,8 +130,7 @@ class Scan:
                 spots, spot_normals = surface.grid(laser_grid, extent, cell_centers=cell_centers)
             if spots.size == 3 and points.size == 3:
                 raise SceneError(
-                    "Scan.grid: expected an exhaustive scan of several pairs, got a grid of one point for the laser "
-                    "and the sensor. Give kind='single' with laser=, or kind='confocal', or larger grids."
+                    "Scan.grid: expected several pairs, got a grid of one point. Give kind='single' with laser=."
                 )
         aside = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
         return cls(

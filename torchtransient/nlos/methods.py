@@ -72,13 +72,11 @@ def check_method(name: str, capture: Capture) -> Method:
     if kind not in method.kinds:
         others = ", ".join(other for other, entry in METHODS.items() if kind in entry.kinds)
         raise ArgumentError(
-            f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, and this one is {kind}. "
-            f"Take one of {others}."
+            f"reconstruct: '{name}' takes {' and '.join(method.kinds)} scans, this one is {kind}. Take one of {others}."
         )
     if method.planar and not is_planar(capture.scan):
         raise ArgumentError(
-            f"reconstruct: method '{name}' takes regular grids of points on a flat wall, and this scan is none "
-            f"({capture.scan!r}). Take bp or fbp."
+            f"reconstruct: method '{name}' takes regular grids on a flat wall, got {capture.scan!r}. Take bp or fbp."
         )
     return method
 

@@ -179,8 +179,7 @@ class PartFile:
             return
         if form != FORMAT or key != self._key:
             raise StorageError(
-                f"part file: '{self.path}' belongs to another simulation: another scene, scan, axis, spp, seed or "
-                "number of tiles. Give another name, or delete it to start anew."
+                f"part file: '{self.path}' belongs to another simulation. Give another name, or delete it."
             )
         self._done, self.about, self.seconds = done, about, seconds
         with self._errors_said():
@@ -330,8 +329,7 @@ def _locked(path: Path) -> Iterator[None]:
                 fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 raise StorageError(
-                    f"part file: another process works on '{path.with_suffix('')}'. Wait for it, or give another name "
-                    "to each simulation."
+                    f"part file: another process works on '{path.with_suffix('')}'. Wait for it, or give another name."
                 ) from error
             # The one that held it before may have deleted it: then it is nobody's any more.
             try:

@@ -301,8 +301,7 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
     for option in options:
         if option not in known:
             raise ArgumentError(
-                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
-                "Leave it out, or take another method."
+                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(known)}. Leave it out."
             )
     if "filter" in options:
         one_of("reconstruct: filter", options["filter"], FILTERS)
@@ -361,10 +360,7 @@ def _on_own_grid(
     found, z = [], axis.centers_opl / 2
     seen = torch.ones_like(z, dtype=torch.bool) if depths is None else (z >= depths[0]) & (z <= depths[1])
     if not bool(seen.any()):
-        raise UnitError(
-            f"reconstruct: expected depths within the record's, {float(z[0]):.4g} to {float(z[-1]):.4g} m, got "
-            f"{shown(depths)}."
-        )
+        raise UnitError(f"reconstruct: expected depths within the record's, {float(z[0]):.4g} to {float(z[-1]):.4g} m.")
     kept = seen.nonzero()[:, 0]
     operator = kinds[name](capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
     with _bar(transient.shape[dim], progress) as bar:

@@ -64,8 +64,7 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
             bins = module(dark).shape[-3]
         if bins != axis.num_bins:
             raise SceneError(
-                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of "
-                f"{sensor!r}. Apply a sensor with bins of its own to capture.transient."
+                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of {sensor!r}."
             )
     return module
 
@@ -466,8 +465,7 @@ def _check_once(parameters: Mapping[str, Any], followed: Mapping[str, torch.Tens
     twice = [key for key in parameters if key in followed]
     if twice:
         raise SceneError(
-            f"CaptureRenderer: {', '.join(twice)}: expected one tensor, got one of the scan, which requires gradients, "
-            "and one of parameters=. Leave the key out of parameters, or take scan.detach()."
+            f"CaptureRenderer: {', '.join(twice)}: expected one tensor, got one of the scan too. Take scan.detach()."
         )
 
 
@@ -502,8 +500,7 @@ def as_capture(
 
     if out.transient is None and out.phasor is None:
         raise ArgumentError(
-            "capture: expected a time axis or frequencies; a capture has no place for other films. Render its scene "
-            "with tt.TransientRenderer(tt.nlos.capture_scene(...), ...)."
+            "capture: expected a time axis or frequencies; a capture has no place for light of other films."
         )
     transient = out.transient
     if sensor is not None:

@@ -52,8 +52,7 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix == ".xml":
         raise SceneError(
-            f"{where}: {str(path)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it as "
-            "it is: tt.nlos.simulate(path)."
+            f"{where}: '{path}' is a complete scene; leave scan out to simulate it: tt.nlos.simulate(path)."
         )
     if suffix not in _MESH_FILES:
         raise SceneError(f"{where}: expected a mesh file ({', '.join(_MESH_FILES)}), got {str(path)!r}.")
@@ -131,8 +130,7 @@ def capture_scene(
     """
     if scan.wall is None:
         raise SceneError(
-            "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
-            "or Scan.points(..., wall=...)."
+            "capture: expected a scan that knows its wall: Scan.grid(wall, ...) or Scan.points(..., wall=...)."
         )
     _check_energy(energy)
     first, last = _range(bounces)
@@ -233,8 +231,7 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
         kind = str(node["type"])
         if name in ("sensor", "integrator") or kind.startswith("transient_") or kind.endswith("_capture_meter"):
             raise SceneError(
-                f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
-                "it out, or render a complete scene with tt.TransientRenderer."
+                f"hidden: {name!r} ({kind}) is no hidden thing: the capture brings sensor, laser and integrator."
             )
         _check_dark(node, name)
 
@@ -243,8 +240,7 @@ def _check_dark(node: Mapping[str, Any], where: str) -> None:
     """Raise SceneError for light among hidden things."""
     if str(node.get("type")) in _LIGHTS:
         raise SceneError(
-            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone: the one light of a capture is the "
-            "laser. Leave it out, or render a complete scene with tt.TransientRenderer."
+            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone beside the laser. Leave it out."
         )
     for name, part in node.items():
         if isinstance(part, Mapping):

@@ -146,8 +146,7 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     laser = laser_of(scene)
     if laser.get_shape() is not None or mi.has_flag(laser.flags(), mi.EmitterFlags.Infinite):
         raise SceneError(
-            f"simulate: expected a laser whose beam falls on a spot, got the emitter {class_of(laser)}. Use "
-            f"laser_beam, projector or spot. {_REMEDY}"
+            f"simulate: expected a laser whose beam falls on a spot, got the emitter {class_of(laser)}. {_REMEDY}"
         )
     fov = None
     if integrator.capture is CaptureType.EXHAUSTIVE and not integrator.equal_grids:
@@ -258,15 +257,13 @@ def _check_hidden(scene: Any, wall: Ends) -> None:
     hidden = [shape for shape in scene.shapes() if (shape.id() or class_of(shape)) not in seen]
     if not hidden:
         raise SceneError(
-            "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
-            "the hidden things as shapes."
+            "hidden: expected at least one shape beside the wall, got none. Add the hidden things as shapes."
         )
     _check_areas(hidden)
     if reaches_before(hidden, wall.points, wall.normals):
         return
     raise SceneError(
-        "hidden: expected something before the wall, on the side that its normals point to, got nothing there: what is "
-        "behind it sends it no light. Move the hidden things or turn the wall (flip_normals)."
+        "hidden: expected something before the wall, got nothing there. Move it, or turn the wall (flip_normals)."
     )
 
 
@@ -304,10 +301,7 @@ def _check_areas(shapes: list[Any]) -> None:
     if not all(np.isfinite(area) for area in areas.values()):
         raise SceneError(f"hidden: expected shapes of finite area, got {told}. Give lengths in metres.")
     if not any(area > 0 for area in areas.values()):
-        raise SceneError(
-            f"hidden: expected shapes with an area that light falls on, got {told}. Give triangles whose corners are "
-            "not all in a row, and scales other than 0."
-        )
+        raise SceneError(f"hidden: expected shapes with an area that light falls on, got {told}.")
 
 
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:

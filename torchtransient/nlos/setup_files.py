@@ -169,8 +169,7 @@ def _turns(section: Section) -> list[Matrix]:
     pairs = [given] if _is_pair(given) else given
     if not isinstance(pairs, list) or not all(map(_is_pair, pairs)):
         raise SceneError(
-            f"{section.where}: rotate: expected [[x, y, z], degrees], [[0, 1, 0], 30] for instance, or a list of "
-            f"those, got {shown(given)}."
+            f"{section.where}: rotate: expected [[x, y, z], degrees] or a list of those, got {shown(given)}."
         )
     turns = []
     for pair in pairs:
@@ -196,8 +195,7 @@ _SCAN_ENTRIES = (
 def _of_description(data: Mapping[str, Any], folder: Path, name: str) -> dict[str, Any]:
     if "hidden" not in data:
         raise SceneError(
-            f"{name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of y-tal), got "
-            f"{', '.join(map(str, data))}."
+            f"{name}: expected an entry 'hidden' (or 'geometry' of y-tal), got {', '.join(map(str, data))}."
         )
     section = Section(data, "capture description", _ENTRIES)
     section.text("name", "")

@@ -510,8 +510,7 @@ def _work(
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
     if isinstance(hidden, Scene):
         raise ArgumentError(
-            "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
-            "simulate the scene as it is, or give shapes by name."
+            "simulate: a tt.Scene has a sensor of its own. Leave scan out to simulate the scene as it is."
         )
     bounces, energy = of_light
     settings: dict[str, Any] = {
@@ -534,10 +533,7 @@ def _scene_work(
         ("bounces", "energy"), of_light, ("its integrator's max_depth and filter_bounces", "its laser"), strict=True
     ):
         if value is not None:
-            raise ArgumentError(
-                f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out, or give scan= and "
-                "hidden shapes."
-            )
+            raise ArgumentError(f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out.")
     if isinstance(scene, Mapping) and not _is_complete(scene):
         raise ArgumentError(
             "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "

@@ -103,8 +103,7 @@ class EllipsoidOperator(ScanOperator):
         longest = 2.0 * max(float((some - middle).abs().max()) for some in (voxels, sensors, lasers))
         if not longest < 1e9 * width:
             raise UnitError(
-                f"{type(self).__name__}: expected points within 1e9 bins of each other, got some {longest / width:.3g} "
-                "bins away. Lengths are in metres."
+                f"{type(self).__name__}: expected points within 1e9 bins, got some {longest / width:.3g} bins away."
             )
         return {
             "voxels": ((voxels - middle) / width).T.contiguous(),

@@ -110,10 +110,7 @@ def refuse_pairs(scan: Scan, who: str) -> None:
         ShapeError: for pairs.
     """
     if scan.kind == "pairs":
-        raise ShapeError(
-            f"{who}: expected a single or an exhaustive scan, got pairs of spots and sensor points. Use "
-            "FilteredBackprojection (phasor fields of any pairs) or Backprojection."
-        )
+        raise ShapeError(f"{who}: expected a single or an exhaustive scan, got pairs. Use FilteredBackprojection.")
 
 
 def refuse_legs(scan: Scan, who: str) -> None:
@@ -128,8 +125,7 @@ def refuse_legs(scan: Scan, who: str) -> None:
     """
     if scan.first_and_last_leg:
         raise ShapeError(
-            f"{who}: expected lengths from the spot to the sensor point, got a scan that counts the first and last leg "
-            "too. Take the capture that subtract_legs(capture) gives, with its scan and axis."
+            f"{who}: expected a scan without first and last leg. Take the capture that subtract_legs(capture) gives."
         )
 
 
@@ -190,8 +186,7 @@ def check_from_zero(time_axis: TimeAxis, who: str) -> None:
     """
     if time_axis.start_opl < -1e-6 * time_axis.bin_width_opl:
         raise UnitError(
-            f"{who}: expected a time axis from zero on, got {time_axis}: nothing is before the wall at times before "
-            "zero. Leave those bins out with capture.crop, or say when the first bin begins, in metres of path."
+            f"{who}: expected a time axis from zero on, in metres of path, got {time_axis}. Use capture.crop."
         )
 
 
@@ -216,8 +211,7 @@ def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None
     reach, record = axis.end_opl - near, axis.end_opl - axis.start_opl
     if reach < -MOST * max(side, record):
         raise UnitError(
-            f"{who}: expected a record that goes on after time zero and its legs of {near:.4g} m, got {axis}. When "
-            "does the first bin begin?"
+            f"{who}: expected a record after its legs of {near:.4g} m, got {axis}. When does the first bin begin?"
         )
     late = axis.start_opl - far > 1e3 * MOST * max(side, width)
     if side > MOST * max(reach, record) or 0 < side < width or late:

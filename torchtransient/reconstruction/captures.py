@@ -45,10 +45,7 @@ def subtract_legs(capture: Capture) -> Capture:
     skipped = max(0, math.ceil(-start / width - 1e-6))
     bins = axis.num_bins - skipped
     if bins < 1:
-        raise UnitError(
-            f"subtract_legs: expected a capture that is longer than its shortest legs, {float(legs.min()):.4g} m, got "
-            f"one up to {axis.end_opl:.4g} m. Does its time axis count the legs?"
-        )
+        raise UnitError(f"subtract_legs: expected bins behind the legs, got {axis}. Does its time axis count the legs?")
     # A zero that is one to rounding.
     first = start + skipped * width
     shorter = TimeAxis(0.0 if abs(first) < 1e-6 * width else first, width, bins)
@@ -120,7 +117,6 @@ def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
     # Smaller ones vanish or have few digits, and empty bins would be zero over zero.
     if floor < 0 or 0 < floor < least:
         raise UnitError(
-            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. For "
-            "counts take 0.25."
+            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}."
         )
     return floor

@@ -102,8 +102,7 @@ class DiffusionDeconvolution(ConfocalOperator):
         kernel /= max(self._total(), 1e-300) ** 2
         if not float(kernel.sum()) > SHARE_OF_LIGHT:
             raise UnitError(
-                f"DiffusionDeconvolution: expected a slab whose light falls into the record, got none within "
-                f"{bins * width:.3g} m of optical path. Let the time axis be longer, or the slab thinner."
+                "DiffusionDeconvolution: no light is in the record. Let the axis be longer, or the slab thinner."
             )
         # Later light than the record's would come round as early light; displacements are the same to both sides.
         whole = torch.zeros(2 * bins, 2 * rows, 2 * columns, dtype=torch.float64, device="cpu")

@@ -324,8 +324,7 @@ class Midpoints(TransientOperator):
         off = (spots / pitch - (spots / pitch).clamp_min(0).minimum(extent)).abs()
         if float(off[:, 2].max()) > OFF_GRID * min(sensors.pitch) or float(off[:, :2].max()) > 0.5 + OFF_GRID:
             raise ShapeError(
-                f"MidpointFK: expected spots in the plane of the sensor points and within their rectangle, got some "
-                f"{float(off.max()):.3g} off it, in pitches along the wall and metres across. Use Backprojection."
+                "MidpointFK: expected spots among the sensor points, within their rectangle. Use Backprojection."
             )
         # In steps of half the pitch from the first sensor point; (M, N, 2) of spots and sensor points.
         middles = ((spots[:, None] + points) / pitch)[..., :2]

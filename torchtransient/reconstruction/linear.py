@@ -160,8 +160,7 @@ class LinearOperator(nn.Module, ABC):
         asking = [key for key, t in (*self.named_parameters(), *self.named_buffers()) if t.requires_grad]
         if asking:
             raise GradientError(
-                f"{who}: expected tables without gradients, got {', '.join(asking)} with requires_grad. Operators are "
-                "differentiable by their operands alone: multiply those, or detach the tables."
+                f"{who}: expected tables without gradients, which they would not get, got {', '.join(asking)}."
             )
         return x.to(self.dtype.to_complex() if x.is_complex() or not real else self.dtype)
 

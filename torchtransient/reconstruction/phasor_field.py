@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import finite, real_array, shown, with_article
+from torchtransient.checks import finite, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import check_wavelength, refuse_pairs
 from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
@@ -187,8 +187,7 @@ class PhasorField(ScanOperator):
     ) -> None:
         if not isinstance(points, VoxelGrid):
             raise ArgumentError(
-                f"PhasorField: expected planes as a VoxelGrid, got {shown(points)}. Make them with VoxelGrid.before; "
-                "FilteredBackprojection takes points."
+                f"PhasorField: expected a VoxelGrid, got {shown(points)}. FilteredBackprojection takes points."
             )
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
@@ -196,8 +195,7 @@ class PhasorField(ScanOperator):
         self.camera: Camera = DirectLight() if camera is None else camera
         if not self.camera.focuses_laser and scan.kind != "single":
             raise SceneError(
-                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got "
-                f"{with_article(scan.kind)} one. Choose a spot of an exhaustive capture with capture.single(index)."
+                f"PhasorField: expected one laser spot for a TransientCamera, got {scan!r}. See capture.single(index)."
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
         self.real_volume = False
@@ -222,9 +220,7 @@ class PhasorField(ScanOperator):
         same = all(abs(a - b) * n <= OFF_GRID * b for a, b, n in zip(grid.pitch, wall.pitch, grid.size, strict=True))
         if not (parallel and same):
             raise ShapeError(
-                "PhasorField: expected planes along the wall's rows and columns with its pitch of "
-                f"{wall.pitch[0]:.5g} x {wall.pitch[1]:.5g} m, got {grid!r}. "
-                "Use VoxelGrid.before(scan, depths), or FilteredBackprojection, which takes any points."
+                f"PhasorField: expected planes along the wall's rows and columns with its pitch {wall!r}, got {grid!r}."
             )
         # Along the axes of the wall, from its first point; the normal of the planes may be the opposite one.
         self.corner = wall.local(grid.first)
@@ -233,8 +229,7 @@ class PhasorField(ScanOperator):
         # Where nothing says which side is the hidden one, all may be on either.
         if not (nearest > 0 or (farthest < 0 and self.scan.sensor_normals is None)):
             raise ShapeError(
-                f"PhasorField: expected planes before the wall, got some {nearest:.3g} to {farthest:.3g} m before it: "
-                "at the wall, behind it, or on both sides. Let depths be above zero."
+                f"PhasorField: expected planes before the wall, got some {nearest:.3g} to {farthest:.3g} m before it."
             )
 
     def _leg_lengths(self) -> tuple[Tensor, Tensor]:

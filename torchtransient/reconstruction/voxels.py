@@ -67,8 +67,7 @@ class PlanarScan:
         off = float((p - expected).norm(dim=-1).max())
         if not (slack > 0 and off <= slack and abs(float(x @ y)) <= OFF_GRID * dx * dy):
             raise ShapeError(
-                f"{who}: expected sensor points on a regular, rectangular grid of a flat wall, got some {off:.3g} m "
-                f"off it (pitch {dy:.3g} x {dx:.3g} m). Use Backprojection, which takes any points."
+                f"{who}: expected sensor points on a regular, rectangular grid of a flat wall, got some {off:.3g} m off"
             )
         along_x = x / dx
         # At right angles to rounding, where the points are to a share of their pitch.
@@ -247,8 +246,7 @@ class VoxelGrid:
             spans.append((float(along.max() + along.min()) / 2, spread * cells))
         if extent is None and min(span for _, span in spans) <= ON_ONE_LINE * max(span for _, span in spans):
             raise SceneError(
-                f"VoxelGrid.before: the sensor points of this scan lie on one line of the planes ({scan!r}), which "
-                "does not say how wide and high a volume is. Give extent=(width, height) in metres."
+                f"VoxelGrid.before: the points of {scan!r} lie on one line. Give extent=(width, height) in metres."
             )
         given = (spans[0][1], spans[1][1]) if extent is None else _numbers("VoxelGrid.before: extent", extent, 2)
         width, height = (positive("VoxelGrid.before: extent", value) for value in given)
@@ -381,8 +379,7 @@ def _mean_normal(scan: Scan, points: Tensor) -> Tensor:
     across: Tensor = towards - (towards @ axes[0]) * axes[0] if len(points) > 1 else towards
     if float(across.norm()) <= ON_ONE_LINE * float(towards.norm()):
         raise ShapeError(
-            "VoxelGrid.before: expected points that say where the hidden side is, got a sensor on the one line that "
-            "they lie on. Give their normals to Scan.points, or take VoxelGrid.bounds."
+            "VoxelGrid.before: the sensor stands on the one line of its points. Give their normals to Scan.points."
         )
     return across
 
@@ -484,10 +481,7 @@ def _check_volume(volume: HiddenVolume) -> None:
     if volume.directions is not None:
         _check_values("directions", volume.directions, (3, *volume.grid.shape))
         if volume.directions.shape[:-4] != volume.values.shape[: -3 - len(frames)]:
-            raise ShapeError(
-                f"HiddenVolume: expected directions for each of the values {tuple(volume.values.shape)}, got "
-                f"{tuple(volume.directions.shape)}."
-            )
+            raise ShapeError("HiddenVolume: expected directions for each of the values, got other leading dimensions.")
     metadata_text(volume.metadata, "HiddenVolume")
 
 
@@ -495,6 +489,5 @@ def _check_values(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
     if tensor.ndim <= len(shape) or tuple(tensor.shape[-len(shape) :]) != shape or tensor.is_complex():
         sizes = ", ".join(map(str, shape))
         raise ShapeError(
-            f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {tuple(tensor.shape)} of "
-            f"{tensor.dtype}."
+            f"HiddenVolume: expected {name} (..., C, {sizes}), real, got {tuple(tensor.shape)} {tensor.dtype}."
         )
