@@ -127,7 +127,7 @@ def test_backprojection_finds_a_point_and_transforms_name_it():
     # Half a voxel along each axis.
     assert ((brightest - torch.tensor(point)).abs() <= 0.026).all()
     for method in ("fk", "phasor"):
-        with pytest.raises(ArgumentError, match=r"this one is pairs\. Take one of bp, fbp"):
+        with pytest.raises(ArgumentError, match=r"not pairs\. Take one of bp, fbp"):
             N.reconstruct(measured, method)
     without = replace(measured.scan, first_and_last_leg=False)
     of = {"time_axis": measured.axis}

@@ -72,7 +72,7 @@ def check_method(name: str, capture: Capture) -> Method:
     if kind not in method.kinds:
         others = ", ".join(other for other, entry in METHODS.items() if kind in entry.kinds)
         raise ArgumentError(
-            f"reconstruct: '{name}' takes {' and '.join(method.kinds)} scans, this one is {kind}. Take one of {others}."
+            f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, not {kind}. Take one of {others}."
         )
     if method.planar and not is_planar(capture.scan):
         raise ArgumentError(

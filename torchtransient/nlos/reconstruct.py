@@ -301,7 +301,7 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
     for option in options:
         if option not in known:
             raise ArgumentError(
-                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(known)}. Leave it out."
+                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}."
             )
     if "filter" in options:
         one_of("reconstruct: filter", options["filter"], FILTERS)

@@ -166,15 +166,21 @@ class ScanWatch:
         with dr.suspend_grad():
             points, origin = scanned_points(scene, sensor), mi.Point3f(sensor.origin)
             laser = origin_of(scene, sensor)
-            rays = {"sensor": _rays(origin, points - origin)}
+            ways = {"sensor": (origin, points - origin)}
             if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
-                rays["laser"] = _rays(laser, aims_of(scene, sensor, capture, None))
-            tolerance = dr.opaque(mi.Float, self.tolerance)
-            off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
-            normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])
+                ways["laser"] = laser, aims_of(scene, sensor, capture, None)
+            tolerance, off, rays = dr.opaque(mi.Float, self.tolerance), {}, {}
+            for who, (start, way) in ways.items():
+                length = dr.norm(way)
+                rays[who] = mi.Ray3f(start, way / length)
+                met = scene.ray_intersect_preliminary(rays[who], coherent=True)
+                # NaN is elsewhere, too.
+                off[who] = ~(dr.abs(met.t - length) <= tolerance)
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"])
             dr.eval(points, normals, off)
         found = {}
-        for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
+        for who, elsewhere in off.items():
+            wrong = np.array(elsewhere)
             if wrong.any():
                 found[SENSOR_RAYS if who == "sensor" else LASER_RAYS] = (
                     f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
@@ -190,23 +196,6 @@ class ScanWatch:
                 "has no gradient that would bring it back."
             )
         return found
-
-
-def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
-    """Rays (Ray3f) along ways, and their lengths."""
-    import drjit as dr
-    import mitsuba as mi
-
-    length = dr.norm(way)
-    return mi.Ray3f(origin, way / length), length
-
-
-def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
-    """Return a mask of rays that meet something before their length, or nothing there; NaN is elsewhere, too."""
-    import drjit as dr
-
-    met = scene.ray_intersect_preliminary(ray, coherent=True)
-    return ~(dr.abs(met.t - length) <= tolerance)
 
 
 def _normals(scene: Any, ray: Any) -> Any:

@@ -208,8 +208,7 @@ def film_size(scan: Scan) -> tuple[int, int]:
     Args:
         scan: of the capture.
     """
-    shape = scan.sensor_shape
-    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0])
+    return _rows_and_columns(scan.sensor_shape)
 
 
 def laser_size(scan: Scan) -> tuple[int, int]:
@@ -218,8 +217,12 @@ def laser_size(scan: Scan) -> tuple[int, int]:
     Args:
         scan: of the capture.
     """
-    shape = scan.laser_shape
-    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0] if shape else 1)
+    return _rows_and_columns(scan.laser_shape)
+
+
+def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:
+    rows, columns = (1, 1, *shape)[-2:]
+    return rows, columns
 
 
 def _check_shapes(shapes: Mapping[str, Any]) -> None:

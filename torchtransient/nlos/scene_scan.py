@@ -78,7 +78,13 @@ def scan_of_scene(scene: Any) -> Scan:
         _check_same(spots.of(there), seen.points[there], seen.points, "laser")
         laser_points, laser_normals = points, normals
     else:
-        _check_all_meet(spots)
+        missed = spots.missed()
+        if len(missed):
+            way = np.array2string(spots.directions[missed[0]], precision=4)
+            raise SceneError(
+                f"scan: {len(missed)} of the laser's {len(spots.shapes)} beams meet nothing, the first is number "
+                f"{missed[0]}, along {way}. Aim the laser at the relay wall."
+            )
         grid = (film.laser_scan_height, film.laser_scan_width, 3)
         shape: Any = {"single": (3,), "pairs": points.shape}.get(kind, grid)
         laser_points, laser_normals = spots.points.reshape(shape), spots.normals.reshape(shape)
@@ -239,16 +245,6 @@ def _on_extended_wall(ends: Ends, size: tuple[int, int]) -> tuple[Ends, NDArray[
         stacklevel=2,
     )
     return Ends(points, normals, ends.shapes, ends.origins, ends.directions), met
-
-
-def _check_all_meet(spots: Ends) -> None:
-    missed = spots.missed()
-    if len(missed):
-        raise SceneError(
-            f"scan: {len(missed)} of the laser's {len(spots.shapes)} beams meet nothing in the scene, the first is "
-            f"number {missed[0]}, from {np.array2string(spots.origins[missed[0]], precision=4)} along "
-            f"{np.array2string(spots.directions[missed[0]], precision=4)}. Aim the laser at the relay wall."
-        )
 
 
 def _check_hidden(scene: Any, wall: Ends) -> None:

@@ -201,7 +201,9 @@ def _of_description(data: Mapping[str, Any], folder: Path, name: str) -> dict[st
     section.text("name", "")
     hidden = described_shapes(section.get("hidden"), folder)
     scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
-    frequencies = _frequencies(section)
+    listed = section.get("frequencies", None)
+    listed = [listed] if isinstance(listed, int | float | str) else listed
+    frequencies = None if listed is None else FrequencyAxis(tuple(as_number(one, "frequencies") for one in listed))
     if frequencies is not None and "time_axis" in section:
         raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
     return {
@@ -276,35 +278,16 @@ def _given(section: Section, counts: Mapping[str, tuple[int, ...]]) -> dict[str,
 
 
 def _axis(data: Any, scan: Scan, hidden: Mapping[str, Any]) -> TimeAxis:
-    seconds = isinstance(data, Mapping) and any(str(name).endswith("_s") for name in data)
-    start, width = ("start_s", "bin_width_s") if seconds else ("start_opl", "bin_width_opl")
-    section = Section(data, "time_axis", (start, width, "num_bins"))
-    whole = start in section and "num_bins" in section
-    if seconds:
-        if not whole:
-            raise SceneError("time_axis: expected start_s, bin_width_s and num_bins, or lengths (start_opl, ...).")
-        return TimeAxis.from_seconds(section.number(start), section.number(width), section.whole("num_bins"))
-    size = section.number(width, DEFAULT_BIN_WIDTH_OPL)
-    if whole:
-        return TimeAxis(section.number(start), size, section.whole("num_bins"))
-    if start in section or "num_bins" in section:
+    section = Section(data, "time_axis", ("start_opl", "bin_width_opl", "num_bins"))
+    width = section.number("bin_width_opl", DEFAULT_BIN_WIDTH_OPL)
+    if "start_opl" in section and "num_bins" in section:
+        return TimeAxis(section.number("start_opl"), width, section.whole("num_bins"))
+    if "start_opl" in section or "num_bins" in section:
         raise SceneError("time_axis: expected start_opl and num_bins together, or neither, got one of them.")
     try:
-        return scan.default_axis(bounds(dict(hidden)), size)
+        return scan.default_axis(bounds(dict(hidden)), width)
     except SceneError as error:
         raise SceneError(f"time_axis: bins can be found for shapes alone whose size is known here; {error}") from error
-
-
-def _frequencies(section: Section) -> FrequencyAxis | None:
-    given = section.get("frequencies", None)
-    if given is None:
-        return None
-    if isinstance(given, list):
-        return FrequencyAxis(tuple(as_number(value, "frequencies") for value in given))
-    part = Section(given, "frequencies", ("first", "step", "count", "start_opl"))
-    return FrequencyAxis.uniform(
-        part.number("first"), part.number("step"), part.whole("count"), start_opl=part.number("start_opl", 0.0)
-    )
 
 
 def _bounces(section: Section) -> tuple[int, ...] | str:
