@@ -132,7 +132,7 @@ class Scan:
                 raise SceneError(
                     "Scan.grid: expected several pairs, got a grid of one point. Give kind='single' with laser=."
                 )
-        aside = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
+        aside: Any = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
         return cls(
             kind=kind,
             sensor_points=torch.from_numpy(points),
@@ -374,12 +374,10 @@ def _refuse(name: str, value: Any, kind: str, instead: str) -> None:
 
 def _float64_points(name: str, values: Any, device: torch.device | None = None) -> Tensor:
     """Return points (..., 3) as float64, with their gradients. Raises ShapeError and UnitError."""
-    tensor = values
-    if not isinstance(values, Tensor):
-        plain = real_array(values)
-        if plain is None:
-            raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
-        tensor = torch.from_numpy(plain)
+    plain = values if isinstance(values, Tensor) else real_array(values)
+    if plain is None:
+        raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
+    tensor = plain if isinstance(plain, Tensor) else torch.from_numpy(plain)
     if tensor.is_complex() or tensor.ndim == 0 or tensor.shape[-1] != 3 or tensor.numel() == 0:
         raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
     tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)

@@ -196,7 +196,7 @@ class PartFile:
         """Check the rows by their checksums. Raises StorageError."""
         there = self._rows()
         for first, count, checksum in self._done.values():
-            if zlib.crc32(there[first : first + count]) != checksum:
+            if zlib.crc32(there[first : first + count].data) != checksum:
                 raise StorageError(
                     f"part file: '{self._data}' is damaged or cut off: rows {first} to {first + count - 1} are not "
                     f"those that '{self.path}' tells of. Delete both to start anew."

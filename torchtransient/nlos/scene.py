@@ -193,7 +193,7 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
             return shapes
         return {"hidden": dict(hidden)}
     if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
-        return {"hidden": _mesh(*hidden, "hidden")}
+        return {"hidden": _mesh(hidden[0], hidden[1], "hidden")}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
         return {"hidden": _mesh(hidden.vertices, hidden.faces, "hidden")}
     raise SceneError(

@@ -303,9 +303,10 @@ def _sensor(given: Any, folder: Path) -> Device | None:
         return None
     if not isinstance(given, Mapping | str):
         raise SceneError(f"sensor: expected the file of a device or its entries, got {shown(given)}.")
-    path = file_beside(given, (folder,), "sensor") if isinstance(given, str) else None
+    if isinstance(given, str):
+        path = file_beside(given, (folder,), "sensor")
     try:
-        if path is None:
+        if isinstance(given, Mapping):
             return Device.from_dict(given)
         return Device.from_json(path) if path.suffix.lower() == ".json" else Device.from_yaml(path)
     except TorchTransientError as error:

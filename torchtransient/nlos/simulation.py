@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
-import os
 import sys
 import time
 import warnings
@@ -539,10 +538,6 @@ def _scene_work(
             "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "
             f"{', '.join(map(str, scene)) or 'nothing'} and no scan. Make one with tt.nlos.Scan.grid(wall, ...)."
         )
-    if not isinstance(scene, str | os.PathLike | Mapping | Scene):
-        raise ArgumentError(
-            f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
-        )
     loaded = load(scene)
     if variant is None and isinstance(scene, Scene):
         variant = scene._requested_variant
@@ -595,8 +590,8 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 rows = np.empty((points, layout.columns), np.float32) if rows is None else rows
                 rows[slice(*work.run(number))] = part
             if kept is not None:
-                settings = {"seconds": seconds, "about": asdict(layout), "instead_of": before}
-                kept.keep(number, first, part, total=total, **settings)
+                about = asdict(layout)
+                kept.keep(number, first, part, total=total, seconds=seconds, about=about, instead_of=before)
             bar.update(1)
     assert layout is not None
     if kept is not None:

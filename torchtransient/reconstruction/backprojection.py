@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
@@ -133,7 +134,7 @@ class EllipsoidOperator(ScanOperator):
         """
         out = self.voxels.new_zeros(items, self.voxels.shape[1])
         for group in self.groups():
-            padded = self._padded(rows_of(group))
+            padded = functional.pad(rows_of(group), (_BEFORE, _PAD - _BEFORE))
             slopes = padded.diff(dim=-1, append=padded[..., :1] * 0).reshape(items, -1)
             padded = padded.reshape(items, -1)
             for tile, index, fraction, weight in self._blocks(group):
@@ -161,11 +162,6 @@ class EllipsoidOperator(ScanOperator):
                     rows[n].index_add_(0, flat, (light - late).reshape(-1))
                     rows[n].index_add_(0, after, late.reshape(-1))
             yield group, rows.view(items, -1, length)[..., _BEFORE : _BEFORE - _PAD]
-
-    def _padded(self, rows: Tensor) -> Tensor:
-        out = rows.new_zeros(*rows.shape[:-1], rows.shape[-1] + _PAD)
-        out[..., _BEFORE : _BEFORE - _PAD] = rows
-        return out
 
     def _blocks(self, group: Group) -> Iterator[tuple[slice, Tensor, Tensor, Tensor | None]]:
         """Yield the pieces of a group: the voxels of a tile, (rows, voxels) indices into the padded rows of the group,

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture, Scan
+from torchtransient.capture import Scan
 from torchtransient.checks import finite, positive
 from torchtransient.errors import UnitError
 from torchtransient.reconstruction.capture_checks import SNR, check_thickness, within
 from torchtransient.reconstruction.linear import each
-from torchtransient.reconstruction.transient_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.transient_operator import InvertibleOperator
 from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.volume_methods import SLAB_SNR
 
@@ -35,7 +35,7 @@ FOAM = (262.0, 0.53, 1.12, 0.0036)
 FOAM_THICKNESS = 0.0254
 
 
-class DiffusionDeconvolution(ConfocalOperator):
+class DiffusionDeconvolution(InvertibleOperator):
     """Confocal captures through a slab that lies on the scanned wall, as a linear operator, and its Wiener inverse.
 
     ``operator(transient)``: the light (..., T, Y, X) that arrives through the slab, of the light at its far side;
@@ -157,25 +157,11 @@ class DiffusionDeconvolution(ConfocalOperator):
     def adjoint_(self, y: Tensor) -> Tensor:
         return each(lambda item: self._spread(item, torch.view_as_complex(self.kernel).conj()), y, 3)
 
-    @property
-    def inverse(self) -> SlabInverse:
-        """The Wiener inverse: captures through the slab to captures without, (..., T, Y, X) both."""
-        return SlabInverse(self)
+    def invert(self, data: Tensor) -> Tensor:
+        return self._filtered(data, self._wiener())
 
-    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """Return a transient without the slab, by the Wiener inverse.
-
-        Args:
-            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
-
-        Returns:
-            (..., T, Y, X), of a capture (C, T, Y, X).
-
-        Raises:
-            ShapeError: for other transients and captures.
-        """
-        found: Tensor = self.inverse(self.transients(transient))
-        return found
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        return self._filtered(volume, self._wiener().conj())
 
     def _spread(self, x: Tensor, spectrum: Tensor) -> Tensor:
         """Convolve with the kernel, which is nowhere negative.
@@ -196,20 +182,6 @@ class DiffusionDeconvolution(ConfocalOperator):
     def _wiener(self) -> Tensor:
         kernel = torch.view_as_complex(self.kernel)
         return kernel.conj() / (kernel.abs().square() + 1 / self.snr)
-
-
-class SlabInverse(InverseOperator):
-    """The Wiener inverse of :class:`DiffusionDeconvolution`."""
-
-    operator: DiffusionDeconvolution
-
-    def map_(self, x: Tensor) -> Tensor:
-        wiener = self.operator._wiener()
-        return each(lambda item: self.operator._filtered(item, wiener), x, 3)
-
-    def adjoint_(self, y: Tensor) -> Tensor:
-        wiener = self.operator._wiener().conj()
-        return each(lambda item: self.operator._filtered(item, wiener), y, 3)
 
 
 def _gaussians(spread: Tensor, at: Tensor) -> Tensor:

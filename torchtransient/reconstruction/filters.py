@@ -59,7 +59,12 @@ class PhasorFilter:
         return self.cycles * self.wavelength / 6
 
     def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
-        check_sampling(self, bin_width_opl, who)
+        if self.wavelength < 2 * bin_width_opl:
+            raise UnitError(f"{who}: expected a wavelength of two bins at least, got {self.wavelength:.4g} m.")
+        if self.sigma < bin_width_opl / 4:
+            raise UnitError(
+                f"{who}: expected a sigma of a fourth of a bin at least, got {self.sigma:.4g} m. Take more cycles."
+            )
 
     def samples(self, bin_width_opl: float) -> int:
         # Pulses of less than a cycle are steeper than their wave.
@@ -186,25 +191,6 @@ class LaplacianFilter:
         curved = curved - smooth * curved.sum()
         curved = curved * (-2 / (curved * t**2).sum())
         return smooth.to(like.device, like.dtype), curved.to(like.device, like.dtype)
-
-
-def check_sampling(pulse: PhasorFilter, bin_width_opl: float, who: str) -> None:
-    """Check that bins can hold a pulse.
-
-    Args:
-        pulse: of the virtual illumination.
-        bin_width_opl: metres.
-        who: begins the message.
-
-    Raises:
-        UnitError: for wavelengths below two bins, or a standard deviation below a fourth of one.
-    """
-    if pulse.wavelength < 2 * bin_width_opl:
-        raise UnitError(f"{who}: expected a wavelength of two bins at least, got {pulse.wavelength:.4g} m.")
-    if pulse.sigma < bin_width_opl / 4:
-        raise UnitError(
-            f"{who}: expected a sigma of a fourth of a bin at least, got {pulse.sigma:.4g} m. Take more cycles."
-        )
 
 
 def sample_places(bins: int, samples: int) -> tuple[int, int]:

@@ -38,8 +38,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import SNR, one_of, within
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.transient_operator import (
-    ConfocalOperator,
-    InverseOperator,
+    InvertibleOperator,
     chunk_rows,
     reconstructed,
 )
@@ -153,7 +152,7 @@ FALL = {"diffuse": 4, "retroreflective": 2}
 DEFAULT_SNR = 10.0
 
 
-class ConeOperator(ConfocalOperator):
+class ConeOperator(InvertibleOperator):
     """Base of light-cone transforms: resampling in depth and time, and a sum of convolutions over components.
 
     ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall in
@@ -253,25 +252,11 @@ class ConeOperator(ConfocalOperator):
         v = self._resampled(data, data_matrix, transposed=False, to_v=True)
         return self.volume_of(self._correlated(v, regularised=inverse), volume_matrix)
 
-    @property
-    def inverse(self) -> ConeInverse:
-        """The Wiener inverse: transients (..., T, Y, X) to volumes, a linear operator with an adjoint of its own."""
-        return ConeInverse(self)
+    def invert(self, data: Tensor) -> Tensor:
+        return self._back(data, inverse=True)
 
-    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """Return the Wiener inverse of a transient, linear and differentiable.
-
-        Args:
-            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
-
-        Returns:
-            As many volumes.
-
-        Raises:
-            ShapeError: for other transients and captures.
-        """
-        volume: Tensor = self.inverse(self.transients(transient))
-        return volume
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        return self._model(volume, inverse=True)
 
     # --------------------------------------------------------------------------- resampling, (Z or T, ...) <-> (V, ...)
 
@@ -363,18 +348,6 @@ class ConeOperator(ConfocalOperator):
         over_y: Tensor = torch.fft.ifft(x, dim=1)[:, :rows]
         plane: Tensor = torch.fft.ifft(over_y, dim=2)
         return plane[..., :columns]
-
-
-class ConeInverse(InverseOperator):
-    """The regularised inverse of a light-cone transform, from transients to volumes."""
-
-    operator: ConeOperator
-
-    def map_(self, x: Tensor) -> Tensor:
-        return each(lambda data: self.operator._back(data, inverse=True), x, 3)
-
-    def adjoint_(self, y: Tensor) -> Tensor:
-        return each(lambda volume: self.operator._model(volume, inverse=True), y, len(self.data_shape))
 
 
 class LCT(ConeOperator):

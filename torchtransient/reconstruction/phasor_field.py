@@ -16,7 +16,7 @@ from torchtransient.capture import Capture, Scan
 from torchtransient.checks import finite, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import check_wavelength, refuse_pairs
-from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
+from torchtransient.reconstruction.filters import PhasorFilter
 from torchtransient.reconstruction.transient_operator import ScanOperator, reconstructed
 from torchtransient.reconstruction.voxels import OFF_GRID, PlanarScan, VoxelGrid
 
@@ -190,7 +190,7 @@ class PhasorField(ScanOperator):
                 f"PhasorField: expected a VoxelGrid, got {shown(points)}. FilteredBackprojection takes points."
             )
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
-        check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
+        pulse.check(points, time_axis.bin_width_opl, "PhasorField")
         check_wavelength(pulse.wavelength, scan, time_axis, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
         if not self.camera.focuses_laser and scan.kind != "single":

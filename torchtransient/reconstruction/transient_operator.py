@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -25,7 +26,15 @@ from torchtransient.reconstruction.capture_checks import (
     confocal_wall,
     telling,
 )
-from torchtransient.reconstruction.linear import LinearOperator, check_same, checked_precision, packed, plain, unpacked
+from torchtransient.reconstruction.linear import (
+    LinearOperator,
+    check_same,
+    checked_precision,
+    each,
+    packed,
+    plain,
+    unpacked,
+)
 from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid
 from torchtransient.tensor_record import same
 
@@ -283,6 +292,38 @@ class ConfocalOperator(TransientOperator):
         return scan is self.scan or self.wall.matches(confocal_wall(scan, type(self).__name__))
 
 
+class InvertibleOperator(ConfocalOperator):
+    """A confocal operator with a regularised inverse, which classes define for one item of a batch."""
+
+    @abstractmethod
+    def invert(self, data: Tensor) -> Tensor:
+        """Return the volume of one transient, (*data_shape) to (*volume_shape)."""
+
+    @abstractmethod
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        """Return the adjoint of :meth:`invert`, (*volume_shape) to (*data_shape)."""
+
+    @property
+    def inverse(self) -> InverseOperator:
+        """The Wiener inverse: transients (..., T, Y, X) to volumes, a linear operator with an adjoint of its own."""
+        return InverseOperator(self)
+
+    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
+        """Return the Wiener inverse of a transient, linear and differentiable.
+
+        Args:
+            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
+
+        Returns:
+            As many volumes.
+
+        Raises:
+            ShapeError: for other transients and captures.
+        """
+        volume: Tensor = self.inverse(self.transients(transient))
+        return volume
+
+
 class InverseOperator(LinearOperator):
     """A regularised inverse of an operator, itself a linear operator from its data to its volume.
 
@@ -293,7 +334,7 @@ class InverseOperator(LinearOperator):
         operator: to be inverted.
     """
 
-    def __init__(self, operator: ConfocalOperator) -> None:
+    def __init__(self, operator: InvertibleOperator) -> None:
         super().__init__()
         # Modules that share tables but not the lists of them.
         self.operator = copy.copy(operator)
@@ -308,3 +349,9 @@ class InverseOperator(LinearOperator):
     def points(self) -> Tensor:
         """(Z, Y, X, 3) float64 on the CPU: these voxels in world coordinates, metres."""
         return self.grid.points
+
+    def map_(self, x: Tensor) -> Tensor:
+        return each(self.operator.invert, x, len(self.volume_shape))
+
+    def adjoint_(self, y: Tensor) -> Tensor:
+        return each(self.operator.invert_adjoint, y, len(self.data_shape))

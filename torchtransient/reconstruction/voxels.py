@@ -16,7 +16,7 @@ from torchtransient.capture.scan import bounds_of
 from torchtransient.capture.wall import triple
 from torchtransient.checks import Numbers, count, positive, real_array, shown
 from torchtransient.errors import SceneError, ShapeError, UnitError
-from torchtransient.tensor_record import TensorRecord
+from torchtransient.tensor_record import TensorRecord, same
 
 # Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
 OFF_GRID = 1e-3
@@ -324,9 +324,7 @@ class VoxelGrid:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, VoxelGrid):
             return NotImplemented
-        tensors = ("depths", "first", "along_x", "along_y", "normal")
-        same = all(torch.equal(getattr(self, name), getattr(other, name)) for name in tensors)
-        return same and (self.size, self.pitch) == (other.size, other.pitch)
+        return all(same(a, b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
 
     def __hash__(self) -> int:
         return hash((self.shape, self.pitch))
