@@ -257,7 +257,9 @@ class Capture(TensorRecord):
 
 
 def _measured(name: str, values: Any) -> Tensor | None:
-    """Return numbers of any library as a tensor. Raises ShapeError for masked arrays."""
+    """Return numbers of any library as a tensor. Raises ShapeError for sparse tensors and masked arrays."""
+    if isinstance(values, Tensor) and values.layout != torch.strided:
+        raise ShapeError(f"Capture: expected {name} as a dense tensor, got {values.layout}. Use tensor.to_dense().")
     if values is None or isinstance(values, Tensor):
         return values
     if np.ma.isMaskedArray(values):

@@ -474,7 +474,8 @@ def _check_volume(volume: HiddenVolume) -> None:
     """Raise ShapeError unless values, times and directions are real and fit the grid and each other."""
     frames = () if volume.times is None else tuple(volume.times.shape)
     if volume.times is not None and (len(frames) != 1 or not bool(torch.isfinite(volume.times).all())):
-        raise UnitError(f"HiddenVolume: expected finite times (N,) in metres of optical path, got {volume.times}.")
+        error = UnitError if len(frames) == 1 else ShapeError
+        raise error(f"HiddenVolume: expected finite times (N,) in metres of optical path, got {volume.times}.")
     _check_values("values", volume.values, (*frames, *volume.grid.shape))
     if volume.directions is not None:
         _check_values("directions", volume.directions, (3, *volume.grid.shape))
@@ -484,7 +485,8 @@ def _check_volume(volume: HiddenVolume) -> None:
 
 
 def _check_values(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    if tensor.ndim <= len(shape) or tuple(tensor.shape[-len(shape) :]) != shape or tensor.is_complex():
+    real = not tensor.is_complex() and tensor.dtype != torch.bool and tensor.numel() > 0
+    if not real or tensor.ndim <= len(shape) or tuple(tensor.shape[-len(shape) :]) != shape:
         sizes = ", ".join(map(str, shape))
         raise ShapeError(
             f"HiddenVolume: expected {name} (..., C, {sizes}), real, got {tuple(tensor.shape)} {tensor.dtype}."
