@@ -72,9 +72,8 @@ def test_bounces_and_joules_that_are_none():
             N.capture_scene(Z, CONFOCAL, bounces=bounces)
     for energy in (0, np.float32(2.0), {"type": "rgb", "value": [1.0, 2.0, 3.0]}):
         assert N.capture_scene(Z, CONFOCAL, energy=energy)["laser"]["energy"] is energy
-    for energy, error in ((-1e-9, UnitError), (math.inf, UnitError), (math.nan, UnitError), (True, SceneError),
-                          ("1", SceneError)):  # fmt: skip
-        with pytest.raises(error, match="energy: expected joules"):
+    for energy in (-1e-9, math.inf, math.nan):
+        with pytest.raises(UnitError, match="energy: expected joules"):
             N.capture_scene(Z, CONFOCAL, energy=energy)
 
 
@@ -134,7 +133,6 @@ def test_setups_are_files_of_three_kinds(tmp_path):
     ):  # fmt: skip
         with pytest.raises(SceneError, match=words):
             N.read_setup(tmp_path / path, **given)
-
 
 
 # -------------------------------------------------------------------------------------------------------------- meshes

@@ -130,12 +130,8 @@ def test_walls_and_scans(read):
 
 
 def test_axes_bounces_and_sensors(read):
-    seconds = read(time_axis={"start_s": 0.0, "bin_width_s": 1.6e-11, "num_bins": 512})
-    assert seconds["time_axis"] == tt.TimeAxis.from_seconds(0.0, 1.6e-11, 512)
     listed = read(frequencies=[1.0, 2, "3e0"])
     assert listed["time_axis"] is None and listed["frequencies"] == tt.FrequencyAxis((1.0, 2.0, 3.0))
-    uniform = read(frequencies={"first": 1.0, "step": 0.5, "count": 4, "start_opl": 2.0})
-    assert uniform["frequencies"] == tt.FrequencyAxis.uniform(1.0, 0.5, 4, start_opl=2.0)
     for given, bounces in (("all", "all"), (4, (4,)), ([2, 1], (1, 2))):
         assert read(bounces=given)["bounces"] == bounces
     assert read(sensor=DEVICE)["sensor"] == Device.from_dict(DEVICE)
@@ -181,11 +177,11 @@ MESH = {"vertices": [[0, 0, 1], [1, 0, 1], [0, 1, 1]], "faces": [[0, 2, 1]]}
         ({"scan": {"kind": "confocal"}}, SceneError, "an entry 'size'"),
         ({"scan": {"kind": "confocal", "size": 8, "laser": [0.5, 0.5]}}, ArgumentError, "laser has no meaning"),
         ({"time_axis": {"start_opl": 1.0}}, SceneError, "together, or neither"),
-        ({"time_axis": {"bin_width_s": 1e-11}}, SceneError, "expected start_s"),
+        ({"time_axis": {"bin_width_s": 1e-11}}, SceneError, "Did you mean 'bin_width_opl'"),
         ({"time_axis": {"num_bins": 4}, "frequencies": [1.0]}, SceneError, "exclude each other"),
-        ({"frequencies": {"first": 1.0}}, SceneError, "an entry 'step'"),
+        ({"frequencies": ["low"]}, SceneError, "frequencies: expected a finite number"),
         ({"spp": 0}, SceneError, "spp: expected a whole number of at least 1"),
-        ({"bounces": [2.5]}, SceneError, "bounces: expected"),
+        ({"bounces": [2.5]}, SceneError, "bounces: .*expected a whole number"),
         ({"seed": -1}, SceneError, "at least 0"),
         ({"sensor": "none.yaml"}, SceneError, "^sensor: no file 'none.yaml'"),
         ({"sensor": DEVICE | {"stages": 3}}, StorageError, "sensor: Device 'd': expected stages as a list, got 3"),

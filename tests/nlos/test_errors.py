@@ -85,7 +85,6 @@ SHINES = r"'letter.emitter' \(area\) emits light; expected shapes alone.*Leave i
 NAN = r"expected finite numbers, got NaN or infinity in 'letter.vertices' \(1 of 9\)"
 BEHIND = r"expected something before the wall.*got nothing there.*turn the wall"
 NOTHING = "expected at least one shape beside the wall, got none"
-SEED = "seed: expected a whole number from 0 to 4294967295, got {}"
 BACK = r"rays end on the back of 'wall'.*Move sensor_origin or laser_origin"
 MESH = (np.ones((3, 3)), np.array([[0, 1, 2]]))
 
@@ -139,9 +138,8 @@ CASES = {
         lambda: scene(integrator={"filter_bounces": 4, "min_bounces": 0}), SceneError, "Set max_depth to at least 4",
     ),
     "a negative seed: forecast": (
-        lambda: tt.nlos.forecast(Z, scan(), time_axis=AXIS, seed=-1), ArgumentError, SEED.format(-1),
+        lambda: tt.nlos.forecast(Z, scan(), time_axis=AXIS, seed=-1), ArgumentError, "seed: expected a whole number",
     ),
-    "a seed of 33 bits: renderer": (lambda: renderer(seed=[0, 2**32]), ArgumentError, SEED.format(2**32)),
     "a depth of a layer": (lambda: renderer(max_depth=5), ArgumentError, "max_depth: bounces= says"),
     "samples of 33 bits: simulate": (lambda: simulate(spp=2**32), UnitError, "spp: expected at most 4294967295"),
     "no tiles": (lambda: simulate(tiles=0), ArgumentError, "tiles: expected a whole number of at least 1"),

@@ -46,7 +46,7 @@ def test_what_a_scan_of_pairs_is():
     axis = found.default_axis([place.tolist()] * 2, 0.01)
     for spare in (float(lengths.min()) - axis.start_opl, axis.end_opl - float(lengths.max())):
         assert -1e-9 < spare < 0.01 + 1e-9
-    with pytest.raises(ShapeError, match="one for each sensor point"):
+    with pytest.raises(ShapeError, match=r"expected laser_points \(4, 3\)"):
         replace(found, laser_points=found.laser_points[:3], laser_normals=None)
     with pytest.raises(ArgumentError, match=r"Scan\.points"):
         N.Scan.grid(WALL, 2, kind="pairs")
@@ -127,11 +127,11 @@ def test_backprojection_finds_a_point_and_transforms_name_it():
     # Half a voxel along each axis.
     assert ((brightest - torch.tensor(point)).abs() <= 0.026).all()
     for method in ("fk", "phasor"):
-        with pytest.raises(ArgumentError, match=r"this one is pairs\. Take one of bp, fbp"):
+        with pytest.raises(ArgumentError, match=r"not pairs\. Take one of bp, fbp"):
             N.reconstruct(measured, method)
     without = replace(measured.scan, first_and_last_leg=False)
     of = {"time_axis": measured.axis}
     field = lambda: N.PhasorField(without, box, pulse=N.PhasorFilter(0.1), **of)  # noqa: E731
     for make in (lambda: N.FK(without, **of), lambda: N.MidpointFK(without, **of), field):
-        with pytest.raises(ShapeError, match="Use FilteredBackprojection"):
+        with pytest.raises(ShapeError, match="FilteredBackprojection"):
             make()

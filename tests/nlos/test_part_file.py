@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_a_full_disk_loses_nothing(path, monkeypatch):
         for number, fails_at in ((1, 1), (2, 2)):  # while rows are written, while the list of parts is
             calls = iter(range(1, 9))
             monkeypatch.setattr(os, "fsync", lambda f: full(f) if next(calls) == fails_at else real(f))  # noqa: B023
-            with pytest.raises(StorageError, match=r"No space left.*the same call goes on"):
+            with pytest.raises(StorageError, match="No space left"):
                 keep(kept, number)
             assert not kept.has(number)
         monkeypatch.setattr(os, "fsync", real)
@@ -195,7 +196,7 @@ def test_there_and_back(kind, front, phasor, steady):
     layout = RowLayout.of(made)
     found = layout.rows(made)
     assert found.shape == (len(scan.sensor_points.reshape(-1, 3)), layout.columns) and found.dtype == np.float32
-    back = tt.nlos.Capture(**RowLayout.from_plain(layout.plain()).capture(found, scan, *axes))
+    back = tt.nlos.Capture(**RowLayout.from_plain(asdict(layout)).capture(found, scan, *axes))
     assert back.tensors().keys() == made.tensors().keys()
     for name, tensor in made.tensors().items():
         assert torch.equal(back.tensors()[name], tensor)

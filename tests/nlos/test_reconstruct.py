@@ -97,14 +97,12 @@ def test_mistakes_have_types(tmp_path):
         (ArgumentError, "one of fk", {"method": "magic"}), (ArgumentError, "has no snr=", {"method": "fk", "snr": 1.0}),
         (ArgumentError, "takes no grid=", {"method": "fk", "grid": grid}),
         (ArgumentError, "takes no grid=", {"method": "bp", "grid": grid, "depths": (0, 1)}),
-        (ArgumentError, "filter to be one of", {"method": "fbp", "filter": "sobel"}),
-        (ArgumentError, "'midpoint-fk' takes single and exhaustive scans, .* confocal", {"method": "midpoint-fk"}),
+        (ArgumentError, "filter: expected one of", {"method": "fbp", "filter": "sobel"}),
+        (ArgumentError, "'midpoint-fk' takes single and exhaustive scans, not confocal", {"method": "midpoint-fk"}),
         (UnitError, "near, far", {"depths": 1.0}),
     ):  # fmt: skip
         with pytest.raises(error, match=message):
             tt.nlos.reconstruct(capture, **arguments)
-    with pytest.raises(ShapeError, match="Capture"):
-        tt.nlos.reconstruct(capture.transient)
     with pytest.raises(ArgumentError, match="HiddenVolume"):
         tt.nlos.write_volume(tmp_path / "a.h5", capture)
     with pytest.raises(StorageError, match="volume"):

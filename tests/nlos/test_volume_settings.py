@@ -9,7 +9,7 @@ import torch
 
 import torchtransient as tt
 from support.scalars import no_gradient_is_lost
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 
 N = tt.nlos
 F64 = torch.float64
@@ -107,10 +107,8 @@ def test_captures_without_a_transient_have_no_grid():
     phasors = N.Capture(None, None, SCANS["single"], phasor=torch.zeros(1, 1, 6, 5, dtype=torch.complex64),
                         frequencies=tt.FrequencyAxis((1.0,)))  # fmt: skip
     for call in (lambda: N.default_grid(phasors), lambda: N.reconstruct(phasors)):
-        with pytest.raises(ShapeError, match="reconstruct: expected a capture with a transient, got phasors alone"):
+        with pytest.raises(ShapeError, match="expected a capture with a transient, got phasors alone"):
             call()
-    with pytest.raises(ArgumentError, match=r"choose_method: expected a tt\.nlos\.Capture"):
-        N.choose_method(None)
 
 
 # ---------------------------------------------------------------------------------------------- pitches and wavelengths
@@ -142,7 +140,7 @@ def test_normals_are_those_of_the_brightest_voxel_behind_a_pixel():
     dark = N.HiddenVolume(torch.zeros(1, 2, 1, 2), voxels, "x", directions=torch.zeros(1, 3, 2, 1, 2))
     assert not N.normals_of(dark).any()
     with pytest.raises(ShapeError, match="normals_of: expected a volume with directions"):
-        N.normals_of(None)
+        N.normals_of(N.HiddenVolume(torch.zeros(1, 2, 1, 2), voxels, "fk"))
 
 
 @pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
@@ -174,7 +172,7 @@ def test_planes_within_the_depths_are_kept():
     found = N.reconstruct(capture, "lct", depths=(0.375, 0.875), progress=False)
     # Of 0.125, 0.375, ... those from the one to the other, both of them too.
     assert found.grid.depths.tolist() == [0.375, 0.625, 0.875] and found.values.shape == (1, 3, 6, 5)
-    with pytest.raises(UnitError, match=r"within the record's, 0\.125 to 1\.875 m, got"):
+    with pytest.raises(UnitError, match=r"within the record's, 0\.125 to 1\.875 m"):
         N.reconstruct(capture, "lct", depths=(0.4, 0.6), progress=False)
 
 

@@ -82,8 +82,6 @@ def test_operators_without_tables_and_voxels():
     assert double.to("meta").float().dtype == torch.float32
     with pytest.raises(UnitError, match=r"float32 or torch\.float64"):
         double.half()
-    with pytest.raises(ShapeError, match=r"expected a grid, or points.*Set its grid"):
-        double.points  # noqa: B018
     with pytest.raises(NotImplementedError):
         single.reconstruct(x)
 

@@ -10,7 +10,7 @@ from support.sweeps import together
 from tools.point_captures import point_capture
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Scan
-from torchtransient.errors import ArgumentError, ShapeError, UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction import (
     Backprojection,
     FilteredBackprojection,
@@ -169,20 +169,14 @@ def test_light_at_the_ends_of_a_record_does_not_reach_beyond_them(kind):
         assert not operator(torch.full_like(operator.adjoint(light), math.nan)).any()
 
 
-def test_falloffs_that_a_precision_cannot_hold_are_refused():
-    scan, of = SCANS["confocal"], {"time_axis": AXIS}
-    for falloff in (50.0, -1000.0, 1000.0):
-        with pytest.raises(UnitError, match="falloff"):
-            Backprojection(scan, POINTS, falloff=falloff, **of)
-        with pytest.raises(UnitError, match="falloff"):
-            PhasorField(scan, VoxelGrid.before(scan, DEPTHS), pulse=PhasorFilter(0.1), falloff=falloff, **of)
-    for falloff in (4.0, -4.0):
-        # Distances in metres and in bins are far apart: neither overflows.
-        axis = TimeAxis(0.0, 1e-5, 60000)
-        operator = Backprojection(scan, POINTS, falloff=falloff, time_axis=axis)
-        r = lengths_of(scan, POINTS) / 2
-        found = operator.adjoint(torch.ones(operator.data_shape))
-        torch.testing.assert_close(found.double(), (r ** (-2 * falloff)).sum(1), rtol=1e-4, atol=0)
+@pytest.mark.parametrize("falloff", [4.0, -4.0])
+def test_falloffs_of_long_records(falloff):
+    # Distances in metres and in bins are far apart: neither overflows.
+    scan, axis = SCANS["confocal"], TimeAxis(0.0, 1e-5, 60000)
+    operator = Backprojection(scan, POINTS, falloff=falloff, time_axis=axis)
+    r = lengths_of(scan, POINTS) / 2
+    found = operator.adjoint(torch.ones(operator.data_shape))
+    torch.testing.assert_close(found.double(), (r ** (-2 * falloff)).sum(1), rtol=1e-4, atol=0)
 
 
 def test_laplacian_of_quadratic_brightness():
@@ -200,8 +194,6 @@ def test_filters_that_cannot_be_taken():
     of = {"time_axis": AXIS}
     with pytest.raises(UnitError, match="falloff"):
         Backprojection(scan, grid, falloff=math.nan, **of)
-    with pytest.raises(ArgumentError, match="PhasorFilter or a LaplacianFilter"):
-        FilteredBackprojection(scan, grid, filter="pf", **of)
     for kind, name in ((FilteredBackprojection, "filter"), (PhasorField, "pulse")):
         with pytest.raises(UnitError, match="two bins"):
             kind(scan, grid, **{name: PhasorFilter(0.03)}, **of)
@@ -215,5 +207,3 @@ def test_filters_that_cannot_be_taken():
                  lambda: LaplacianFilter(0.1)):  # fmt: skip
         with pytest.raises(UnitError):
             make()
-    with pytest.raises(ShapeError, match=r"tt\.nlos\.Capture"):
-        backproject(torch.zeros(3), grid)

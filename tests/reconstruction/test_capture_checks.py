@@ -36,13 +36,7 @@ def test_axes_are_those_of_the_operator_to_rounding():
     FK(SCAN, time_axis=replace(FINE, start_opl=-1e-9))
 
 
-def test_what_is_no_capture_is_told_what_to_do():
-    for given, words in (
-        ("a.hdf5", r"reads files\.$"), (torch.ones(3), "operators such as tt.nlos.FK take tensors"),
-        (3, r"expected a tt\.nlos\.Capture, got 3\.$"),
-    ):  # fmt: skip
-        with pytest.raises(ShapeError, match=words):
-            lct(given)
+def test_phasors_alone_are_no_transient():
     phasors = Capture(None, None, SCAN, phasor=torch.ones(1, 1, 6, 5, dtype=torch.complex64),
                       frequencies=FrequencyAxis((1.0,)))  # fmt: skip
     with pytest.raises(ShapeError, match="lct: expected a capture with a transient, got phasors alone"):

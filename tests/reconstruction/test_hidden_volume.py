@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 import torchtransient as tt
 from support.sweeps import together
-from torchtransient.errors import ArgumentError, ShapeError, StorageError, UnitError
+from torchtransient.errors import ShapeError, StorageError, UnitError
 
 N = tt.nlos
 SCAN = N.Scan.grid(N.Wall.plane(1.0, 1.0), (4, 3), kind="confocal")
@@ -101,16 +101,12 @@ def test_pictures_are_sums_over_channels_and_the_highest_of_a_film():
 
 
 @together("change, error, words", [
-    ({"grid": None}, ArgumentError, "expected grid as a VoxelGrid, got None"),
-    ({"method": 3}, ArgumentError, "expected method as a name, got 3"),
-    ({"values": torch.ones(2, 3, 4)}, ShapeError, r"expected values \(\.\.\., C, 2, 3, 4\) .* got \(2, 3, 4\)"),
-    ({"values": torch.ones(1, 2, 3, 4, dtype=torch.bool)}, ShapeError, "torch.bool"),
+    ({"values": torch.ones(2, 3, 4)}, ShapeError, r"expected values \(\.\.\., C, 2, 3, 4\), real, got \(2, 3, 4\)"),
     ({"values": torch.ones(1, 2, 3, 4, dtype=torch.complex64)}, ShapeError, "torch.complex64"),
-    ({"times": [0.1, 0.2]}, ShapeError, r"expected times as a tensor \(N,\) .* got \[0\.1, 0\.2\]"),
     ({"times": torch.tensor([0.1, float("inf")])}, UnitError, "expected finite times"),
     ({"times": torch.ones(2)}, ShapeError, r"expected values \(\.\.\., C, 2, 2, 3, 4\)"),
     ({"directions": torch.ones(1, 2, 2, 3, 4)}, ShapeError, r"expected directions \(\.\.\., C, 3, 2, 3, 4\)"),
-    ({"directions": torch.ones(2, 3, 2, 3, 4)}, ShapeError, r"expected directions \(1, 3, 2, 3, 4\), one for each"),
+    ({"directions": torch.ones(2, 3, 2, 3, 4)}, ShapeError, "expected directions for each of the values"),
     ({"metadata": {"a": object()}}, StorageError, "HiddenVolume"),
 ])  # fmt: skip
 def test_parts_that_do_not_belong_together(change, error, words):

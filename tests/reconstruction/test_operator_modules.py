@@ -23,7 +23,6 @@ from torchtransient.reconstruction import (
     MidpointFK,
     PhasorField,
     PhasorFilter,
-    PlanarScan,
     VoxelGrid,
 )
 
@@ -49,7 +48,7 @@ OTHERS = {
     "scan": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(MOVED, time_axis=AXIS)),
     "hidden side": (
         lambda: FK(CONFOCAL, time_axis=AXIS),
-        lambda: FK(PlanarScan.of(CONFOCAL.sensor_points, -CONFOCAL.sensor_normals, who="test"), time_axis=AXIS),
+        lambda: FK(replace(FK(CONFOCAL, time_axis=AXIS).wall, normal=-CONFOCAL.sensor_normals[0, 0]), time_axis=AXIS),
     ),
     "class": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: LCT(CONFOCAL, time_axis=AXIS)),
     "floor": (lambda: FK(CONFOCAL, time_axis=AXIS), lambda: FK(CONFOCAL, time_axis=AXIS, floor=0.25)),

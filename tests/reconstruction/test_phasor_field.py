@@ -148,10 +148,6 @@ def test_what_cannot_be_taken():
     of = {"time_axis": AXIS, "pulse": PULSE}
     with pytest.raises(ArgumentError, match="FilteredBackprojection takes points"):
         PhasorField(scan, grid.points, **of)
-    with pytest.raises(ArgumentError, match="pulse as a PhasorFilter"):
-        PhasorField(scan, grid, time_axis=AXIS, pulse=0.1)
-    with pytest.raises(ShapeError, match="ConfocalCamera"):
-        PhasorField(scan, grid, camera="transient", **of)
     with pytest.raises(SceneError, match="one laser spot"):
         PhasorField(scan, grid, camera=TransientCamera([0.1]), **of)
     with pytest.raises(ShapeError, match="with its pitch"):

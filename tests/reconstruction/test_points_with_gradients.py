@@ -89,7 +89,7 @@ def test_grids_know_nothing_of_them(normals):
     ))  # fmt: skip
     with no_gradient_is_lost():
         wall = PlanarScan.of_scan(scan, "test")
-        bare = PlanarScan.of(scan.sensor_points, scan.sensor_normals, who="test")
+        bare = PlanarScan.of(scan.sensor_points, who="test")
         made = [VoxelGrid.before(scan, DEPTHS), VoxelGrid.before(scan, DEPTHS, size=(4, 3), extent=(0.2, 0.1))]
         place = wall.local(scan.sensor_points)
     assert not any(tensor.requires_grad for grid in (wall, bare, *made) for tensor in tensors_of(grid))

@@ -1,4 +1,4 @@
-"""Depths and normals of volumes whose surfaces are known."""
+"""Depths of volumes whose surfaces are known."""
 
 import math
 
@@ -8,13 +8,7 @@ import torch
 
 from torchtransient.capture import Scan, Wall
 from torchtransient.errors import ShapeError, UnitError
-from torchtransient.reconstruction import (
-    VoxelGrid,
-    depth_map,
-    normals_from_depth,
-    normals_from_volume,
-    soft_depth,
-)
+from torchtransient.reconstruction import VoxelGrid, depth_map
 
 F64 = torch.float64
 UNEVEN = torch.tensor([0.5, 0.52, 0.55, 0.6, 0.62, 0.66, 0.7, 0.75], dtype=F64)
@@ -55,88 +49,45 @@ def test_derivatives_of_depth():
     bumps = 1 - 20 * (UNEVEN[:, None, None] - (0.56 + 0.1 * torch.rand(2, 3, dtype=F64, generator=generator))) ** 2
     volume = bumps.requires_grad_()
     assert torch.autograd.gradcheck(lambda v: depth_map(v, UNEVEN).depth, volume)
-    assert torch.autograd.gradcheck(lambda v: soft_depth(v, UNEVEN), volume)
-    grid = grid_of(UNEVEN, 3)
-    surface = slanted(grid, 0.05, -0.02, 0.05)[0].requires_grad_()
-    assert torch.autograd.gradcheck(lambda v: normals_from_volume(v, grid), surface)
-    assert torch.autograd.gradcheck(
-        lambda d: normals_from_depth(d, grid), slanted(grid, 0.3, 0.2, 1.0)[1].requires_grad_()
-    )
 
 
 def test_gradients_of_empty_volumes_are_finite():
     grid = grid_of(UNEVEN, 3)
     volume = torch.zeros(2, *grid.shape, requires_grad=True)
-    for function in (
-        lambda v: depth_map(v, grid).depth,
-        lambda v: soft_depth(v, grid),
-        lambda v: normals_from_volume(v, grid),
-    ):
-        result = function(volume)
-        assert torch.isfinite(result).all()
-        (gradient,) = torch.autograd.grad(result.sum(), volume)
-        assert torch.isfinite(gradient).all()
+    result = depth_map(volume, grid).depth
+    assert torch.isfinite(result).all()
+    (gradient,) = torch.autograd.grad(result.sum(), volume)
+    assert torch.isfinite(gradient).all()
 
 
 @pytest.mark.parametrize("slopes", [(0.3, 0.0), (0.25, -0.2)])
-def test_normals_of_planes(slopes):
+def test_depths_of_planes(slopes):
     grid = grid_of(torch.linspace(0.3, 0.9, 61, dtype=F64))
     volume, depth = slanted(grid, *slopes, 0.06)
-    length = math.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
-    expected = (slopes[0] * grid.along_x + slopes[1] * grid.along_y - grid.normal) / length
-    exact = normals_from_depth(depth, grid)
-    assert exact.shape == (3, 9, 9)
-    torch.testing.assert_close(exact, expected[:, None, None].expand(3, 9, 9), rtol=0, atol=1e-12)
-    # Depth by interpolation of a Gaussian: the parabola's error is a few thousandths of a step.
-    found = normals_from_depth(depth_map(volume, grid).depth, grid)
-    assert (found - exact).norm(dim=0).max() < 1e-3
-    # Differences over a pitch of 0.11 m, where the profile is 0.06 m wide: (slope pitch / width)^2 / 6 of the slope.
-    inside = normals_from_volume(volume, grid)[:, 1:-1, 1:-1]
-    error = max(abs(s) * (s * p / 0.06) ** 2 / 6 for s, p in zip(slopes, reversed(grid.pitch), strict=True))
-    assert (inside - exact[:, 1:-1, 1:-1]).norm(dim=0).max() < 1.5 * error + 2e-2 * max(map(abs, slopes)) + 1e-9
+    # A Gaussian is no parabola: some thousandths of a step of 1 cm.
+    assert (depth_map(volume, grid).depth - depth).abs().max() < 1e-4
 
 
 def test_what_cannot_be_taken():
     grid = grid_of(UNEVEN)
-    for function in (depth_map, soft_depth, normals_from_volume):
-        with pytest.raises(ShapeError, match="expected a volume"):
-            function(torch.zeros(3, 3, 3), grid)
-        with pytest.raises(ShapeError, match="squared modulus"):
-            function(torch.zeros(grid.shape, dtype=torch.complex64), grid)
+    with pytest.raises(ShapeError, match="expected a volume"):
+        depth_map(torch.zeros(3, 3, 3), grid)
+    with pytest.raises(ShapeError, match="squared modulus"):
+        depth_map(torch.zeros(grid.shape, dtype=torch.complex64), grid)
     with pytest.raises(ShapeError, match="expected depths"):
         depth_map(torch.zeros(grid.shape), None)
     with pytest.raises(UnitError, match="increase"):
         depth_map(torch.zeros(2, 2, 2), [0.2, 0.1])
     with pytest.raises(UnitError, match="threshold"):
         depth_map(torch.zeros(grid.shape), grid, threshold=2.0)
-    with pytest.raises(UnitError, match="sharpness"):
-        soft_depth(torch.zeros(grid.shape), grid, sharpness=1e50)
-    with pytest.raises(ShapeError, match="knows its axes"):
-        normals_from_depth(torch.zeros(9, 9), UNEVEN)
-    with pytest.raises(ShapeError, match="expected depths"):
-        normals_from_depth(torch.zeros(8, 9), grid)
-    with pytest.raises(ShapeError, match="two planes"):
-        normals_from_volume(torch.zeros(1, 9, 9), grid.at_depths([0.5]))
-
-
-SURFACES = {
-    "depth_map": lambda v, grid: depth_map(v, grid).depth,
-    "soft_depth": soft_depth,
-    "normals_from_volume": normals_from_volume,
-    "normals_from_depth": lambda v, grid: normals_from_depth(v[..., 0, :, :], grid),
-}
 
 
 def test_planes_that_single_precision_does_not_tell_apart():
     # A hundred metres away, where neighbouring numbers are 8e-6 m apart.
     grid = grid_of(100 + 2.5e-6 * torch.arange(64, dtype=F64))
     volume = torch.rand(grid.shape, generator=torch.Generator().manual_seed(1))
-    for function in (SURFACES["depth_map"], soft_depth):
-        found, expected = function(volume, grid), function(volume.double(), grid)
-        assert (found.double() - expected).abs().max() < 1e-5
-    torch.testing.assert_close(
-        normals_from_volume(volume, grid).double(), normals_from_volume(volume.double(), grid), rtol=0, atol=1e-4
-    )
+    found, expected = depth_map(volume, grid).depth, depth_map(volume.double(), grid).depth
+    assert (found.double() - expected).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("strange", [math.nan, -math.inf])
@@ -158,9 +109,8 @@ def test_what_is_not_finite_makes_its_own_pixel_empty(strange):
 def test_nothing_depends_on_the_unit_of_the_volume(scale):
     grid = grid_of(UNEVEN)
     volume = slanted(grid, 0.2, 0.1, 0.1)[0].float()
-    for name in ("depth_map", "soft_depth", "normals_from_volume"):
-        found, expected = SURFACES[name](volume * scale, grid), SURFACES[name](volume, grid)
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    found, expected = depth_map(volume * scale, grid).depth, depth_map(volume, grid).depth
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def lumpy(seed=0, size=(6, 5, 7)):
@@ -168,31 +118,6 @@ def lumpy(seed=0, size=(6, 5, 7)):
     wall = Wall.plane(0.9, 0.4, center=(1.0, 2.0, 3.0), normal=(0.6, 0.0, 0.8))
     grid = VoxelGrid.before(Scan.grid(wall, size[:0:-1], kind="confocal"), UNEVEN[: size[0]])
     return torch.rand(size, dtype=F64, generator=torch.Generator().manual_seed(seed)), grid
-
-
-def test_normals_of_any_volume_are_sums_up_to_the_highest_value():
-    volume, grid = lumpy()
-    volume[:, 2, 3] -= 2.0
-    volume[:, 1, 1] -= volume[:, 1, 1].max().clone()
-    plain, steps = volume.numpy(), np.gradient(grid.depths.numpy())
-    slopes = [
-        np.gradient(plain, grid.pitch[1], axis=2), np.gradient(plain, grid.pitch[0], axis=1),
-        np.gradient(plain, grid.depths.numpy(), axis=0),
-    ]  # fmt: skip
-    axes = torch.stack([grid.along_x, grid.along_y, grid.normal]).numpy()
-    expected = np.zeros((3, *grid.size))
-    for j, i in np.ndindex(*grid.size):
-        last = plain[:, j, i].argmax()
-        sums = [sum(slope[k, j, i] * steps[k] for k in range(last + 1)) for slope in slopes]
-        vector = -np.array(sums) @ axes if plain[:, j, i].max() > 0 else -axes[2]
-        expected[:, j, i] = vector / np.linalg.norm(vector)
-    assert sum(plain.argmax(0).flatten() == 0) > 2
-    torch.testing.assert_close(normals_from_volume(volume, grid), torch.from_numpy(expected), rtol=0, atol=1e-12)
-    depth = 0.6 + 0.1 * volume[0]
-    slopes = np.gradient(depth.numpy(), *grid.pitch)
-    vectors = slopes[1][..., None] * axes[0] + slopes[0][..., None] * axes[1] - axes[2]
-    expected = torch.from_numpy(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).movedim(-1, 0)
-    torch.testing.assert_close(normals_from_depth(depth, grid), expected, rtol=0, atol=1e-12)
 
 
 def test_depths_of_any_volume_are_tops_of_parabolas():
@@ -209,17 +134,3 @@ def test_depths_of_any_volume_are_tops_of_parabolas():
     share = volume.amax(0) / volume.max()
     torch.testing.assert_close(found.confidence, share, rtol=0, atol=1e-15)
     assert torch.equal(found.mask, share >= 0.9) and 0 < int(found.mask.sum()) < 35
-
-
-def test_soft_depths_are_means_under_their_weights():
-    volume, grid = lumpy(3)
-    volume[:, 0, 1] = -volume[:, 0, 1]
-    z = grid.depths[:, None, None]
-    weights = torch.exp(5.0 * volume / volume.amax(0))
-    expected = (weights * z).sum(0) / weights.sum(0)
-    # Nothing above zero: the mean of all planes.
-    expected[0, 1] = grid.depths.mean()
-    torch.testing.assert_close(soft_depth(volume, grid, sharpness=5.0), expected, rtol=0, atol=1e-13)
-    torch.testing.assert_close(
-        soft_depth(volume, grid), soft_depth(volume, grid.depths, sharpness=20.0), rtol=0, atol=0
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture.wall import Wall, grid_size, triple
-from torchtransient.checks import Numbers, as_whole, flag, positive, real_array, shown
+from torchtransient.checks import Numbers, as_whole, positive, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 from torchtransient.tensor_record import same
 
@@ -63,16 +62,14 @@ class Scan:
     wall: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        _check_kind(self.kind)
+        if self.kind not in KINDS:
+            raise ArgumentError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(self.kind)}.")
         device = self.sensor_points.device if isinstance(self.sensor_points, Tensor) else torch.device("cpu")
         for name in _TENSORS[:4]:
             object.__setattr__(self, name, _float64_points(name, getattr(self, name), device))
         for name in _TENSORS[4:]:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _unit_normals(name, _float64_points(name, getattr(self, name), device)))
-        if self.wall is not None and not isinstance(self.wall, Mapping):
-            raise ArgumentError(f"Scan: expected wall as a Mitsuba dictionary or None, got {type(self.wall).__name__}.")
-        flag("Scan: first_and_last_leg", self.first_and_last_leg)
         _check_shapes(self)
         _check_sides(self)
 
@@ -113,11 +110,9 @@ class Scan:
                 exhaustive scan of one pair, which is a single one.
             ArgumentError: for pairs, which :meth:`points` takes; otherwise as the class and :meth:`Wall.grid`.
         """
-        _check_kind(kind)
         if kind not in GRID_KINDS:
             raise ArgumentError(
-                "Scan.grid: pairs of spots and sensor points are lists. Use Scan.points(sensor_points, kind='pairs', "
-                "laser_points=...)."
+                f"Scan.grid: expected kind single, confocal or exhaustive, got {shown(kind)}. Scan.points takes pairs."
             )
         surface = Wall.of(wall)
         nx, ny = grid_size(size, "Scan.grid")
@@ -135,16 +130,15 @@ class Scan:
                 spots, spot_normals = surface.grid(laser_grid, extent, cell_centers=cell_centers)
             if spots.size == 3 and points.size == 3:
                 raise SceneError(
-                    "Scan.grid: expected an exhaustive scan of several pairs, got a grid of one point for the laser "
-                    "and the sensor. Give kind='single' with laser=, or kind='confocal', or larger grids."
+                    "Scan.grid: expected several pairs, got a grid of one point. Give kind='single' with laser=."
                 )
-        aside = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
+        aside: Any = surface.center - _ASIDE * 2 * surface.half_u + _BEFORE * surface.width * surface.normal
         return cls(
             kind=kind,
             sensor_points=torch.from_numpy(points),
-            laser_points=spots if isinstance(spots, Tensor) else torch.from_numpy(spots),
-            sensor_origin=_float64_points("sensor_origin", aside if sensor_origin is None else sensor_origin),
-            laser_origin=_float64_points("laser_origin", aside if laser_origin is None else laser_origin),
+            laser_points=spots,
+            sensor_origin=aside if sensor_origin is None else sensor_origin,
+            laser_origin=aside if laser_origin is None else laser_origin,
             sensor_normals=torch.from_numpy(normals),
             laser_normals=torch.from_numpy(spot_normals),
             first_and_last_leg=first_and_last_leg,
@@ -182,38 +176,28 @@ class Scan:
         Raises:
             ShapeError, UnitError, SceneError, ArgumentError: as the class.
         """
-        _check_kind(kind)
-        sensor = _float64_points("sensor_points", sensor_points)
-        if wall is not None:
-            for name, given in (("normals", normals), ("laser_normals", laser_normals)):
-                if given is not None:
-                    raise ArgumentError(f"Scan.points: {name} and wall= both say how the wall is turned; give one.")
+        sensor, shape = _float64_points("sensor_points", sensor_points), None
+        if wall is not None and not (normals is None and laser_normals is None):
+            raise ArgumentError("Scan.points: normals and wall= both say how the wall is turned; give one of them.")
         if kind == "confocal":
             _refuse("laser_points", laser_points, kind, "its spots are its sensor points")
             _refuse("laser_normals", laser_normals, kind, "its spots are its sensor points")
-            laser = sensor
+            laser, laser_normals = sensor, normals
         elif laser_points is None:
             raise SceneError(f"Scan.points: expected laser_points for kind={kind!r}, got None. Give the laser's spots.")
         else:
             laser = _float64_points("laser_points", laser_points, sensor.device)
-        sensor_normals = None if normals is None else _float64_points("normals", normals, sensor.device)
-        if kind == "confocal":
-            laser_normals = sensor_normals
-        elif laser_normals is not None:
-            laser_normals = _float64_points("laser_normals", laser_normals, sensor.device)
-        shape = None
         if wall is not None:
             surface = Wall.of(wall)
-            sensor_normals = _normals_on(surface, sensor, "Scan.points sensor_points")
-            laser_normals = _normals_on(surface, laser, "Scan.points laser_points")
-            shape = surface.shape
+            normals = _normals_on(surface, sensor, "Scan.points sensor_points")
+            laser_normals, shape = _normals_on(surface, laser, "Scan.points laser_points"), surface.shape
         return cls(
             kind,
             sensor,
             laser,
             sensor_origin=sensor_origin,
             laser_origin=laser_origin,
-            sensor_normals=sensor_normals,
+            sensor_normals=normals,
             laser_normals=laser_normals,
             first_and_last_leg=first_and_last_leg,
             wall=shape,
@@ -240,37 +224,6 @@ class Scan:
     def pairs(self) -> int:
         """Number of histograms in a capture: pairs of a laser spot and a sensor point."""
         return math.prod(self.shape)
-
-    @property
-    def is_planar(self) -> bool:
-        """True if all laser and sensor points lie in one plane, to 1e-6 of their extent."""
-        points = torch.cat([self.sensor_points.reshape(-1, 3), self.laser_points.reshape(-1, 3)])
-        spread = torch.linalg.svdvals((points - points.mean(0)).cpu())
-        return bool(len(spread) < 3 or spread[2] <= 1e-6 * spread[0])
-
-    @property
-    def spacing(self) -> tuple[float, float]:
-        """Distances (along a row, along a column) between neighbours of a regular sensor grid, metres.
-
-        Raises:
-            ShapeError: for a list of points, for a grid that is not regular to 1e-6 of its extent, and for rows or
-                columns of one point.
-        """
-        if self.sensor_points.ndim != 3 or min(self.sensor_shape) < 2:
-            raise ShapeError(f"Scan.spacing: expected a grid of at least 2 x 2 sensor points, got {self.sensor_shape}.")
-        points = self.sensor_points.detach()
-        (rows, columns), first = self.sensor_shape, points[0, 0]
-        across = (points[0, -1] - first) / (columns - 1)
-        down = (points[-1, 0] - first) / (rows - 1)
-        i = torch.arange(rows, dtype=torch.float64, device=points.device)[:, None, None]
-        j = torch.arange(columns, dtype=torch.float64, device=points.device)[None, :, None]
-        error = (points - (first + i * down + j * across)).norm(dim=-1).max()
-        if bool(error > 1e-6 * (points[-1, -1] - first).norm()):
-            raise ShapeError(
-                f"Scan.spacing: expected a regular grid, got points up to {float(error):.3g} m off it. Use the points "
-                "themselves."
-            )
-        return float(across.norm()), float(down.norm())
 
     @property
     def sensor_legs(self) -> Tensor:
@@ -307,7 +260,8 @@ class Scan:
         """
         low, high = bounds_of(hidden_bounds, "Scan.default_axis")
         width = positive("Scan.default_axis: bin_width_opl", bin_width_opl)
-        first, last = math.floor(shortest(self, low, high) / width), math.ceil(longest(self, low, high) / width)
+        shortest, longest = _span(self, low, high)
+        first, last = math.floor(shortest / width), math.ceil(longest / width)
         return TimeAxis(first * width, width, max(1, last - first))
 
     # ------------------------------------------------------------------------------------------------- other scans
@@ -378,11 +332,6 @@ class Scan:
         return f"Scan({self.kind}, {sensor} points over {float(size):.4g} m{lasers}{legs})"
 
 
-def _check_kind(kind: Any) -> None:
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ArgumentError(f"Scan: expected kind to be one of {', '.join(KINDS)}, got {shown(kind)}.")
-
-
 def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """Return an index into the spots of a scan.
 
@@ -410,8 +359,7 @@ def _spot(surface: Wall, laser: Any) -> tuple[Any, np.ndarray]:
     if plain.shape == (2,):
         return surface.at(plain[0], plain[1])
     point = triple("Scan.grid laser", laser)
-    normal = surface.normals_at(point[None], "Scan.grid laser")[0]
-    return (laser if isinstance(laser, Tensor) else point), normal
+    return laser, surface.normals_at(point[None], "Scan.grid laser")[0]
 
 
 def _normals_on(surface: Wall, points: Tensor, what: str) -> Tensor:
@@ -430,13 +378,7 @@ def _float64_points(name: str, values: Any, device: torch.device | None = None) 
     if plain is None:
         raise ShapeError(f"Scan: expected {name} as points of three numbers, got {shown(values)}.")
     tensor = plain if isinstance(plain, Tensor) else torch.from_numpy(plain)
-    if (
-        tensor.is_complex()
-        or tensor.dtype == torch.bool
-        or tensor.ndim == 0
-        or tensor.shape[-1] != 3
-        or tensor.numel() == 0
-    ):
+    if tensor.is_complex() or tensor.ndim == 0 or tensor.shape[-1] != 3 or tensor.numel() == 0:
         raise ShapeError(f"Scan: expected {name} as points (..., 3), got {tensor.dtype} of {tuple(tensor.shape)}.")
     tensor = tensor.to(device=device or tensor.device, dtype=torch.float64)
     if not bool(torch.isfinite(tensor).all()):
@@ -461,15 +403,9 @@ def _check_shapes(scan: Scan) -> None:
     sensor, laser = scan.sensor_points, scan.laser_points
     if sensor.ndim not in (2, 3):
         raise ShapeError(f"Scan: expected sensor_points (Sy, Sx, 3) or (N, 3), got {tuple(sensor.shape)}.")
-    each = scan.kind in ("confocal", "pairs")
-    allowed = {"single": (1,), "exhaustive": (2, 3)}.get(scan.kind, (sensor.ndim,))
-    words = {
-        "single": "(3,), the one spot",
-        "confocal": f"{tuple(sensor.shape)}, the sensor points",
-        "exhaustive": "(Ly, Lx, 3) or (M, 3)",
-        "pairs": f"{tuple(sensor.shape)}, one for each sensor point",
-    }[scan.kind]
-    if laser.ndim not in allowed or (each and laser.shape != sensor.shape):
+    expected = (3,) if scan.kind == "single" else tuple(sensor.shape)
+    if laser.ndim not in (2, 3) if scan.kind == "exhaustive" else laser.shape != expected:
+        words = "(Ly, Lx, 3) or (M, 3)" if scan.kind == "exhaustive" else expected
         raise ShapeError(f"Scan: expected laser_points {words} for kind={scan.kind!r}, got {tuple(laser.shape)}.")
     if scan.kind == "confocal" and not bool(torch.equal(laser, sensor)):
         raise SceneError("Scan: expected the laser points of a confocal scan to be its sensor points, got others.")
@@ -491,17 +427,16 @@ def _check_sides(scan: Scan) -> None:
         heights = ((origin - points) * normals).sum(-1).detach()
         behind = int((heights <= 0).sum())
         if behind:
-            lowest = float(heights.min())
-            place = f"behind them by up to {-lowest:.4g} m" if lowest < 0 else "in the wall itself"
             raise SceneError(
                 f"Scan: expected {name}_origin in front of the wall, got {origin.tolist()}, which {behind} of "
-                f"{heights.numel()} points do not see: it is {place}. Move "
-                "it to the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
+                f"{heights.numel()} points do not see, {-float(heights.min()):.4g} m behind them at most. Move it to "
+                "the side that the normals point to, or turn the wall (flip_normals, or the order of corners)."
             )
 
 
 # ------------------------------------------------------------------------------
 # Shortest and longest path from spots over a box to sensor points: the span of a time axis.
+
 
 def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     """Return the corners (3,) of a box of lowest and highest coordinates, float64.
@@ -522,55 +457,19 @@ def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     return box[0], box[1]
 
 
-def shortest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Return a lower bound of the lengths of three-bounce paths over a box, metres.
+def _span(scan: Scan, low: Tensor, high: Tensor) -> tuple[float, float]:
+    """Bounds of the lengths of three-bounce paths over a box, metres.
 
-    The sum of the distances of spot and sensor point to the box, each to its own nearest point: exact for confocal
-    scans, at most too short otherwise.
-
-    Args:
-        scan: the scan.
-        low: lowest corner (3,).
-        high: highest corner (3,).
+    From below: the sum of the distances of spot and sensor point to the box, each to its own nearest point, exact for
+    confocal scans. From above: sums of distances are convex, the longest path goes over a corner.
     """
-    first, last = _legs(scan)
-    near = [torch.linalg.vector_norm(p - p.clamp(low, high), dim=-1) for p in _points(scan)]
-    return _combined(scan, near[0] + first, near[1] + last, longest=False)
-
-
-def longest(scan: Scan, low: Tensor, high: Tensor) -> float:
-    """Return an upper bound of the lengths of three-bounce paths over a box, metres.
-
-    Sums of distances are convex: the longest path goes over a corner.
-
-    Args:
-        scan: the scan.
-        low: lowest corner (3,).
-        high: highest corner (3,).
-    """
-    laser, sensor = _points(scan)
-    first, last = _legs(scan)
-    found = 0.0
-    for corner in itertools.product(*zip(low.tolist(), high.tolist(), strict=True)):
-        point = torch.tensor(corner, dtype=torch.float64, device="cpu")
-        to_spot, to_sensor = (torch.linalg.vector_norm(p - point, dim=-1) for p in (laser, sensor))
-        found = max(found, _combined(scan, to_spot + first, to_sensor + last, longest=True))
-    return found
-
-
-def _points(scan: Scan) -> tuple[Tensor, Tensor]:
-    return scan.laser_points.detach().cpu().reshape(-1, 3), scan.sensor_points.detach().cpu().reshape(-1, 3)
-
-
-def _legs(scan: Scan) -> tuple[Tensor, Tensor]:
-    if not scan.first_and_last_leg:
-        zero = torch.zeros((), dtype=torch.float64, device="cpu")
-        return zero, zero
-    return scan.laser_legs.detach().cpu().reshape(-1), scan.sensor_legs.detach().cpu().reshape(-1)
-
-
-def _combined(scan: Scan, first: Tensor, last: Tensor, *, longest: bool) -> float:
+    corners = torch.cartesian_prod(*torch.stack([low, high], 1))
+    near, far = [], []
+    for points, legs in ((scan.laser_points, scan.laser_legs), (scan.sensor_points, scan.sensor_legs)):
+        flat = points.detach().cpu().reshape(-1, 3)
+        leg = legs.detach().cpu().reshape(-1) * scan.first_and_last_leg
+        near.append(torch.linalg.vector_norm(flat - flat.clamp(low, high), dim=-1) + leg)
+        far.append(torch.linalg.vector_norm(flat[:, None] - corners, dim=-1) + leg[:, None])
     if scan.kind in ("confocal", "pairs"):
-        both = first + last
-        return float(both.max() if longest else both.min())
-    return float(first.max() + last.max()) if longest else float(first.min() + last.min())
+        return float((near[0] + near[1]).min()), float((far[0] + far[1]).max())
+    return float(near[0].min() + near[1].min()), float((far[0].amax(0) + far[1].amax(0)).max())

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchtransient.checks import Numbers, as_whole, checked_mesh, flag, positive, real_array, shares, shown, transform
+from torchtransient.checks import Numbers, checked_mesh, count, positive, real_array, shares, shown, transform
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
 
 Array = NDArray[np.float64]
@@ -194,11 +194,6 @@ class Wall:
         a, b = self.half_u + self.half_v, self.half_u - self.half_v
         return float(2 * max(np.linalg.norm(a), np.linalg.norm(b)))
 
-    @property
-    def is_planar(self) -> bool:
-        """True for a parallelogram; a mesh counts as curved, however flat it is."""
-        return self.vertices is None
-
     def at(self, u: Any, v: Any) -> tuple[Array, Array]:
         """Return points and unit normals (..., 3) at coordinates.
 
@@ -209,16 +204,8 @@ class Wall:
 
         Raises:
             SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.
-            ShapeError: for anything but numbers that broadcast.
         """
-        places = [real_array(u), real_array(v)]
-        if places[0] is None or places[1] is None:
-            raise ShapeError(f"Wall.at: expected coordinates (u, v) as numbers, got {shown(u)} and {shown(v)}.")
-        try:
-            u, v = np.broadcast_arrays(places[0], places[1])
-        except ValueError:
-            shapes = f"{places[0].shape} and {places[1].shape}"
-            raise ShapeError(f"Wall.at: expected coordinates (u, v) that broadcast, got shapes {shapes}.") from None
+        u, v = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
         if not (np.all((u >= 0) & (u <= 1)) and np.all((v >= 0) & (v <= 1))):
             raise SceneError("Wall.at: expected coordinates (u, v) between 0 and 1, got some outside of the wall.")
         u, v = (self._inside(x, half)[..., None] for x, half in ((u, self.half_u), (v, self.half_v)))
@@ -259,7 +246,6 @@ class Wall:
             SceneError: for an extent without an area or outside of the wall, and as :meth:`at`.
         """
         nx, ny = grid_size(size, "Wall.grid")
-        flag("cell_centers", cell_centers)
         u0, v0, u1, v1 = _extent(extent)
         u, v = _places(nx, u0, u1, cell_centers), _places(ny, v0, v1, cell_centers)
         return self.at(u[None, :], v[:, None])
@@ -335,10 +321,8 @@ def triple(what: str, values: Any) -> Array:
         ShapeError, UnitError: for anything else.
     """
     array = real_array(values)
-    if array is None:
+    if array is None or array.shape != (3,):
         raise ShapeError(f"{what}: expected three numbers [x, y, z], got {shown(values)}.")
-    if array.shape != (3,):
-        raise ShapeError(f"{what}: expected three numbers [x, y, z], got shape {array.shape}.")
     if not np.isfinite(array).all():
         raise UnitError(f"{what}: expected finite metres, got {array.tolist()}.")
     return array
@@ -354,12 +338,10 @@ def grid_size(size: int | Sequence[int], who: str) -> tuple[int, int]:
     Raises:
         ShapeError: for anything else.
     """
-    given: Any = size
-    several = isinstance(given, Sequence) or getattr(given, "ndim", 0) == 1
-    pair = [as_whole(n) for n in (given if several else (given, given))]
-    nx, ny = pair if len(pair) == 2 else (None, None)
-    if nx is None or ny is None or min(nx, ny) < 1:
-        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, at least 1, got {shown(size)}.")
+    pair = tuple(size) if isinstance(size, Sequence | np.ndarray) else (size, size)
+    if len(pair) != 2:
+        raise ShapeError(f"{who}: expected (nx, ny) or one whole number, got {shown(size)}.")
+    nx, ny = (count(f"{who}: size", n, 1, ShapeError) for n in pair)
     if nx * ny > _MOST_POINTS:
         raise ShapeError(f"{who}: expected at most {_MOST_POINTS} points in all, got {shown(size)}.")
     return nx, ny
@@ -414,28 +396,37 @@ def first_hits(origins: Array, direction: Array, corners: Array) -> tuple[Array,
     Returns:
         Distance (N,) and index (N,) of the triangle; infinity and -1 for rays that meet none.
 
-    Source: Moeller and Trumbore (1997), for the triangles alone that share a cell with a ray on a grid across the rays.
+    Source: Moeller and Trumbore (1997), for pairs alone whose ray is within the box of the triangle across the rays.
     """
-    cells = _Cells(corners, direction)
+    first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    first /= np.linalg.norm(first)
+    frame = np.stack([first, np.cross(direction, first)], axis=1)
+    places, flat = origins @ frame, corners @ frame
+    slack = 1e-6 * np.ptp(flat.reshape(-1, 2), axis=0)
+    low, high = flat.min(1) - slack, flat.max(1) + slack
+    order = np.argsort(places[:, 0], kind="stable")
+    x, y = places[order].T.copy()
+    begin = np.searchsorted(x, low[:, 0])
+    counts = np.searchsorted(x, high[:, 0]) - begin
+    total = np.cumsum(counts)
     distances, indices = np.full(len(origins), np.inf), np.full(len(origins), -1, dtype=np.int64)
-    rows, counts = cells.candidates(origins)
-    ends = np.cumsum(counts)
     start = 0
-    while start < len(origins):
-        # As many rays as fit, and one at least.
-        base = ends[start] - counts[start]
-        stop = max(start + 1, int(np.searchsorted(ends, base + _PAIRS_AT_ONCE, side="right")))
+    while start < len(corners):
+        # As many triangles as fit, and one at least.
+        stop = max(start + 1, int(np.searchsorted(total, total[start] - counts[start] + _PAIRS_AT_ONCE, side="right")))
         here = counts[start:stop]
-        ray = np.repeat(np.arange(start, stop), here)
-        within = np.arange(len(ray)) - np.repeat(np.cumsum(here) - here, here)
-        triangle = cells.triangles[np.repeat(rows[start:stop], here) + within]
+        place = np.arange(here.sum()) + np.repeat(begin[start:stop] - (np.cumsum(here) - here), here)
+        beside = y[place]
+        near = np.flatnonzero(
+            (beside >= np.repeat(low[start:stop, 1], here)) & (beside <= np.repeat(high[start:stop, 1], here))
+        )
+        ray, triangle = order[place[near]], np.repeat(np.arange(start, stop), here)[near]
         t = _distances(origins[ray], direction, corners[triangle])
         # Of equally near ones the first in the mesh, as a search over all triangles would have it.
-        order = np.lexsort((triangle, t, ray))
-        rays, first = np.unique(ray[order], return_index=True)
-        nearest = t[order][first]
-        distances[rays] = nearest
-        indices[rays] = np.where(np.isfinite(nearest), triangle[order][first], -1)
+        nearest = np.lexsort((triangle, t, ray))
+        nearest = nearest[np.unique(ray[nearest], return_index=True)[1]]
+        nearest = nearest[t[nearest] < distances[ray[nearest]]]
+        distances[ray[nearest]], indices[ray[nearest]] = t[nearest], triangle[nearest]
         start = stop
     return distances, indices
 
@@ -456,54 +447,6 @@ def _distances(origins: Array, direction: Array, corners: Array) -> Array:
     t = (other * second).sum(1) * inverse
     met = open_to_ray & (u >= -_BARY_SLACK) & (v >= -_BARY_SLACK) & (u + v <= 1 + _BARY_SLACK) & (t > 0)
     return np.where(met, t, np.inf)
-
-
-class _Cells:
-    """Lists of triangles that reach into each cell of a grid across a direction."""
-
-    def __init__(self, corners: Array, direction: Array):
-        helper = np.eye(3)[np.abs(direction).argmin()]
-        first = np.cross(direction, helper)
-        first /= np.linalg.norm(first)
-        self._frame = np.stack([first, np.cross(direction, first)], axis=1)
-        flat = corners @ self._frame
-        low, high = flat.min(1), flat.max(1)
-        self._low = low.min(0)
-        self._size = np.maximum(high.max(0) - self._low, 1e-300)
-        # A triangle that reaches into many cells is listed in each: fewer cells until the lists stay short.
-        self._count = max(1, int(np.sqrt(len(corners))))
-        while self._count > 1 and self._spans(low, high)[2].sum() > 16 * len(corners):
-            self._count = (self._count + 1) // 2
-        begin, width, number = self._spans(low, high)
-        triangle = np.repeat(np.arange(len(corners)), number)
-        within = np.arange(len(triangle)) - np.repeat(np.cumsum(number) - number, number)
-        wide = np.repeat(width[:, 0], number)
-        cell = self._index(np.repeat(begin, number, axis=0) + np.stack([within % wide, within // wide], axis=1))
-        order = np.argsort(cell, kind="stable")
-        self.triangles = triangle[order]
-        self._starts = np.searchsorted(cell[order], np.arange(self._count**2 + 1))
-
-    def candidates(self, origins: Array) -> tuple[Indices, Indices]:
-        """Return the start in `triangles` and the length of each ray's list; length 0 beside the grid."""
-        place = origins @ self._frame
-        slack = 1e-9 * self._size
-        inside = ((place >= self._low - slack) & (place <= self._low + self._size + slack)).all(1)
-        cell = self._index(self._cell(place))
-        return self._starts[cell], np.where(inside, self._starts[cell + 1] - self._starts[cell], 0)
-
-    def _cell(self, places: Array) -> Indices:
-        scaled = np.floor((places - self._low) / self._size * self._count)
-        return np.asarray(np.clip(scaled, 0, self._count - 1), dtype=np.int64)
-
-    def _spans(self, low: Array, high: Array) -> tuple[Indices, Indices, Indices]:
-        """First cells (F, 2) of triangles, numbers of cells along both axes, and in all."""
-        slack = 1e-6 * self._size / self._count
-        begin, end = self._cell(low - slack), self._cell(high + slack)
-        width = end - begin + 1
-        return begin, width, width.prod(1)
-
-    def _index(self, cells: Indices) -> Indices:
-        return np.asarray(cells[..., 1] * self._count + cells[..., 0])
 
 
 def _triangle_normals(corners: Array) -> Array:

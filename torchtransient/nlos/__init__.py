@@ -15,7 +15,7 @@
 - `LCT`, `lct`: the light-cone transform with its Wiener inverse
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
-- `stabilized_root`, `StabilizedRoot`: roots of light, as f-k takes them, with a slope at empty bins
+- `stabilized_root`: roots of light, as f-k takes them, with a slope at empty bins
 - `LinearOperator`: what all of these are
 - `PlanarScan`: a regular grid of a flat wall, which transforms take in place of a scan
 - `subtract_legs`: a capture without the first and the last leg of its light
@@ -26,9 +26,8 @@
 - `PhasorField`, `phasor_image`: waves of a band of frequencies, from plane to plane
 - `DirectLight`, `ConfocalCamera`: virtual cameras of phasor fields
 - `TransientCamera`: one that sees light travel
-- `depth_map`, `soft_depth`: where surfaces are in what was reconstructed, the latter with gradients
+- `depth_map`: where surfaces are in what was reconstructed
 - `DepthMap`: depths, strengths and where there is something
-- `normals_from_depth`, `normals_from_volume`: how those surfaces are turned
 - `reconstruct`: the volume that one of these methods finds in a capture
 - `choose_method`: which one suits it, and why
 - `default_grid`: voxels before the wall of a capture
@@ -75,7 +74,6 @@ from torchtransient.reconstruction import MidpointFK as MidpointFK
 from torchtransient.reconstruction import PhasorField as PhasorField
 from torchtransient.reconstruction import PhasorFilter as PhasorFilter
 from torchtransient.reconstruction import PlanarScan as PlanarScan
-from torchtransient.reconstruction import StabilizedRoot as StabilizedRoot
 from torchtransient.reconstruction import TransientCamera as TransientCamera
 from torchtransient.reconstruction import VoxelGrid as VoxelGrid
 from torchtransient.reconstruction import backproject as backproject
@@ -85,9 +83,6 @@ from torchtransient.reconstruction import filtered_backproject as filtered_backp
 from torchtransient.reconstruction import fk as fk
 from torchtransient.reconstruction import lct as lct
 from torchtransient.reconstruction import midpoint_fk as midpoint_fk
-from torchtransient.reconstruction import normals_from_depth as normals_from_depth
-from torchtransient.reconstruction import normals_from_volume as normals_from_volume
 from torchtransient.reconstruction import phasor_image as phasor_image
-from torchtransient.reconstruction import soft_depth as soft_depth
 from torchtransient.reconstruction import stabilized_root as stabilized_root
 from torchtransient.reconstruction import subtract_legs as subtract_legs

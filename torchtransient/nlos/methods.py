@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from torchtransient.checks import count, shown, with_article
 from torchtransient.errors import ArgumentError, ShapeError, StorageError
 from torchtransient.nlos.simulation import size_in_words
 from torchtransient.reconstruction import VoxelGrid
-from torchtransient.reconstruction.capture_checks import not_a_capture
+from torchtransient.reconstruction.capture_checks import checked_capture
 from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.rendering.memory import available_bytes
 from torchtransient.volume_methods import METHODS as METHODS
@@ -40,12 +41,7 @@ def choose_method(capture: Capture) -> Choice:
 
     Returns:
         Name of the method, and the reason for it.
-
-    Raises:
-        ArgumentError: for other objects.
     """
-    if not isinstance(capture, Capture):
-        raise ArgumentError(f"choose_method: {not_a_capture(capture)}")
     kind = capture.scan.kind
     this = with_article(kind)
     if kind == "pairs":
@@ -70,19 +66,17 @@ def check_method(name: str, capture: Capture) -> Method:
     Raises:
         ArgumentError: for unknown names, and for scans that the method does not take.
     """
-    if not isinstance(name, str) or name not in METHODS:
+    if name not in METHODS:
         raise ArgumentError(f"reconstruct: expected method to be one of {', '.join(METHODS)}, got {shown(name)}.")
     method, kind = METHODS[name], capture.scan.kind
     if kind not in method.kinds:
         others = ", ".join(other for other, entry in METHODS.items() if kind in entry.kinds)
         raise ArgumentError(
-            f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, and this one is {kind}. "
-            f"Take one of {others}."
+            f"reconstruct: method '{name}' takes {' and '.join(method.kinds)} scans, not {kind}. Take one of {others}."
         )
     if method.planar and not is_planar(capture.scan):
         raise ArgumentError(
-            f"reconstruct: method '{name}' takes regular grids of points on a flat wall, and this scan is none "
-            f"({capture.scan!r}). Take bp or fbp."
+            f"reconstruct: method '{name}' takes regular grids on a flat wall, got {capture.scan!r}. Take bp or fbp."
         )
     return method
 
@@ -93,11 +87,10 @@ def is_planar(scan: Scan) -> bool:
     Args:
         scan: of any kind.
     """
-    try:
+    with contextlib.suppress(ShapeError):
         PlanarScan.of_scan(scan, "choose_method")
-    except ShapeError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _pitch_of(scan: Scan) -> float:
@@ -128,10 +121,9 @@ def default_wavelength(capture: Capture) -> float:
     Raises:
         ShapeError: for a capture without a transient.
     """
-    if capture.axis is None:
-        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    _, axis = checked_capture(capture, "default_wavelength")
     turns = 4.0 if capture.scan.kind in ("confocal", "pairs") else 2.0
-    return max(turns * _pitch_of(capture.scan), 4 * capture.axis.bin_width_opl)
+    return max(turns * _pitch_of(capture.scan), 4 * axis.bin_width_opl)
 
 
 # Planes whose points backprojection holds at once: filters run over all rows once for each such pass. Bytes of a
@@ -151,18 +143,13 @@ def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, optio
     Raises:
         StorageError: where even the least memory of the method is not there.
     """
-    light = capture.transient
-    assert light is not None
+    light, _ = checked_capture(capture, "reconstruct")
     needed = least_bytes(name, capture, grid, options)
     available = available_bytes("cuda" if light.device.type == "cuda" else "llvm")
     if light.device.type == "meta" or available is None or needed <= available:
         return
-    if grid is not None:
-        size: tuple[int, ...] = grid.shape
-        way = "Take fewer voxels or depths"
-    else:
-        size, way = tuple(light.shape[-3:]), "Crop the capture, add up bins, or take fewer points"
-    sizes = " x ".join(map(str, size))
+    sizes = " x ".join(map(str, light.shape[-3:] if grid is None else grid.shape))
+    way = "Crop the capture, add up bins, or take fewer points" if grid is None else "Take fewer voxels or depths"
     raise StorageError(
         f"reconstruct: method '{name}' would take {size_in_words(needed)} at least for {sizes} numbers, and "
         f"{size_in_words(available)} are available on this {light.device.type}. {way}."
@@ -181,8 +168,7 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
     Returns:
         Bytes.
     """
-    light, axis = capture.transient, capture.axis
-    assert light is not None and axis is not None
+    light, axis = checked_capture(capture, "reconstruct")
     number = 8 if light.dtype == torch.float64 else 4
     if grid is not None:
         times = getattr(options.get("camera"), "times", None)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchtransient.array_files.part_files import whole_file
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.checks import short_message
@@ -59,18 +61,19 @@ class RowLayout:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> RowLayout:
-        """Return the layout that :meth:`plain` described."""
+        """Return the layout of its fields, as JSON has them."""
         given: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in plain.items()}
         return cls(**given)
 
-    def plain(self) -> dict[str, Any]:
-        """Return the layout as data for JSON."""
-        return asdict(self)
+    @property
+    def split(self) -> int:
+        """Number of columns of a row before those of the steady image."""
+        return math.prod(self.front) * (2 if self.phasor else 1)
 
     @property
     def columns(self) -> int:
         """Number of columns of a row."""
-        return self._measured_columns() + self._steady_columns()
+        return self.split + (math.prod(self.steady) if self.steady else 0)
 
     def rows(self, capture: Capture) -> Rows:
         """Return the rows (N, columns) of a capture's sensor points, in the order of the scan."""
@@ -81,15 +84,14 @@ class RowLayout:
         parts = [measured.reshape(len(measured), -1)]
         if capture.steady is not None:
             parts.append(_points_first(capture.steady, rank).reshape(len(measured), -1))
-        found: Rows = torch.cat(parts, 1).numpy() if len(parts) > 1 else parts[0].numpy()
-        return found
+        return torch.cat(parts, 1).numpy() if len(parts) > 1 else parts[0].numpy()
 
     def capture(
         self, rows: Rows, scan: Scan, axis: TimeAxis | None, frequencies: FrequencyAxis | None
     ) -> dict[str, Any]:
         """Return the arguments of :class:`Capture`, but its metadata, as views of ``rows`` (N, columns)."""
-        split, numbers = self._measured_columns(), torch.from_numpy(rows)
-        measured, steady = numbers[:, :split], numbers[:, split:]
+        numbers = torch.from_numpy(rows)
+        measured, steady = numbers[:, : self.split], numbers[:, self.split :]
         if self.phasor:
             # Beside a steady image the pairs of a row may begin at odd places.
             measured = torch.view_as_complex(measured.reshape(len(numbers), -1, 2).contiguous())
@@ -99,12 +101,6 @@ class RowLayout:
             made["steady"] = _points_last(steady, self.steady, scan)
         settings = {"channels": self.channels, "polarized": self.polarized}
         return made | settings | {"scan": scan, "axis": axis, "frequencies": frequencies}
-
-    def _measured_columns(self) -> int:
-        return int(np.prod(self.front, dtype=np.int64)) * (2 if self.phasor else 1)
-
-    def _steady_columns(self) -> int:
-        return int(np.prod(self.steady, dtype=np.int64)) if self.steady else 0
 
 
 def _measured(capture: Capture) -> torch.Tensor:
@@ -145,28 +141,25 @@ class PartFile:
     def __init__(self, path: Path, key: str) -> None:
         self.path, self._key = path, key
         self._data = path.with_name(path.name + ".npy")
-        self._lock = _Lock(path.with_name(path.name + ".lock"))
+        self._lock = contextlib.ExitStack()
         self._done: dict[int, list[int]] = {}
         self._file: IO[bytes] | None = None
-        self._shape: tuple[int, int] = (0, 0)
         self.about: dict[str, Any] = {}
         self.seconds = 0.0
 
     def __enter__(self) -> PartFile:
         if not self.path.parent.is_dir():
             raise StorageError(f"part file: the folder '{self.path.parent}' does not exist. Create it first.")
-        self._lock.take()
-        try:
+        with contextlib.ExitStack() as lock:
+            lock.enter_context(_locked(self.path.with_name(self.path.name + ".lock")))
             if self.path.exists():
                 self._read()
-        except BaseException:
-            self._lock.release()
-            raise
+            self._lock = lock.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._close()
-        self._lock.release()
+        self._lock.close()
 
     # -------------------------------------------------------------------------------------------------------- reading
 
@@ -174,11 +167,9 @@ class PartFile:
         try:
             said = json.loads(self.path.read_text(encoding="utf-8"))
             done = {int(number): [int(n) for n in entry] for number, entry in said["done"].items()}
-            form, key, about = said["format"], said["key"], dict(said["about"])
-            rows, columns = (int(n) for n in said["shape"])
-            seconds = float(said["seconds"])
-            if any(first < 0 or count < 1 or first + count > rows for first, count, _ in done.values()):
-                raise ValueError("rows beyond the last one")
+            form, key, about, seconds = said["format"], said["key"], dict(said["about"]), float(said["seconds"])
+            if any(first < 0 or count < 1 for first, count, _ in done.values()):
+                raise ValueError("rows before the first one")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise StorageError(
                 f"part file: '{self.path}' is not the part file of a simulation ({FORMAT}), or is damaged: "
@@ -188,10 +179,9 @@ class PartFile:
             return
         if form != FORMAT or key != self._key:
             raise StorageError(
-                f"part file: '{self.path}' belongs to another simulation: another scene, scan, axis, spp, seed or "
-                "number of tiles. Give another name, or delete it to start anew."
+                f"part file: '{self.path}' belongs to another simulation. Give another name, or delete it."
             )
-        self._done, self._shape, self.about, self.seconds = done, (rows, columns), about, seconds
+        self._done, self.about, self.seconds = done, about, seconds
         with self._errors_said():
             try:
                 self._file = self._data.open("r+b")
@@ -204,8 +194,9 @@ class PartFile:
 
     def _check(self) -> None:
         """Check the rows by their checksums. Raises StorageError."""
+        there = self._rows()
         for first, count, checksum in self._done.values():
-            if zlib.crc32(self._bytes(first, count)) != checksum:
+            if zlib.crc32(there[first : first + count].data) != checksum:
                 raise StorageError(
                     f"part file: '{self._data}' is damaged or cut off: rows {first} to {first + count - 1} are not "
                     f"those that '{self.path}' tells of. Delete both to start anew."
@@ -223,20 +214,15 @@ class PartFile:
     def rows(self, first: int, count: int) -> Rows:
         """Return some rows, (count, columns)."""
         with self._errors_said():
-            found = np.frombuffer(self._bytes(first, count), dtype=np.float32)
-            return found.reshape(count, self._shape[1]).copy()
+            return self._rows()[first : first + count].copy()
 
     def everything(self) -> Rows:
         """Return all rows, read into memory."""
         with self._errors_said():
-            return np.load(self._data, mmap_mode=None, allow_pickle=False)  # type: ignore[no-any-return]
+            return np.load(self._data, allow_pickle=False)  # type: ignore[no-any-return]
 
-    def _bytes(self, first: int, count: int) -> bytes:
-        assert self._file is not None
-        size = 4 * self._shape[1]
-        self._file.seek(self._start() + first * size)
-        # No more than there is: a number that is damaged asks for any memory.
-        return self._file.read(min(count * size, os.fstat(self._file.fileno()).st_size))
+    def _rows(self) -> Rows:
+        return np.load(self._data, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
 
     # -------------------------------------------------------------------------------------------------------- writing
 
@@ -259,46 +245,29 @@ class PartFile:
             StorageError: for a full disk, which leaves the parts before.
         """
         with self._errors_said():
-            if self._file is None:
-                self._create(total, rows.shape[1])
-            assert self._file is not None
             data = np.ascontiguousarray(rows, dtype=np.float32).tobytes()
-            self._file.seek(self._start() + first * 4 * self._shape[1])
+            if self._file is None:
+                self._file = self._data.open("w+b")
+                header = {"descr": "<f4", "fortran_order": False, "shape": (total, rows.shape[1])}
+                np.lib.format.write_array_header_1_0(self._file, header)
+                self._file.truncate(self._start() + 4 * total * rows.shape[1])
+            self._file.seek(self._start() + first * 4 * rows.shape[1])
             self._file.write(data)
             self._file.flush()
             os.fsync(self._file.fileno())
             done = {n: entry for n, entry in self._done.items() if n != instead_of}
             done[number] = [first, len(rows), zlib.crc32(data)]
-            self._say(done, self.seconds + seconds, about)
-            self._done, self.seconds, self.about = done, self.seconds + seconds, dict(about)
-
-    def _create(self, total: int, columns: int) -> None:
-        self._shape = (total, columns)
-        self._file = self._data.open("w+b")
-        header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float32)), "fortran_order": False}
-        np.lib.format.write_array_header_1_0(self._file, header | {"shape": self._shape})
-        self._file.truncate(self._start() + 4 * total * columns)
+            seconds += self.seconds
+            said = {"format": FORMAT, "key": self._key, "done": done, "seconds": seconds, "about": dict(about)}
+            with whole_file(self.path, "part file") as fresh:
+                fresh.write_text(json.dumps(said), encoding="utf-8")
+            self._done, self.seconds, self.about = done, seconds, dict(about)
 
     def _start(self) -> int:
         """Return the place of the first row: behind the header, which says its own length."""
         assert self._file is not None
         self._file.seek(8)
         return 10 + int.from_bytes(self._file.read(2), "little")
-
-    def _say(self, done: Mapping[int, list[int]], seconds: float, about: Mapping[str, Any]) -> None:
-        said = {
-            "format": FORMAT, "key": self._key, "shape": self._shape, "done": done, "seconds": seconds,
-            "about": dict(about),
-        }  # fmt: skip
-        fresh = self.path.with_name(self.path.name + ".new")
-        try:
-            with fresh.open("w", encoding="utf-8") as file:
-                json.dump(said, file)
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self.path)
-        finally:
-            fresh.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete the files; the lock goes at the end of the ``with`` block."""
@@ -318,7 +287,7 @@ class PartFile:
     def _errors_said(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, ValueError) as error:
+        except (OSError, EOFError, ValueError) as error:
             if isinstance(error, StorageError):
                 raise
             raise StorageError(
@@ -342,53 +311,35 @@ def delete_part_file(path: Path) -> None:
         kept.remove()
 
 
-class _Lock:
-    """A file that one process at a time holds; the system lets go of it when the process ends, however it does."""
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file that one process at a time holds; the system lets go of it when the process ends, however it does.
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._file = path, None  # type: Path, IO[str] | None
+    Raises StorageError where another process holds it.
+    """
+    import fcntl
 
-    def take(self) -> None:
-        """Raise StorageError where another process holds it."""
-        while True:
+    while True:
+        try:
+            file = path.open("a+", encoding="utf-8")
+        except OSError as error:
+            raise StorageError(f"part file: '{path}' could not be opened: {error}.") from error
+        with file:
             try:
-                file = self._path.open("a+", encoding="utf-8")
+                fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise StorageError(f"part file: '{self._path}' could not be opened: {error}.") from error
-            try:
-                _hold(file)
-            except OSError as error:
-                file.close()
                 raise StorageError(
-                    f"part file: another process works on '{self._path.with_suffix('')}'. Wait for it, or give another "
-                    "name to each simulation."
+                    f"part file: another process works on '{path.with_suffix('')}'. Wait for it, or give another name."
                 ) from error
             # The one that held it before may have deleted it: then it is nobody's any more.
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), self._path.stat()):
-                    self._file = file
-                    return
-            file.close()
-
-    def release(self) -> None:
-        """Delete the file, and let go of it."""
-        assert self._file is not None  # it was taken
-        if os.name == "nt":  # which keeps files that are open
-            self._file.close()
-        with contextlib.suppress(OSError):
-            self._path.unlink(missing_ok=True)
-        self._file.close()
-        self._file = None
-
-
-def _hold(file: IO[str]) -> None:
-    """Raise OSError where another process holds the file."""
-    if os.name == "nt":
-        import msvcrt
-
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-    else:
-        import fcntl
-
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                ours = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            except FileNotFoundError:
+                continue
+            if not ours:
+                continue
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return

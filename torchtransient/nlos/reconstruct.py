@@ -47,15 +47,14 @@ from torchtransient.reconstruction.capture_checks import (
     check_reach,
     check_wavelength,
     checked_capture,
-    not_a_capture,
+    one_of,
 )
 from torchtransient.volume_methods import FILTERS, Method
 
 
 def _checked_light(capture: Capture, who: str) -> Capture:
     """Return a capture whose light is finite. Raises UnitError for NaN, which transforms spread over the volume."""
-    light = capture.transient
-    assert light is not None  # a capture without one has been refused
+    light, _ = checked_capture(capture, who)
     finite = torch.isfinite(light)
     if bool(finite.all()):
         return capture
@@ -115,7 +114,6 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     Raises:
         ShapeError, UnitError: as :class:`DiffusionDeconvolution`, and for light that is not finite.
     """
-    checked_capture(capture, "without_slab")
     capture = subtract_legs(capture)
     transient, axis = checked_capture(capture, "without_slab")
     _checked_light(capture, "without_slab")
@@ -188,37 +186,31 @@ def reconstruct(
         StorageError: for a volume beyond the memory.
         ShapeError, UnitError, DeviceError: as the operators.
     """
-    if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
-    if capture.transient is None:
-        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    _, axis = checked_capture(capture, "reconstruct")
     choice = choose_method(capture) if method is None else Choice(method, "asked for")
     entry = check_method(choice.name, capture)
     options = {name: value for name, value in options.items() if value is not None}
     _check_options(choice.name, entry.options, options)
-    if grid is not None and not isinstance(grid, VoxelGrid):
-        raise ArgumentError(f"reconstruct: expected grid as a tt.nlos.VoxelGrid, got {shown(grid)}.")
     if grid is not None and (depths is not None or not entry.free_grid):
         why = "it says its depths itself; leave one of them out" if entry.free_grid else "its voxels are its own"
         raise ArgumentError(f"reconstruct: method '{choice.name}' takes no grid= here: {why}.")
-    assert capture.axis is not None
-    check_proportions(capture.scan, capture.axis, "reconstruct")
+    check_proportions(capture.scan, axis, "reconstruct")
     capture = _checked_light(_intensities(capture), "reconstruct")
     if not entry.takes_legs:
         capture = _from_zero(subtract_legs(capture))
+    _, axis = checked_capture(capture, "reconstruct")
     near_far = None if depths is None else _checked_depths(depths)
-    assert capture.axis is not None
     with torch.no_grad():
         if entry.free_grid:
             voxels = default_grid(capture, depths=near_far) if grid is None else grid
-            check_reach(capture.scan, voxels, capture.axis, "reconstruct", seen=True)
+            check_reach(capture.scan, voxels, axis, "reconstruct", seen=True)
             check_volume_fits(choice.name, capture, voxels, options)
             values, directions, times, used = _on_grid(choice.name, capture, voxels, options, progress)
         else:
             check_volume_fits(choice.name, capture, None, options)
             values, directions, voxels = _on_own_grid(choice.name, capture, near_far, options, progress)
             times, used = None, options
-    metadata = {"reason": choice.reason, "settings": _settings(entry, used, capture.axis)}
+    metadata = {"reason": choice.reason, "settings": _settings(entry, used, axis)}
     return HiddenVolume(values, voxels, choice.name, metadata=metadata, times=times, directions=directions)
 
 
@@ -242,11 +234,7 @@ def default_grid(
         ShapeError, UnitError: as `VoxelGrid.before`, and for phasors alone.
         SceneError: for other numbers of planes, and where sensor points on one line say nothing of an ``extent``.
     """
-    if not isinstance(capture, Capture):
-        raise ShapeError(f"reconstruct: {not_a_capture(capture)}")
-    axis = capture.axis
-    if axis is None:
-        raise ShapeError("reconstruct: expected a capture with a transient, got phasors alone.")
+    _, axis = checked_capture(capture, "default_grid")
     legs = float(capture.scan.legs.detach().min()) if capture.scan.first_and_last_leg else 0.0
     far = (axis.end_opl - legs) / 2
     if depths is None:
@@ -292,9 +280,9 @@ def normals_of(volume: HiddenVolume) -> Tensor:
     Raises:
         ShapeError: for a volume without directions.
     """
-    if not isinstance(volume, HiddenVolume) or volume.directions is None:
+    if volume.directions is None:
         raise ShapeError(
-            f"normals_of: expected a volume with directions (method directional-lct), got {shown(volume)}."
+            f"normals_of: expected a volume with directions (method directional-lct), got one by {volume.method}."
         )
     vectors = volume.directions
     while vectors.ndim > 5:
@@ -313,16 +301,10 @@ def _check_options(name: str, known: Iterable[str], options: dict[str, Any]) -> 
     for option in options:
         if option not in known:
             raise ArgumentError(
-                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}. "
-                "Leave it out, or take another method."
+                f"reconstruct: method '{name}' has no {option}=, it takes {', '.join(f'{n}=' for n in known)}."
             )
-    for option in ("target", "filter"):
-        if not isinstance(options.get(option, ""), str):
-            raise ArgumentError(f"reconstruct: expected {option} as a name, got {shown(options[option])}.")
-    if "filter" in options and options["filter"] not in FILTERS:
-        raise ArgumentError(
-            f"reconstruct: expected filter to be one of {', '.join(FILTERS)}, got {options['filter']!r}."
-        )
+    if "filter" in options:
+        one_of("reconstruct: filter", options["filter"], FILTERS)
     if options.get("filter") == "laplacian" and ("wavelength" in options or "cycles" in options):
         raise ArgumentError(
             "reconstruct: wavelength= and cycles= have no meaning for filter='laplacian'. Leave them out."
@@ -343,8 +325,7 @@ def _settings(entry: Method, used: dict[str, Any], axis: TimeAxis) -> dict[str, 
 
 
 def _intensities(capture: Capture) -> Capture:
-    transient = capture.transient
-    assert transient is not None  # a capture without one has been refused
+    transient, _ = checked_capture(capture, "reconstruct")
     if capture.polarized:
         transient = transient.select(-len(capture.scan.shape) - 3, 0)
     return replace(capture, transient=transient, steady=None, polarized=False, phasor=None, frequencies=None)
@@ -352,8 +333,7 @@ def _intensities(capture: Capture) -> Capture:
 
 def _from_zero(capture: Capture) -> Capture:
     """Without the bins that begin before time zero."""
-    axis = capture.axis
-    assert axis is not None
+    _, axis = checked_capture(capture, "reconstruct")
     early = math.ceil(-axis.start_opl / axis.bin_width_opl - 1e-6)
     if early < 1:
         return capture
@@ -375,16 +355,12 @@ def _on_own_grid(
     kinds: dict[str, Callable[..., Any]] = {
         "fk": FK, "midpoint-fk": MidpointFK, "lct": LCT, "directional-lct": DirectionalLCT,
     }  # fmt: skip
-    axis, transient = capture.axis, capture.transient
-    assert axis is not None and transient is not None
+    transient, axis = checked_capture(capture, "reconstruct")
     dim = transient.ndim - len(capture.scan.shape) - 2
     found, z = [], axis.centers_opl / 2
     seen = torch.ones_like(z, dtype=torch.bool) if depths is None else (z >= depths[0]) & (z <= depths[1])
     if not bool(seen.any()):
-        raise UnitError(
-            f"reconstruct: expected depths within the record's, {float(z[0]):.4g} to {float(z[-1]):.4g} m, got "
-            f"{shown(depths)}."
-        )
+        raise UnitError(f"reconstruct: expected depths within the record's, {float(z[0]):.4g} to {float(z[-1]):.4g} m.")
     kept = seen.nonzero()[:, 0]
     operator = kinds[name](capture.scan, time_axis=axis, dtype=precision_of(transient), **options).to(transient.device)
     with _bar(transient.shape[dim], progress) as bar:
@@ -401,8 +377,7 @@ def _on_grid(
     name: str, capture: Capture, grid: VoxelGrid, options: dict[str, Any], progress: bool
 ) -> tuple[Tensor, Tensor | None, Tensor | None, dict[str, Any]]:
     """By a method that takes any planes, some of them at a time."""
-    axis, transient = capture.axis, capture.transient
-    assert axis is not None and transient is not None
+    transient, axis = checked_capture(capture, "reconstruct")
     used = dict(options)
     laplacian = used.get("filter") == "laplacian"
     if laplacian:
@@ -410,7 +385,7 @@ def _on_grid(
     elif name != "bp":
         wavelength = used.setdefault("wavelength", default_wavelength(capture))
         check_wavelength(positive("reconstruct: wavelength", wavelength), capture.scan, axis, "reconstruct")
-    make = _maker(name, capture, axis, used)
+    make = _maker(name, capture, used)
     found = []
     # Phasor fields share their spectra over all planes; backprojection takes a step of the bar for some of them.
     at_once = len(grid.depths) if name == "phasor" else AT_ONCE
@@ -427,10 +402,9 @@ def _on_grid(
     return values, None, camera.times, used
 
 
-def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any]) -> Callable[[VoxelGrid], Any]:
+def _maker(name: str, capture: Capture, options: dict[str, Any]) -> Callable[[VoxelGrid], Any]:
     """The operator of a method on some planes."""
-    transient = capture.transient
-    assert transient is not None
+    transient, axis = checked_capture(capture, "reconstruct")
     common = {"time_axis": axis, "falloff": options.get("falloff", 0.0), "dtype": precision_of(transient)}
     if name == "bp" or options.get("filter") == "laplacian":
         return lambda grid: Backprojection(capture.scan, grid, **common)
@@ -441,7 +415,7 @@ def _maker(name: str, capture: Capture, axis: TimeAxis, options: dict[str, Any])
     return lambda grid: PhasorField(capture.scan, grid, pulse=pulse, camera=camera, **common)
 
 
-def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | ConfocalCamera | TransientCamera:
+def camera_of(name: str, times: tuple[float, float, int] | None) -> DirectLight | ConfocalCamera | TransientCamera:
     """Return a virtual camera by its name.
 
     Args:
@@ -449,25 +423,11 @@ def camera_of(name: str, times: Sequence[float] | None) -> DirectLight | Confoca
         times: (start, stop, count), metres, of the latter two.
 
     Raises:
-        ArgumentError: for unknown names, and where times are missing or have no meaning.
-        UnitError: for times that are not three finite numbers.
+        UnitError: for times that are not finite.
     """
-    if isinstance(name, str) and name == "direct":
-        if times is not None:
-            raise ArgumentError("reconstruct: times are for the cameras confocal and transient. Leave them out.")
+    if name == "direct":
         return DirectLight()
-    cameras: dict[str, type[ConfocalCamera | TransientCamera]] = {
-        "confocal": ConfocalCamera,
-        "transient": TransientCamera,
-    }
-    if not isinstance(name, str) or name not in cameras:
-        raise ArgumentError(f"reconstruct: expected a camera direct, confocal or transient, got {shown(name)}.")
-    if times is None:
-        raise ArgumentError(f"reconstruct: the camera {name} films: expected times (start, stop, count), got none.")
-    numbers = real_array(times)
-    if numbers is None or numbers.shape != (3,):
-        raise UnitError(f"reconstruct: expected times as (start, stop, count), got {shown(times)}.")
-    start, stop, number = numbers.tolist()
-    frames = count("reconstruct: count of times", number)
-    first, last = finite("reconstruct: times", start), finite("reconstruct: times", stop)
-    return cameras[name](torch.linspace(first, last, frames, dtype=torch.float64, device="cpu"))
+    assert times is not None  # the command has asked for them
+    start, stop, frames = times
+    moments = torch.linspace(start, stop, count("reconstruct: times", frames), dtype=torch.float64, device="cpu")
+    return ConfocalCamera(moments) if name == "confocal" else TransientCamera(moments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from torch import nn
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import as_whole, of_class, shown
+from torchtransient.checks import count
 from torchtransient.errors import ArgumentError, PhysicsWarning, SceneError, TorchTransientError
 from torchtransient.nlos.scene import (
     DEFAULT_BIN_WIDTH_OPL,
@@ -30,7 +31,7 @@ from torchtransient.nlos.scene import (
 )
 from torchtransient.nlos.scene_scan import check_scan_is_seen, reaches_before, tolerance_of
 from torchtransient.rendering.arguments import checked_samples
-from torchtransient.rendering.job import SEED_RANGE, draw_seed
+from torchtransient.rendering.job import SEED_RANGE
 from torchtransient.rendering.output import RenderOutput
 from torchtransient.rendering.renderer import TransientRenderer
 from torchtransient.scene.edits import BuildOptions
@@ -63,8 +64,7 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
             bins = module(dark).shape[-3]
         if bins != axis.num_bins:
             raise SceneError(
-                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of "
-                f"{sensor!r}. Apply a sensor with bins of its own to capture.transient."
+                f"sensor: expected an answer with the transient's {axis.num_bins} bins, got {bins} of {sensor!r}."
             )
     return module
 
@@ -114,23 +114,14 @@ def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: 
     Returns:
         Tensor of the same shape.
     """
+    flat = transient
     if scan.kind == "exhaustive":
-        (rows, columns), (laser_rows, laser_columns) = film_size(scan), laser_size(scan)
-        flat = transient.reshape(*transient.shape[:-4], laser_rows * laser_columns, rows * columns)
-        seen = _answer(sensor, flat, generator)
-        return seen.reshape(*seen.shape[:-2], *transient.shape[-4:])
-    result: torch.Tensor = _answer(sensor, transient, generator)
-    return result
-
-
-def _answer(sensor: nn.Module, transient: torch.Tensor, generator: torch.Generator | None) -> torch.Tensor:
-    """Apply a module of ``tt.sensing``, or any other, which may take no generator."""
+        flat = transient.reshape(*transient.shape[:-4], math.prod(laser_size(scan)), math.prod(film_size(scan)))
+    # Modules of ``tt.sensing`` take a generator, others may not.
     known = inspect.signature(sensor.forward).parameters.values()
-    if any(one.name == "generator" or one.kind is one.VAR_KEYWORD for one in known):
-        answer: torch.Tensor = sensor(transient, generator=generator)
-    else:
-        answer = sensor(transient)
-    return answer
+    takes_generator = any(one.name == "generator" or one.kind is one.VAR_KEYWORD for one in known)
+    seen: torch.Tensor = sensor(flat, generator=generator) if takes_generator else sensor(flat)
+    return seen.reshape(*seen.shape[:-2], *transient.shape[-4:]) if scan.kind == "exhaustive" else seen
 
 
 def checked_seed(who: str, value: Any) -> int:
@@ -143,52 +134,7 @@ def checked_seed(who: str, value: Any) -> int:
     Raises:
         ArgumentError: for other values.
     """
-    number = as_whole(value)
-    if number is None or not 0 <= number < SEED_RANGE:
-        raise ArgumentError(
-            f"{who}: seed: expected a whole number from 0 to {SEED_RANGE - 1}, got {shown(value)}. Others would count "
-            "modulo 2^32, and be the same as one of these."
-        )
-    return number
-
-
-def _check_seeds(who: str, value: Any) -> None:
-    """Check one seed, one for each entry of a batch, or the tensor of ``vmap``, which cannot be looked at."""
-    if value is None:
-        return
-    if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 1:
-        for one in value:
-            _check_seeds(who, one)
-        return
-    _, of_each_entry = draw_seed(value)
-    if of_each_entry is None:
-        checked_seed(who, value)
-
-
-def check_sensor(who: str, sensor: Any, generator: Any = None) -> None:
-    """Check the types of a sensor and a generator.
-
-    Args:
-        who: begins the message.
-        sensor: module, device or None.
-        generator: torch.Generator or None.
-
-    Raises:
-        ArgumentError: for other objects.
-    """
-    if not isinstance(sensor, nn.Module | Device | None):
-        raise ArgumentError(f"{who}: expected sensor as a module or device of tt.sensing, got {shown(sensor)}.")
-    if not isinstance(generator, torch.Generator | None):
-        raise ArgumentError(f"{who}: expected generator as a torch.Generator or None, got {shown(generator)}.")
-
-
-def _keys_and_values(who: str, name: str, given: Any) -> dict[str, Any]:
-    """Return parameters by key, of a mapping or a list of keys. Raises SceneError for other objects."""
-    listed = isinstance(given, Iterable) and not isinstance(given, (str, bytes)) and not hasattr(given, "dtype")
-    keys = list(given) if listed else [given]
-    if not listed or not all(isinstance(key, str) for key in keys):
-        raise SceneError(f"{who}: {name}: expected keys of scene.parameters(), or values by key, got {shown(given)}.")
-    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(keys)
+    return count(f"{who}: seed", value, 0, ArgumentError, SEED_RANGE - 1)
 
 
 # What findings are about.
@@ -220,15 +166,21 @@ class ScanWatch:
         with dr.suspend_grad():
             points, origin = scanned_points(scene, sensor), mi.Point3f(sensor.origin)
             laser = origin_of(scene, sensor)
-            rays = {"sensor": _rays(origin, points - origin)}
+            ways = {"sensor": (origin, points - origin)}
             if capture is not CaptureType.CONFOCAL or not np.array_equal(laser, origin):
-                rays["laser"] = _rays(laser, aims_of(scene, sensor, capture, None))
-            tolerance = dr.opaque(mi.Float, self.tolerance)
-            off = {who: _end_elsewhere(scene, *ray, tolerance) for who, ray in rays.items()}
-            normals = None if self.normals is not None else _normals(scene, rays["sensor"][0])
+                ways["laser"] = laser, aims_of(scene, sensor, capture, None)
+            tolerance, off, rays = dr.opaque(mi.Float, self.tolerance), {}, {}
+            for who, (start, way) in ways.items():
+                length = dr.norm(way)
+                rays[who] = mi.Ray3f(start, way / length)
+                met = scene.ray_intersect_preliminary(rays[who], coherent=True)
+                # NaN is elsewhere, too.
+                off[who] = ~(dr.abs(met.t - length) <= tolerance)
+            normals = None if self.normals is not None else _normals(scene, rays["sensor"])
             dr.eval(points, normals, off)
         found = {}
-        for who, wrong in ((who, np.array(wrong)) for who, wrong in off.items()):
+        for who, elsewhere in off.items():
+            wrong = np.array(elsewhere)
             if wrong.any():
                 found[SENSOR_RAYS if who == "sensor" else LASER_RAYS] = (
                     f"{wrong.sum()} of {len(wrong)} rays of the {who} do not end at their points of the wall, for the "
@@ -244,23 +196,6 @@ class ScanWatch:
                 "has no gradient that would bring it back."
             )
         return found
-
-
-def _rays(origin: Any, way: Any) -> tuple[Any, Any]:
-    """Rays (Ray3f) along ways, and their lengths."""
-    import drjit as dr
-    import mitsuba as mi
-
-    length = dr.norm(way)
-    return mi.Ray3f(origin, way / length), length
-
-
-def _end_elsewhere(scene: Any, ray: Any, length: Any, tolerance: Any) -> Any:
-    """Return a mask of rays that meet something before their length, or nothing there; NaN is elsewhere, too."""
-    import drjit as dr
-
-    met = scene.ray_intersect_preliminary(ray, coherent=True)
-    return ~(dr.abs(met.t - length) <= tolerance)
 
 
 def _normals(scene: Any, ray: Any) -> Any:
@@ -330,9 +265,7 @@ class CaptureRenderer(nn.Module):
         **settings: Any,
     ):
         super().__init__()
-        of_class("CaptureRenderer: scan", scan, Scan)
-        check_sensor("CaptureRenderer", sensor)
-        wanted = _keys_and_values("CaptureRenderer", "parameters", parameters)
+        wanted = dict(parameters) if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
         settings["spp"] = checked_samples("CaptureRenderer: spp", settings.get("spp"))
         if settings.get("max_depth") is not None:
             raise ArgumentError("CaptureRenderer: max_depth: bounces= says how far light is followed; leave it out.")
@@ -380,19 +313,17 @@ class CaptureRenderer(nn.Module):
         """Render a :class:`Capture`.
 
         Args:
-            values, seed, spp, progress: as in :meth:`TransientRenderer.forward`; seeds are below 2^32.
+            values, seed, spp, progress: as in :meth:`TransientRenderer.forward`.
             generator: of the noise of ``sensor``.
 
         Raises:
-            SceneError, ArgumentError: as there, and for other seeds, which modulo 2^32 are those of others.
+            SceneError, ArgumentError: as there.
         """
-        _check_seeds("CaptureRenderer", seed)
-        check_sensor("CaptureRenderer", self.sensor, generator)
         checked_samples("CaptureRenderer: spp", spp)
         self._sources.check()
         given = _attached(self.scan)
         if values is not None:
-            given |= _keys_and_values("CaptureRenderer", "values", values)
+            given |= dict(values)
         out = self.renderer(given, seed=seed, spp=spp, progress=progress)
         self._say_black(out)
         capture = as_capture(out, self._scan_of(given), sensor=self.sensor, generator=generator)
@@ -523,8 +454,7 @@ def _check_once(parameters: Mapping[str, Any], followed: Mapping[str, torch.Tens
     twice = [key for key in parameters if key in followed]
     if twice:
         raise SceneError(
-            f"CaptureRenderer: {', '.join(twice)}: expected one tensor, got one of the scan, which requires gradients, "
-            "and one of parameters=. Leave the key out of parameters, or take scan.detach()."
+            f"CaptureRenderer: {', '.join(twice)}: expected one tensor, got one of the scan too. Take scan.detach()."
         )
 
 
@@ -557,12 +487,9 @@ def as_capture(
     def shaped(tensor: torch.Tensor | None) -> torch.Tensor | None:
         return None if tensor is None else in_scan_shape(tensor, scan)
 
-    other = next((name for name in ("gated", "rates", "beats") if getattr(out, name) is not None), None)
-    if other is not None:
-        asked = {"gated": "gates", "rates": "rates", "beats": "chirps"}[other]
+    if out.transient is None and out.phasor is None:
         raise ArgumentError(
-            f"capture: expected a time axis or frequencies; a capture has no place for {other} light. Render its scene "
-            f"with tt.TransientRenderer(tt.nlos.capture_scene(...), {asked}=...)."
+            "capture: expected a time axis or frequencies; a capture has no place for light of other films."
         )
     transient = out.transient
     if sensor is not None:

@@ -12,7 +12,7 @@ import torch
 from torchtransient import scenes
 from torchtransient.array_files.array_file import read_some
 from torchtransient.capture import Scan
-from torchtransient.checks import MOST, as_number, as_whole, checked_mesh, of_class, shown
+from torchtransient.checks import as_whole, checked_mesh, shown
 from torchtransient.errors import SceneError, StorageError, TorchTransientError, UnitError
 from torchtransient.scene.edits import BuildOptions
 from torchtransient.scene.load import load
@@ -52,17 +52,14 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix == ".xml":
         raise SceneError(
-            f"{where}: {str(path)!r} is a complete scene, with a sensor of its own; leave scan out to simulate it as "
-            "it is: tt.nlos.simulate(path)."
+            f"{where}: '{path}' is a complete scene; leave scan out to simulate it: tt.nlos.simulate(path)."
         )
     if suffix not in _MESH_FILES:
         raise SceneError(f"{where}: expected a mesh file ({', '.join(_MESH_FILES)}), got {str(path)!r}.")
     if not path.is_file():
         raise SceneError(f"{where}: no file {str(path)!r}, seen from {Path.cwd()}. Give the path of a mesh.")
     if suffix == ".npz":
-        shape = mesh_arrays_shape(*mesh_of_npz(path, where), where)
-        del shape["bsdf"]
-        return shape
+        return _mesh(*mesh_of_npz(path, where), where)
     return {"type": _PLUGINS[suffix], "filename": str(path), "face_normals": True}
 
 
@@ -131,11 +128,9 @@ def capture_scene(
             and for a scan without a wall.
         UnitError: for an energy below zero.
     """
-    of_class("capture: scan", scan, Scan)
     if scan.wall is None:
         raise SceneError(
-            "capture: expected a scan that knows its wall, got one of points alone. Make it with Scan.grid(wall, ...) "
-            "or Scan.points(..., wall=...)."
+            "capture: expected a scan that knows its wall: Scan.grid(wall, ...) or Scan.points(..., wall=...)."
         )
     _check_energy(energy)
     first, last = _range(bounces)
@@ -198,9 +193,9 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
             return shapes
         return {"hidden": dict(hidden)}
     if isinstance(hidden, (tuple, list)) and len(hidden) == 2:
-        return {"hidden": _mesh(*hidden)}
+        return {"hidden": _mesh(hidden[0], hidden[1], "hidden")}
     if hasattr(hidden, "vertices") and hasattr(hidden, "faces"):
-        return {"hidden": _mesh(hidden.vertices, hidden.faces)}
+        return {"hidden": _mesh(hidden.vertices, hidden.faces, "hidden")}
     raise SceneError(
         "hidden: expected a Mitsuba shape dictionary, a dictionary of them, (vertices, faces), an object with vertices "
         f"and faces, or a mesh file, got {type(hidden).__name__}."
@@ -213,8 +208,7 @@ def film_size(scan: Scan) -> tuple[int, int]:
     Args:
         scan: of the capture.
     """
-    shape = scan.sensor_shape
-    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0])
+    return _rows_and_columns(scan.sensor_shape)
 
 
 def laser_size(scan: Scan) -> tuple[int, int]:
@@ -223,8 +217,12 @@ def laser_size(scan: Scan) -> tuple[int, int]:
     Args:
         scan: of the capture.
     """
-    shape = scan.laser_shape
-    return (shape[0], shape[1]) if len(shape) > 1 else (1, shape[0] if shape else 1)
+    return _rows_and_columns(scan.laser_shape)
+
+
+def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:
+    rows, columns = (1, 1, *shape)[-2:]
+    return rows, columns
 
 
 def _check_shapes(shapes: Mapping[str, Any]) -> None:
@@ -233,12 +231,10 @@ def _check_shapes(shapes: Mapping[str, Any]) -> None:
     for name, node in shapes.items():
         if not isinstance(node, Mapping) or "type" not in node:
             raise SceneError(f"hidden: expected {name!r} as a dictionary with a type, got {shown(node)}.")
-        found = [key for key in ("sensor", "integrator") if key == name]
         kind = str(node["type"])
-        if found or kind.startswith("transient_") or kind.endswith("_capture_meter"):
+        if name in ("sensor", "integrator") or kind.startswith("transient_") or kind.endswith("_capture_meter"):
             raise SceneError(
-                f"hidden: {name!r} ({kind}) is no hidden thing: sensor, laser and integrator come from the scan. Leave "
-                "it out, or render a complete scene with tt.TransientRenderer."
+                f"hidden: {name!r} ({kind}) is no hidden thing: the capture brings sensor, laser and integrator."
             )
         _check_dark(node, name)
 
@@ -247,8 +243,7 @@ def _check_dark(node: Mapping[str, Any], where: str) -> None:
     """Raise SceneError for light among hidden things."""
     if str(node.get("type")) in _LIGHTS:
         raise SceneError(
-            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone: the one light of a capture is the "
-            "laser. Leave it out, or render a complete scene with tt.TransientRenderer."
+            f"hidden: {where!r} ({node['type']}) emits light; expected shapes alone beside the laser. Leave it out."
         )
     for name, part in node.items():
         if isinstance(part, Mapping):
@@ -256,18 +251,13 @@ def _check_dark(node: Mapping[str, Any], where: str) -> None:
 
 
 def _check_energy(energy: Any) -> None:
-    """Raise UnitError for numbers that no laser brings, SceneError for what is no spectrum."""
-    if isinstance(energy, Mapping):
-        return
-    joules = as_number(energy)
-    if joules is None:
-        raise SceneError(f"energy: expected joules, or a spectrum as a Mitsuba dictionary, got {shown(energy)}.")
-    if not 0 <= joules < _MOST_ENERGY:
+    """Raise UnitError for numbers that no laser brings."""
+    if not isinstance(energy, Mapping) and not 0 <= energy < _MOST_ENERGY:
         raise UnitError(f"energy: expected joules of at least 0, got {shown(energy)} (of {_MOST_ENERGY:g} at most).")
 
 
-def _mesh(vertices: Any, faces: Any) -> dict[str, Any]:
-    points, triangles = checked_mesh("hidden", vertices, faces)
+def _mesh(vertices: Any, faces: Any, where: str) -> dict[str, Any]:
+    points, triangles = checked_mesh(where, vertices, faces)
     return {"type": "mesh_arrays", "vertices": points, "faces": triangles}
 
 
@@ -275,11 +265,9 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     """The first and the last number that counts; -1 for no limit."""
     if isinstance(bounces, str) and bounces == ALL_BOUNCES:
         return 0, -1
-    several = isinstance(bounces, (tuple, list, range)) or getattr(bounces, "ndim", 0) == 1
-    given = [as_whole(n) for n in (bounces if several else [bounces])]
-    numbers = sorted(n for n in given if n is not None and 2 <= n < MOST)
-    numbers = numbers if len(numbers) == len(given) else []
-    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+    given = [bounces] if np.ndim(bounces) == 0 else list(bounces)
+    numbers = sorted(n for n in map(as_whole, given) if n is not None)
+    if not numbers or numbers != list(range(numbers[0], numbers[0] + len(given))) or numbers[0] < 2:
         raise SceneError(
             "bounces: expected whole numbers of at least 2 without gaps, such as (3,) or (3, 4, 5), or 'all', "
             f"got {shown(bounces)}. The laser's spot is the first bounce, so light around one corner has 3."
@@ -287,10 +275,8 @@ def _range(bounces: Sequence[int] | str) -> tuple[int, int]:
     return numbers[0], numbers[-1]
 
 
-def _numbers(values: Any) -> np.ndarray:
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().numpy()
-    return np.asarray(values, dtype=np.float64)
+def _numbers(points: torch.Tensor) -> np.ndarray:
+    return points.detach().cpu().numpy()
 
 
 def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:

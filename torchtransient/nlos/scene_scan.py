@@ -44,7 +44,7 @@ class Ends:
         return Ends(points, normals, [self.shapes[i] for i in which], origins, directions)
 
 
-def scan_of_scene(scene: Any, number: int = 0) -> Scan:
+def scan_of_scene(scene: Any) -> Scan:
     """Return the scan that a built scene's sensor, laser and integrator ``transient_nlos_path`` make, without a wall.
 
     Points are the ends of the rays of pixel centres, rows as the film has them; where some look past the wall, a
@@ -52,17 +52,15 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
 
     Args:
         scene: a built Mitsuba scene.
-        number: of the sensor.
 
     Raises:
         SceneError: for another integrator, a laser that has no spot, rays that meet nothing or the back of a wall, and
             spots of a confocal capture that are no sensor points.
     """
-    integrator, sensor = scene.integrator(), scene.sensors()[number]
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
     if not hasattr(integrator, "capture"):
         raise SceneError(
-            f"simulate: expected a scene with the integrator transient_nlos_path, got {class_of(integrator)}. "
-            f"{_REMEDY}"
+            f"simulate: expected a scene with the integrator transient_nlos_path, got {class_of(integrator)}. {_REMEDY}"
         )
     sensor, film = integrator.resolve(scene, sensor)
     kind = integrator.capture.name.lower()
@@ -80,7 +78,13 @@ def scan_of_scene(scene: Any, number: int = 0) -> Scan:
         _check_same(spots.of(there), seen.points[there], seen.points, "laser")
         laser_points, laser_normals = points, normals
     else:
-        _check_all_meet(spots)
+        missed = spots.missed()
+        if len(missed):
+            way = np.array2string(spots.directions[missed[0]], precision=4)
+            raise SceneError(
+                f"scan: {len(missed)} of the laser's {len(spots.shapes)} beams meet nothing, the first is number "
+                f"{missed[0]}, along {way}. Aim the laser at the relay wall."
+            )
         grid = (film.laser_scan_height, film.laser_scan_width, 3)
         shape: Any = {"single": (3,), "pairs": points.shape}.get(kind, grid)
         laser_points, laser_normals = spots.points.reshape(shape), spots.normals.reshape(shape)
@@ -148,8 +152,7 @@ def _laser_ends(scene: Any, sensor: Any, integrator: Any) -> tuple[NDArray[np.fl
     laser = laser_of(scene)
     if laser.get_shape() is not None or mi.has_flag(laser.flags(), mi.EmitterFlags.Infinite):
         raise SceneError(
-            f"simulate: expected a laser whose beam falls on a spot, got the emitter {class_of(laser)}. Use "
-            f"laser_beam, projector or spot. {_REMEDY}"
+            f"simulate: expected a laser whose beam falls on a spot, got the emitter {class_of(laser)}. {_REMEDY}"
         )
     fov = None
     if integrator.capture is CaptureType.EXHAUSTIVE and not integrator.equal_grids:
@@ -244,31 +247,19 @@ def _on_extended_wall(ends: Ends, size: tuple[int, int]) -> tuple[Ends, NDArray[
     return Ends(points, normals, ends.shapes, ends.origins, ends.directions), met
 
 
-def _check_all_meet(spots: Ends) -> None:
-    missed = spots.missed()
-    if len(missed):
-        raise SceneError(
-            f"scan: {len(missed)} of the laser's {len(spots.shapes)} beams meet nothing in the scene, the first is "
-            f"number {missed[0]}, from {np.array2string(spots.origins[missed[0]], precision=4)} along "
-            f"{np.array2string(spots.directions[missed[0]], precision=4)}. Aim the laser at the relay wall."
-        )
-
-
 def _check_hidden(scene: Any, wall: Ends) -> None:
     """Raise SceneError unless a shape that rays do not meet reaches before the wall."""
     seen = set(wall.shapes)
     hidden = [shape for shape in scene.shapes() if (shape.id() or class_of(shape)) not in seen]
     if not hidden:
         raise SceneError(
-            "hidden: expected at least one shape beside the wall, got none: a capture around a corner of nothing. Add "
-            "the hidden things as shapes."
+            "hidden: expected at least one shape beside the wall, got none. Add the hidden things as shapes."
         )
     _check_areas(hidden)
     if reaches_before(hidden, wall.points, wall.normals):
         return
     raise SceneError(
-        "hidden: expected something before the wall, on the side that its normals point to, got nothing there: what is "
-        "behind it sends it no light. Move the hidden things or turn the wall (flip_normals)."
+        "hidden: expected something before the wall, got nothing there. Move it, or turn the wall (flip_normals)."
     )
 
 
@@ -306,10 +297,7 @@ def _check_areas(shapes: list[Any]) -> None:
     if not all(np.isfinite(area) for area in areas.values()):
         raise SceneError(f"hidden: expected shapes of finite area, got {told}. Give lengths in metres.")
     if not any(area > 0 for area in areas.values()):
-        raise SceneError(
-            f"hidden: expected shapes with an area that light falls on, got {told}. Give triangles whose corners are "
-            "not all in a row, and scales other than 0."
-        )
+        raise SceneError(f"hidden: expected shapes with an area that light falls on, got {told}.")
 
 
 def _check_same(ends: Ends, points: NDArray[np.float64], scanned: NDArray[np.float64], who: str) -> None:

@@ -17,6 +17,7 @@ Only `hidden` and `scan` must be there.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -129,20 +130,13 @@ def _shape(entry: Mapping[str, Any], kind: str, where: str, folder: Path) -> dic
         shape["to_world"] = place
     if section.flag("flip_normals", False):
         shape["flip_normals"] = True
-    if "bsdf" in section and "albedo" in section:
+    bsdf = section.get("bsdf", None)
+    if bsdf is not None and "albedo" in section:
         raise SceneError(f"{where}: albedo and bsdf exclude each other; give one.")
-    shape["bsdf"] = _bsdf(section) if "bsdf" in section else diffuse(_albedo(section))
+    if bsdf is not None and not (isinstance(bsdf, Mapping) and isinstance(bsdf.get("type"), str)):
+        raise SceneError(f"{where}: bsdf: expected a dictionary of Mitsuba with a type, got {shown(bsdf)}.")
+    shape["bsdf"] = diffuse(_albedo(section)) if bsdf is None else dict(bsdf)
     return shape
-
-
-def _bsdf(section: Section) -> dict[str, Any]:
-    given = section.get("bsdf")
-    if not isinstance(given, Mapping) or not isinstance(given.get("type"), str):
-        raise SceneError(
-            f"{section.where}: bsdf: expected a dictionary of Mitsuba, {{type: conductor}} for instance, got "
-            f"{shown(given)}."
-        )
-    return dict(given)
 
 
 def _albedo(section: Section, default: float = 0.5) -> Any:
@@ -160,16 +154,14 @@ def _place(section: Section) -> Matrix | None:
         if not isinstance(rows, list) or len(rows) != 4:
             raise SceneError(f"{section.where}: to_world: expected four rows of four numbers, got {shown(rows)}.")
         return np.array([Section({"row": row}, section.where, ("row",)).numbers("row", (4,)) for row in rows])
-    matrix = None
+    steps = []
     if "scale" in section:
         size = section.get("scale")
-        matrix = scale(section.numbers("scale", (3,)) if isinstance(size, list) else section.number("scale"))
-    for turn in _turns(section):
-        matrix = turn if matrix is None else turn @ matrix
+        steps.append(scale(section.numbers("scale", (3,)) if isinstance(size, list) else section.number("scale")))
+    steps += _turns(section)
     if "translate" in section:
-        moved = translate(section.numbers("translate", (3,)))
-        matrix = moved if matrix is None else moved @ matrix
-    return matrix
+        steps.append(translate(section.numbers("translate", (3,))))
+    return functools.reduce(lambda before, step: step @ before, steps) if steps else None
 
 
 def _turns(section: Section) -> list[Matrix]:
@@ -177,8 +169,7 @@ def _turns(section: Section) -> list[Matrix]:
     pairs = [given] if _is_pair(given) else given
     if not isinstance(pairs, list) or not all(map(_is_pair, pairs)):
         raise SceneError(
-            f"{section.where}: rotate: expected [[x, y, z], degrees], [[0, 1, 0], 30] for instance, or a list of "
-            f"those, got {shown(given)}."
+            f"{section.where}: rotate: expected [[x, y, z], degrees] or a list of those, got {shown(given)}."
         )
     turns = []
     for pair in pairs:
@@ -204,14 +195,15 @@ _SCAN_ENTRIES = (
 def _of_description(data: Mapping[str, Any], folder: Path, name: str) -> dict[str, Any]:
     if "hidden" not in data:
         raise SceneError(
-            f"{name}: expected an entry 'hidden' (a capture of torchtransient) or 'geometry' (a scene of y-tal), got "
-            f"{', '.join(map(str, data))}."
+            f"{name}: expected an entry 'hidden' (or 'geometry' of y-tal), got {', '.join(map(str, data))}."
         )
     section = Section(data, "capture description", _ENTRIES)
     section.text("name", "")
     hidden = described_shapes(section.get("hidden"), folder)
     scan = scan_of(section.get("scan"), wall_of(section.get("wall", {}), folder))
-    frequencies = _frequencies(section)
+    listed = section.get("frequencies", None)
+    listed = [listed] if isinstance(listed, int | float | str) else listed
+    frequencies = None if listed is None else FrequencyAxis(tuple(as_number(one, "frequencies") for one in listed))
     if frequencies is not None and "time_axis" in section:
         raise SceneError("capture description: time_axis and frequencies exclude each other; give one.")
     return {
@@ -286,48 +278,24 @@ def _given(section: Section, counts: Mapping[str, tuple[int, ...]]) -> dict[str,
 
 
 def _axis(data: Any, scan: Scan, hidden: Mapping[str, Any]) -> TimeAxis:
-    seconds = isinstance(data, Mapping) and any(str(name).endswith("_s") for name in data)
-    start, width = ("start_s", "bin_width_s") if seconds else ("start_opl", "bin_width_opl")
-    section = Section(data, "time_axis", (start, width, "num_bins"))
-    whole = start in section and "num_bins" in section
-    if seconds:
-        if not whole:
-            raise SceneError("time_axis: expected start_s, bin_width_s and num_bins, or lengths (start_opl, ...).")
-        return TimeAxis.from_seconds(section.number(start), section.number(width), section.whole("num_bins"))
-    size = section.number(width, DEFAULT_BIN_WIDTH_OPL)
-    if whole:
-        return TimeAxis(section.number(start), size, section.whole("num_bins"))
-    if start in section or "num_bins" in section:
+    section = Section(data, "time_axis", ("start_opl", "bin_width_opl", "num_bins"))
+    width = section.number("bin_width_opl", DEFAULT_BIN_WIDTH_OPL)
+    if "start_opl" in section and "num_bins" in section:
+        return TimeAxis(section.number("start_opl"), width, section.whole("num_bins"))
+    if "start_opl" in section or "num_bins" in section:
         raise SceneError("time_axis: expected start_opl and num_bins together, or neither, got one of them.")
     try:
-        return scan.default_axis(bounds(dict(hidden)), size)
+        return scan.default_axis(bounds(dict(hidden)), width)
     except SceneError as error:
         raise SceneError(f"time_axis: bins can be found for shapes alone whose size is known here; {error}") from error
-
-
-def _frequencies(section: Section) -> FrequencyAxis | None:
-    given = section.get("frequencies", None)
-    if given is None:
-        return None
-    if isinstance(given, list):
-        return FrequencyAxis(tuple(as_number(value, "frequencies") for value in given))
-    part = Section(given, "frequencies", ("first", "step", "count", "start_opl"))
-    return FrequencyAxis.uniform(
-        part.number("first"), part.number("step"), part.whole("count"), start_opl=part.number("start_opl", 0.0)
-    )
 
 
 def _bounces(section: Section) -> tuple[int, ...] | str:
     given = section.get("bounces", list(DEFAULT_BOUNCES))
     if given == ALL_BOUNCES:
         return ALL_BOUNCES
-    wanted = given if isinstance(given, list) else [given]
-    numbers = [as_number(value, "bounces") for value in wanted]
-    if not numbers or any(number != round(number) or number < 1 for number in numbers):
-        raise SceneError(
-            f"bounces: expected whole numbers of at least 1, [3] for instance, or 'all', got {shown(given)}."
-        )
-    return tuple(sorted({int(number) for number in numbers}))
+    several = given if isinstance(given, list) else [given]
+    return tuple(sorted({Section({"a number": n}, "bounces", ("a number",)).whole("a number") for n in several}))
 
 
 def _sensor(given: Any, folder: Path) -> Device | None:

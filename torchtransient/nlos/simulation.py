@@ -8,14 +8,14 @@ that were done keep their bits.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
-import os
 import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,7 +25,7 @@ import torch
 from torchtransient.array_files.array_file import path_of
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import Numbers, count, of_class
+from torchtransient.checks import Numbers, count
 from torchtransient.errors import ArgumentError, PhysicsWarning, StorageError
 from torchtransient.files.content_key import content_key, contents_of
 from torchtransient.nlos.part_file import PartFile, RowLayout, Rows
@@ -35,7 +35,6 @@ from torchtransient.nlos.renderer import (
     CaptureRenderer,
     as_capture,
     check_scan,
-    check_sensor,
     checked_module,
     checked_seed,
     in_film_shape,
@@ -432,9 +431,15 @@ def simulate(
             to another simulation, is damaged, or is worked on by another process.
     """
     seed, path = checked_seed("simulate", seed), None if part is None else path_of(part, "simulate: part")
-    check_sensor("simulate", sensor, generator)
     work = _work(hidden, scan, time_axis, frequencies, spp, (bounces, energy), variant, _parts(scan, path, tiles))
-    chain = None if sensor is None else _chain(sensor, work.axes()[0])
+    chain, axis = None, work.axes()[0]
+    if sensor is not None:
+        if axis is None:
+            raise ArgumentError(
+                "simulate: a sensor takes transients, and phasors are asked for; leave out one of them."
+            )
+        # Counts as they are drawn: nothing of a simulation has gradients.
+        chain = checked_module(sensor, axis, "straight_through")
     part_file = nullcontext() if path is None else PartFile(path, work.key(seed))
     with part_file as kept, active_variant(work.variant.name), torch.no_grad():
         finished = kept is not None and all(_has(kept, work, number) for number in range(work.count))
@@ -479,16 +484,13 @@ def forecast(
         ArgumentError: for unknown arguments; others as :func:`simulate`.
     """
     checked_seed("forecast", settings.get("seed", DEFAULT_SEED))
-    time_axis, frequencies, spp, *of_light = (
-        settings.pop(name, None) for name in ("time_axis", "frequencies", "spp", "bounces", "energy")
-    )
-    unknown = sorted(set(settings) - {"seed", "sensor", "keep_part", "progress", "generator"})
+    unknown = sorted(settings.keys() - inspect.signature(simulate).parameters.keys())
     if unknown:
         raise ArgumentError(f"forecast: expected the arguments of simulate, got {', '.join(unknown)}.")
+    time_axis, frequencies, spp = (settings.get(name) for name in ("time_axis", "frequencies", "spp"))
+    of_light = settings.get("bounces"), settings.get("energy")
     path = None if part is None else path_of(part, "simulate: part")
-    work = _work(
-        hidden, scan, time_axis, frequencies, spp, (of_light[0], of_light[1]), variant, _parts(scan, path, tiles)
-    )
+    work = _work(hidden, scan, time_axis, frequencies, spp, of_light, variant, _parts(scan, path, tiles))
     with active_variant(work.variant.name):
         return _forecast_of(work, timed=True)
 
@@ -505,11 +507,9 @@ def _work(
     spp = checked_samples("simulate: spp", spp)
     if scan is None:
         return _scene_work(hidden, time_axis, frequencies, spp, of_light, variant, parts)
-    of_class("simulate: scan", scan, Scan)
     if isinstance(hidden, Scene):
         raise ArgumentError(
-            "simulate: a tt.Scene has a sensor of its own; expected hidden shapes beside scan=. Leave scan out to "
-            "simulate the scene as it is, or give shapes by name."
+            "simulate: a tt.Scene has a sensor of its own. Leave scan out to simulate the scene as it is."
         )
     bounces, energy = of_light
     settings: dict[str, Any] = {
@@ -532,24 +532,16 @@ def _scene_work(
         ("bounces", "energy"), of_light, ("its integrator's max_depth and filter_bounces", "its laser"), strict=True
     ):
         if value is not None:
-            raise ArgumentError(
-                f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out, or give scan= and "
-                "hidden shapes."
-            )
+            raise ArgumentError(f"simulate: {name} has no effect on a complete scene: {where} say so. Leave it out.")
     if isinstance(scene, Mapping) and not _is_complete(scene):
         raise ArgumentError(
             "simulate: expected scan= beside hidden shapes, or a complete scene with integrator, laser and sensor, got "
             f"{', '.join(map(str, scene)) or 'nothing'} and no scan. Make one with tt.nlos.Scan.grid(wall, ...)."
         )
-    if not isinstance(scene, str | os.PathLike | Mapping | Scene):
-        raise ArgumentError(
-            f"simulate: expected scan= beside a mesh, or a complete scene, got {type(scene).__name__} and no scan."
-        )
     loaded = load(scene)
-    given = variant
-    if given is None and isinstance(scene, Scene):
-        given = scene._requested_variant
-    chosen = _choose_variant(loaded, given)
+    if variant is None and isinstance(scene, Scene):
+        variant = scene._requested_variant
+    chosen = _choose_variant(loaded, variant)
     return SceneWork(load(loaded, variant=chosen.name), time_axis, frequencies, spp, chosen, parts)
 
 
@@ -598,7 +590,7 @@ def _in_parts(work: Work, seed: int, kept: PartFile | None, progress: bool) -> t
                 rows = np.empty((points, layout.columns), np.float32) if rows is None else rows
                 rows[slice(*work.run(number))] = part
             if kept is not None:
-                about = layout.plain()
+                about = asdict(layout)
                 kept.keep(number, first, part, total=total, seconds=seconds, about=about, instead_of=before)
             bar.update(1)
     assert layout is not None
@@ -617,14 +609,3 @@ def _slot(number: int, points: int) -> int:
 
 def _has(kept: PartFile, work: Work, number: int) -> bool:
     return kept.last is not None and number <= kept.last if isinstance(work, SceneWork) else kept.has(number)
-
-
-# -------------------------------------------------------------------------------------------------------------- results
-
-
-def _chain(sensor: torch.nn.Module | Device, axis: TimeAxis | None) -> torch.nn.Module:
-    if axis is None:
-        raise ArgumentError("simulate: a sensor takes transients, and phasors are asked for; leave out one of them.")
-    # Counts as they are drawn: nothing of a simulation has gradients.
-    return checked_module(sensor, axis, "straight_through")
-

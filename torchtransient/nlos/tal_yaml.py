@@ -189,15 +189,9 @@ def _check_supported(section: Section) -> None:
     ):  # fmt: skip
         section.flag(name, True)
     if not section.flag("integrator_nlos_laser_sampling", True):
-        raise SceneError(
-            "y-tal scene: integrator_nlos_laser_sampling: false is not supported: the laser lights a point of the "
-            "wall, which paths are connected to. Leave the entry out."
-        )
+        raise SceneError("y-tal scene: integrator_nlos_laser_sampling: false is not supported. Leave the entry out.")
     if section.flag("auto_detect_bins", False):
-        raise SceneError(
-            "y-tal scene: auto_detect_bins: true is not supported (y-tal's renderer leaves it out too). Give start_opl "
-            "and num_bins; Scan.default_axis suggests some."
-        )
+        raise SceneError("y-tal scene: auto_detect_bins: true is not supported. Give start_opl and num_bins.")
 
 
 def _frequencies(section: Section, axis: TimeAxis) -> FrequencyAxis | None:
@@ -242,10 +236,7 @@ def _geometry(section: Section, folders: Sequence[Path]) -> tuple[Wall, dict[str
     shapes = {name: _shape(part, name, folders) for name, part in zip(names, parts, strict=True)}
     wall = shapes.pop(wall_name)
     if wall["type"] != "rectangle":
-        raise SceneError(
-            f"y-tal scene: the relay wall {wall_name!r} is of type {wall['type']}; only a rectangle is supported here. "
-            "tt.nlos.Scan.grid((vertices, faces), ...) scans curved walls."
-        )
+        raise SceneError(f"y-tal scene: expected a rectangle as relay wall, got {wall_name!r} of type {wall['type']}.")
     if not shapes:
         raise SceneError("y-tal scene: geometry: expected a hidden shape beside the relay wall, got none.")
     return Wall.of(wall), shapes
@@ -289,7 +280,10 @@ def _scan(section: Section, wall: Wall) -> Scan:
     if kind == "single":
         laser = _looked_at(section, "x", size[0]), _looked_at(section, "y", size[1])
         return Scan.grid(wall, size, kind=kind, laser=laser, first_and_last_leg=legs, **origins)
-    aperture, laser_size = _aperture(section), _laser_size(section)
+    names = (("start_x", 0.0), ("start_y", 0.0), ("end_x", 1.0), ("end_y", 1.0))
+    aperture = tuple(float(section.number(f"laser_aperture_{name}", default)) for name, default in names)
+    given = "laser_width" in section or "laser_height" in section
+    laser_size = (section.whole("laser_width", 32), section.whole("laser_height", 32)) if given else None
     if kind == "confocal" or _equal_grids(section):
         if aperture != (0.0, 0.0, 1.0, 1.0) or (laser_size and laser_size != size):
             raise SceneError(
@@ -312,22 +306,9 @@ def _looked_at(section: Section, axis: str, pixels: int) -> float:
     value = section.number(name, pixels / 2)
     if not 0 < value <= pixels:
         raise SceneError(
-            f"y-tal scene: {name}: expected null, or a number above 0 and at most {pixels}, got {value:g} (y-tal "
-            "takes 0 for null)."
+            f"y-tal scene: {name}: expected a number above 0 up to {pixels}, got {value:g} (y-tal takes 0 for null)."
         )
     return float(value / pixels)
-
-
-def _laser_size(section: Section) -> tuple[int, int] | None:
-    if "laser_width" not in section and "laser_height" not in section:
-        return None
-    return section.whole("laser_width", 32), section.whole("laser_height", 32)
-
-
-def _aperture(section: Section) -> tuple[float, float, float, float]:
-    names = (("start_x", 0.0), ("start_y", 0.0), ("end_x", 1.0), ("end_y", 1.0))
-    u0, v0, u1, v1 = (float(section.number(f"laser_aperture_{name}", default)) for name, default in names)
-    return u0, v0, u1, v1
 
 
 def _equal_grids(section: Section) -> bool:

@@ -4,7 +4,6 @@ from torchtransient.reconstruction.backprojection import Backprojection as Backp
 from torchtransient.reconstruction.backprojection import FilteredBackprojection as FilteredBackprojection
 from torchtransient.reconstruction.backprojection import backproject as backproject
 from torchtransient.reconstruction.backprojection import filtered_backproject as filtered_backproject
-from torchtransient.reconstruction.captures import StabilizedRoot as StabilizedRoot
 from torchtransient.reconstruction.captures import stabilized_root as stabilized_root
 from torchtransient.reconstruction.captures import subtract_legs as subtract_legs
 from torchtransient.reconstruction.diffusion import DiffusionDeconvolution as DiffusionDeconvolution
@@ -26,9 +25,6 @@ from torchtransient.reconstruction.phasor_field import TransientCamera as Transi
 from torchtransient.reconstruction.phasor_field import phasor_image as phasor_image
 from torchtransient.reconstruction.surfaces import DepthMap as DepthMap
 from torchtransient.reconstruction.surfaces import depth_map as depth_map
-from torchtransient.reconstruction.surfaces import normals_from_depth as normals_from_depth
-from torchtransient.reconstruction.surfaces import normals_from_volume as normals_from_volume
-from torchtransient.reconstruction.surfaces import soft_depth as soft_depth
 from torchtransient.reconstruction.voxels import HiddenVolume as HiddenVolume
 from torchtransient.reconstruction.voxels import PlanarScan as PlanarScan
 from torchtransient.reconstruction.voxels import VoxelGrid as VoxelGrid

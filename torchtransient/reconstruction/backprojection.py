@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import finite, shown
-from torchtransient.errors import ArgumentError, UnitError
-from torchtransient.reconstruction.capture_checks import check_falloff, check_wavelength, checked_axis
-from torchtransient.reconstruction.filters import PhasorFilter, ReconstructionFilter, sample_places
+from torchtransient.checks import finite
+from torchtransient.errors import UnitError
+from torchtransient.reconstruction.capture_checks import check_wavelength
+from torchtransient.reconstruction.filters import LaplacianFilter, PhasorFilter, sample_places
 from torchtransient.reconstruction.transient_operator import ScanOperator, reconstructed
 from torchtransient.reconstruction.voxels import VoxelGrid
 
@@ -58,11 +59,13 @@ class EllipsoidOperator(ScanOperator):
         time_axis: of the transients.
         falloff: p of the factor (r_laser r_sensor)^-p, distances in metres, none of them below half a bin.
         dtype: float32 or float64.
-        samples: values of a row in each bin, see :func:`sample_places`.
 
     Raises:
-        UnitError: for a falloff that is not finite or beyond the range of the precision.
+        UnitError: for a falloff that is not finite.
     """
+
+    # Values of a row in each bin, see :func:`sample_places`.
+    samples = 1
 
     def __init__(
         self,
@@ -70,14 +73,13 @@ class EllipsoidOperator(ScanOperator):
         points: VoxelGrid | Tensor,
         *,
         time_axis: TimeAxis,
-        falloff: float,
-        dtype: torch.dtype,
-        samples: int = 1,
+        falloff: float = 0.0,
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
         self.falloff = finite(f"{type(self).__name__}: falloff", falloff)
-        self.samples, self.step = samples, time_axis.bin_width_opl / samples
-        first, last = sample_places(time_axis.num_bins, samples)
+        self.step = time_axis.bin_width_opl / self.samples
+        first, last = sample_places(time_axis.num_bins, self.samples)
         self.row_length = last - first
         self._set_tables()
 
@@ -99,7 +101,11 @@ class EllipsoidOperator(ScanOperator):
         if scan.kind in ("confocal", "pairs"):
             bins, spots = bins + spots, torch.zeros_like(spots)
         voxels = self.points.reshape(-1, 3)
-        self._check_lengths(voxels - middle, sensors - middle, lasers - middle)
+        longest = 2.0 * max(float((some - middle).abs().max()) for some in (voxels, sensors, lasers))
+        if not longest < 1e9 * width:
+            raise UnitError(
+                f"{type(self).__name__}: expected points within 1e9 bins, got some {longest / width:.3g} bins away."
+            )
         return {
             "voxels": ((voxels - middle) / width).T.contiguous(),
             "sensors": ((sensors - middle) / width).T.contiguous(),
@@ -107,17 +113,6 @@ class EllipsoidOperator(ScanOperator):
             "sensor_bins": bins,
             "laser_bins": spots,
         }
-
-    def _check_lengths(self, voxels: Tensor, sensors: Tensor, lasers: Tensor) -> None:
-        who, half = type(self).__name__, self.axis.bin_width_opl / 2
-        longest = 2.0 * float(voxels.abs().max() + sensors.abs().max() + lasers.abs().max())
-        if not longest < 1e9 * self.step:
-            raise UnitError(
-                f"{who}: expected points within 1e9 bins of each other, got some {longest / self.step:.3g} bins away. "
-                "Lengths are in metres."
-            )
-        near = max(half, _apart(voxels, sensors)) * max(half, _apart(voxels, lasers))
-        check_falloff(self.falloff, near, longest**2, self.dtype, who)
 
     voxels: Tensor
     sensors: Tensor
@@ -139,7 +134,7 @@ class EllipsoidOperator(ScanOperator):
         """
         out = self.voxels.new_zeros(items, self.voxels.shape[1])
         for group in self.groups():
-            padded = self._padded(rows_of(group))
+            padded = functional.pad(rows_of(group), (_BEFORE, _PAD - _BEFORE))
             slopes = padded.diff(dim=-1, append=padded[..., :1] * 0).reshape(items, -1)
             padded = padded.reshape(items, -1)
             for tile, index, fraction, weight in self._blocks(group):
@@ -168,11 +163,6 @@ class EllipsoidOperator(ScanOperator):
                     rows[n].index_add_(0, after, late.reshape(-1))
             yield group, rows.view(items, -1, length)[..., _BEFORE : _BEFORE - _PAD]
 
-    def _padded(self, rows: Tensor) -> Tensor:
-        out = rows.new_zeros(*rows.shape[:-1], rows.shape[-1] + _PAD)
-        out[..., _BEFORE : _BEFORE - _PAD] = rows
-        return out
-
     def _blocks(self, group: Group) -> Iterator[tuple[slice, Tensor, Tensor, Tensor | None]]:
         """Yield the pieces of a group: the voxels of a tile, (rows, voxels) indices into the padded rows of the group,
         fractions of a bin, and weights unless all are one.
@@ -188,22 +178,16 @@ class EllipsoidOperator(ScanOperator):
         for a in range(0, self.voxels.shape[1], size):
             tile = slice(a, min(a + size, self.voxels.shape[1]))
             voxels = self.voxels[:, tile]
-            first = None if confocal or pairs else _distances(self.lasers[:, group.lasers], voxels)
+            to_spots = None if confocal or pairs else _distances(self.lasers[:, group.lasers], voxels)
             for b in range(0, points, step):
                 part = slice(b, min(b + step, points))
                 last = _distances(sensors[:, part], voxels)
-                to_spot = _distances(self.lasers[:, group.sensors][:, part], voxels) if pairs else None
+                if pairs:
+                    to_spots = _distances(self.lasers[:, group.sensors][:, part], voxels)[None]
                 for spot in range(spots):
-                    if to_spot is not None:
-                        position = (last + to_spot).add_(bins[part, None])
-                        weight = self._weight(last, to_spot)
-                    elif first is None:
-                        position = (last + last).add_(bins[part, None])
-                        weight = self._weight(last, last)
-                    else:
-                        offset = bins[part, None] + self.laser_bins[group.lasers.start + spot]
-                        position = (last + first[spot]).add_(offset)
-                        weight = self._weight(last, first[spot])
+                    first = last if to_spots is None else to_spots[spot]
+                    position = (last + first).add_(bins[part, None] + self.laser_bins[group.lasers.start + spot])
+                    weight = self._weight(last, first)
                     # Lengths before the record read the zero in front of a row, those behind it the ones at its end.
                     position.clamp_(0, length - 2)
                     index = position.to(torch.int32)
@@ -249,12 +233,6 @@ class EllipsoidOperator(ScanOperator):
         """Write rows (items, R, T) to the place that :meth:`rows_of` reads."""
         part = split[:, :, group.lasers, group.sensors]
         part.copy_(rows.transpose(1, 2).reshape(part.shape))
-
-
-def _apart(a: Tensor, b: Tensor) -> float:
-    """Return the distance of the boxes around points (N, 3) and (M, 3), zero where they overlap."""
-    gaps = torch.maximum(a.amin(0) - b.amax(0), b.amin(0) - a.amax(0)).clamp_min(0)
-    return float(gaps.norm())
 
 
 def _distances(points: Tensor, voxels: Tensor) -> Tensor:
@@ -303,21 +281,10 @@ class Backprojection(EllipsoidOperator):
 
     Raises:
         ShapeError: for other scans, axes and points.
-        UnitError: for points that are not finite or far beyond the record, and for a falloff out of range.
+        UnitError: for points that are not finite or far beyond the record, and for a falloff that is not finite.
 
     Time grows with pairs times voxels (some 4 ns each on a core); memory beyond operands with neither.
     """
-
-    def __init__(
-        self,
-        scan: Scan,
-        points: VoxelGrid | Tensor,
-        *,
-        time_axis: TimeAxis,
-        falloff: float = 0.0,
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
-        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
         """Return ``adjoint`` of a transient.
@@ -334,8 +301,6 @@ class Backprojection(EllipsoidOperator):
         return self.adjoint(self.transients(transient))
 
     def map_(self, x: Tensor) -> Tensor:
-        if x.is_complex():
-            return torch.complex(self.map_(x.real), self.map_(x.imag))
         lead = x.shape[: x.ndim - len(self.volume_shape)]
         out = x.new_empty(*lead, *self.data_shape)
         split = self.split(out)
@@ -344,8 +309,6 @@ class Backprojection(EllipsoidOperator):
         return out
 
     def adjoint_(self, y: Tensor) -> Tensor:
-        if y.is_complex():
-            return torch.complex(self.adjoint_(y.real), self.adjoint_(y.imag))
         split = self.split(y)
         found = self.gather(lambda group: self.rows_of(split, group), len(split))
         lead = y.shape[: y.ndim - len(self.data_shape)]
@@ -354,7 +317,7 @@ class Backprojection(EllipsoidOperator):
 
 
 def filtered_backproject(
-    capture: Capture, points: VoxelGrid | Tensor, *, filter: ReconstructionFilter, falloff: float = 0.0
+    capture: Capture, points: VoxelGrid | Tensor, *, filter: PhasorFilter | LaplacianFilter, falloff: float = 0.0
 ) -> Tensor:
     """Backproject a capture behind a filter: :meth:`FilteredBackprojection.reconstruct` by its own scan and axis.
 
@@ -370,8 +333,9 @@ def filtered_backproject(
     Raises:
         ShapeError, UnitError: as the class.
     """
-    options = {"filter": filter, "falloff": falloff}
-    return reconstructed(capture, FilteredBackprojection, points, who="filtered_backproject", **options)
+    return reconstructed(
+        capture, FilteredBackprojection, points, who="filtered_backproject", filter=filter, falloff=falloff
+    )
 
 
 class FilteredBackprojection(EllipsoidOperator):
@@ -383,11 +347,9 @@ class FilteredBackprojection(EllipsoidOperator):
     Args:
         scan, points, time_axis, falloff, dtype: as of :class:`Backprojection`.
         filter: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019),
-            ``LaplacianFilter(sigma)`` (Velten et al. 2012), or an object with the methods of
-            :class:`ReconstructionFilter`.
+            or ``LaplacianFilter(sigma)`` (Velten et al. 2012).
 
     Raises:
-        ArgumentError: for other filters.
         ShapeError, UnitError: as :class:`Backprojection` and the filter.
 
     Rows are filtered a group at a time, at wavelengths below 16 bins with more than one sample a bin. Lines between
@@ -402,18 +364,14 @@ class FilteredBackprojection(EllipsoidOperator):
         points: VoxelGrid | Tensor,
         *,
         time_axis: TimeAxis,
-        filter: ReconstructionFilter,
+        filter: PhasorFilter | LaplacianFilter,
         falloff: float = 0.0,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if not callable(getattr(filter, "rows_adjoint", None)):
-            raise ArgumentError(
-                f"FilteredBackprojection: expected filter as a PhasorFilter or a LaplacianFilter, got {shown(filter)}."
-            )
-        width = checked_axis(time_axis, "FilteredBackprojection").bin_width_opl
+        width = time_axis.bin_width_opl
         filter.check(points if isinstance(points, VoxelGrid) else None, width, "FilteredBackprojection")
-        samples = filter.samples(width)
-        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype, samples=samples)
+        self.samples = filter.samples(width)
+        super().__init__(scan, points, time_axis=time_axis, falloff=falloff, dtype=dtype)
         if isinstance(filter, PhasorFilter):
             check_wavelength(filter.wavelength, self.scan, time_axis, "FilteredBackprojection")
         self.filter = filter
@@ -454,9 +412,6 @@ class FilteredBackprojection(EllipsoidOperator):
         volume = found if self.real_volume else _complex_items(found)
         lead = y.shape[: y.ndim - len(self.data_shape)]
         return self.filter.volume(volume.reshape(*lead, *self.volume_shape))
-
-    def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, {self.filter}"
 
 
 def _real_items(x: Tensor) -> Tensor:

@@ -6,12 +6,12 @@ import math
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.capture.capture import computed
-from torchtransient.checks import finite, shown
+from torchtransient.checks import finite
 from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import checked_capture
 
@@ -45,10 +45,7 @@ def subtract_legs(capture: Capture) -> Capture:
     skipped = max(0, math.ceil(-start / width - 1e-6))
     bins = axis.num_bins - skipped
     if bins < 1:
-        raise UnitError(
-            f"subtract_legs: expected a capture that is longer than its shortest legs, {float(legs.min()):.4g} m, got "
-            f"one up to {axis.end_opl:.4g} m. Does its time axis count the legs?"
-        )
+        raise UnitError(f"subtract_legs: expected bins behind the legs, got {axis}. Does its time axis count the legs?")
     # A zero that is one to rounding.
     first = start + skipped * width
     shorter = TimeAxis(0.0 if abs(first) < 1e-6 * width else first, width, bins)
@@ -92,11 +89,10 @@ def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
 
     Raises:
         UnitError: for a floor below zero or below the smallest number of the precision.
-        ShapeError: for other objects than tensors of real numbers.
+        ShapeError: for complex numbers.
     """
-    if not isinstance(transient, Tensor) or transient.is_complex():
-        got = transient.dtype if isinstance(transient, Tensor) else shown(transient)
-        raise ShapeError(f"stabilized_root: expected a transient as a tensor of real numbers, got {got}.")
+    if transient.is_complex():
+        raise ShapeError(f"stabilized_root: expected a transient of real numbers, got {transient.dtype}.")
     h = transient if transient.is_floating_point() else transient.to(torch.float32)
     floor = checked_floor(floor, h.dtype)
     if floor:
@@ -105,24 +101,6 @@ def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
     # The inner `where` keeps the infinite slope at zero out of products with zero, which would be NaN.
     magnitude = torch.where(empty, torch.ones_like(h), h.abs())
     return torch.where(empty, torch.zeros_like(h), torch.sign(h) * magnitude.sqrt())
-
-
-class StabilizedRoot(nn.Module):
-    """:func:`stabilized_root` as a layer.
-
-    Args:
-        floor: in the unit of the transient.
-    """
-
-    def __init__(self, floor: float = COUNTS_FLOOR) -> None:
-        super().__init__()
-        self.floor = checked_floor(floor)
-
-    def forward(self, transient: Tensor) -> Tensor:
-        return stabilized_root(transient, self.floor)
-
-    def extra_repr(self) -> str:
-        return f"floor={self.floor:g}"
 
 
 def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
@@ -135,13 +113,10 @@ def checked_floor(value: float, dtype: torch.dtype = torch.float64) -> float:
     Raises:
         UnitError: for numbers below zero or below the smallest number of ``dtype``.
     """
-    floor = finite("stabilized_root: floor", value)
-    if floor < 0:
-        raise UnitError(f"stabilized_root: expected a floor of zero or more, got {floor!r}. For counts take 0.25.")
+    floor, least = finite("stabilized_root: floor", value), torch.finfo(dtype).tiny
     # Smaller ones vanish or have few digits, and empty bins would be zero over zero.
-    if 0 < floor < (least := torch.finfo(dtype).tiny):
+    if floor < 0 or 0 < floor < least:
         raise UnitError(
-            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}. Scale "
-            "the transient, or take double precision."
+            f"stabilized_root: expected a floor of zero or of {least:.3g} at least in {dtype}, got {floor!r}."
         )
     return floor

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis
-from torchtransient.capture import Capture, Scan
-from torchtransient.checks import as_whole, finite, positive, shown
+from torchtransient.capture import Scan
+from torchtransient.checks import finite, positive
 from torchtransient.errors import UnitError
 from torchtransient.reconstruction.capture_checks import SNR, check_thickness, within
 from torchtransient.reconstruction.linear import each
-from torchtransient.reconstruction.transient_operator import ConfocalOperator, InverseOperator
+from torchtransient.reconstruction.transient_operator import InvertibleOperator
 from torchtransient.reconstruction.voxels import PlanarScan
 from torchtransient.volume_methods import SLAB_SNR
 
@@ -35,7 +35,7 @@ FOAM = (262.0, 0.53, 1.12, 0.0036)
 FOAM_THICKNESS = 0.0254
 
 
-class DiffusionDeconvolution(ConfocalOperator):
+class DiffusionDeconvolution(InvertibleOperator):
     """Confocal captures through a slab that lies on the scanned wall, as a linear operator, and its Wiener inverse.
 
     ``operator(transient)``: the light (..., T, Y, X) that arrives through the slab, of the light at its far side;
@@ -49,7 +49,6 @@ class DiffusionDeconvolution(ConfocalOperator):
         thickness: metres.
         properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
             which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.
-        passes: crossings of the slab, 2 of confocal captures.
         snr: power of the light over that of the noise where nothing is lost, at frequency zero; light that the slab
             takes beyond that cannot come back.
         dtype: float32 or float64.
@@ -75,19 +74,20 @@ class DiffusionDeconvolution(ConfocalOperator):
         time_axis: TimeAxis,
         thickness: float = FOAM_THICKNESS,
         properties: tuple[float, float, float, float] = FOAM,
-        passes: int = 2,
         snr: float = SLAB_SNR,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
-        check_thickness(positive("DiffusionDeconvolution: thickness", thickness), scan, "DiffusionDeconvolution")
-        who = type(self).__name__
+        who = "DiffusionDeconvolution"
         self.thickness = positive(f"{who}: thickness", thickness)
-        self.properties = _slab_properties(properties, who)
-        number = as_whole(passes)
-        if number not in (1, 2):
-            raise UnitError(f"{who}: expected light that crosses the slab once or twice, got passes={shown(passes)}.")
-        self.passes, self.snr = number, within(f"{who}: snr", snr, *SNR)
+        check_thickness(self.thickness, scan, who)
+        scattering, absorption, index, extrapolation = properties
+        positive(f"{who}: reduced scattering", scattering)
+        if finite(f"{who}: absorption", absorption) < 0:
+            raise UnitError(f"{who}: expected an absorption of zero or more per metre, got {absorption!r}.")
+        positive(f"{who}: index", index)
+        positive(f"{who}: extrapolation length", extrapolation)
+        self.properties, self.snr = tuple(properties), within(f"{who}: snr", snr, *SNR)
         self._set_tables()
 
     def tables(self) -> dict[str, Tensor]:
@@ -98,12 +98,11 @@ class DiffusionDeconvolution(ConfocalOperator):
             _gaussians(spread, torch.arange(self._reach(n, pitch, spread), dtype=torch.float64, device="cpu") * pitch)
             for n, pitch in zip((rows, columns), self.grid.pitch, strict=True)
         ]
-        kernel = _crossed(light, *along, passes=self.passes, size=(rows + 1, columns + 1)).clamp_min_(0)
-        kernel /= max(self._total(), 1e-300) ** self.passes
+        kernel = _crossed_twice(light, *along, size=(rows + 1, columns + 1)).clamp_min_(0)
+        kernel /= max(self._total(), 1e-300) ** 2
         if not float(kernel.sum()) > SHARE_OF_LIGHT:
             raise UnitError(
-                f"DiffusionDeconvolution: expected a slab whose light falls into the record, got none within "
-                f"{bins * width:.3g} m of optical path. Let the time axis be longer, or the slab thinner."
+                "DiffusionDeconvolution: no light is in the record. Let the axis be longer, or the slab thinner."
             )
         # Later light than the record's would come round as early light; displacements are the same to both sides.
         whole = torch.zeros(2 * bins, 2 * rows, 2 * columns, dtype=torch.float64, device="cpu")
@@ -149,8 +148,6 @@ class DiffusionDeconvolution(ConfocalOperator):
         """Displacements on one side that light between two crossings of the slab may have: so many that what strays
         farther is less than 1e-12 of what comes to the scan.
         """
-        if self.passes == 1:
-            return points + 1
         strays = 28 * float(spread.amax()) / pitch**2
         return max(2 * points, math.ceil((points + math.sqrt(points**2 + strays)) / 2)) + 1
 
@@ -160,25 +157,11 @@ class DiffusionDeconvolution(ConfocalOperator):
     def adjoint_(self, y: Tensor) -> Tensor:
         return each(lambda item: self._spread(item, torch.view_as_complex(self.kernel).conj()), y, 3)
 
-    @property
-    def inverse(self) -> SlabInverse:
-        """The Wiener inverse: captures through the slab to captures without, (..., T, Y, X) both."""
-        return SlabInverse(self)
+    def invert(self, data: Tensor) -> Tensor:
+        return self._filtered(data, self._wiener())
 
-    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """Return a transient without the slab, by the Wiener inverse.
-
-        Args:
-            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
-
-        Returns:
-            (..., T, Y, X), of a capture (C, T, Y, X).
-
-        Raises:
-            ShapeError, DeviceError: for other transients and captures.
-        """
-        found: Tensor = self.inverse(self.transients(transient))
-        return found
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        return self._filtered(volume, self._wiener().conj())
 
     def _spread(self, x: Tensor, spectrum: Tensor) -> Tensor:
         """Convolve with the kernel, which is nowhere negative.
@@ -201,39 +184,6 @@ class DiffusionDeconvolution(ConfocalOperator):
         return kernel.conj() / (kernel.abs().square() + 1 / self.snr)
 
 
-class SlabInverse(InverseOperator):
-    """The Wiener inverse of :class:`DiffusionDeconvolution`."""
-
-    operator: DiffusionDeconvolution
-
-    def map_(self, x: Tensor) -> Tensor:
-        wiener = self.operator._wiener()
-        return each(lambda item: self.operator._filtered(item, wiener), x, 3)
-
-    def adjoint_(self, y: Tensor) -> Tensor:
-        wiener = self.operator._wiener().conj()
-        return each(lambda item: self.operator._filtered(item, wiener), y, 3)
-
-
-def _slab_properties(properties: tuple[float, float, float, float], who: str) -> tuple[float, float, float, float]:
-    several = isinstance(properties, (list, tuple)) or getattr(properties, "ndim", 0) == 1
-    if not several or len(properties) != len(FOAM):
-        raise UnitError(
-            f"{who}: expected properties as (reduced scattering 1/m, absorption 1/m, index, extrapolation length m), "
-            f"got {shown(properties)}."
-        )
-    scattering, absorption, index, extrapolation = properties
-    absorption = finite(f"{who}: absorption", absorption)
-    if absorption < 0:
-        raise UnitError(f"{who}: expected an absorption of zero or more per metre, got {absorption!r}.")
-    return (
-        positive(f"{who}: reduced scattering", scattering),
-        absorption,
-        positive(f"{who}: index", index),
-        positive(f"{who}: extrapolation length", extrapolation),
-    )
-
-
 def _gaussians(spread: Tensor, at: Tensor) -> Tensor:
     """exp(-x^2 / spread), (D, N)."""
     return torch.exp(-at.square() / spread[:, None])
@@ -246,12 +196,10 @@ def _sum_of_gaussians(spread: Tensor, pitch: float) -> Tensor:
     return torch.where(wide, torch.sqrt(math.pi * spread) / pitch, _gaussians(spread, k * pitch).sum(1))
 
 
-def _crossed(light: Tensor, along_y: Tensor, along_x: Tensor, *, passes: int, size: tuple[int, int]) -> Tensor:
+def _crossed_twice(light: Tensor, along_y: Tensor, along_x: Tensor, *, size: tuple[int, int]) -> Tensor:
     """(D, *size): ``light`` (D,) times Gaussians (D, Ny) and (D, Nx) of displacements from zero on, which are the same
-    to both sides; ``passes=2``: convolved with itself in time and along the slab.
+    to both sides, convolved with itself in time and along the slab.
     """
-    if passes == 1:
-        return light[:, None, None] * along_y[:, : size[0], None] * along_x[:, None, : size[1]]
     # Cosine transforms, in which places are multiplied while delays are convolved.
     (to_y, from_y), (to_x, from_x) = (_cosines(a.shape[1]) for a in (along_y, along_x))
     of_y, of_x = along_y @ to_y, (along_x @ to_x) * light[:, None]

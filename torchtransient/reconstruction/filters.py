@@ -1,10 +1,17 @@
-"""Filters of filtered backprojection: of transients before it, or of the volume after it."""
+"""Filters of filtered backprojection: of transients before it, or of the volume after it.
+
+A filter is linear in rows (..., T) in time and in volumes (..., Z, Y, X), and has the adjoints of both.
+``complex_volume``: True where filtered rows are complex. ``check`` raises for volumes that it cannot filter, before
+anything is computed; ``image`` makes a picture of a filtered volume. ``samples``: samples per bin that a filtered row
+needs, so that lines between them follow it; ``rows(rows, width, samples)`` has them at the middles of bins, evenly
+between these, and as far before the first and behind the last as the bins reach (:func:`sample_places`).
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,33 +25,6 @@ from torchtransient.reconstruction.voxels import VoxelGrid
 
 # Samples of a wavelength. Lines between them lose (pi / SAMPLES)^2 / 3 of a wave in the mean, 1.3 %.
 SAMPLES = 16
-
-
-class ReconstructionFilter(Protocol):
-    """A linear filter of rows (..., T) in time and of volumes (..., Z, Y, X), each with its adjoint.
-
-    ``complex_volume``: True where filtered rows are complex. ``check`` raises for volumes that it cannot filter, before
-    anything is computed; ``image`` makes a picture of a filtered volume. ``samples``: samples per bin that a filtered
-    row needs, so that lines between them follow it; ``rows(rows, width, samples)`` has them at the middles of bins,
-    evenly between these, and as far before the first and behind the last as the bins reach (:func:`sample_places`).
-    """
-
-    @property
-    def complex_volume(self) -> bool: ...
-
-    def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None: ...
-
-    def samples(self, bin_width_opl: float) -> int: ...
-
-    def rows(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor: ...
-
-    def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor: ...
-
-    def volume(self, volume: Tensor) -> Tensor: ...
-
-    def volume_adjoint(self, volume: Tensor) -> Tensor: ...
-
-    def image(self, volume: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -64,6 +44,8 @@ class PhasorFilter:
             a fourth of one.
     """
 
+    complex_volume: ClassVar[bool] = True
+
     wavelength: float
     cycles: float = 4.0
 
@@ -76,18 +58,19 @@ class PhasorFilter:
         """Standard deviation of the pulse's envelope, metres."""
         return self.cycles * self.wavelength / 6
 
-    @property
-    def complex_volume(self) -> bool:
-        return True
-
     def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
-        check_sampling(self, bin_width_opl, who)
+        if self.wavelength < 2 * bin_width_opl:
+            raise UnitError(f"{who}: expected a wavelength of two bins at least, got {self.wavelength:.4g} m.")
+        if self.sigma < bin_width_opl / 4:
+            raise UnitError(
+                f"{who}: expected a sigma of a fourth of a bin at least, got {self.sigma:.4g} m. Take more cycles."
+            )
 
     def samples(self, bin_width_opl: float) -> int:
         # Pulses of less than a cycle are steeper than their wave.
         return max(1, math.ceil(SAMPLES * bin_width_opl / (self.wavelength * min(1.0, self.cycles)) - 1e-9))
 
-    def rows(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
+    def rows(self, rows: Tensor, bin_width_opl: float, samples: int) -> Tensor:
         bins, (first, last) = rows.shape[-1], sample_places(rows.shape[-1], samples)
         padded = fast_length(2 * bins)
         # Zeros between bins repeat the spectrum.
@@ -96,7 +79,7 @@ class PhasorFilter:
         found: Tensor = torch.fft.ifft(spectrum)
         return torch.cat([found[..., first:], found[..., :last]], -1) if first else found[..., :last]
 
-    def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
+    def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int) -> Tensor:
         bins = (rows.shape[-1] - 1 - 2 * (samples // 2)) // samples + 1
         first, last = sample_places(bins, samples)
         padded = fast_length(2 * bins)
@@ -150,14 +133,12 @@ class LaplacianFilter:
         ShapeError: by an operator, for other volumes.
     """
 
+    complex_volume: ClassVar[bool] = False
+
     sigma: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sigma", within("LaplacianFilter: sigma", self.sigma, 0.2, 1e3))
-
-    @property
-    def complex_volume(self) -> bool:
-        return False
 
     def check(self, grid: VoxelGrid | None, bin_width_opl: float, who: str) -> None:
         if grid is None:
@@ -168,17 +149,16 @@ class LaplacianFilter:
         # Depths of single precision are even enough.
         if len(steps) and float(steps.max() - steps.min()) > 1e-3 * float(steps.max()):
             raise ShapeError(
-                f"{who}: expected evenly spaced planes for a LaplacianFilter, got steps of {float(steps.min()):.4g} to "
-                f"{float(steps.max()):.4g} m."
+                f"{who}: expected evenly spaced planes for a LaplacianFilter, got steps of {steps.tolist()} m."
             )
 
     def samples(self, bin_width_opl: float) -> int:
         return 1
 
-    def rows(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
+    def rows(self, rows: Tensor, bin_width_opl: float, samples: int) -> Tensor:
         return rows
 
-    def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int = 1) -> Tensor:
+    def rows_adjoint(self, rows: Tensor, bin_width_opl: float, samples: int) -> Tensor:
         return rows
 
     def volume(self, volume: Tensor) -> Tensor:
@@ -211,29 +191,6 @@ class LaplacianFilter:
         curved = curved - smooth * curved.sum()
         curved = curved * (-2 / (curved * t**2).sum())
         return smooth.to(like.device, like.dtype), curved.to(like.device, like.dtype)
-
-
-def check_sampling(pulse: PhasorFilter, bin_width_opl: float, who: str) -> None:
-    """Check that bins can hold a pulse.
-
-    Args:
-        pulse: of the virtual illumination.
-        bin_width_opl: metres.
-        who: begins the message.
-
-    Raises:
-        UnitError: for wavelengths below two bins, or a standard deviation below a fourth of one.
-    """
-    if pulse.wavelength < 2 * bin_width_opl:
-        raise UnitError(
-            f"{who}: expected a wavelength of two bins at least, {2 * bin_width_opl:.4g} m, got "
-            f"{pulse.wavelength:.4g} m."
-        )
-    if pulse.sigma < bin_width_opl / 4:
-        raise UnitError(
-            f"{who}: expected a pulse with a standard deviation of a fourth of a bin at least, "
-            f"{bin_width_opl / 4:.4g} m, got {pulse.sigma:.4g} m of {pulse.cycles:g} cycles. Take more of them."
-        )
 
 
 def sample_places(bins: int, samples: int) -> tuple[int, int]:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -31,14 +32,7 @@ from torch import Tensor
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
 from torchtransient.errors import ShapeError
-from torchtransient.reconstruction.capture_checks import (
-    check_from_zero,
-    checked_axis,
-    checked_scan,
-    one_of,
-    refuse_legs,
-    refuse_pairs,
-)
+from torchtransient.reconstruction.capture_checks import check_from_zero, one_of, refuse_legs, refuse_pairs
 from torchtransient.reconstruction.captures import checked_floor, stabilized_root
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.transient_operator import (
@@ -147,7 +141,7 @@ class FK(ConfocalOperator):
             (..., Z, Y, X), of a capture (C, Z, Y, X).
 
         Raises:
-            ShapeError, DeviceError: for other transients and captures.
+            ShapeError: for other transients and captures.
         """
         return self.picture(stabilized_root(self.transients(transient), self.floor))
 
@@ -236,12 +230,9 @@ class FK(ConfocalOperator):
             low, high = max(first, 1), min(last, columns)
             if low < high:
                 mirrored = spectrum[2 * columns - high + 1 : 2 * columns - low + 1]
-                if high - low == 1:
-                    yield mirrored, slice(low, high)
-                else:
-                    part = mirrored.flip(0)
-                    yield part, slice(low, high)
-                    mirrored.copy_(part.flip(0))
+                part = mirrored.flip(0)
+                yield part, slice(low, high)
+                mirrored.copy_(part.flip(0))
 
     def _mirrored(self, rows: slice) -> tuple[Tensor, Tensor]:
         """Tables of some kx for all ky, those below zero too."""
@@ -288,11 +279,11 @@ def _window_transform(time: Tensor, taps: int) -> Tensor:
     return taps * torch.sinh(root) / root
 
 
-def _beta(taps: int, oversampling: float = 2.0) -> float:
-    """The window's shape for a record that is padded ``oversampling`` times (Beatty, Nishimura, Pauly, "Rapid gridding
+def _beta(taps: int) -> float:
+    """The window's shape for a record that is padded to twice its length (Beatty, Nishimura, Pauly, "Rapid gridding
     reconstruction with a minimal oversampling ratio", IEEE Trans. Medical Imaging 24, 2005, equation 5).
     """
-    return math.pi * math.sqrt((taps / oversampling) ** 2 * (oversampling - 0.5) ** 2 - 0.8)
+    return math.pi * math.sqrt((taps / 2) ** 2 * 1.5**2 - 0.8)
 
 
 class Midpoints(TransientOperator):
@@ -319,8 +310,13 @@ class Midpoints(TransientOperator):
     times: Tensor
 
     def __init__(self, scan: Scan, *, time_axis: TimeAxis, dtype: torch.dtype = torch.float32) -> None:
-        sensors = _sensors(scan, time_axis, "MidpointFK")
+        if scan.kind == "confocal":
+            raise ShapeError("MidpointFK: expected a single or exhaustive scan, got a confocal one. Use FK.")
+        refuse_pairs(scan, "MidpointFK")
+        refuse_legs(scan, "MidpointFK")
+        check_from_zero(time_axis, "MidpointFK")
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
+        sensors = PlanarScan.of_scan(scan, "MidpointFK")
         rows, columns = sensors.size
         spots, points = (sensors.local(p).reshape(-1, 3) for p in (scan.laser_points, scan.sensor_points))
         pitch = torch.tensor([sensors.pitch[1], sensors.pitch[0], 1.0], dtype=torch.float64, device="cpu")
@@ -328,8 +324,7 @@ class Midpoints(TransientOperator):
         off = (spots / pitch - (spots / pitch).clamp_min(0).minimum(extent)).abs()
         if float(off[:, 2].max()) > OFF_GRID * min(sensors.pitch) or float(off[:, :2].max()) > 0.5 + OFF_GRID:
             raise ShapeError(
-                f"MidpointFK: expected spots in the plane of the sensor points and within their rectangle, got some "
-                f"{float(off.max()):.3g} off it, in pitches along the wall and metres across. Use Backprojection."
+                "MidpointFK: expected spots among the sensor points, within their rectangle. Use Backprojection."
             )
         # In steps of half the pitch from the first sensor point; (M, N, 2) of spots and sensor points.
         middles = ((spots[:, None] + points) / pitch)[..., :2]
@@ -338,12 +333,9 @@ class Midpoints(TransientOperator):
         size = (2 * rows, 2 * columns)
         index = torch.stack([index[..., 0].clamp(0, size[1] - 1), index[..., 1].clamp(0, size[0] - 1)], -1)
         step = (sensors.pitch[0] / 2, sensors.pitch[1] / 2)
-        first = (
-            sensors.first + float(phase[0]) * step[1] * sensors.along_x + float(phase[1]) * step[0] * sensors.along_y
-        )
-        self.wall = PlanarScan(
-            size, step, first, along_x=sensors.along_x, along_y=sensors.along_y, normal=sensors.normal
-        )
+        first = sensors.first + float(phase[0]) * step[1] * sensors.along_x
+        first = first + float(phase[1]) * step[0] * sensors.along_y
+        self.wall = replace(sensors, size=size, pitch=step, first=first)
         self.grid = VoxelGrid.of_wall(self.wall, time_axis.centers_opl / 2)
         self._place = (index[..., 1] * size[1] + index[..., 0]).reshape(-1)
         self._distance_squared = (spots[:, None] - points).square().sum(-1).reshape(-1)
@@ -437,16 +429,11 @@ class MidpointFK(TransientOperator):
         taps: int = 4,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__(checked_scan(scan, "MidpointFK"), time_axis=time_axis, dtype=dtype)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         self.midpoints = Midpoints(scan, time_axis=time_axis, dtype=dtype)
         self.fk = FK(self.midpoints.wall, time_axis=time_axis, target=target, floor=floor, taps=taps, dtype=dtype)
         self.grid = self.fk.grid
         self.volume_shape, self.data_shape = self.fk.volume_shape, self.midpoints.data_shape
-
-    @property
-    def depths(self) -> Tensor:
-        """(Z,) float64: distances of the planes from the wall, metres."""
-        return self.grid.depths
 
     def map_(self, x: Tensor) -> Tensor:
         return self.midpoints.map_(self.fk.map_(x))
@@ -464,7 +451,7 @@ class MidpointFK(TransientOperator):
             (..., Z, 2 Y, 2 X).
 
         Raises:
-            ShapeError, DeviceError: for other transients and captures.
+            ShapeError: for other transients and captures.
         """
         data = self.transients(transient)
         return self.fk.picture(self.midpoints.adjoint(stabilized_root(data, self.fk.floor)))
@@ -484,13 +471,3 @@ def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
         ShapeError, UnitError: as the class.
     """
     return reconstructed(capture, MidpointFK, who="midpoint_fk", **options)
-
-
-def _sensors(scan: Scan, time_axis: TimeAxis, who: str) -> PlanarScan:
-    """The sensors' grid of a scan. Raises ShapeError, UnitError."""
-    if checked_scan(scan, who).kind == "confocal":
-        raise ShapeError(f"{who}: expected a single or exhaustive scan, got a confocal one. Use FK.")
-    refuse_pairs(scan, who)
-    refuse_legs(scan, who)
-    check_from_zero(checked_axis(time_axis, who), who)
-    return PlanarScan.of_scan(scan, who)

@@ -22,6 +22,7 @@ kernels make one number: nu_i = conj(a_i) H / (sum |a|^2 + noise).
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -37,8 +38,7 @@ from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction.capture_checks import SNR, one_of, within
 from torchtransient.reconstruction.linear import each
 from torchtransient.reconstruction.transient_operator import (
-    ConfocalOperator,
-    InverseOperator,
+    InvertibleOperator,
     chunk_rows,
     reconstructed,
 )
@@ -148,41 +148,11 @@ def _offset_powers(count: int, pitch: float, moment: int) -> Tensor:
     return powers
 
 
-@dataclass(frozen=True)
-class Resampling:
-    """A sparse matrix as (row, column, value) of its entries."""
-
-    rows: Tensor
-    columns: Tensor
-    values: Tensor
-
-    def apply(self, x: Tensor, count: int, *, transposed: bool = False) -> Tensor:
-        """Multiply a tensor by the matrix.
-
-        Args:
-            x: (T, N).
-            count: rows of the result.
-            transposed: by the transpose instead.
-
-        Returns:
-            (count, N).
-        """
-        rows, columns = (self.columns, self.rows) if transposed else (self.rows, self.columns)
-        out = x.new_zeros(count, x.shape[1])
-        # In pieces of N, so that the products stay small.
-        step = max(1, 4 * chunk_rows(len(rows), x.device))
-        for first in range(0, x.shape[1], step):
-            part = x[:, first : first + step]
-            products = part.index_select(0, columns).mul_(self.values[:, None])
-            out[:, first : first + step].index_add_(0, rows, products)
-        return out
-
-
 FALL = {"diffuse": 4, "retroreflective": 2}
 DEFAULT_SNR = 10.0
 
 
-class ConeOperator(ConfocalOperator):
+class ConeOperator(InvertibleOperator):
     """Base of light-cone transforms: resampling in depth and time, and a sum of convolutions over components.
 
     ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall in
@@ -190,6 +160,10 @@ class ConeOperator(ConfocalOperator):
     volumes are made of components. Arguments as of :class:`LCT`.
     """
 
+    depth_v: Tensor
+    depth_t: Tensor
+    by_v: Tensor
+    by_t: Tensor
     moments: tuple[tuple[int, int], ...]
     scales: tuple[float, ...] = (1.0,)
 
@@ -198,10 +172,10 @@ class ConeOperator(ConfocalOperator):
         scan: Scan | PlanarScan,
         *,
         time_axis: TimeAxis,
-        dtype: torch.dtype,
-        target: str,
-        snr: float,
-        v_bins: int | None,
+        target: str = "diffuse",
+        snr: float = DEFAULT_SNR,
+        v_bins: int | None = None,
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__(scan, time_axis=time_axis, dtype=dtype)
         who = type(self).__name__
@@ -278,33 +252,25 @@ class ConeOperator(ConfocalOperator):
         v = self._resampled(data, data_matrix, transposed=False, to_v=True)
         return self.volume_of(self._correlated(v, regularised=inverse), volume_matrix)
 
-    @property
-    def inverse(self) -> ConeInverse:
-        """The Wiener inverse: transients (..., T, Y, X) to volumes, a linear operator with an adjoint of its own."""
-        return ConeInverse(self)
+    def invert(self, data: Tensor) -> Tensor:
+        return self._back(data, inverse=True)
 
-    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
-        """Return the Wiener inverse of a transient, linear and differentiable.
-
-        Args:
-            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
-
-        Returns:
-            As many volumes.
-
-        Raises:
-            ShapeError, DeviceError: for other transients and captures.
-        """
-        volume: Tensor = self.inverse(self.transients(transient))
-        return volume
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        return self._model(volume, inverse=True)
 
     # --------------------------------------------------------------------------- resampling, (Z or T, ...) <-> (V, ...)
 
     def _resampled(self, x: Tensor, values: str, *, transposed: bool, to_v: bool) -> Tensor:
-        """``x`` (n, Y, X) times the matrix ``values``, whose rows are bins of v, or its transpose."""
+        """``x`` (n, Y, X) times the sparse matrix ``values``, whose rows are bins of v, or its transpose."""
         v, t = (self.depth_v, self.depth_t) if values == "volume" else (self.by_v, self.by_t)
-        matrix = Resampling(cast(Tensor, v), cast(Tensor, t), cast(Tensor, getattr(self, values)))
-        out = matrix.apply(x.reshape(len(x), -1), self.v_bins if to_v else self.axis.num_bins, transposed=transposed)
+        rows, columns = (t, v) if transposed else (v, t)
+        entries, flat = getattr(self, values)[:, None], x.reshape(len(x), -1)
+        out = x.new_zeros(self.v_bins if to_v else self.axis.num_bins, flat.shape[1])
+        # In pieces, so that the products stay small.
+        step = max(1, 4 * chunk_rows(len(rows), x.device))
+        for first in range(0, flat.shape[1], step):
+            part = flat[:, first : first + step]
+            out[:, first : first + step].index_add_(0, rows, part.index_select(0, columns).mul_(entries))
         return out.reshape(len(out), *self.grid.size)
 
     # ---------------------------------------------------------------------------------------- convolutions in (V, Y, X)
@@ -325,11 +291,9 @@ class ConeOperator(ConfocalOperator):
         spectra = [self._spectrum(x) for x in components]
         out = torch.empty_like(spectra[0])
         for part, first, last in self._frequencies(out):
-            sum_ = None
-            for spectrum, (y, x) in zip(spectra, self.kernels(first, last), strict=True):
-                term = self._plane_fft(spectrum[first:last]).mul_(y).mul_(x)
-                sum_ = term if sum_ is None else sum_.add_(term)
-            assert sum_ is not None
+            kernels = zip(spectra, self.kernels(first, last), strict=True)
+            terms = (self._plane_fft(spectrum[first:last]).mul_(y).mul_(x) for spectrum, (y, x) in kernels)
+            sum_ = functools.reduce(Tensor.add_, terms)
             if regularised:
                 sum_.div_(self._power(first, last))
             part.copy_(self._plane_ifft(sum_))
@@ -353,17 +317,14 @@ class ConeOperator(ConfocalOperator):
         """Power of the kernels and of noise: one over the signal-to-noise ratio times the kernels' mean power, so that
         the ratio has no unit and means the same for every size of wall and volume.
         """
-        power: Tensor | None = None
-        for y, x in self.kernels(first, last):
-            term = y.abs().square() * x.abs().square()
-            power = term if power is None else power.add_(term)
-        assert power is not None
-        return power.add_(self.mean_power() / self.snr)
+        terms = (y.abs().square() * x.abs().square() for y, x in self.kernels(first, last))
+        return functools.reduce(Tensor.add_, terms).add_(self.mean_power() / self.snr)
 
     def mean_power(self) -> float:
         """Mean of the kernels' power over all frequencies."""
         sums = [
-            scale**2 * math.prod(
+            scale**2
+            * math.prod(
                 float(_offset_powers(n, pitch, power).square().sum())
                 for n, pitch, power in zip(self.grid.size, self.grid.pitch, powers, strict=True)
             )
@@ -387,18 +348,6 @@ class ConeOperator(ConfocalOperator):
         over_y: Tensor = torch.fft.ifft(x, dim=1)[:, :rows]
         plane: Tensor = torch.fft.ifft(over_y, dim=2)
         return plane[..., :columns]
-
-
-class ConeInverse(InverseOperator):
-    """The regularised inverse of a light-cone transform, from transients to volumes."""
-
-    operator: ConeOperator
-
-    def map_(self, x: Tensor) -> Tensor:
-        return each(lambda data: self.operator._back(data, inverse=True), x, 3)
-
-    def adjoint_(self, y: Tensor) -> Tensor:
-        return each(lambda volume: self.operator._model(volume, inverse=True), y, len(self.data_shape))
 
 
 class LCT(ConeOperator):
@@ -429,18 +378,6 @@ class LCT(ConeOperator):
     """
 
     moments = ((0, 0),)
-
-    def __init__(
-        self,
-        scan: Scan | PlanarScan,
-        *,
-        time_axis: TimeAxis,
-        target: str = "diffuse",
-        snr: float = DEFAULT_SNR,
-        v_bins: int | None = None,
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
-        super().__init__(scan, time_axis=time_axis, dtype=dtype, target=target, snr=snr, v_bins=v_bins)
 
     def components(self, volume: Tensor, matrix: str) -> list[Tensor]:
         return [self._resampled(volume, matrix, transposed=False, to_v=True)]

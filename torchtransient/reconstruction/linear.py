@@ -12,16 +12,28 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields, is_dataclass
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchtransient.errors import DeviceError, GradientError, ShapeError, StorageError, UnitError
+from torchtransient.errors import GradientError, ShapeError, StorageError, UnitError
 
-PRECISIONS = (torch.float32, torch.float64)
+
+def checked_precision(dtype: torch.dtype, who: str) -> torch.dtype:
+    """Return a precision of tables.
+
+    Args:
+        dtype: float32 or float64.
+        who: begins the message.
+
+    Raises:
+        UnitError: for other types.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise UnitError(f"{who}: expected dtype torch.float32 or torch.float64, got {dtype}.")
+    return dtype
 
 
 class _Apply(torch.autograd.Function):
@@ -29,8 +41,9 @@ class _Apply(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
-        with torch.no_grad(), _own_precision(x.device):
-            return operator._mapped(x, adjoint)
+        # Without autocast: what measurements and phases lose by half precision is more than a network does.
+        with torch.no_grad(), torch.autocast("cuda" if x.is_cuda else "cpu", enabled=False):
+            return (operator.adjoint_ if adjoint else operator.map_)(x)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -53,13 +66,6 @@ class _Apply(torch.autograd.Function):
         return _apply(x if dim is None else x.movedim(dim, 0), operator, adjoint), None if dim is None else 0
 
 
-def _own_precision(device: torch.device) -> AbstractContextManager[Any]:
-    """Without ``torch.autocast``: what measurements and phases lose by half precision is more than a network does."""
-    if device.type == "meta" or not torch.is_autocast_enabled(device.type):
-        return nullcontext()
-    return torch.autocast(device.type, enabled=False)
-
-
 def _apply(x: Tensor, operator: LinearOperator, adjoint: bool) -> Tensor:
     result: Tensor = _Apply.apply(x, operator, adjoint)  # type: ignore[no-untyped-call]
     return result
@@ -77,8 +83,7 @@ class LinearOperator(nn.Module, ABC):
     called from several threads at once, and are each other's adjoints to rounding: ``<A x, y> = <x, A^H y>``, the real
     part of it where one of the two is real by nature (:attr:`real_volume`, :attr:`real_data`). They take tensors of the
     operator's own precision (:attr:`dtype`, real; complex ones have the matching complex type); others are converted,
-    half precision to float32 tables as well. ``torch.autocast`` does not reach into them. Leading dimensions may be of
-    size zero; then they are not called.
+    half precision to float32 tables as well. ``torch.autocast`` does not reach into them.
 
     Tables are buffers. Operators are differentiable by their operands alone: GradientError for tables and parameters of
     a class that require a gradient, which would get none. Not supported: ``torch.compile(fullgraph=True)``; without
@@ -115,17 +120,6 @@ class LinearOperator(nn.Module, ABC):
             (..., *volume_shape).
         """
 
-    def _mapped(self, x: Tensor, adjoint: bool) -> Tensor:
-        if x.numel():
-            return (self.adjoint_ if adjoint else self.map_)(x)
-        taken, shape, real = (
-            (self.data_shape, self.volume_shape, self.real_volume)
-            if adjoint
-            else (self.volume_shape, self.data_shape, self.real_data)
-        )
-        lead = x.shape[: x.ndim - len(taken)]
-        return x.new_zeros(*lead, *shape, dtype=self.dtype if real else self.dtype.to_complex())
-
     def forward(self, volume: Tensor) -> Tensor:
         """Apply the map, ``A volume``.
 
@@ -136,7 +130,7 @@ class LinearOperator(nn.Module, ABC):
             (..., *data_shape).
 
         Raises:
-            ShapeError, DeviceError: for another shape or device.
+            ShapeError: for another shape.
         """
         volume = self._taken(self.volume_name, volume, self.volume_shape, real=self.real_volume)
         return _apply(volume, self, False)
@@ -151,38 +145,28 @@ class LinearOperator(nn.Module, ABC):
             (..., *volume_shape).
 
         Raises:
-            ShapeError, DeviceError: for another shape or device.
+            ShapeError: for another shape.
         """
         data = self._taken(self.data_name, data, self.data_shape, real=self.real_data)
         return _apply(data, self, True)
 
     def _taken(self, name: str, x: Tensor, shape: tuple[int, ...], *, real: bool) -> Tensor:
         who = type(self).__name__
-        if not isinstance(x, Tensor):
-            raise ShapeError(f"{who}: expected {name} as a tensor (..., {_words(shape)}), got {type(x).__name__}.")
         if tuple(x.shape[x.ndim - len(shape) :]) != shape:
-            raise ShapeError(f"{who}: expected {name} (..., {_words(shape)}), got {tuple(x.shape)}.")
+            sizes = ", ".join(map(str, shape))
+            raise ShapeError(f"{who}: expected {name} (..., {sizes}), got {tuple(x.shape)}.")
         if real and x.is_complex():
             raise ShapeError(f"{who}: expected {name} of real numbers, got {x.dtype}. Give its real part or modulus.")
-        device = self.device
-        if device is not None and x.device != device:
-            raise DeviceError(
-                f"{who}: expected {name} on {device}, where the operator is, got one on {x.device}. Move one of them "
-                "with .to(device)."
-            )
         asking = [key for key, t in (*self.named_parameters(), *self.named_buffers()) if t.requires_grad]
         if asking:
             raise GradientError(
-                f"{who}: expected tables without gradients, got {', '.join(asking)} with requires_grad. Operators are "
-                "differentiable by their operands alone: multiply those, or detach the tables."
+                f"{who}: expected tables without gradients, which they would not get, got {', '.join(asking)}."
             )
         return x.to(self.dtype.to_complex() if x.is_complex() or not real else self.dtype)
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Self:
         """Moves and conversions of a module, which :attr:`dtype` follows, whatever tables there are."""
-        dtype = fn(torch.empty((), dtype=self.dtype, device="cpu")).dtype
-        if dtype not in PRECISIONS:
-            raise UnitError(f"{type(self).__name__}: expected dtype torch.float32 or torch.float64, got {dtype}.")
+        dtype = checked_precision(fn(torch.empty((), dtype=self.dtype, device="cpu")).dtype, type(self).__name__)
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         if dtype != self.dtype:
             self.dtype = dtype
@@ -223,10 +207,6 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     return out.reshape(*lead, *shape)
 
 
-def _words(shape: tuple[int, ...]) -> str:
-    return ", ".join(map(str, shape))
-
-
 # Shares by which numbers may differ: those of another machine, or that a file rounds to single precision.
 SLACK = 1e-6
 # Sums of a tensor that tell it from others.
@@ -256,7 +236,7 @@ def unpacked(state: Any, who: str) -> Any:
         StorageError: for other objects.
     """
     try:
-        return json.loads(bytes(state.cpu().tolist()).decode())
+        return json.loads(bytes(state.tolist()))
     except (AttributeError, TypeError, ValueError) as error:
         raise StorageError(f"{who}: expected the state of an operator, as state_dict() gives it: {error}.") from None
 
@@ -295,25 +275,24 @@ def check_same(mine: Any, theirs: Any, who: str, what: str = "settings") -> None
         ShapeError: where they differ by more than rounding.
     """
     if isinstance(mine, dict) and isinstance(theirs, dict) and mine.keys() == theirs.keys():
-        if "sums" in mine and mine["shape"] == theirs["shape"]:
-            slack = SLACK * max(mine["size"], theirs["size"]) * math.sqrt(max(1, math.prod(mine["shape"])))
-            if all(abs(a - b) <= slack for a, b in zip(mine["sums"], theirs["sums"], strict=True)):
-                return
-            raise ShapeError(_difference(who, what, "the same values", "others"))
-        for key in mine:
-            check_same(mine[key], theirs[key], who, key if what == "settings" else f"{what}.{key}")
-        return
-    if isinstance(mine, list) and isinstance(theirs, list) and len(mine) == len(theirs):
+        if "sums" not in mine:
+            for key in mine:
+                check_same(mine[key], theirs[key], who, key if what == "settings" else f"{what}.{key}")
+            return
+        slack = SLACK * max(mine["size"], theirs["size"]) * math.sqrt(max(1, math.prod(mine["shape"])))
+        near = (abs(a - b) <= slack for a, b in zip(mine["sums"], theirs["sums"], strict=True))
+        equal = mine["shape"] == theirs["shape"] and all(near)
+    elif isinstance(mine, list) and isinstance(theirs, list) and len(mine) == len(theirs):
         for a, b in zip(mine, theirs, strict=True):
             check_same(a, b, who, what)
         return
-    numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (mine, theirs))
-    if not (math.isclose(mine, theirs, rel_tol=SLACK, abs_tol=1e-3 * SLACK) if numbers else mine == theirs):
-        raise ShapeError(_difference(who, what, mine, theirs))
-
-
-def _difference(who: str, what: str, mine: Any, theirs: Any) -> str:
-    return (
-        f"{who}: expected the state of an operator like this one, with {what} {mine!r}, got one with {theirs!r}. Make "
-        "the operator as the one that was saved."
-    )
+    elif isinstance(mine, float) or isinstance(theirs, float):
+        both = isinstance(mine, float | int) and isinstance(theirs, float | int)
+        equal = both and math.isclose(mine, theirs, rel_tol=SLACK, abs_tol=1e-3 * SLACK)
+    else:
+        equal = mine == theirs
+    if not equal:
+        raise ShapeError(
+            f"{who}: expected the state of an operator like this one, with {what} {mine!r}, got one with {theirs!r}. "
+            "Make the operator as the one that was saved."
+        )

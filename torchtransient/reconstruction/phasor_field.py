@@ -6,17 +6,17 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from torchtransient.axes import TimeAxis, fast_length
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import finite, real_array, shown, with_article
+from torchtransient.checks import finite, real_array, shown
 from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.reconstruction.capture_checks import check_falloff, check_wavelength, refuse_pairs
-from torchtransient.reconstruction.filters import PhasorFilter, check_sampling
+from torchtransient.reconstruction.capture_checks import check_wavelength, refuse_pairs
+from torchtransient.reconstruction.filters import PhasorFilter
 from torchtransient.reconstruction.transient_operator import ScanOperator, reconstructed
 from torchtransient.reconstruction.voxels import OFF_GRID, PlanarScan, VoxelGrid
 
@@ -29,14 +29,8 @@ class DirectLight:
     (..., Z, Y, X).
     """
 
-    @property
-    def times(self) -> None:
-        """No video."""
-        return None
-
-    @property
-    def focuses_laser(self) -> bool:
-        return True
+    times: ClassVar[None] = None
+    focuses_laser: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +45,12 @@ class ConfocalCamera:
         ShapeError, UnitError: for other shapes, and times that are not finite.
     """
 
+    focuses_laser: ClassVar[bool] = True
+
     times: Tensor
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times, "ConfocalCamera"))
-
-    @property
-    def focuses_laser(self) -> bool:
-        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +67,12 @@ class TransientCamera:
         ShapeError, UnitError: for other shapes, and times that are not finite.
     """
 
+    focuses_laser: ClassVar[bool] = False
+
     times: Tensor
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times", _times(self.times, "TransientCamera"))
-
-    @property
-    def focuses_laser(self) -> bool:
-        return False
 
 
 Camera = DirectLight | ConfocalCamera | TransientCamera
@@ -123,11 +113,6 @@ def _turned(turns: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(turns), (turns - turns.round()) * (2 * math.pi))
 
 
-def _phase_pairs(turns: Tensor) -> Tensor:
-    """Real and imaginary part (..., 2) of ``exp(2 pi i turns)``."""
-    return torch.view_as_real(_turned(turns))
-
-
 # Complex numbers of spectra that are worked on at once.
 CPU_CHUNK, GPU_CHUNK = 1 << 20, 1 << 25
 # Standard deviations of the pulse's spectrum that are kept to both sides.
@@ -152,8 +137,7 @@ def phasor_image(
     Raises:
         ShapeError, SceneError, UnitError: as the class.
     """
-    options = {"pulse": pulse, "camera": camera, "falloff": falloff}
-    return reconstructed(capture, PhasorField, points, who="phasor_image", **options)
+    return reconstructed(capture, PhasorField, points, who="phasor_image", pulse=pulse, camera=camera, falloff=falloff)
 
 
 class PhasorField(ScanOperator):
@@ -203,23 +187,15 @@ class PhasorField(ScanOperator):
     ) -> None:
         if not isinstance(points, VoxelGrid):
             raise ArgumentError(
-                f"PhasorField: expected planes as a VoxelGrid, got {shown(points)}. Make them with VoxelGrid.before; "
-                "FilteredBackprojection takes points."
+                f"PhasorField: expected a VoxelGrid, got {shown(points)}. FilteredBackprojection takes points."
             )
         super().__init__(scan, points, time_axis=time_axis, dtype=dtype)
-        if not isinstance(pulse, PhasorFilter):
-            raise ArgumentError(f"PhasorField: expected pulse as a PhasorFilter, got {shown(pulse)}.")
-        check_sampling(pulse, time_axis.bin_width_opl, "PhasorField")
+        pulse.check(points, time_axis.bin_width_opl, "PhasorField")
         check_wavelength(pulse.wavelength, scan, time_axis, "PhasorField")
         self.camera: Camera = DirectLight() if camera is None else camera
-        if not isinstance(self.camera, Camera):
-            raise ShapeError(
-                f"PhasorField: expected a DirectLight, ConfocalCamera or TransientCamera, got {shown(camera)}."
-            )
-        if isinstance(self.camera, TransientCamera) and scan.kind != "single":
+        if not self.camera.focuses_laser and scan.kind != "single":
             raise SceneError(
-                f"PhasorField: expected a scan with one laser spot for a TransientCamera, got "
-                f"{with_article(scan.kind)} one. Choose a spot of an exhaustive capture with capture.single(index)."
+                f"PhasorField: expected one laser spot for a TransientCamera, got {scan!r}. See capture.single(index)."
             )
         self.pulse, self.falloff = pulse, finite("PhasorField: falloff", falloff)
         self.real_volume = False
@@ -229,8 +205,6 @@ class PhasorField(ScanOperator):
         self.lasers = self.wall.local(scan.laser_points).reshape(-1, 3)
         if self.camera.times is not None:
             self.volume_shape = (len(self.camera.times), *self.volume_shape)
-        near = max(self._nearest, float(self.heights.abs().min()))
-        check_falloff(self.falloff, near**2, self._lengths()[1] ** 2, dtype, "PhasorField")
         self.frequencies, self.band_weights = self._band()
         self.shape_fft = tuple(fast_length(s + v - 1) for s, v in zip(self.wall.size, points.size, strict=True))
         self._set_tables()
@@ -246,9 +220,7 @@ class PhasorField(ScanOperator):
         same = all(abs(a - b) * n <= OFF_GRID * b for a, b, n in zip(grid.pitch, wall.pitch, grid.size, strict=True))
         if not (parallel and same):
             raise ShapeError(
-                "PhasorField: expected planes along the wall's rows and columns with its pitch of "
-                f"{wall.pitch[0]:.5g} x {wall.pitch[1]:.5g} m, got {grid!r}. "
-                "Use VoxelGrid.before(scan, depths), or FilteredBackprojection, which takes any points."
+                f"PhasorField: expected planes along the wall's rows and columns with its pitch {wall!r}, got {grid!r}."
             )
         # Along the axes of the wall, from its first point; the normal of the planes may be the opposite one.
         self.corner = wall.local(grid.first)
@@ -257,16 +229,14 @@ class PhasorField(ScanOperator):
         # Where nothing says which side is the hidden one, all may be on either.
         if not (nearest > 0 or (farthest < 0 and self.scan.sensor_normals is None)):
             raise ShapeError(
-                f"PhasorField: expected planes before the wall, got some {nearest:.3g} to {farthest:.3g} m before it: "
-                "at the wall, behind it, or on both sides. Let depths be above zero."
+                f"PhasorField: expected planes before the wall, got some {nearest:.3g} to {farthest:.3g} m before it."
             )
 
     def _leg_lengths(self) -> tuple[Tensor, Tensor]:
         """Return the legs of the spots (L,) and the sensor points (S,), metres, zeros where they do not count."""
-        if not self.scan.first_and_last_leg:
-            lengths = torch.zeros(len(self.lasers) + math.prod(self.wall.size), dtype=torch.float64, device="cpu")
-            return lengths[: len(self.lasers)], lengths[len(self.lasers) :]
         spots, points = (legs.cpu().reshape(-1) for legs in (self.scan.laser_legs, self.scan.sensor_legs))
+        if not self.scan.first_and_last_leg:
+            return torch.zeros_like(spots), torch.zeros_like(points)
         if self.scan.kind != "confocal":
             return spots, points
         return torch.zeros(1, dtype=torch.float64, device="cpu"), points + spots
@@ -292,19 +262,11 @@ class PhasorField(ScanOperator):
         """Lengths that are looked at, without legs: none is shorter or longer."""
         rows, columns = self.grid.size
         dy, dx = self.grid.pitch
-        corners = torch.tensor(
-            [
-                [float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h]
-                for i, j, h in itertools.product((0, columns - 1), (0, rows - 1), self.heights[[0, -1]].tolist())
-            ],
-            dtype=torch.float64, device="cpu",
-        )
-        edge = [
-            [i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0]
-            for i in (0, self.wall.size[1] - 1)
-            for j in (0, self.wall.size[0] - 1)
-        ]
-        sensors = torch.tensor(edge, dtype=torch.float64, device="cpu")
+        ends = itertools.product((0, columns - 1), (0, rows - 1), self.heights[[0, -1]].tolist())
+        of_planes = [[float(self.corner[0]) + i * dx, float(self.corner[1]) + j * dy, h] for i, j, h in ends]
+        edges = itertools.product((0, self.wall.size[1] - 1), (0, self.wall.size[0] - 1))
+        of_wall = [[i * self.wall.pitch[1], j * self.wall.pitch[0], 0.0] for i, j in edges]
+        corners, sensors = (torch.tensor(x, dtype=torch.float64, device="cpu") for x in (of_planes, of_wall))
         # Distances are convex: the longest ends at corners. None is shorter than the way along the normal.
         far, near = float(torch.cdist(corners, sensors).max()), float(self.heights.abs().min())
         if self.scan.kind == "confocal":
@@ -327,8 +289,8 @@ class PhasorField(ScanOperator):
         times = torch.zeros(1, dtype=torch.float64, device="cpu") if self.camera.times is None else self.camera.times
         return {
             "dft": torch.cat([weights * phase.cos(), weights * phase.sin()]),
-            "legs": _phase_pairs(self.frequencies[:, None] * torch.cat([spots, points])),
-            "moments": _phase_pairs(times[:, None] * self.frequencies),
+            "legs": torch.view_as_real(_turned(self.frequencies[:, None] * torch.cat([spots, points]))),
+            "moments": torch.view_as_real(_turned(times[:, None] * self.frequencies)),
         }
 
     def reconstruct(self, transient: Tensor | Capture) -> Tensor:
@@ -471,6 +433,3 @@ class PhasorField(ScanOperator):
     def _nearest(self) -> float:
         """Half a bin, metres."""
         return self.axis.bin_width_opl / 2
-
-    def extra_repr(self) -> str:
-        return f"{super().extra_repr()}, {self.pulse}, {len(self.frequencies)} frequencies"

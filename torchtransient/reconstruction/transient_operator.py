@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,24 +14,29 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.capture import Capture, Scan
-from torchtransient.checks import arguments_of
+from torchtransient.capture.capture import precision_of
 from torchtransient.errors import ShapeError
 from torchtransient.reconstruction.capture_checks import (
     check_from_zero,
     check_proportions,
     check_reach,
-    checked_axis,
     checked_capture,
     checked_intensities,
     checked_points,
-    checked_precision,
-    checked_scan,
     confocal_wall,
-    same_light,
     telling,
 )
-from torchtransient.reconstruction.linear import LinearOperator, check_same, packed, plain, unpacked
+from torchtransient.reconstruction.linear import (
+    LinearOperator,
+    check_same,
+    checked_precision,
+    each,
+    packed,
+    plain,
+    unpacked,
+)
 from torchtransient.reconstruction.voxels import PlanarScan, VoxelGrid
+from torchtransient.tensor_record import same
 
 
 class TransientOperator(LinearOperator):
@@ -51,7 +57,6 @@ class TransientOperator(LinearOperator):
         dtype: float32 or float64.
 
     Raises:
-        ArgumentError: for other objects than a time axis.
         UnitError: for another dtype, and a wall and a record that are not of one size.
     """
 
@@ -61,17 +66,15 @@ class TransientOperator(LinearOperator):
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         super().__init__()
         who = type(self).__name__
-        scan = scan if isinstance(scan, PlanarScan) else checked_scan(scan, who)
-        self.scan, self.axis = _kept(scan), checked_axis(time_axis, who)
-        self.dtype = checked_precision(dtype, who)
-        check_proportions(scan, self.axis, who)
+        # A copy that later changes of the caller's tensors do not reach.
+        copies: dict[str, Any] = {k: v.detach().clone() for k, v in vars(scan).items() if isinstance(v, Tensor)}
+        self.scan, self.axis, self.dtype = replace(scan, **copies), time_axis, checked_precision(dtype, who)
+        check_proportions(scan, time_axis, who)
 
     @property
     def points(self) -> Tensor:
         """Places of the values of a volume in world coordinates, (..., 3) float64 on the CPU, metres."""
-        if self.grid is None:
-            who = type(self).__name__
-            raise ShapeError(f"{who}: expected a grid, or points of the class itself, got neither. Set its grid.")
+        assert self.grid is not None  # else the class has points of its own
         return self.grid.points
 
     @property
@@ -157,19 +160,18 @@ class TransientOperator(LinearOperator):
         return self._taken("transient", transient, self.data_shape, real=True)
 
     def _takes(self, scan: Scan) -> bool:
-        """Return True where captures of a scan are the operator's data."""
-        return isinstance(self.scan, Scan) and same_light(scan, self.scan)
+        """Return True where captures of a scan are the operator's data: equal kind, points and, where they count,
+        legs.
+        """
+        if scan is self.scan:
+            return True
+        mine, theirs = self._measured(), telling(scan)
+        return len(mine) == len(theirs) and all(same(a, b) for a, b in zip(mine, theirs, strict=True))
 
     def extra_repr(self) -> str:
         volume = " x ".join(map(str, self.volume_shape))
         what = "voxels" if self.volume_name == "volume" else "bins and points"
         return f"{volume} {what}, {self.scan!r}, {self.axis}, {str(self.dtype).removeprefix('torch.')}"
-
-
-def _kept(scan: Scan | PlanarScan) -> Scan | PlanarScan:
-    """A copy that later changes of the caller's tensors do not reach."""
-    copies: dict[str, Any] = {k: v.detach().clone() for k, v in vars(scan).items() if isinstance(v, Tensor)}
-    return replace(scan, **copies)
 
 
 def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who: str, **options: Any) -> Tensor:
@@ -186,13 +188,11 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
         ``reconstruct`` of the capture.
 
     Raises:
-        ShapeError: for other objects than captures, for phasors alone, and as the class.
+        ShapeError: for phasors alone, and as the class.
     """
     transient, axis = checked_capture(capture, who)
-    options.setdefault("dtype", torch.float64 if transient.dtype == torch.float64 else torch.float32)
-    with arguments_of(who, kind.__init__, ("scan", "time_axis")):
-        operator = kind(capture.scan, *points, time_axis=axis, **options)
-    operator = operator.to(transient.device)
+    options.setdefault("dtype", precision_of(transient))
+    operator = kind(capture.scan, *points, time_axis=axis, **options).to(transient.device)
     volume: Tensor = operator.reconstruct(capture)
     return volume
 
@@ -209,7 +209,7 @@ class ScanOperator(TransientOperator):
         dtype: float32 or float64.
 
     Raises:
-        ShapeError: for other objects than scans and points.
+        ShapeError: for other objects than points.
         UnitError: for points that are not finite or far beyond the record, and for another dtype.
     """
 
@@ -217,7 +217,7 @@ class ScanOperator(TransientOperator):
 
     def __init__(self, scan: Scan, points: VoxelGrid | Tensor, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         who = type(self).__name__
-        super().__init__(checked_scan(scan, who), time_axis=time_axis, dtype=dtype)
+        super().__init__(scan, time_axis=time_axis, dtype=dtype)
         self.grid = points if isinstance(points, VoxelGrid) else None
         self._points = None if isinstance(points, VoxelGrid) else checked_points(points, who)
         check_reach(scan, points if self._points is None else self._points, time_axis, who)
@@ -269,7 +269,7 @@ class ConfocalOperator(TransientOperator):
     def __init__(self, scan: Scan | PlanarScan, *, time_axis: TimeAxis, dtype: torch.dtype) -> None:
         who = type(self).__name__
         confocal_wall(scan, who)
-        bins = checked_axis(time_axis, who).num_bins
+        bins = time_axis.num_bins
         if bins < LEAST_BINS:
             raise ShapeError(f"{who}: expected a time axis of {LEAST_BINS} bins at least, got {bins}.")
         if not self.early:
@@ -292,6 +292,38 @@ class ConfocalOperator(TransientOperator):
         return scan is self.scan or self.wall.matches(confocal_wall(scan, type(self).__name__))
 
 
+class InvertibleOperator(ConfocalOperator):
+    """A confocal operator with a regularised inverse, which classes define for one item of a batch."""
+
+    @abstractmethod
+    def invert(self, data: Tensor) -> Tensor:
+        """Return the volume of one transient, (*data_shape) to (*volume_shape)."""
+
+    @abstractmethod
+    def invert_adjoint(self, volume: Tensor) -> Tensor:
+        """Return the adjoint of :meth:`invert`, (*volume_shape) to (*data_shape)."""
+
+    @property
+    def inverse(self) -> InverseOperator:
+        """The Wiener inverse: transients (..., T, Y, X) to volumes, a linear operator with an adjoint of its own."""
+        return InverseOperator(self)
+
+    def reconstruct(self, transient: Tensor | Capture) -> Tensor:
+        """Return the Wiener inverse of a transient, linear and differentiable.
+
+        Args:
+            transient: (..., T, Y, X), or a capture of the operator's scan and axis.
+
+        Returns:
+            As many volumes.
+
+        Raises:
+            ShapeError: for other transients and captures.
+        """
+        volume: Tensor = self.inverse(self.transients(transient))
+        return volume
+
+
 class InverseOperator(LinearOperator):
     """A regularised inverse of an operator, itself a linear operator from its data to its volume.
 
@@ -302,36 +334,24 @@ class InverseOperator(LinearOperator):
         operator: to be inverted.
     """
 
-    def __init__(self, operator: ConfocalOperator) -> None:
+    def __init__(self, operator: InvertibleOperator) -> None:
         super().__init__()
         # Modules that share tables but not the lists of them.
         self.operator = copy.copy(operator)
         for name in ("_buffers", "_parameters", "_modules"):
             setattr(self.operator, name, dict(getattr(operator, name)))
         self.volume_shape, self.data_shape = operator.data_shape, operator.volume_shape
+        self.axis, self.grid, self.depths = operator.axis, operator.grid, operator.depths
         self.dtype = operator.dtype
         self.volume_name, self.data_name = "transient", operator.volume_name
 
     @property
-    def axis(self) -> TimeAxis:
-        """Time axis of the transients."""
-        return self.operator.axis
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """Voxels of the result."""
-        return self.operator.grid
-
-    @property
     def points(self) -> Tensor:
         """(Z, Y, X, 3) float64 on the CPU: these voxels in world coordinates, metres."""
-        return self.operator.points
+        return self.grid.points
 
-    @property
-    def depths(self) -> Tensor:
-        """(Z,) float64: distances of their planes from the wall, metres."""
-        return self.operator.depths
+    def map_(self, x: Tensor) -> Tensor:
+        return each(self.operator.invert, x, len(self.volume_shape))
 
-    def extra_repr(self) -> str:
-        taken, found = (" x ".join(map(str, shape)) for shape in (self.volume_shape, self.data_shape))
-        return f"{self.volume_name} of {taken} to {self.data_name} of {found}"
+    def adjoint_(self, y: Tensor) -> Tensor:
+        return each(self.operator.invert_adjoint, y, len(self.data_shape))

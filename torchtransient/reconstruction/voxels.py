@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, ClassVar
@@ -14,9 +13,10 @@ from torch import Tensor
 from torchtransient.capture import Scan, Wall
 from torchtransient.capture.capture import metadata_text, summed
 from torchtransient.capture.scan import bounds_of
-from torchtransient.checks import Numbers, count, of_class, positive, real_array, shown
-from torchtransient.errors import ArgumentError, SceneError, ShapeError, UnitError
-from torchtransient.tensor_record import TensorRecord
+from torchtransient.capture.wall import triple
+from torchtransient.checks import Numbers, count, positive, real_array, shown
+from torchtransient.errors import SceneError, ShapeError, UnitError
+from torchtransient.tensor_record import TensorRecord, same
 
 # Share of a pitch that points may be off the grid: single precision of a scan that is metres away from the origin.
 OFF_GRID = 1e-3
@@ -43,23 +43,21 @@ class PlanarScan:
     normal: Tensor
 
     @staticmethod
-    def of(points: Tensor, normals: Tensor | None = None, *, who: str, what: str = "sensor points") -> PlanarScan:
-        """Return the grid of points.
+    def of(points: Tensor, *, who: str) -> PlanarScan:
+        """Return the grid of points, whose normal is ``along_x`` times ``along_y``.
 
         Args:
             points: (Y, X, 3), two along each side at least, metres.
-            normals: (Y, X, 3) of the wall, towards the hidden side; without them it is that of ``along_x`` times
-                ``along_y``.
             who: begins the message.
-            what: name of the points in the message.
 
         Raises:
             ShapeError: for a list of points, and for grids that are not regular, not at right angles, or not flat.
         """
-        check_real(points, f"{who}: {what}")
         p = points.detach().to("cpu", torch.float64, copy=True)
         if p.ndim != 3 or p.shape[-1] != 3 or min(p.shape[:2]) < 2:
-            raise ShapeError(f"{who}: expected {what} as a grid (Y, X, 3) of 2 x 2 at least, got {tuple(p.shape)}.")
+            raise ShapeError(
+                f"{who}: expected sensor points as a grid (Y, X, 3) of 2 x 2 at least, got {tuple(p.shape)}."
+            )
         rows, columns = p.shape[:2]
         x, y = (p[0, -1] - p[0, 0]) / (columns - 1), (p[-1, 0] - p[0, 0]) / (rows - 1)
         dx, dy = float(x.norm()), float(y.norm())
@@ -69,16 +67,13 @@ class PlanarScan:
         off = float((p - expected).norm(dim=-1).max())
         if not (slack > 0 and off <= slack and abs(float(x @ y)) <= OFF_GRID * dx * dy):
             raise ShapeError(
-                f"{who}: expected {what} on a regular, rectangular grid of a flat wall, got some {off:.3g} m off it "
-                f"(pitch {dy:.3g} x {dx:.3g} m, angle {_angle(x, y)}). Use Backprojection, which takes any points."
+                f"{who}: expected sensor points on a regular, rectangular grid of a flat wall, got some {off:.3g} m off"
             )
         along_x = x / dx
         # At right angles to rounding, where the points are to a share of their pitch.
         along_y = y - (y @ along_x) * along_x
         along_y = along_y / along_y.norm()
         normal = torch.linalg.cross(along_x, along_y)
-        if normals is not None:
-            normal = _with_normals(normal, normals)
         return PlanarScan((rows, columns), (dy, dx), p[0, 0], along_x=along_x, along_y=along_y, normal=normal)
 
     @staticmethod
@@ -92,7 +87,6 @@ class PlanarScan:
         Raises:
             ShapeError: for other scans.
         """
-        of_class(f"{who}: scan", scan, Scan, error=ShapeError)
         wall = PlanarScan.of(scan.sensor_points, who=who)
         return replace(wall, normal=hidden_side(scan, wall.normal))
 
@@ -142,36 +136,13 @@ def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
         normal: (3,).
     """
     if scan.sensor_normals is not None:
-        return _with_normals(normal, scan.sensor_normals)
+        mean = scan.sensor_normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
+        return normal if float(mean @ normal) >= 0 else -normal
     points = scan.sensor_points.detach().to("cpu", torch.float64).reshape(-1, 3)
     middle, extent = points.mean(0), float((points.amax(0) - points.amin(0)).norm())
     origins = (origin.detach().to("cpu", torch.float64) for origin in (scan.sensor_origin, scan.laser_origin))
     heights = [float((origin - middle) @ normal) for origin in origins]
     return -normal if max(heights) < -1e-6 * extent else normal
-
-
-def check_real(points: Tensor, what: str) -> None:
-    """Refuse complex tensors and truth values, which a conversion would make real numbers of.
-
-    Args:
-        points: any tensor.
-        what: begins the message.
-
-    Raises:
-        ShapeError: for such tensors.
-    """
-    if points.is_complex() or points.dtype == torch.bool:
-        raise ShapeError(f"{what}: expected real numbers, got {points.dtype}.")
-
-
-def _with_normals(normal: Tensor, normals: Tensor) -> Tensor:
-    mean = normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
-    return normal if float(mean @ normal) >= 0 else -normal
-
-
-def _angle(x: Tensor, y: Tensor) -> str:
-    cos = float(x @ y) / max(float(x.norm() * y.norm()), 1e-300)
-    return f"{math.degrees(math.acos(max(-1.0, min(1.0, cos)))):.2f} degrees"
 
 
 # How far points are off one line at most, as a share of its length.
@@ -209,17 +180,12 @@ class VoxelGrid:
 
     def __post_init__(self) -> None:
         depths = checked_depths(self.depths, "VoxelGrid")
-        size = tuple(count("VoxelGrid: size", n) for n in _numbers("VoxelGrid: size", self.size, 2, one=False))
-        pitch = tuple(positive("VoxelGrid: pitch", p) for p in _numbers("VoxelGrid: pitch", self.pitch, 2, one=False))
+        size = tuple(count("VoxelGrid: size", n) for n in self.size)
+        pitch = tuple(positive("VoxelGrid: pitch", p) for p in self.pitch)
         for name, value in {"depths": depths, "size": size, "pitch": pitch}.items():
             object.__setattr__(self, name, value)
         for name in ("first", "along_x", "along_y", "normal"):
-            plain = real_array(getattr(self, name))
-            if plain is None or plain.shape != (3,):
-                raise ShapeError(f"VoxelGrid: expected {name} as a vector (3,), got {shown(getattr(self, name))}.")
-            if not np.isfinite(plain).all():
-                raise UnitError(f"VoxelGrid: expected {name} of finite numbers, got {plain.tolist()}.")
-            object.__setattr__(self, name, torch.from_numpy(plain))
+            object.__setattr__(self, name, torch.from_numpy(triple(f"VoxelGrid: {name}", getattr(self, name))))
         axes = torch.stack([self.along_x, self.along_y, self.normal])
         if not torch.allclose(axes @ axes.T, torch.eye(3, dtype=torch.float64, device="cpu"), atol=1e-6):
             raise ShapeError(
@@ -260,7 +226,6 @@ class VoxelGrid:
             UnitError: for depths that do not increase.
             SceneError: where points on one line, or one point, do not say an extent.
         """
-        of_class("VoxelGrid.before: scan", scan, Scan, error=ShapeError)
         depths = checked_depths(depths, "VoxelGrid.before")
         if size is None and extent is None:
             wall = PlanarScan.of_scan(scan, "VoxelGrid.before without size and extent")
@@ -268,7 +233,7 @@ class VoxelGrid:
         points = scan.sensor_points.detach().to("cpu", torch.float64)
         along_x, along_y, normal = _wall_axes(scan, points)
         if size is None and points.ndim != 3:
-            raise ShapeError(f"VoxelGrid.before: expected size= for a list of points, got {shown(size)}.")
+            raise ShapeError("VoxelGrid.before: expected size= for a list of points, got none.")
         shape = reversed(points.shape[:-1]) if size is None else _numbers("VoxelGrid.before: size", size, 2)
         columns, rows = (count("VoxelGrid.before: size", n) for n in shape)
         flat = points.reshape(-1, 3)
@@ -281,8 +246,7 @@ class VoxelGrid:
             spans.append((float(along.max() + along.min()) / 2, spread * cells))
         if extent is None and min(span for _, span in spans) <= ON_ONE_LINE * max(span for _, span in spans):
             raise SceneError(
-                f"VoxelGrid.before: the sensor points of this scan lie on one line of the planes ({scan!r}), which "
-                "does not say how wide and high a volume is. Give extent=(width, height) in metres."
+                f"VoxelGrid.before: the points of {scan!r} lie on one line. Give extent=(width, height) in metres."
             )
         given = (spans[0][1], spans[1][1]) if extent is None else _numbers("VoxelGrid.before: extent", extent, 2)
         width, height = (positive("VoxelGrid.before: extent", value) for value in given)
@@ -305,15 +269,7 @@ class VoxelGrid:
         Raises:
             ShapeError, UnitError: as the class.
         """
-        return cls(
-            depths,
-            wall.size,
-            wall.pitch,
-            first=wall.first,
-            along_x=wall.along_x,
-            along_y=wall.along_y,
-            normal=wall.normal,
-        )
+        return cls(depths, **vars(wall))
 
     @classmethod
     def bounds(cls, bounds: Any, size: int | Sequence[int]) -> VoxelGrid:
@@ -368,9 +324,7 @@ class VoxelGrid:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, VoxelGrid):
             return NotImplemented
-        tensors = ("depths", "first", "along_x", "along_y", "normal")
-        same = all(torch.equal(getattr(self, name), getattr(other, name)) for name in tensors)
-        return same and (self.size, self.pitch) == (other.size, other.pitch)
+        return all(same(a, b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
 
     def __hash__(self) -> int:
         return hash((self.shape, self.pitch))
@@ -401,12 +355,12 @@ def checked_depths(values: Any, who: str) -> Tensor:
     return depths
 
 
-def _numbers(name: str, value: Any, many: int, *, one: bool = True) -> list[float]:
-    """``many`` numbers; ``one``: or one that stands for all. Raises ShapeError."""
+def _numbers(name: str, value: Any, many: int) -> list[float]:
+    """``many`` numbers, or one that stands for all. Raises ShapeError."""
     plain = real_array(value)
-    if plain is None or (plain.shape != (many,) and not (one and plain.shape == ())):
-        raise ShapeError(f"{name}: expected {many} numbers{' or one for all' * one}, got {shown(value)}.")
-    numbers: list[float] = plain.tolist() if plain.ndim else [plain.item()] * many
+    if plain is None or plain.shape not in ((many,), ()):
+        raise ShapeError(f"{name}: expected {many} numbers or one for all, got {shown(value)}.")
+    numbers: list[float] = np.broadcast_to(plain, many).tolist()
     return numbers
 
 
@@ -423,8 +377,7 @@ def _mean_normal(scan: Scan, points: Tensor) -> Tensor:
     across: Tensor = towards - (towards @ axes[0]) * axes[0] if len(points) > 1 else towards
     if float(across.norm()) <= ON_ONE_LINE * float(towards.norm()):
         raise ShapeError(
-            "VoxelGrid.before: expected points that say where the hidden side is, got a sensor on the one line that "
-            "they lie on. Give their normals to Scan.points, or take VoxelGrid.bounds."
+            "VoxelGrid.before: the sensor stands on the one line of its points. Give their normals to Scan.points."
         )
     return across
 
@@ -519,36 +472,22 @@ class HiddenVolume(TensorRecord):
 
 def _check_volume(volume: HiddenVolume) -> None:
     """Raise ShapeError unless values, times and directions are real and fit the grid and each other."""
-    if not isinstance(volume.grid, VoxelGrid):
-        raise ArgumentError(f"HiddenVolume: expected grid as a VoxelGrid, got {shown(volume.grid)}.")
-    frames = () if volume.times is None else _frames(volume.times)
+    frames = () if volume.times is None else tuple(volume.times.shape)
+    if volume.times is not None and (len(frames) != 1 or not bool(torch.isfinite(volume.times).all())):
+        error = UnitError if len(frames) == 1 else ShapeError
+        raise error(f"HiddenVolume: expected finite times (N,) in metres of optical path, got {volume.times}.")
     _check_values("values", volume.values, (*frames, *volume.grid.shape))
     if volume.directions is not None:
         _check_values("directions", volume.directions, (3, *volume.grid.shape))
-        items = tuple(volume.values.shape[: -3 - len(frames)])
-        if tuple(volume.directions.shape[:-4]) != items:
-            sizes = ", ".join(map(str, (*items, 3, *volume.grid.shape)))
-            raise ShapeError(
-                f"HiddenVolume: expected directions ({sizes}), one for each of the values, got "
-                f"{tuple(volume.directions.shape)}."
-            )
-    if not isinstance(volume.method, str) or "\0" in volume.method:
-        raise ArgumentError(f"HiddenVolume: expected method as a name, got {shown(volume.method)}.")
+        if volume.directions.shape[:-4] != volume.values.shape[: -3 - len(frames)]:
+            raise ShapeError("HiddenVolume: expected directions for each of the values, got other leading dimensions.")
     metadata_text(volume.metadata, "HiddenVolume")
 
 
-def _frames(times: Any) -> tuple[int]:
-    if not isinstance(times, Tensor) or times.ndim != 1 or times.is_complex():
-        got = f"{tuple(times.shape)} {times.dtype}" if isinstance(times, Tensor) else shown(times)
-        raise ShapeError(f"HiddenVolume: expected times as a tensor (N,) of real numbers, got {got}.")
-    if not bool(torch.isfinite(times).all()):
-        raise UnitError("HiddenVolume: expected finite times in metres of optical path, got some that are not.")
-    return (len(times),)
-
-
-def _check_values(name: str, tensor: Any, shape: tuple[int, ...]) -> None:
-    fits = isinstance(tensor, Tensor) and tensor.ndim > len(shape) and tuple(tensor.shape[-len(shape) :]) == shape
-    if not fits or tensor.is_complex() or tensor.dtype == torch.bool or tensor.numel() == 0:
-        got = f"{tuple(tensor.shape)} {tensor.dtype}" if isinstance(tensor, Tensor) else shown(tensor)
+def _check_values(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    real = not tensor.is_complex() and tensor.dtype != torch.bool and tensor.numel() > 0
+    if not real or tensor.ndim <= len(shape) or tuple(tensor.shape[-len(shape) :]) != shape:
         sizes = ", ".join(map(str, shape))
-        raise ShapeError(f"HiddenVolume: expected {name} (..., C, {sizes}) of real numbers, got {got}.")
+        raise ShapeError(
+            f"HiddenVolume: expected {name} (..., C, {sizes}), real, got {tuple(tensor.shape)} {tensor.dtype}."
+        )

@@ -15,6 +15,7 @@ from support.sweeps import together
 from torchtransient.axes import FrequencyAxis, TimeAxis
 from torchtransient.capture import Capture
 from torchtransient.errors import StorageError
+from torchtransient.reconstruction import PlanarScan
 
 LEGS, PLAIN = grids(), grids(legs=False)
 
@@ -263,9 +264,7 @@ def test_numbers_of_old_matlab_files_against_scipy(tmp_path, compressed):
     kinds |= {kind: rng.random((3, 3, 4)).astype(kind) for kind in ("f4", "f8")}
     kinds |= {"sparse": (rng.random((32, 32, 512)) < 1e-4).astype(np.uint8), "whole": np.full((3, 3, 4), 7.0)}
     for given in kinds.values():
-        scipy.io.savemat(
-            tmp_path / "a.mat", {"rect_data": given, "width": 0.5, "ts": 4e-12}, do_compression=compressed
-        )
+        scipy.io.savemat(tmp_path / "a.mat", {"rect_data": given, "width": 0.5, "ts": 4e-12}, do_compression=compressed)
         found = Capture.read(tmp_path / "a.mat").transient[0]
         # MATLAB's (x, y, t), each as it was written.
         np.testing.assert_array_equal(found.numpy(), given.transpose(2, 1, 0))
@@ -329,7 +328,9 @@ def test_widths_and_spacings_differ_by_a_cell(tmp_path, off, taken):
             Capture.read(tmp_path / "a.mat")
         return
     # A confocal scan goes by its width.
-    assert Capture.read(tmp_path / "a.mat").scan.spacing == pytest.approx(((4 + off) / 16,) * 2)
+    assert PlanarScan.of_scan(Capture.read(tmp_path / "a.mat").scan, "test").pitch[::-1] == pytest.approx(
+        ((4 + off) / 16,) * 2
+    )
 
 
 def test_a_fixed_point_by_its_index(tmp_path):
@@ -339,7 +340,7 @@ def test_a_fixed_point_by_its_index(tmp_path):
     found = Capture.read(tmp_path / "a.mat")
     # (t, x, y) in the file: three rows of two columns, lit at x = 1, y = 2.
     assert found.scan.kind == "single" and found.scan.sensor_shape == (3, 2)
-    assert found.scan.spacing == pytest.approx((0.5, 0.5))
+    assert PlanarScan.of_scan(found.scan, "test").pitch[::-1] == pytest.approx((0.5, 0.5))
     torch.testing.assert_close(found.scan.laser_points, torch.tensor([0.25, 0.5, 0.0], dtype=torch.float64))
     np.testing.assert_array_equal(found.transient[0].numpy(), data.swapaxes(1, 2))
     write_mat(tmp_path / "a.mat", said | {"more": np.ones(1)})

@@ -12,6 +12,7 @@ import torch
 
 from torchtransient.errors import StorageError
 from torchtransient.files import read_capture
+from torchtransient.reconstruction import PlanarScan
 from torchtransient.units import SPEED_OF_LIGHT
 
 MEASURED = Path(__file__).with_name("measured")
@@ -29,7 +30,7 @@ def test_a_scan_through_foam():
     assert capture.transient.shape == (1, 512, 32, 32) and capture.transient.dtype == torch.float32
     np.testing.assert_array_equal(capture.transient[0], raw(SCAN, "meas").transpose(2, 1, 0))
     points, pitch = capture.scan.sensor_points, 0.6 / 32
-    np.testing.assert_allclose(capture.scan.spacing, (pitch, pitch), rtol=1e-12)
+    np.testing.assert_allclose(PlanarScan.of_scan(capture.scan, "test").pitch[::-1], (pitch, pitch), rtol=1e-12)
     np.testing.assert_allclose(points[0, 0], [-0.3 + pitch / 2, -0.3 + pitch / 2, 0], atol=1e-15)
     np.testing.assert_allclose(points[3, 5] - points[0, 0], [5 * pitch, 3 * pitch, 0], atol=1e-15)
     assert capture.scan.kind == "confocal" and not capture.scan.first_and_last_leg
@@ -37,7 +38,7 @@ def test_a_scan_through_foam():
     assert assumed["bin_width_s"] == 16e-12 and assumed["start_s"] == 0.0
     assert assumed["sensor_origin"] == capture.scan.sensor_origin.tolist()
     wide = read_capture(SCAN, wall_size=(0.6, 0.7)).scan
-    np.testing.assert_allclose(wide.spacing, np.array([0.6, 0.7]) / 32, rtol=1e-12)
+    np.testing.assert_allclose(PlanarScan.of_scan(wide, "test").pitch[::-1], np.array([0.6, 0.7]) / 32, rtol=1e-12)
     with pytest.raises(StorageError, match=r"does not say wall_size. Give wall_size="):
         read_capture(SCAN)
 
