@@ -23,7 +23,7 @@ from support.killed_writers import output
 from support.sealed_files import as_first_version
 from support.sweeps import together
 from torchtransient.array_files import array_file, hdf5
-from torchtransient.errors import ArgumentError, MissingPackageError, ShapeError, StorageError, UnitError
+from torchtransient.errors import MissingPackageError, ShapeError, StorageError, UnitError
 from torchtransient.files import read_result, write_result
 
 SEED = 3
