@@ -43,8 +43,10 @@ CASES = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=pytest.mark.slow if case == "single" else pytest.mark.soak) for case in CASES],
+)
 def test_late_light(case):
     interior, whole, error = agree(CASES[case](), 2**15, 8, 2**17, 16, step=1e-2, most_error=0.25)
     assert abs(interior - whole) > 5 * error

@@ -110,7 +110,7 @@ def test_keys_listed_are_keys_offered(rows, folder, name):
     assert listed(rows).get(name, set()) == offered(SETTINGS[name], folder)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_all_keys_listed_are_keys_offered(rows, folder):
     found = listed(rows)
     for name, setting in SETTINGS.items():
@@ -259,13 +259,13 @@ def sample():
     return [*bare, *random.Random(3).sample(nested, 6)]
 
 
-EIGHTHS = [pytest.param(eighth, marks=pytest.mark.soak if eighth else pytest.mark.slow) for eighth in range(8)]
+PARTS = [pytest.param(part, marks=pytest.mark.soak if part else pytest.mark.slow) for part in range(16)]
 
 
-@pytest.mark.parametrize("eighth", EIGHTHS)
-def test_against_finite_differences(tmp_path, eighth):
+@pytest.mark.parametrize("part", PARTS)
+def test_against_finite_differences(tmp_path, part):
     """Few samples: what they cannot decide, the whole sweep does."""
-    file, settings = ResultFile(tmp_path / "results.jsonl"), sample()[eighth::8]
+    file, settings = ResultFile(tmp_path / "results.jsonl"), sample()[part::16]
     runner.sweep(settings, file, quick=True)
     results = file.results()
     assert {line["setting"] for line in results} >= {setting.name for setting in settings if setting.kind == "bsdf"}

@@ -47,6 +47,14 @@ ALIKE = {
 }  # fmt: skip
 
 
+# Of the slow ones, those that take more than six seconds and move edges or bend rays as quicker ones do: soaked.
+LONGEST = {
+    "instance_of_glass_turns", "spline_bends", "ellipsoid_mirror_moves", "linear_curve_bends", "mirror_tilts",
+    "polar_two_sided_tilts", "camera_moves_in_glass", "instance_turns", "sun_direction", "polar_wall_distance",
+    "pattern_and_light_move", "medium_wall_behind",
+}  # fmt: skip
+
+
 def marked(cases):
     """Parameters of a test, with the marker that a case's cost asks for."""
     found, seen, later = [], Counter(), Counter()
@@ -54,8 +62,8 @@ def marked(cases):
         slow = "slow" in case.tags or case.name in LONG or seen[case.row] >= FIRST
         seen[case.row] += not slow
         later[case.row] += slow
-        marks = [pytest.mark.soak if later[case.row] > SECOND else pytest.mark.slow] if slow else []
-        marks += [pytest.mark.slow] if not slow and case.name in ALIKE else []
+        soak = case.name in LONGEST or later[case.row] > SECOND
+        marks = [pytest.mark.soak if soak else pytest.mark.slow] if slow or case.name in ALIKE else []
         found.append(pytest.param(case, id=case.name, marks=marks))
     return found
 

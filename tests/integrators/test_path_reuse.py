@@ -156,7 +156,7 @@ def test_wavelengths():
     check_same_light(room(), "llvm_ad_spectral")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_means_are_those_of_plain_paths_to_a_thousandth():
     """Energy to 1e-3, Student's t of blocks with mean 0 and deviation 1.
 

@@ -44,12 +44,11 @@ def gradients(lit):
     return {key: value.grad for key, value in lit.values.items()}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lit", "other", "weight"),
     [
-        (under_a_sphere, WALL_POSE, 1e-6),
-        (under_a_sun, SUN, 0.0),
+        pytest.param(under_a_sphere, WALL_POSE, 1e-6, marks=pytest.mark.slow),
+        pytest.param(under_a_sun, SUN, 0.0, marks=pytest.mark.soak),
     ],
 )
 def test_a_length_beside_it_changes_no_derivative_by_an_albedo(lit, other, weight):

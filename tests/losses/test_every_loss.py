@@ -295,9 +295,15 @@ def test_on_the_device_of_the_tensors(case):
     torch.testing.assert_close(found.cpu(), case(x.cpu(), y.cpu(), mask.cpu()))
 
 
-@pytest.mark.slow
-@every
-def test_compiled(case):
+@pytest.mark.parametrize(
+    "cases", [pytest.param(CASES[::4], marks=pytest.mark.slow), pytest.param(CASES, marks=pytest.mark.soak)], ids=len
+)
+def test_compiled(cases):
+    for case in cases:
+        check_compiled(case)
+
+
+def check_compiled(case):
     """Values and gradients; likelihoods break the graph where they look at their values, others where they ask what
     compares for its arguments.
     """

@@ -65,7 +65,7 @@ def render(scene, keys=(), spp=1024, count=6):
     ("sensor", "sigma_t", "key"),
     [
         ("perspective", 1.0, "fog.sigma_t.value.value"),
-        pytest.param("orthographic", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.slow),
+        pytest.param("orthographic", grid(1.0), "fog.sigma_t.data", marks=pytest.mark.soak),
     ],
 )
 def test_light_is_attenuated_up_to_the_camera(sensor, sigma_t, key):

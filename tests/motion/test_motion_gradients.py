@@ -84,8 +84,14 @@ def of_a_corner(name):
     return image, step
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["velocity", "turn", "pose"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("velocity", marks=pytest.mark.soak),
+        pytest.param("turn", marks=pytest.mark.slow),
+        pytest.param("pose", marks=pytest.mark.slow),
+    ],
+)
 def test_differences_in_a_corner(name):
     image, step = of_a_corner(name)
 

@@ -135,10 +135,13 @@ SIDEWAYS = torch.zeros(4, 4)
 SIDEWAYS[:2, 3] = torch.tensor([1.0, 0.5])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("where", "key"),
-    [("in view", "plate.to_world"), ("in view", "sensor.to_world"), ("its shadow", "lamp.position")],
+    [
+        pytest.param("in view", "plate.to_world", marks=pytest.mark.slow),
+        pytest.param("in view", "sensor.to_world", marks=pytest.mark.soak),
+        pytest.param("its shadow", "lamp.position", marks=pytest.mark.slow),
+    ],
 )
 def test_outlines_that_poses_move(where, key):
     """What they hide and uncover has other rates. No outline comes to the border of a pixel, where differences kink."""
@@ -170,11 +173,15 @@ def behind(bender):
 
 AWAY = torch.zeros(4, 4)
 AWAY[2, 3] = 1.0
-SEEN = [("mirror", "body.to_world"), ("mirror", "lamp.position"), ("mirror", "bender.to_world"),
-        ("pane", "body.to_world"), ("pane", "sensor.to_world")]  # fmt: skip
+SEEN = [
+    pytest.param("mirror", "body.to_world", marks=pytest.mark.slow),
+    pytest.param("mirror", "lamp.position", marks=pytest.mark.slow),
+    pytest.param("mirror", "bender.to_world", marks=pytest.mark.soak),
+    pytest.param("pane", "body.to_world", marks=pytest.mark.soak),
+    pytest.param("pane", "sensor.to_world", marks=pytest.mark.soak),
+]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("bender", "key"), SEEN)
 def test_outlines_and_shadows_behind_a_mirror_or_a_pane_that_moves(bender, key):
     """The light that they hide and uncover has the rate of the whole way. Of poses of a mirror, what moves it away."""
@@ -193,7 +200,7 @@ def test_outlines_in_beats():
 # ------------------------------------------------------------------------------------------- glass, meshes, copies, fog
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_velocities_and_index_of_glass():
     """A tilted pane before a wall, with a lamp that paths find."""
     pane = {"type": "cube", "to_world": translate([0, 0, 2.0]) @ rotate([1, 0, 0], 10) @ scale([3, 3, 0.1]),
@@ -227,7 +234,7 @@ def test_velocities_of_lamps_whose_vertices_move():
     compare(renderer_of(bent_lamp(), ["lamp.vertex_velocity", "back.velocity.linear"], spp=2048))
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_places_and_shadows_of_lamps_whose_vertices_move():
     grows = {"lamp.vertex_positions": torch.tensor([[0.5, 0, 1], [1, 0.3, 0.5], [0.2, 0.5, 0.8], [0.5, -0.4, 1.2]])}
     compare(renderer_of(bent_lamp(), list(grows)), grows)

@@ -66,7 +66,7 @@ def test_the_tree_has_every_page():
     assert wanted <= entries <= wanted | {"gallery/index", "reference/index"}
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_it_is_built_without_a_warning(tmp_path):
     """With every page, every example, and links that lead somewhere."""
     begin = time.monotonic()

@@ -42,7 +42,7 @@ def said(tmp_path_factory):
     return {name: [x for x in done.stdout.splitlines() if x.startswith(f"{name}:")] for name in sources}
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_blocks_of_pages(said):
     """No argument of the library is refused that it takes when it runs."""
     pages = {name: lines for name, lines in said.items() if name not in ("script.py", "wrong.py")}

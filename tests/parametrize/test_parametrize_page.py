@@ -43,7 +43,7 @@ def errors(names, values):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_fit_finds_the_truth(names):
     """Bounds: three times the worst of the page's three seeds."""
     found = errors(names, names["history"][-1])

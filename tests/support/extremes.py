@@ -23,7 +23,7 @@ for_all_runs = pytest.mark.parametrize(
     ("variant", "sampler", "examples"),
     [
         ("llvm_ad_mono", "owen", 12),
-        pytest.param("llvm_ad_rgb", "independent", 60, marks=pytest.mark.slow),
+        pytest.param("llvm_ad_rgb", "independent", 20, marks=pytest.mark.slow),
     ],
 )
 
