@@ -145,7 +145,7 @@ def test_rows_of_numbers_are_typed_as_they_are_taken():
     assert lists_alone == set()
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_type_checker_knows_every_name(tmp_path):
     """`mypy --strict` on a script that uses every public name."""
     names = list(public_names())

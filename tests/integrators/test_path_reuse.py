@@ -147,7 +147,7 @@ def check_same_light(scene, variant=VARIANT):
     assert result.chi2_z < 4.5, str(result)
 
 
-@pytest.mark.parametrize("name", long(SCENES, ["blend"]))
+@pytest.mark.parametrize("name", long(SCENES, ["blend"], ["long gaussian"]))
 def test_it_is_the_light_of_plain_paths(name):
     check_same_light(SCENES[name]())
 

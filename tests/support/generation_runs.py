@@ -74,7 +74,7 @@ def alive(pid):
         return False
 
 
-def wait_until(condition, seconds=60.0, every=0.002):
+def wait_until(condition, seconds=300.0, every=0.002):
     """The first value of `condition()` that is true."""
     until = time.monotonic() + seconds
     while not (found := condition()):

@@ -7,9 +7,16 @@ import itertools
 import pytest
 
 
-def long(values, quick):
-    """Parameters of a test, of which those that are not ``quick`` are run with the slow ones."""
-    return [pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values]
+def long(values, quick, soaked=()):
+    """Parameters of a test, of which those that are not ``quick`` are run with the slow ones, or by the soak."""
+    values = list(values)
+    if not all(value in values for value in (*quick, *soaked)):
+        raise ValueError(f"long: expected all of {quick} and {soaked} to be among {values}.")
+
+    def marks(value):
+        return [] if value in quick else [pytest.mark.soak if value in soaked else pytest.mark.slow]
+
+    return [pytest.param(value, marks=marks(value)) for value in values]
 
 
 def long_rows(rows, quick):

@@ -103,8 +103,9 @@ def start(script, *arguments):
     return done.returncode == 0, done.stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize(
+    "workers", [pytest.param(0, marks=pytest.mark.soak), pytest.param(1, marks=pytest.mark.slow)]
+)
 def test_ends_with_the_weights_of_a_run_that_was_not_stopped(tmp_path, workers):
     script = tmp_path / "run.py"
     text = textwrap.dedent(SCRIPT).replace("STEPS", str(STEPS)).replace("EVERY", str(EVERY))

@@ -204,7 +204,7 @@ def test_stokes_components_know_the_normals(tmp_path):
     assert mosaic[1] < 0.6 * alone[1]
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_the_transient_tells_what_the_steady_image_does_not(tmp_path):
     (fits,) = small_run("scattering_material", tmp_path)
     # From a start 50 and 150 % off.

@@ -65,7 +65,7 @@ def torchrun(output, *, kill):
     return run.returncode, said
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the ranks of torchrun in /proc")
 def test_two_ranks_one_of_which_is_killed_learn_what_one_learns(tmp_path):
     ended, said = torchrun(tmp_path / "two", kill=True)

@@ -169,8 +169,14 @@ def mean_and_error(values):
     return values.mean(), values.std(ddof=1) / np.sqrt(len(values))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+# Clouds take as long as all others together.
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=pytest.mark.soak if "cloud" in case.name else pytest.mark.slow)
+        for case in CASES
+    ],
+)
 def test_derivatives_are_those_of_finite_differences(case):
     """Within four standard errors, and forward mode is reverse mode at each seed."""
     problem = Problem(replace(case, fd_spp=case.fd_spp if case.fd_spp != case.spp else 4 * case.spp))
