@@ -426,7 +426,7 @@ def check(values: Mapping[str, Any], text: Any, what: str, known: Callable[[str]
     """Compare arrays and entries with the checksums of their file.
 
     Args:
-        values: what was read, by name.
+        values: arrays and entries that were read, by name.
         text: checksums of the file.
         what: subject of messages.
         known: predicate of names that were read.

@@ -30,7 +30,7 @@ def fit_colour(
     Args:
         renderer: a TransientRenderer whose only parameter is KEY, at its start value.
         target: (C, T, H, W).
-        steps: of Adam.
+        steps: number of steps of Adam.
         look: called with loss and output of every step.
 
     Returns:

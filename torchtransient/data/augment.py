@@ -63,8 +63,9 @@ class Augment:
 
     Args:
         operations: :class:`Flip`, :class:`QuarterTurn`, :class:`Crop`, :class:`Affine`, one or several in a row.
-        intrinsics: (..., 3, 3) of the camera, for samples without an entry of this name; results have the new one.
-        to_world: (..., 4, 4) of the camera, likewise.
+        intrinsics: intrinsic matrix (..., 3, 3) of the camera, for samples without an entry of this name; results have
+            the new one.
+        to_world: pose (..., 4, 4) of the camera, likewise for samples without an entry of this name.
         polarized: light has four Stokes components before the channels.
         fields: treatment of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim),
             "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
@@ -115,7 +116,7 @@ class Augment:
 
         Args:
             sample: dictionary, or a tuple of the entries ``names``.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Sample of the same kind.
@@ -196,8 +197,8 @@ class Augmented(Epochs, Dataset[Any]):
     Pickles; for workers that were forked or spawned.
 
     Args:
-        dataset: of samples by number.
-        augment: drawn anew for each sample.
+        dataset: map-style data set, whose samples are read by number.
+        augment: augmentation, drawn anew for each sample.
         seed: each sample has a generator of its own, so that it is the same in every worker, in every epoch until
             :meth:`set_epoch`; None draws from torch's, anew each time.
 
@@ -220,7 +221,7 @@ class Augmented(Epochs, Dataset[Any]):
         """Return a sample.
 
         Args:
-            number: of the sample, negative from the end.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
             epoch: distinguishes the maps of epochs, and the noise of a data set of this library with a seed of its own;
                 None is 0.
 
@@ -240,7 +241,7 @@ class AugmentedStream(IterableDataset[Any]):
 
     Args:
         dataset: iterable data set.
-        augment: drawn anew for each sample.
+        augment: augmentation, drawn anew for each sample.
         seed: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
             often the sample came before, among the samples of a TransientStream or from this iterator. None draws from
             torch's generator.
@@ -338,9 +339,9 @@ def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tenso
 
     Args:
         light: (..., 4, ..., H, W), already moved.
-        dim: of the components, negative.
+        dim: dimension of the Stokes components, negative: counted from the last one.
         drawn: map of the pixels.
-        camera_matrix: (..., 3, 3) before the map, or None.
+        camera_matrix: intrinsics (..., 3, 3) of the camera before the map, or None.
 
     Returns:
         As ``light``.

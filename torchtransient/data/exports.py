@@ -47,8 +47,8 @@ def export_web_dataset(
     type that they are stored in. A tar appears once it is whole; those that are there are replaced.
 
     Args:
-        where: as of :class:`~torchtransient.data.TransientDataset`.
-        folder: that exists.
+        where: folder, pattern of names, shard, or a list of these, see :class:`~torchtransient.data.TransientDataset`.
+        folder: existing folder that the files are written to.
         progress: show a bar.
         reading: other arguments of :class:`~torchtransient.data.TransientDataset`, windows and transforms too.
 
@@ -119,7 +119,7 @@ def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[d
     """Read the samples of a tar one by one, without the package webdataset.
 
     Args:
-        path: of the tar.
+        path: path of the tar.
         as_stored: keep the type of counts instead of float32.
 
     Returns:
@@ -155,8 +155,9 @@ def export_tal(where: Any, folder: str | Path, *, field: str | None = None, prog
     information.
 
     Args:
-        where: as of :class:`~torchtransient.data.TransientDataset`; shards whose header has a scan.
-        folder: that exists.
+        where: folder, pattern of names, shard, or a list of these, see :class:`~torchtransient.data.TransientDataset`;
+            their headers have a scan.
+        folder: existing folder that the files are written to.
         field: array that becomes ``H``: "transient", "phasor", or a "measurement" on the same axis; None for the first
             of them that there is.
         progress: show a bar.

@@ -28,7 +28,7 @@ def traced(error: BaseException) -> str:
     """Return the traceback as text, of its last 40 lines.
 
     Args:
-        error: that was raised.
+        error: exception that was raised.
 
     Returns:
         Text.
@@ -103,8 +103,8 @@ def spawned(body: Callable[[Connection, bytes], None], packed: bytes, name: str)
 
     Args:
         body: function of the other end of the pipe and ``packed``.
-        packed: what the process is given.
-        name: of the process.
+        packed: pickled data that the process is given.
+        name: name of the process.
 
     Returns:
         Process, and this end of the pipe.

@@ -79,7 +79,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         """Render a sample.
 
         Args:
-            number: of the sample, negative from the end.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
             epoch: distinguishes the noise of epochs; None is 0.
 
         Returns:

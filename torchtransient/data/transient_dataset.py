@@ -134,7 +134,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         """Read a sample.
 
         Args:
-            number: of the sample, negative from the end.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
             epoch: distinguishes the noise of epochs; None is 0.
 
         Returns:
@@ -194,9 +194,9 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     ranks and workers. Workers of a DataLoader divide the share of their rank.
 
     Args:
-        where: as of :class:`TransientDataset`.
+        where: folder, pattern of names, shard, or a list of these, see :class:`TransientDataset`.
         shuffle: False for files and rows in order.
-        seed: of the order.
+        seed: seed of the shuffled order.
         rank: share of the samples that this process reads; by default that of torch.distributed, or of RANK.
         world_size: number of shares, likewise. Shares differ by one sample where samples cannot be divided evenly.
         even: leave out the last samples of an epoch's order, so that no rank waits for another one.
@@ -236,10 +236,10 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         """Choose the order of the next iteration, in all workers. Call it before iterating over the loader.
 
         Args:
-            epoch: from 0 on.
+            epoch: number of the epoch, from 0.
             batches: batches of ``batch_size`` that a loader of this rank has given already, in an epoch that goes on:
                 they are left out, and those that follow are the same as without a stop. With as many workers as before.
-            batch_size: of the loader.
+            batch_size: number of samples in a batch of the loader.
         """
         numbers = [
             count(f"{WHAT}: epoch", epoch, 0),
@@ -372,7 +372,7 @@ class ShardTable:
     open files; a process that was forked opens its own.
 
     Args:
-        where: as of :class:`TransientDataset`.
+        where: folder, pattern of names, shard, or a list of these, see :class:`TransientDataset`.
 
     Raises:
         StorageError: for shards that do not belong together.
@@ -419,7 +419,7 @@ class ShardTable:
         """Open shard; those that were not used for long are closed.
 
         Args:
-            number: of the file.
+            number: number of the file, from 0.
 
         Returns:
             Shard.

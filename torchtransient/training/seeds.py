@@ -67,7 +67,7 @@ class Seeds:
         Args:
             step: number of the step.
             sample: number of the one sample that it is for; or the rank, so that ranks draw different numbers.
-            device: of the generator.
+            device: device of the generator.
 
         Raises:
             UnitError: for other numbers.

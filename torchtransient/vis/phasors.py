@@ -84,7 +84,7 @@ def phasor_video(
     to red around zero on one symmetric scale.
 
     Args:
-        source: as for :func:`phasor_picture`.
+        source: phasors, complex (C, F, H, W), a result with such a ``phasor``, or its file, see :func:`phasor_picture`.
         path: file, ``.mp4`` or ``.gif``.
         which: index of the frequency.
         steps: number of frames.

@@ -209,7 +209,7 @@ def peak_time_picture(
     The scale holds 98 % of the pixels.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``.
         path: file to write the figure to.
         title: text above the picture.
 
@@ -252,7 +252,8 @@ def rainbow(
     """Draw when light arrives as hue, red is early and violet late, and how much as brightness.
 
     Args:
-        source, axis: as in ``frames``. Without an axis, lengths are counted in bins.
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``. Without an axis, lengths are counted in
+            bins.
         path: file to write the image to.
         style: "peak" gives every pixel the hue of its :func:`peak_time`; "fusion" adds up the light of all bins, each
             in its own hue, so that early and late light mix as coloured lamps do.
@@ -357,10 +358,11 @@ def streak(
     """Draw one row or column of pixels over time, as a streak camera sees it, time downwards.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``.
         path: file to write the figure to.
         row, column: the line, one of both; None for the middle row.
-        exposure, curve: as in ``tone_map``, whose "log" shows the front and weak light behind it.
+        exposure, curve: factor before the tone curve and its name, see ``tone_map``; "log" shows the front and weak
+            light behind it.
 
     Returns:
         The matplotlib figure.
@@ -410,13 +412,13 @@ def frame_grid(
     """Draw moments beside each other, each with its time.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``.
         path: file to write the figure to.
         bins: bins that are shown; None takes ``count`` moments between which equal shares of the light arrive.
         count: number of moments.
         columns: most moments in a row.
         exposure: factor for all moments; None gives each its own, for late light is far weaker than early light.
-        curve: as in ``tone_map``.
+        curve: tone curve, "srgb", "gamma", "linear" or "log", see ``tone_map``.
         title: text above the figure.
 
     Returns:
@@ -453,7 +455,7 @@ def histogram(
     """Draw light over time of some pixels, a panel each.
 
     Args:
-        source, axis: as in ``frames``, with any number of channels: three are red, green and blue lines, one is black,
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``; any number of channels: three are red,
             others go from violet to yellow.
         path: file to write the figure to.
         pixels: (row, column) of each.

@@ -82,7 +82,7 @@ def images_of(
     """Return the intensity over time, or images of time gates (C, G, H, W), its axis, and "bin" or "gate".
 
     Args:
-        source, axis, who, any_channels: as of :func:`transient_of`.
+        source, axis, who, any_channels: the source and how it is read, see :func:`transient_of`.
 
     Raises:
         ShapeError: as of ``transient_of``, and for gates with an axis.

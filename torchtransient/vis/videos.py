@@ -75,7 +75,7 @@ def frames(
             the middle laser spot), or a file. Gated images are frames in the order of their gates.
         axis: time axis; None takes that of the source.
         exposure: factor of the radiance in a bin; None leaves 1 % of the lit pixels of all frames white.
-        curve: as in ``tone_map``.
+        curve: tone curve, "srgb", "gamma", "linear" or "log", see ``tone_map``.
         accumulate: show the light that has arrived so far.
         stamp: put the time under each frame.
         scale: side of a pixel on the screen; None enlarges small pictures to some 320 pixels.
@@ -120,7 +120,7 @@ def video(
     """Write the :func:`frames` of a transient as ``.mp4`` or ``.gif``.
 
     Args:
-        source, axis: as of ``frames``.
+        source, axis: transient (C, T, H, W) and its time axis, see ``frames``.
         path: file.
         fps: frames per second.
         progress: show a bar.

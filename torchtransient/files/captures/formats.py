@@ -96,7 +96,8 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
         path: place of the file.
         capture: the capture.
         metadata: plain data beside the capture's own, in the library's own format.
-        format: as in :func:`read_capture`, but layouts that are only read. The library's own holds all of a capture.
+        format: name of a layout that can be written, see :func:`read_capture`. The library's own holds all of a
+            capture.
 
     Returns:
         The path.

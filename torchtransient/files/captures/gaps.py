@@ -160,7 +160,7 @@ class Gaps:
         Later assumptions may be missing: a reader makes its scan and its axis before.
 
         Args:
-            entries: what else the file says; ``not_read`` are names of entries that were left alone.
+            entries: other contents of the file by name; ``not_read`` are names of entries that were left alone.
         """
         said = {"assumed": self.assumed} if self.assumed else {}
         return {"format": self._layout, **said, **{name: value for name, value in entries.items() if value is not None}}
@@ -169,7 +169,7 @@ class Gaps:
         """Return an error that names file and layout.
 
         Args:
-            message: what is wrong and what to do.
+            message: description of the fault and of what to do about it.
         """
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
@@ -179,8 +179,8 @@ def real_in(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
 
     Args:
         contents: the file.
-        name: of the array.
-        gaps: for messages.
+        name: name of the array.
+        gaps: arguments of the reader, for messages.
 
     Raises:
         StorageError: for other numbers.
@@ -196,8 +196,8 @@ def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = Non
 
     Args:
         contents: the file.
-        name: of the array.
-        gaps: for messages.
+        name: name of the array.
+        gaps: arguments of the reader, for messages.
         dims: number of its dimensions, None for any.
 
     Raises:
@@ -215,8 +215,8 @@ def optional_number(contents: Contents, name: str, gaps: Gaps) -> float | None:
 
     Args:
         contents: the file.
-        name: of the number.
-        gaps: for messages.
+        name: name of the number.
+        gaps: arguments of the reader, for messages.
 
     Raises:
         StorageError: for anything else.
@@ -249,7 +249,7 @@ def assumed_in(capture: Capture, name: str, value: Any) -> bool:
     """Return True if a capture's metadata say that a value was assumed, and it still is the same.
 
     Args:
-        capture: with any metadata.
+        capture: capture, whose metadata may be anything.
         name: argument of :func:`read_capture`.
         value: value in the capture.
     """
@@ -275,7 +275,7 @@ def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArr
     """Return numbers about the hidden volume from the metadata of a capture.
 
     Args:
-        capture: with any metadata.
+        capture: capture, whose metadata may be anything.
         sizes: numbers of values by name.
 
     Returns:
@@ -294,7 +294,7 @@ def hidden_side(scan: Scan) -> NDArray[np.float64]:
     normals.
 
     Args:
-        scan: of a capture.
+        scan: scan of a capture.
     """
     towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
     mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
@@ -343,7 +343,7 @@ def flat_scan(
     """Return a scan on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
 
     Args:
-        kind: of the scan.
+        kind: kind of the scan.
         points: grid or list (..., 3), metres.
         gaps: arguments of the reader.
         spot: (3,) of a single scan.
@@ -360,7 +360,7 @@ def scan_of(kind: str, *arrays: NDArray[Any] | None, legs: bool) -> Scan:
     """Return a scan of arrays.
 
     Args:
-        kind: of the scan.
+        kind: kind of the scan.
         arrays: points of sensor and laser (..., 3), metres, their origins (3,), their normals in the shapes of the
             points, or None.
         legs: lengths count the first and the last leg.
@@ -376,7 +376,7 @@ def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> T
     """Return the transient (T, ...) of a capture of one channel.
 
     Args:
-        capture: of one channel, no batch.
+        capture: capture with one channel and no batch.
         layout: name of the layout, for messages.
         legs: value of ``first_and_last_leg`` that the layout has, None for both.
 
@@ -400,7 +400,7 @@ def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: i
     """Check that a tensor has one channel, no batch, and counts that can be read again.
 
     Args:
-        capture: that it belongs to.
+        capture: capture that the tensor belongs to.
         tensor: (..., C, T, ...).
         layout: name of the layout, for messages.
         before_channel: dimensions before C.

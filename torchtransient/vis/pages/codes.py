@@ -36,7 +36,7 @@ class Table:
     """Values of the 256 codes, or 65536 of the kind "wide".
 
     Attributes:
-        name: what the codes are of.
+        name: name of the quantity that the codes stand for.
         values: (256,) float32, NaN for the last code.
         error: largest difference between a number and the value of its code, relative to the number for light and
             numbers of both signs, else absolute.

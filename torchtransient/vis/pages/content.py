@@ -26,10 +26,10 @@ class Slider:
     """Positions of the slider.
 
     Attributes:
-        name, unit: quantity along it.
-        centers: (T,) float64.
+        name, unit: name and unit of the quantity along it.
+        centers: values of the quantity at the positions, (T,) float64.
         second, second_unit, factor: another quantity, ``factor`` times the first; empty for none.
-        labels: what each position is, such as a gate from its start to its end; empty for centers alone.
+        labels: texts of the positions, such as a gate from its start to its end; empty for centers alone.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Planes:
         """Return the planes with a function applied to each tensor.
 
         Args:
-            function: of one tensor (..., T, H, W).
+            function: function of one tensor (..., T, H, W).
         """
         parts = (self.light, self.ratios, self.phase, self.error)
         light, *others = (None if part is None else function(part) for part in parts)
