@@ -79,8 +79,8 @@ def product(matrix: Tensor, x: Tensor) -> Tensor:
     `torch.autocast` a backward pass would round those to half precision, by up to 1e-2 of a gradient.
 
     Args:
-        matrix: (M, K).
-        x: (..., K, P).
+        matrix: matrix (M, K).
+        x: matrices (..., K, P).
 
     Returns:
         (..., M, P).

@@ -93,7 +93,7 @@ def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene
     """Return the scene of a command line.
 
     Args:
-        scene: its file.
+        scene: file of the scene.
         variant: Mitsuba variant, None for the default.
         params: texts NAME=VALUE that fill $NAME of the file.
     """
@@ -259,7 +259,7 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
 
     Args:
         output: the render.
-        film: its film.
+        film: film of the render.
         options: values by name.
         title: title of the pictures.
     """

@@ -69,7 +69,7 @@ class Augment:
         polarized: light has four Stokes components before the channels.
         fields: treatment of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim),
             "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
-        names: entries of samples that are tuples.
+        names: names of the entries, for samples that are tuples.
         sensor: name of the camera in the keys of ``values``, or several; without it every ``to_world`` might be the
             camera's.
         kept_values: keys of ``values`` that are known to stay true.
@@ -199,8 +199,8 @@ class Augmented(Epochs, Dataset[Any]):
     Args:
         dataset: map-style data set, whose samples are read by number.
         augment: augmentation, drawn anew for each sample.
-        seed: each sample has a generator of its own, so that it is the same in every worker, in every epoch until
-            :meth:`set_epoch`; None draws from torch's, anew each time.
+        seed: seed of the maps. Each sample has a generator of its own, so that it is the same in every worker, in every
+            epoch until :meth:`set_epoch`; None draws from torch's, anew each time.
 
     Raises:
         ArgumentError: for streams.
@@ -222,8 +222,8 @@ class Augmented(Epochs, Dataset[Any]):
 
         Args:
             number: number of the sample in the data set, from 0; negative ones count from the end.
-            epoch: distinguishes the maps of epochs, and the noise of a data set of this library with a seed of its own;
-                None is 0.
+            epoch: number of the epoch, which distinguishes the maps of epochs, and the noise of a data set of this
+                library with a seed of its own; None is 0.
 
         Returns:
             Sample with its map drawn.
@@ -242,9 +242,9 @@ class AugmentedStream(IterableDataset[Any]):
     Args:
         dataset: iterable data set.
         augment: augmentation, drawn anew for each sample.
-        seed: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
-            often the sample came before, among the samples of a TransientStream or from this iterator. None draws from
-            torch's generator.
+        seed: seed of the maps. A map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has
+            one, and on how often the sample came before, among the samples of a TransientStream or from this iterator.
+            None draws from torch's generator.
 
     Raises:
         UnitError: for a seed below zero.
@@ -338,7 +338,7 @@ def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tenso
     on its ray; half a turn leaves it.
 
     Args:
-        light: (..., 4, ..., H, W), already moved.
+        light: Stokes components (..., 4, ..., H, W), already moved.
         dim: dimension of the Stokes components, negative: counted from the last one.
         drawn: map of the pixels.
         camera_matrix: intrinsics (..., 3, 3) of the camera before the map, or None.

@@ -253,7 +253,7 @@ def make_on_ray(
         calls: its arguments for each share.
         address: address of a running cluster. None takes the one that this process is connected to, or that RAY_ADDRESS
             names, or a new one on this machine.
-        tick: called every half second.
+        tick: function that is called every half second.
 
     Returns:
         Workers that were replaced within the tasks.

@@ -117,8 +117,8 @@ class Crop(Operation):
     """Window of the image.
 
     Args:
-        size: (height, width) in pixels.
-        offset: (first row, first column); None for a random place.
+        size: size (height, width) in pixels.
+        offset: place (first row, first column) of the window; None for a random one.
 
     Raises:
         ShapeError: for other sizes.
@@ -365,7 +365,7 @@ class PixelMap:
         """Map an image by the nearest pixel.
 
         Args:
-            image: (..., H, W).
+            image: image (..., H, W).
             fill: value beyond the rim.
             name: name of the image, for messages.
 
@@ -396,7 +396,7 @@ class PixelMap:
         """Map an image by linear interpolation, zero beyond the rim; every bin and channel by itself.
 
         Args:
-            image: (..., H, W).
+            image: image (..., H, W).
             name: name of the image, for messages.
 
         Returns:

@@ -92,9 +92,10 @@ class Recipe(Specification):
             ``steady``, labels and ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
         time_axis: bins of the film, see :class:`~torchtransient.TransientRenderer`, which explains ``frequencies``,
             ``gates``, ``rates``, ``chirps``, ``max_depth``, ``spp``, ``sensors``, ``pulse`` and ``irf``.
-        temporal_filter: "auto" is that of the scene's film, whatever varies.
-        variant: None settles it here as :func:`torchtransient.load` does.
-        scan: makes it a capture around a corner, which needs a time axis (or frequencies), since hidden things move.
+        temporal_filter: filter over time; "auto" is that of the scene's film, whatever varies.
+        variant: variant of Mitsuba; None settles it here as :func:`torchtransient.load` does.
+        scan: scan, which makes it a capture around a corner; that needs a time axis (or frequencies), since hidden
+            things move.
         bounces: numbers of bounces that count in a capture, see :class:`~torchtransient.nlos.CaptureRenderer`.
         energy: joules of the laser of a capture, see :class:`~torchtransient.nlos.CaptureRenderer`.
         device: :class:`~torchtransient.sensing.Device`, or its name or file: its draw from the transient is
@@ -104,7 +105,7 @@ class Recipe(Specification):
             none, else what they name ("auto" where scenes differ, "scene" where a key of ``vary`` stands for it).
             "scene" is what the scene names, ``independent`` included, which recipes without the entry ``sampler`` have:
             folders of older versions go on with it.
-        seed: another one is another data set.
+        seed: seed of all draws; another one makes another data set.
         parameters: values of the $names of an XML scene.
         n: number of samples in a data set, unless :func:`generate` gets another one.
         plugins: names of modules with Mitsuba plugins of one's own, which are added

@@ -80,7 +80,7 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
 
         Args:
             number: number of the sample in the data set, from 0; negative ones count from the end.
-            epoch: distinguishes the noise of epochs; None is 0.
+            epoch: number of the epoch, which distinguishes the noise of epochs; None is 0.
 
         Returns:
             Sample.

@@ -152,7 +152,7 @@ class Epochs:
 
         Args:
             number: number of the sample in the data set, from 0; negative ones count from the end.
-            epoch: distinguishes the draws of epochs; None is 0.
+            epoch: number of the epoch, which distinguishes the draws of epochs; None is 0.
         """
         raise NotImplementedError
 

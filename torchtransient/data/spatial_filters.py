@@ -22,7 +22,7 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor) -> Tenso
 
     Args:
         function: filter, a function of images (N, 1, H, W).
-        light: (..., H, W), (B, C, T, H, W) for instance, floating point.
+        light: light (..., H, W), (B, C, T, H, W) for instance, floating point.
 
     Returns:
         (..., H', W').
@@ -61,7 +61,7 @@ class SpatialFilter(nn.Module):
         """Filter images.
 
         Args:
-            light: (..., H, W).
+            light: light (..., H, W), floating point.
 
         Returns:
             (..., H', W').

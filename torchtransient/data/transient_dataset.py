@@ -135,7 +135,7 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
 
         Args:
             number: number of the sample in the data set, from 0; negative ones count from the end.
-            epoch: distinguishes the noise of epochs; None is 0.
+            epoch: number of the epoch, which distinguishes the noise of epochs; None is 0.
 
         Returns:
             Sample.
@@ -197,10 +197,11 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         where: folder, pattern of names, shard, or a list of these, see :class:`TransientDataset`.
         shuffle: False for files and rows in order.
         seed: seed of the shuffled order.
-        rank: share of the samples that this process reads; by default that of torch.distributed, or of RANK.
+        rank: number of the share of the samples that this process reads; by default the rank of torch.distributed, or
+            RANK.
         world_size: number of shares, likewise. Shares differ by one sample where samples cannot be divided evenly.
         even: leave out the last samples of an epoch's order, so that no rank waits for another one.
-        noise_seed: ``seed`` of :class:`TransientDataset`; the noise of an epoch is its own.
+        noise_seed: ``seed`` of :class:`TransientDataset`; every epoch has noise of its own.
         reading: other arguments of :class:`TransientDataset`.
 
     Raises:

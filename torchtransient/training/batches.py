@@ -55,7 +55,7 @@ class Ranks:
         """Return the mean of a number over all ranks, which all have to call this.
 
         Args:
-            value: number of this rank.
+            value: number that this rank has.
         """
         if self.size == 1:
             return float(value)
@@ -81,7 +81,7 @@ def ranks(device: str = "cpu", *, threads: int | None = None, timeout_s: float =
             that the process can see and has no choice of others, so that with "cuda" every rank is shown its own alone
             (CUDA_VISIBLE_DEVICES): call this before anything has used CUDA, in torch or in a variant of Mitsuba.
         threads: number of threads of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares
-            the machine among its ranks. They come back to their number before.
+            the cores of the machine among its ranks. They come back to their number before.
         timeout_s: seconds that a rank waits for the others.
 
     Raises:

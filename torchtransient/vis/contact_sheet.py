@@ -47,7 +47,7 @@ def contact_sheet(
     Args:
         cells: the samples, all with the same images.
         path: file to write the figure to.
-        times: (T + 1,) edges of the bins of the curves, metres of optical path.
+        times: edges (T + 1,) of the bins of the curves, metres of optical path.
         title: text above the sheet.
 
     Returns:

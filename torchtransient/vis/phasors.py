@@ -38,7 +38,7 @@ def phasor_picture(
     """Draw phasor images, a row for each frequency and a panel for each quantity; scales hold 99 % of the pixels.
 
     Args:
-        source: complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
+        source: phasors, complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
         path: file to write the figure to.
         show: panels. "real" and "imaginary", blue to red around zero on one symmetric scale; "amplitude"; "phase",
             cyclic hue, grey where dark; "domain", hue by phase and brightness by amplitude.

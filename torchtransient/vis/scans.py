@@ -136,7 +136,7 @@ def scan_layout(
         scan: a Scan, or a Capture with its own.
         path: file to write the figure to.
         hidden: hidden shapes as ``tt.nlos.simulate`` takes them, drawn transparent: shapes by name, one shape,
-            (vertices, with both; meshes as arrays, rectangles, cubes, disks, spheres and cylinders.
+            (vertices, faces) or an object with both; meshes as arrays, rectangles, cubes, disks, spheres and cylinders.
         title: text above the figure.
 
     Returns:

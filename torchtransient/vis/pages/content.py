@@ -46,10 +46,10 @@ class Planes:
     """Numbers of one entry of a page, each tensor (..., T, H, W) on the CPU.
 
     Attributes:
-        light: (K, T, H, W), K = 1 or 3.
-        ratios: (3, T, H, W), S1, S2 and S3 over S0.
-        phase: (T, H, W), radians.
-        error: (T, H, W), standard errors of the mean over channels.
+        light: light (K, T, H, W), K = 1 or 3.
+        ratios: S1, S2 and S3 over S0, (3, T, H, W).
+        phase: phase (T, H, W), radians.
+        error: standard errors of the mean over channels, (T, H, W).
     """
 
     light: Tensor
@@ -126,7 +126,7 @@ def time_slider(centers_opl: NDArray[np.float64]) -> Slider:
     """Return the slider of bins of time.
 
     Args:
-        centers_opl: (T,) centres, metres of optical path.
+        centers_opl: centres of the bins, (T,), metres of optical path.
     """
     return Slider("optical path length", "m", centers_opl, "time", "ns", _NS_PER_METRE)
 

@@ -140,9 +140,9 @@ def layout_of(
         content: content of the page.
         modes: names of the modes by key, the first one shown.
         notes: HTML about errors of the numbers and what was left out.
-        title: heading.
+        title: heading of the page.
         maps: colours by name.
-        sums: sums over bins are at hand.
+        sums: whether sums over bins are at hand.
     """
     m = import_bokeh().models
     bins = content.shape[0]
