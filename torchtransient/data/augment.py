@@ -43,9 +43,9 @@ _NAMED = ("intrinsics", "to_world", "values", "outside")
 class Augment:
     """Draw one map of the pixels and apply it to all of a sample: light, labels, and the camera.
 
-    A call takes a dictionary as of :class:`~torchtransient.data.TransientDataset`, or a tuple whose entries ``names``
-    lists; leading dimensions of a batch get the same map. It returns a new sample; entries that no map changes are
-    passed on, not copied. Images of numpy come back as tensors.
+    A call takes a dictionary like the samples of :class:`~torchtransient.data.TransientDataset`, or a tuple whose
+    entries ``names`` lists; leading dimensions of a batch get the same map. It returns a new sample; entries that no
+    map changes are passed on, not copied. Images of numpy come back as tensors.
 
     - ``transient``, ``steady``, ``phasor``, ``gated``, ``rates``, ``beats``: interpolated between pixels, bin by bin,
       where pixels do not come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter.
@@ -67,8 +67,8 @@ class Augment:
             the new one.
         to_world: pose (..., 4, 4) of the camera, likewise for samples without an entry of this name.
         polarized: light has four Stokes components before the channels.
-        fields: treatment of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim),
-            "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
+        fields: treatment of entries of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the
+            rim), "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
         names: names of the entries, for samples that are tuples.
         sensor: name of the camera in the keys of ``values``, or several; without it every ``to_world`` might be the
             camera's.

@@ -229,7 +229,7 @@ def _between(a: Box, b: Box) -> float:
 
 
 def _warn_of_many_scenes(recipe: Specification) -> None:
-    """Warn of entries of which every sample has another one."""
+    """Warn of exchanged entries that are another one in every sample, so that each builds a scene."""
     for key in recipe.exchanged:
         distribution = recipe.vary[key]
         if isinstance(distribution, Choice):

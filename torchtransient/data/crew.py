@@ -324,7 +324,7 @@ class SampleBar:
 
 @dataclass
 class Ledger:
-    """Shards that wait and that are in work, and the blame of samples over which workers die.
+    """Shards that wait and shards that are being made, and the blame of samples at which workers die.
 
     A crash counts twice, a kill once, since it may come from outside; a sample with 2 (retries + 1) points is given up
     and recorded as failed.

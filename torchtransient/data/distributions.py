@@ -198,7 +198,7 @@ class Distribution(ABC):
 
     @abstractmethod
     def draw(self, random: Draw, place: Place) -> Any:
-        """Draw a value; the same numbers, the same value.
+        """Draw a value, which the random numbers and the place alone determine.
 
         Args:
             random: source of numbers in [0, 1).
@@ -538,7 +538,7 @@ class Choice(Distribution):
         self._keep(values=values, weights=weights)
 
     def share(self, number: int) -> float:
-        """Number in [0, 1) that draws a value.
+        """Return the number in [0, 1) that draws a value.
 
         Args:
             number: index of the value in ``values``; for a value of weight zero, which no number draws, any comes back.

@@ -91,7 +91,7 @@ def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) ->
         as_stored: keep the type of counts instead of float32.
 
     Returns:
-        Sample as of a TransientDataset.
+        Sample like those of a TransientDataset.
 
     Raises:
         StorageError: for members that are damaged or of other kinds.
@@ -123,7 +123,7 @@ def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[d
         as_stored: keep the type of counts instead of float32.
 
     Returns:
-        Iterator of samples as of a TransientDataset.
+        Iterator of samples like those of a TransientDataset.
 
     Raises:
         StorageError: for damaged files.
@@ -210,7 +210,7 @@ def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any, measu
 
 
 def _member(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    """A member without an owner or a time."""
+    """Add a member without an owner or a time to a tar."""
     entry = tarfile.TarInfo(name)
     entry.size = len(content)
     tar.addfile(entry, io.BytesIO(content))

@@ -151,8 +151,8 @@ class Maker:
         return self.kept(self.recipe.structure(0)).film
 
     def standard_error(self, index: int) -> float:
-        """Return the relative standard error of a sample: root mean square of the errors over the cube, by that of the
-        numbers as they are rendered, so that 1 is noise alone. From two renders.
+        """Return the relative standard error of a sample: root mean square of the errors over the cube, divided by that
+        of the numbers as they are rendered, so that 1 is noise alone. From two renders.
 
         Args:
             index: number of the sample in the recipe, from 0.

@@ -52,9 +52,9 @@ _PATIENCE_S, _WAIT_S = 2.0, 1.0
 class OnlineDataset(IterableDataset[dict[str, Any]]):
     """Samples of a recipe, rendered while they are used: endless, drawn at random from the latest ``capacity`` of them.
 
-    A sample is a dictionary as of :class:`~torchtransient.data.TransientDataset`: its arrays by name as tensors of the
-    caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe. ``DataLoader(data, batch_size=8)`` makes
-    batches; ``num_workers`` other than 0 is an error, since the data set has processes of its own. ::
+    A sample is a dictionary like those of :class:`~torchtransient.data.TransientDataset`: its arrays by name as tensors
+    of the caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe. ``DataLoader(data, batch_size=8)``
+    makes batches; ``num_workers`` other than 0 is an error, since the data set has processes of its own. ::
 
         with OnlineDataset(recipe, workers=2) as data:
             for step, batch in zip(range(10_000), DataLoader(data, batch_size=8)):
@@ -75,9 +75,9 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
         capacity: number of samples that are kept, in shared memory.
         workers: processes that render, with one thread each. They are spawned, so a script needs ``if __name__ ==
             "__main__":``.
-        uses: number of times that a sample is used in the mean. The trainer waits for a new sample where it has drawn
-            so many times as many as were made; a producer waits until the samples that it would replace have been used
-            so often. With ``math.inf`` none of them waits, and the oldest sample is replaced.
+        uses: number of times that a sample is used on average. The trainer waits for a new sample where it has drawn
+            ``uses`` times as many as were made; a producer waits until the samples that it would replace have been used
+            that often. With ``math.inf`` none of them waits, and the oldest sample is replaced.
         seed: seed of the random choice of samples.
         warm: number of samples that are made before the first is drawn, at most ``capacity``.
         first: number of the first sample; the others follow, each once. Leaves out the samples of a validation set.

@@ -444,5 +444,5 @@ def _whole(number: int, generator: torch.Generator | None) -> int:
 
 
 def _device(generator: torch.Generator | None) -> torch.device | None:
-    """A generator draws where it is."""
+    """Return the device of a generator, on which it draws; None without one."""
     return None if generator is None else generator.device

@@ -187,7 +187,7 @@ def cell_of(sample: Sample, behind: int = 2) -> Cell:
 
 
 def _name(key: str) -> str:
-    """The first part of a key, and its last one where it says something."""
+    """The first part of a key, and the last one that is not a general word such as "value"."""
     parts = [part for part in key.split(".") if part not in ("value", "data", "reflectance", "bsdf", "emitter")]
     return ".".join(dict.fromkeys((parts or [key])[:1] + (parts or [key])[-1:]))
 

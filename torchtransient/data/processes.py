@@ -98,8 +98,8 @@ def add_plugins(modules: PluginNames, what: str) -> None:
 
 
 def spawned(body: Callable[[Connection, bytes], None], packed: bytes, name: str) -> tuple[BaseProcess, Connection]:
-    """Start a process without Ctrl-C, from its first instruction on, which ends with this one. It is spawned: a forked
-    one has no threads of Dr.Jit.
+    """Start a process that ignores Ctrl-C from its first instruction on, and that ends with this one. It is spawned: a
+    forked one has no threads of Dr.Jit.
 
     Args:
         body: function of the other end of the pipe and ``packed``.

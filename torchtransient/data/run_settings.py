@@ -219,7 +219,7 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
         described: content of the file.
 
     Returns:
-        Content of the file afterwards: of two runs that begin at once one is first.
+        Content of the file afterwards: that of the first one, where two runs begin at once.
 
     Raises:
         StorageError: for a full disk.
@@ -234,7 +234,7 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
 def check_same(
     found: Mapping[str, Any], wanted: Mapping[str, Any], where: Path, names: tuple[str, ...] = DECIDING
 ) -> None:
-    """Check that a data set is the one that is asked for; entries in both count.
+    """Check that a data set is the one that is asked for, by the entries that both descriptions have.
 
     Args:
         found: description in the folder.

@@ -95,7 +95,7 @@ class OutsideLight:
 
     @property
     def expected(self) -> tuple[float, float]:
-        """Share of cut samples among all of the recipe: ends of an interval of 95 % (Wilson 1927)."""
+        """Share of cut samples among all of the recipe: ends of its 95 % interval (Wilson 1927)."""
         if not self.samples:
             return 0.0, 1.0
         n, p = self.samples, self.cut / self.samples
@@ -142,7 +142,7 @@ class OutsideLight:
 
 
 class Epochs:
-    """Data set with an epoch, which workers of a DataLoader that stay receive."""
+    """Data set with an epoch, which persistent workers of a DataLoader receive too."""
 
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]

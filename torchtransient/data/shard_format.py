@@ -34,8 +34,8 @@ _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 
 def measured_names(about: Any) -> tuple[str, ...]:
-    """Return the arrays that were measured: by the film under its own name, and by sensors. Others are labels, and the
-    steady image.
+    """Return the arrays that were measured: by the film under its own name, and by sensors. Other arrays are labels,
+    and the steady image.
 
     Args:
         about: entry ``about`` of a header.
@@ -305,9 +305,9 @@ class Compressor:
 
 @contextmanager
 def _fixed_settings() -> Iterator[None]:
-    """Fix the settings of Blosc, which takes block size, level and threads from the environment too, and makes other
-    bytes of them. Without a number it starts threads for every chunk, which wait for each other and for those of other
-    workers.
+    """Fix the settings of Blosc, which would take block size, level and threads from the environment, and write other
+    bytes then. Without a number of threads it starts some for every chunk, which wait for each other and for those of
+    other workers.
     """
     settings = {name: os.environ.pop(name) for name in list(os.environ) if name.startswith("BLOSC_")}
     os.environ["BLOSC_NTHREADS"] = "1"

@@ -28,8 +28,8 @@ _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
 
 
 class ShardMaker:
-    """Maker of shards of one recipe. The process computes with one thread from here on: with more of them sums are
-    added up in the order in which threads come, and bytes differ.
+    """Maker of shards of one recipe. The process computes with one thread from here on: with several, sums are added up
+    in the order in which threads finish, and bytes differ.
 
     Its methods report their progress by ``say``, each message a sign of life: ("begin", shard, index), ("end", shard,
     index, reason of a failure or None), ("retry", shard, index, reason), ("traced", shard, index, traceback),

@@ -1,9 +1,9 @@
-"""Shards: HDF5 files of several samples, whose bytes are a function of the samples alone. Files from anyone are checked
-before they are believed.
+"""Shards: HDF5 files of several samples, whose bytes are a function of the samples alone. Files of unknown origin are
+checked before their content is used.
 
 ``about``, JSON as bytes, has the format, the header, the encodings, texts and failures; ``index`` int64 (N,), ``seed``
 uint32 (N,), ``outside`` float64 (N, 2) and ``there`` uint8 (N,) have an entry for each row; ``arrays/<name>`` (N, ...)
-are the samples, rows that failed without chunks; ``values/<key>`` (N, ...) the drawn values. Behind the end of HDF5
+are the samples, without chunks for rows that failed; ``values/<key>`` (N, ...) the drawn values. Behind the end of HDF5
 stand eight letters and the SHA-256 of all bytes before them. Chunks carry Fletcher's checksum besides, which every
 reader of HDF5 checks. There are no times, hosts or names of users in a shard.
 """
@@ -158,8 +158,8 @@ class Shard:
             return tuple(self._dataset(name).shape[1:])
 
     def time_axis(self, name: str) -> int | None:
-        """Return the axis of the bins of an array: as the header says of measured arrays; else second, behind channels,
-        or third, behind the Stokes components, in polarized variants.
+        """Return the axis of the bins of an array: for measured arrays the one that the header says; else the second,
+        behind channels, or in polarized variants the third, behind the Stokes components.
 
         Args:
             name: name of the array.
@@ -599,7 +599,7 @@ def part_of(given: slice, size: int, name: str) -> slice:
         Slice.
 
     Raises:
-        StorageError: for steps, and for nothing.
+        StorageError: for slices with a step, and for empty ones.
     """
     start, stop, step = given.indices(size)
     if step != 1 or stop <= start:

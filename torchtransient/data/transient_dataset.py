@@ -55,9 +55,9 @@ _VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient
 class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """Samples of shards by number, in the order of the files and their rows, without those that failed.
 
-    A sample is a dictionary of its arrays by name, ``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels, of
-    ``values``, the drawn values by key, of ``outside``, (2,), the shares of its light before and after the time window
-    that it was rendered with, and of ``index``, its number in the recipe. ``torch.utils.data.DataLoader`` makes batches
+    A sample is a dictionary: its arrays by name (``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels),
+    ``values`` (the drawn values by key), ``outside`` (the shares (2,) of its light before and after the time window
+    that it was rendered with) and ``index`` (its number in the recipe). ``torch.utils.data.DataLoader`` makes batches
     of them. Files are opened when they are first read, in every process anew: the data set pickles, and workers may be
     forked or spawned.
 

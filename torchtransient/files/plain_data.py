@@ -62,7 +62,7 @@ def plain(value: Any, parts: list[NDArray[Any]] | None, where: str) -> Any:
 
 
 def restored(value: Any, arrays: Mapping[str, Any]) -> Any:
-    """Return the data that :func:`plain` has made JSON of.
+    """Return the data from which :func:`plain` has made JSON.
 
     Args:
         value: plain data.

@@ -64,7 +64,7 @@ class Ranks:
         return float(total) / self.size
 
     def wait(self) -> None:
-        """Go on when all ranks have come here: after the first one has written what the others read."""
+        """Wait until all ranks have come here, for instance until the first one has written a file for the others."""
         if self.size > 1:
             dist.barrier()
 
@@ -81,7 +81,7 @@ def ranks(device: str = "cpu", *, threads: int | None = None, timeout_s: float =
             that the process can see and has no choice of others, so that with "cuda" every rank is shown its own alone
             (CUDA_VISIBLE_DEVICES): call this before anything has used CUDA, in torch or in a variant of Mitsuba.
         threads: number of threads of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares
-            the cores of the machine among its ranks. They come back to their number before.
+            the cores of the machine among its ranks. At the end both numbers are what they were before.
         timeout_s: seconds that a rank waits for the others.
 
     Raises:
@@ -168,8 +168,8 @@ class Batches(Sampler[list[int]]):
     """Numbers of the samples of every step, without an end; :meth:`loader` reads them.
 
     Samples come in an order that is shuffled anew in every epoch; a batch may begin in one epoch and end in the next,
-    so that all batches have one size and no sample is left out. At each step rank r of n reads the r-th n-th of the
-    batch. Runs of 1 and of 2 ranks learn from the same samples at the same step.
+    so that all batches have one size and no sample is left out. At each step rank r of n reads the r-th of n equal
+    parts of the batch. Runs of 1 and of 2 ranks learn from the same samples at the same step.
 
     The order depends on ``seed``, ``size`` and the number of samples before it alone. :attr:`step` is the position of
     the next iterator. A loop that counts its steps sets it when it goes on; iterators, which prefetch, do not change

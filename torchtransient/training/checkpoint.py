@@ -238,8 +238,8 @@ def save_checkpoint(
         StorageError: for states that could not be read without executing something, and where nothing can be written.
         ArgumentError: for parts without a state.
 
-    Not in it: the source of the network's data beyond their position, buffers that modules do not put into their state,
-    and attributes.
+    Not in the checkpoint: the source of the network's data beyond their position, buffers that modules do not put into
+    their state, and attributes.
     """
     place = path_of(path, "save_checkpoint")
     parts = dict(parts)

@@ -25,9 +25,9 @@ _LETTERS = 30
 
 @dataclass(frozen=True)
 class Cell:
-    """One sample. ``title``: a line, cut off where it would run into the next one. ``images``: by name, (H, W, 3) in
-    [0, 1] as they are shown, or (H, W) of numbers, which share one scale in a sheet. ``curve``: light over the bins,
-    (T,), or None.
+    """One sample. ``title``: a line, cut off where it would run into the next one. ``images``: images by name, (H, W,
+    3) in [0, 1] as they are shown, or (H, W) of numbers, which share one scale in a sheet. ``curve``: light over the
+    bins, (T,), or None.
     """
 
     title: str

@@ -99,7 +99,7 @@ def phasor_video(
     Raises:
         ShapeError: for another shape, other numbers of frequencies.
         IndexError: for an index outside.
-        StorageError: as of ``video``.
+        StorageError: as for ``video``.
     """
     check_video(path)
     images, known = _images(source, frequencies, "phasor_video")

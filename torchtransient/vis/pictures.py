@@ -94,7 +94,7 @@ def _median_pixel(steady: Tensor) -> tuple[int, int]:
 
 
 def _row_bands(transient: Tensor) -> Iterator[Tensor]:
-    """Yield parts of some rows: the sum over channels of a whole cube would be a third of it once more."""
+    """Yield parts of some rows: the sum over channels of a whole cube would take a third of its memory more."""
     for row in range(0, transient.shape[2], _ROWS_AT_ONCE):
         yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
 

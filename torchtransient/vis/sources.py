@@ -85,7 +85,7 @@ def images_of(
         source, axis, who, any_channels: the source and how it is read, see :func:`transient_of`.
 
     Raises:
-        ShapeError: as of ``transient_of``, and for gates with an axis.
+        ShapeError: as for ``transient_of``, and for gates with an axis.
     """
     loaded = _load(source, "transient")
     if loaded.transient is not None or loaded.gated is None:

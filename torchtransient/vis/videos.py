@@ -132,7 +132,7 @@ def video(
     Raises:
         StorageError: for another ending or a folder that is missing, before any frame is made.
         MissingPackageError: without imageio-ffmpeg or Pillow (extra ``vis``).
-        ShapeError, UnitError: as of ``frames``.
+        ShapeError, UnitError: as for ``frames``.
     """
     check_video(path)
     shown = frames(source, axis=axis, **settings)
