@@ -180,7 +180,7 @@ def as_whole(value: Any) -> int | None:
     """Return a whole number as an int; None for 2.0, texts, truth values.
 
     Args:
-        value: of any library that has whole numbers.
+        value: value of any kind; whole numbers of other libraries, such as NumPy and torch, count.
     """
     if _is_no_number(value) or getattr(value, "ndim", None):
         return None
@@ -289,7 +289,7 @@ def unit_of(name: str) -> str:
     """Return the unit that a name ends in, as it follows a range in a message; empty for names without one.
 
     Args:
-        name: of an argument, "delay_s".
+        name: name of an argument, such as "delay_s".
     """
     unit = _UNITS.get(name.rpartition("_")[2]) if "_" in name else None
     return f" {unit}" if unit else ""

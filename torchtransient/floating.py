@@ -23,7 +23,7 @@ def without_autocast(function: Callable[Arguments, Result]) -> Callable[Argument
     measurement loses 3e-3 of its value by it, phases their millimetres, and poses their centimetres.
 
     Args:
-        function: of tensors, positional or by name.
+        function: function of tensors, positional or by name.
     """
 
     @functools.wraps(function)
@@ -79,8 +79,8 @@ def product(matrix: Tensor, x: Tensor) -> Tensor:
     `torch.autocast` a backward pass would round those to half precision, by up to 1e-2 of a gradient.
 
     Args:
-        matrix: (M, K).
-        x: (..., K, P).
+        matrix: matrix (M, K).
+        x: matrices (..., K, P).
 
     Returns:
         (..., M, P).
@@ -142,7 +142,7 @@ def in_single(function: Callable[Arguments, Result]) -> Callable[Arguments, Resu
     per cycle fare no better. Gradients arrive in the precision of the tensors that were given.
 
     Args:
-        function: of tensors, positional or by name.
+        function: function of tensors, positional or by name.
     """
 
     @functools.wraps(function)

@@ -207,7 +207,7 @@ def array_of(tensor: torch.Tensor, what: str) -> NDArray[Any]:
     """Return a tensor as an array on the CPU, on its memory where it lies there.
 
     Args:
-        tensor: any device, with or without gradient.
+        tensor: tensor on any device, with or without gradient.
         what: subject of messages.
 
     Raises:
@@ -231,7 +231,7 @@ def tensor_in(array: Any) -> torch.Tensor:
     """Return an array of a file as a tensor, on its memory if its bytes have this machine's order.
 
     Args:
-        array: numbers.
+        array: array of numbers.
     """
     found = np.asarray(array)
     return torch.from_numpy(found.astype(found.dtype.newbyteorder("="), copy=False))
@@ -377,7 +377,7 @@ def parts_of(shape: tuple[int, ...], rows: int) -> Iterator[Any]:
 
     Args:
         shape: shape of the array, (..., H, W).
-        rows: rows of a part.
+        rows: number of rows of a part.
     """
     if len(shape) < 2:
         yield ...
@@ -390,7 +390,7 @@ def array_digest(array: NDArray[Any], rows: int) -> str:
     """Return the digest of an array.
 
     Args:
-        array: numbers.
+        array: array of numbers.
         rows: rows that are hashed at a time.
     """
     found = Digest(array.dtype, array.shape)
@@ -426,7 +426,7 @@ def check(values: Mapping[str, Any], text: Any, what: str, known: Callable[[str]
     """Compare arrays and entries with the checksums of their file.
 
     Args:
-        values: what was read, by name.
+        values: arrays and entries that were read, by name.
         text: checksums of the file.
         what: subject of messages.
         known: predicate of names that were read.

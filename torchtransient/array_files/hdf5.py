@@ -144,7 +144,7 @@ def is_number(dtype: np.dtype[Any]) -> bool:
     """Return True for dtypes that tensors can have, complex ones of two such numbers.
 
     Args:
-        dtype: of an array.
+        dtype: dtype of an array.
     """
     return dtype.kind in "biufc" and dtype.itemsize <= (16 if dtype.kind == "c" else 8)
 
@@ -203,7 +203,7 @@ def read_attributes(file: Any, what: str, names: Iterable[str] | None = None) ->
     """Read attributes of an open file.
 
     Args:
-        file: of h5py.
+        file: file of h5py.
         what: subject of messages.
         names: names that are read if they are there, None for all.
 

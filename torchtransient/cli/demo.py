@@ -29,9 +29,9 @@ def fit_colour(
 
     Args:
         renderer: a TransientRenderer whose only parameter is KEY, at its start value.
-        target: (C, T, H, W).
-        steps: of Adam.
-        look: called with loss and output of every step.
+        target: transient (C, T, H, W) that is aimed at.
+        steps: number of steps of Adam.
+        look: function that is called with loss and output of every step.
 
     Returns:
         The colour that was found.

@@ -140,7 +140,7 @@ def probe(variant: str) -> Finding:
     """Return the finding of a small scene that is rendered and differentiated in a process of its own.
 
     Args:
-        variant: of Mitsuba.
+        variant: variant of Mitsuba.
     """
     code, _, errors = _run([sys.executable, "-c", _RENDER, variant], dict(os.environ))
     if code == 0:

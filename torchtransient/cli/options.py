@@ -93,7 +93,7 @@ def load_scene(scene: Path, variant: str | None, params: Sequence[str]) -> Scene
     """Return the scene of a command line.
 
     Args:
-        scene: its file.
+        scene: file of the scene.
         variant: Mitsuba variant, None for the default.
         params: texts NAME=VALUE that fill $NAME of the file.
     """
@@ -191,7 +191,7 @@ def summary(film: FilmLayout, output: Any) -> tuple[str, str]:
     """Return the contents of a written file in words, and how they were made.
 
     Args:
-        film: of the render.
+        film: film of the render.
         output: the render.
     """
     tensor = film.tensor(output)
@@ -233,7 +233,7 @@ def check_pictures(options: dict[str, Any], film: FilmLayout | None) -> None:
 
     Args:
         options: values by name.
-        film: of the render, None before it is known.
+        film: film of the render, None before it is known.
 
     Raises:
         StorageError: for a place that cannot be written.
@@ -259,9 +259,9 @@ def write_pictures(output: Any, film: FilmLayout, options: dict[str, Any], title
 
     Args:
         output: the render.
-        film: its film.
+        film: film of the render.
         options: values by name.
-        title: of the pictures.
+        title: title of the pictures.
     """
     import torchtransient as tt
 
@@ -295,7 +295,7 @@ def in_options(message: str) -> str:
     """Return a message of the library with options in the place of Python.
 
     Args:
-        message: of an error or a warning.
+        message: message of an error or a warning.
     """
     for kind, flags in OPTIONS.items():
         message = message.replace(f"Give {kind.example}", f"Give {', '.join(flags)}")
@@ -308,7 +308,7 @@ def arguments_as_options(message: str, names: Sequence[str]) -> str:
     """Return a message with ``name=`` as ``--name``.
 
     Args:
-        message: of an error.
+        message: message of an error.
         names: arguments that are options.
     """
     for name in names:

@@ -43,9 +43,9 @@ _NAMED = ("intrinsics", "to_world", "values", "outside")
 class Augment:
     """Draw one map of the pixels and apply it to all of a sample: light, labels, and the camera.
 
-    A call takes a dictionary as of :class:`~torchtransient.data.TransientDataset`, or a tuple whose entries ``names``
-    lists; leading dimensions of a batch get the same map. It returns a new sample; entries that no map changes are
-    passed on, not copied. Images of numpy come back as tensors.
+    A call takes a dictionary like the samples of :class:`~torchtransient.data.TransientDataset`, or a tuple whose
+    entries ``names`` lists; leading dimensions of a batch get the same map. It returns a new sample; entries that no
+    map changes are passed on, not copied. Images of numpy come back as tensors.
 
     - ``transient``, ``steady``, ``phasor``, ``gated``, ``rates``, ``beats``: interpolated between pixels, bin by bin,
       where pixels do not come to lie on pixels; zero beyond the rim. They are radiance: larger pixels are not brighter.
@@ -63,12 +63,13 @@ class Augment:
 
     Args:
         operations: :class:`Flip`, :class:`QuarterTurn`, :class:`Crop`, :class:`Affine`, one or several in a row.
-        intrinsics: (..., 3, 3) of the camera, for samples without an entry of this name; results have the new one.
-        to_world: (..., 4, 4) of the camera, likewise.
+        intrinsics: intrinsic matrix (..., 3, 3) of the camera, for samples without an entry of this name; results have
+            the new one.
+        to_world: pose (..., 4, 4) of the camera, likewise for samples without an entry of this name.
         polarized: light has four Stokes components before the channels.
-        fields: treatment of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the rim),
-            "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
-        names: entries of samples that are tuples.
+        fields: treatment of entries of other names, ``{"mask": "number"}``: "light", "label" (nearest, NaN beyond the
+            rim), "number" (nearest, -1), "point" and "direction" (3, H, W) of the world, "unchanged".
+        names: names of the entries, for samples that are tuples.
         sensor: name of the camera in the keys of ``values``, or several; without it every ``to_world`` might be the
             camera's.
         kept_values: keys of ``values`` that are known to stay true.
@@ -115,7 +116,7 @@ class Augment:
 
         Args:
             sample: dictionary, or a tuple of the entries ``names``.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Sample of the same kind.
@@ -196,10 +197,10 @@ class Augmented(Epochs, Dataset[Any]):
     Pickles; for workers that were forked or spawned.
 
     Args:
-        dataset: of samples by number.
-        augment: drawn anew for each sample.
-        seed: each sample has a generator of its own, so that it is the same in every worker, in every epoch until
-            :meth:`set_epoch`; None draws from torch's, anew each time.
+        dataset: map-style data set, whose samples are read by number.
+        augment: augmentation, drawn anew for each sample.
+        seed: seed of the maps. Each sample has a generator of its own, so that it is the same in every worker, in every
+            epoch until :meth:`set_epoch`; None draws from torch's, anew each time.
 
     Raises:
         ArgumentError: for streams.
@@ -220,9 +221,9 @@ class Augmented(Epochs, Dataset[Any]):
         """Return a sample.
 
         Args:
-            number: of the sample, negative from the end.
-            epoch: distinguishes the maps of epochs, and the noise of a data set of this library with a seed of its own;
-                None is 0.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
+            epoch: number of the epoch, which distinguishes the maps of epochs, and the noise of a data set of this
+                library with a seed of its own; None is 0.
 
         Returns:
             Sample with its map drawn.
@@ -240,10 +241,10 @@ class AugmentedStream(IterableDataset[Any]):
 
     Args:
         dataset: iterable data set.
-        augment: drawn anew for each sample.
-        seed: the map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has one, and on how
-            often the sample came before, among the samples of a TransientStream or from this iterator. None draws from
-            torch's generator.
+        augment: augmentation, drawn anew for each sample.
+        seed: seed of the maps. A map depends on it, on the sample's ``index``, on the stream's ``epoch`` where it has
+            one, and on how often the sample came before, among the samples of a TransientStream or from this iterator.
+            None draws from torch's generator.
 
     Raises:
         UnitError: for a seed below zero.
@@ -337,10 +338,10 @@ def turned_stokes(light: Tensor, dim: int, drawn: PixelMap, camera_matrix: Tenso
     on its ray; half a turn leaves it.
 
     Args:
-        light: (..., 4, ..., H, W), already moved.
-        dim: of the components, negative.
+        light: Stokes components (..., 4, ..., H, W), already moved.
+        dim: dimension of the Stokes components, negative: counted from the last one.
         drawn: map of the pixels.
-        camera_matrix: (..., 3, 3) before the map, or None.
+        camera_matrix: intrinsics (..., 3, 3) of the camera before the map, or None.
 
     Returns:
         As ``light``.

@@ -67,7 +67,7 @@ def check_values(
     """Check that a map leaves the values of a sample true.
 
     Args:
-        values: by key, or None.
+        values: drawn values of the sample by key, or None.
         drawn: map of the pixels.
         cameras: names of the camera in keys, () for unknown.
         kept: keys that are known to stay true.
@@ -91,7 +91,7 @@ def stays_true(key: str, drawn: PixelMap, cameras: Sequence[str]) -> bool:
     """Return True for a value that is known to stay true.
 
     Args:
-        key: of the value.
+        key: key of the value in the ``vary`` of the recipe.
         drawn: map of the pixels.
         cameras: names of the camera in keys.
 

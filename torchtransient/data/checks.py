@@ -104,7 +104,7 @@ def structures_of(recipe: Specification, indices: Iterable[int]) -> list[tuple[S
 
     Args:
         recipe: description.
-        indices: of samples.
+        indices: numbers of the samples in the recipe, from 0.
 
     Returns:
         Pairs of a structure and the samples that have it.
@@ -229,7 +229,7 @@ def _between(a: Box, b: Box) -> float:
 
 
 def _warn_of_many_scenes(recipe: Specification) -> None:
-    """Warn of entries of which every sample has another one."""
+    """Warn of exchanged entries that are another one in every sample, so that each builds a scene."""
     for key in recipe.exchanged:
         distribution = recipe.vary[key]
         if isinstance(distribution, Choice):
@@ -321,8 +321,8 @@ class StructureCost:
 
     Args:
         text: name of the structure.
-        first_s: from nothing to its first sample (building, tracing, compiling).
-        sample_s: each sample after that, median.
+        first_s: seconds from nothing to its first sample (building, tracing, compiling).
+        sample_s: seconds of each sample after that, median.
     """
 
     text: str
@@ -337,13 +337,13 @@ class Cost:
     Args:
         values: keys that vary as values.
         exchanged: keys whose every new combination is a new structure.
-        seen: structures among the first 64 samples.
+        seen: number of structures among the first 64 samples.
         structures: cost of those that were measured.
-        sample_bytes: of a sample before compression.
-        stored_bytes: of a sample on disk by store, None where it could not be measured.
-        outside: light outside of the window, as of :meth:`Recipe.check`.
-        standard_error: relative, of the numbers of one sample.
-        n: samples of the data set, None where the recipe does not say.
+        sample_bytes: bytes of a sample before compression.
+        stored_bytes: bytes of a sample on disk by store, None where it could not be measured.
+        outside: light outside of the time window, see :meth:`Recipe.check`.
+        standard_error: relative standard error of the numbers of one sample.
+        n: number of samples in the data set, None where the recipe does not say.
     """
 
     values: tuple[str, ...]
@@ -406,7 +406,7 @@ def forecast(recipe: Specification, maker: Maker, samples: int, progress: bool, 
     Args:
         recipe: description.
         maker: maker whose scenes are used; its scenes are built anew.
-        samples: of each of the first 4 structures, after 3 that warm up.
+        samples: number of samples that are timed of each of the first 4 structures, after 3 that warm up.
         progress: show a bar.
         outside: result of :func:`light_outside`.
 

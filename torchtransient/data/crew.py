@@ -79,9 +79,9 @@ class Crew(ABC, Generic[AnyMember]):
     :meth:`poll` and :meth:`close`.
 
     Args:
-        settings: of the run.
-        workers: number of them at most.
-        ledger: shards to do.
+        settings: settings of the run.
+        workers: largest number of workers.
+        ledger: ledger of the shards to make.
         timeout_s: seconds for one sample; None for 30 times the slowest so far, at least 120.
     """
 
@@ -107,7 +107,7 @@ class Crew(ABC, Generic[AnyMember]):
         """End all workers.
 
         Args:
-            stopped: in the middle of their work.
+            stopped: whether they are stopped in the middle of their work.
         """
 
     def __enter__(self) -> Self:
@@ -120,7 +120,7 @@ class Crew(ABC, Generic[AnyMember]):
         """Measure the first sample that can be made.
 
         Args:
-            indices: samples to try.
+            indices: numbers of the samples to try.
 
         Returns:
             ``Measured`` of it.
@@ -138,7 +138,7 @@ class Crew(ABC, Generic[AnyMember]):
         """Make shards.
 
         Args:
-            shards: their numbers.
+            shards: numbers of the shards.
             described: content of ``recipe.json``.
 
         Raises:
@@ -210,7 +210,7 @@ class Crew(ABC, Generic[AnyMember]):
         """Take in a message of a worker.
 
         Args:
-            worker: its sender.
+            worker: worker that has sent it.
             kind: first word, see ``ShardMaker``, and "ready", "measured", "wrote", "fatal".
             facts: its other entries.
 
@@ -264,7 +264,7 @@ class RunLog:
     properly, so lines may be missing then.
 
     Args:
-        folder: of the data set.
+        folder: folder of the data set.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -287,8 +287,8 @@ class SampleBar:
     """Progress bar over samples, with numbers of failures and of replaced workers.
 
     Args:
-        total: samples.
-        done: samples that are there.
+        total: number of all samples.
+        done: number of samples that are there already.
         shown: whether there is a bar.
     """
 
@@ -304,9 +304,9 @@ class SampleBar:
         """Move the bar.
 
         Args:
-            samples: that were made; negative ones were lost with their shard.
-            failed: among them.
-            restarts: workers that were replaced.
+            samples: number of samples that were made; negative for samples that were lost with their shard.
+            failed: number of failed ones among them.
+            restarts: number of workers that were replaced.
         """
         self.failed += failed
         self.restarts += restarts
@@ -324,22 +324,22 @@ class SampleBar:
 
 @dataclass
 class Ledger:
-    """Shards that wait and that are in work, and the blame of samples over which workers die.
+    """Shards that wait and shards that are being made, and the blame of samples at which workers die.
 
     A crash counts twice, a kill once, since it may come from outside; a sample with 2 (retries + 1) points is given up
     and recorded as failed.
 
     Args:
         retries: deaths at one sample that are tolerated.
-        log: of the run.
-        bar: of the run.
+        log: log of the run.
+        bar: progress bar of the run.
         waiting: numbers of shards.
         skipped: reasons of samples that are given up, by shard.
-        samples: made.
-        failed: samples.
-        bytes: of finished shards.
-        restarts: of workers.
-        shards: finished.
+        samples: number of samples that were made.
+        failed: number of samples that failed.
+        bytes: bytes of the finished shards.
+        restarts: number of workers that were replaced.
+        shards: number of finished shards.
     """
 
     retries: int
@@ -367,7 +367,7 @@ class Ledger:
         """Return the samples of a shard that are given up, with the reason.
 
         Args:
-            shard: its number.
+            shard: number of the shard.
 
         Returns:
             Reasons by index.
@@ -379,7 +379,7 @@ class Ledger:
         be to blame.
 
         Args:
-            shard: its number.
+            shard: number of the shard.
 
         Returns:
             Indices in order.
@@ -391,8 +391,8 @@ class Ledger:
         """Record a sample that was made or failed.
 
         Args:
-            shard: its number.
-            index: of the sample.
+            shard: number of the shard.
+            index: number of the sample in the recipe, from 0.
             failed: reason of a failure, or None.
         """
         self._in_a_row = 0
@@ -409,9 +409,9 @@ class Ledger:
         """Record a finished shard.
 
         Args:
-            shard: its number.
-            samples: in it, failed ones included.
-            failed: among them.
+            shard: number of the shard.
+            samples: number of samples in it, failed ones included.
+            failed: number of failed ones among them.
             size: bytes of the file.
         """
         for counted in (self._ended, self._failed, self._deaths):
@@ -426,10 +426,10 @@ class Ledger:
         """Record the death of a worker; its shard waits again.
 
         Args:
-            shard: that it worked on, or None.
-            index: of the sample that it worked on, or None.
-            reason: for the log.
-            own_fault: it crashed or hung.
+            shard: number of the shard that it worked on, or None.
+            index: number of the sample that it worked on, or None.
+            reason: cause of its death, for the log.
+            own_fault: the worker crashed or hung, rather than being killed from outside.
 
         Raises:
             TorchTransientError: after 20 deaths at one shard, 30 in a row without a sample, 3 before the first sample.

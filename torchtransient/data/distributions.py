@@ -32,7 +32,7 @@ class Draw(Protocol):
         """Draw independent numbers in [0, 1).
 
         Args:
-            shape: of the array.
+            shape: shape of the array.
 
         Returns:
             float64, of this shape.
@@ -44,8 +44,8 @@ class Stream:
     """Random numbers of one purpose of one sample.
 
     Args:
-        seed: of the recipe.
-        index: of the sample.
+        seed: seed of the recipe.
+        index: number of the sample in the recipe, from 0.
         purpose: the key that varies, for instance.
     """
 
@@ -57,7 +57,7 @@ class Stream:
         """Draw independent numbers in [0, 1).
 
         Args:
-            shape: of the array.
+            shape: shape of the array.
 
         Returns:
             float64, of this shape.
@@ -73,7 +73,7 @@ class Fixed:
     """Constant in place of a stream.
 
     Args:
-        number: in [0, 1).
+        number: the constant, in [0, 1).
     """
 
     def __init__(self, number: float) -> None:
@@ -83,7 +83,7 @@ class Fixed:
         """Return the constant.
 
         Args:
-            shape: of the array.
+            shape: shape of the array.
 
         Returns:
             float64, of this shape.
@@ -96,7 +96,7 @@ class Extreme:
     stream: a distribution that draws until something fits has to come to an end.
 
     Args:
-        upper: the upper end.
+        upper: True for the upper end, False for the lower one.
     """
 
     calls = 16
@@ -109,7 +109,7 @@ class Extreme:
         """Return the end of [0, 1), for the first calls.
 
         Args:
-            shape: of the array.
+            shape: shape of the array.
 
         Returns:
             float64, of this shape.
@@ -127,10 +127,10 @@ class Place:
     """Key for which a value is drawn.
 
     Args:
-        key: of the recipe.
+        key: key in the ``vary`` of the recipe.
         kind: NUMBERS, POSE or ANYTHING.
-        shape: of the value, for NUMBERS and POSE.
-        described: value in the description, float64, likewise.
+        shape: shape of the value, for NUMBERS and POSE.
+        described: value in the scene description, float64, for NUMBERS and POSE; None for keys without one.
     """
 
     key: str
@@ -198,7 +198,7 @@ class Distribution(ABC):
 
     @abstractmethod
     def draw(self, random: Draw, place: Place) -> Any:
-        """Draw a value; the same numbers, the same value.
+        """Draw a value, which the random numbers and the place alone determine.
 
         Args:
             random: source of numbers in [0, 1).
@@ -243,9 +243,9 @@ def bounds(who: str, low: Any, high: Any, *, least: float = -np.inf) -> tuple[An
 
     Args:
         who: name of the distribution.
-        low: number or array.
-        high: of the same shape, not below.
-        least: smallest ``low``.
+        low: lower bound, a number or an array.
+        high: upper bound of the same shape, not below ``low``.
+        least: smallest ``low`` that is allowed.
 
     Returns:
         Floats or nested lists.
@@ -278,9 +278,9 @@ def spread(who: str, place: Place, random: Draw, same: bool, *values: Any) -> tu
 
     Args:
         who: name of the distribution.
-        place: for which they are drawn.
-        random: source of numbers.
-        same: one number for all entries.
+        place: key for which they are drawn.
+        random: source of numbers in [0, 1).
+        same: draw one number for all entries.
         values: arrays that are broadcast to the shape.
 
     Returns:
@@ -320,9 +320,10 @@ class Uniform(Distribution):
     """Even distribution between two bounds.
 
     Args:
-        low: number, or array of the key's shape.
-        high: likewise.
-        same: entries of a colour, a position or a texture are equal (a grey colour) instead of independent.
+        low: lower bound: a number, or an array of the key's shape.
+        high: upper bound: a number, or an array of the key's shape.
+        same: draw one number for all entries of a colour (which is grey then), a position or a texture, instead of
+            independent ones.
 
     Raises:
         UnitError: for low > high.
@@ -359,9 +360,9 @@ class LogUniform(Uniform):
     """Even distribution of the logarithm, for numbers of unknown size (extinctions, intensities).
 
     Args:
-        low: number, or array of the key's shape, above zero.
-        high: likewise.
-        same: as in :class:`Uniform`.
+        low: lower bound above zero: a number, or an array of the key's shape.
+        high: upper bound: a number, or an array of the key's shape.
+        same: draw one number for all entries of a colour, a position or a texture, see :class:`Uniform`.
 
     Raises:
         UnitError: unless 0 < low <= high.
@@ -396,11 +397,11 @@ class Normal(Distribution):
     """Normal distribution, truncated (not clipped) at ``low`` and ``high``.
 
     Args:
-        mean: number, or array of the key's shape.
-        std: standard deviation, likewise.
+        mean: centre of the distribution before it is truncated: a number, or an array of the key's shape.
+        std: standard deviation: a number, or an array of the key's shape.
         low: lower end, None for none.
         high: upper end, None for none.
-        same: as in :class:`Uniform`.
+        same: draw one number for all entries of a colour, a position or a texture, see :class:`Uniform`.
 
     Raises:
         UnitError: for a negative deviation, and where less than 1e-9 of the distribution lies between the ends.
@@ -476,7 +477,7 @@ class Scale(Distribution):
     Args:
         low: smallest factor, at least 0.
         high: largest factor.
-        same: one factor for all axes or entries.
+        same: draw one factor for all axes or entries.
 
     Raises:
         UnitError: for low > high and numbers below zero.
@@ -537,10 +538,10 @@ class Choice(Distribution):
         self._keep(values=values, weights=weights)
 
     def share(self, number: int) -> float:
-        """Number in [0, 1) that draws a value.
+        """Return the number in [0, 1) that draws a value.
 
         Args:
-            number: of the value; any number comes back for a value of weight zero.
+            number: index of the value in ``values``; for a value of weight zero, which no number draws, any comes back.
 
         Returns:
             The number.
@@ -574,8 +575,8 @@ def checked_choices(who: str, values: Any, weights: Any) -> tuple[list[Any], lis
 
     Args:
         who: name for messages.
-        values: sequence.
-        weights: sequence of the same length, or None.
+        values: sequence of choices.
+        weights: relative frequencies, a sequence of the same length, or None.
 
     Returns:
         Lists.
@@ -620,9 +621,9 @@ def pick(random: Draw, count: int, weights: Numbers | None) -> int:
     """Draw a number by weights.
 
     Args:
-        random: source of numbers.
+        random: source of numbers in [0, 1).
         count: numbers to choose from.
-        weights: relative, None for even ones.
+        weights: relative frequencies, None for even ones.
 
     Returns:
         Number below ``count``.

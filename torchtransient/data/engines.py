@@ -37,7 +37,7 @@ class LocalWorker(Member):
     """Process and the pipe to it. It is spawned: a forked one has no threads of Dr.Jit.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
     """
 
     def __init__(self, settings: RunSettings) -> None:
@@ -107,7 +107,7 @@ class Supervisor(Crew[LocalWorker]):
         """End the workers: idle ones are asked to, after ten seconds all are killed.
 
         Args:
-            stopped: in the middle of their work; they are terminated.
+            stopped: whether they are stopped in the middle of their work; then they are terminated.
         """
         try:
             for worker in self.workers:
@@ -126,7 +126,7 @@ class InProcessWorker(Member):
     """Worker without a process, which executes its task when the crew polls.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
     """
 
     def __init__(self, settings: RunSettings) -> None:
@@ -251,9 +251,9 @@ def make_on_ray(
     Args:
         make: ``generate``.
         calls: its arguments for each share.
-        address: of a running cluster. None: the one that this process is connected to, or that RAY_ADDRESS names, or a
-            new one on this machine.
-        tick: called every half second.
+        address: address of a running cluster. None takes the one that this process is connected to, or that RAY_ADDRESS
+            names, or a new one on this machine.
+        tick: function that is called every half second.
 
     Returns:
         Workers that were replaced within the tasks.

@@ -47,8 +47,8 @@ def export_web_dataset(
     type that they are stored in. A tar appears once it is whole; those that are there are replaced.
 
     Args:
-        where: as of :class:`~torchtransient.data.TransientDataset`.
-        folder: that exists.
+        where: folder, pattern of names, shard, or a list of these, see :class:`~torchtransient.data.TransientDataset`.
+        folder: existing folder that the files are written to.
         progress: show a bar.
         reading: other arguments of :class:`~torchtransient.data.TransientDataset`, windows and transforms too.
 
@@ -91,7 +91,7 @@ def decode_web_sample(members: Mapping[str, Any], *, as_stored: bool = False) ->
         as_stored: keep the type of counts instead of float32.
 
     Returns:
-        Sample as of a TransientDataset.
+        Sample like those of a TransientDataset.
 
     Raises:
         StorageError: for members that are damaged or of other kinds.
@@ -119,11 +119,11 @@ def read_web_dataset(path: str | Path, *, as_stored: bool = False) -> Iterator[d
     """Read the samples of a tar one by one, without the package webdataset.
 
     Args:
-        path: of the tar.
+        path: path of the tar.
         as_stored: keep the type of counts instead of float32.
 
     Returns:
-        Iterator of samples as of a TransientDataset.
+        Iterator of samples like those of a TransientDataset.
 
     Raises:
         StorageError: for damaged files.
@@ -155,8 +155,9 @@ def export_tal(where: Any, folder: str | Path, *, field: str | None = None, prog
     information.
 
     Args:
-        where: as of :class:`~torchtransient.data.TransientDataset`; shards whose header has a scan.
-        folder: that exists.
+        where: folder, pattern of names, shard, or a list of these, see :class:`~torchtransient.data.TransientDataset`;
+            their headers have a scan.
+        folder: existing folder that the files are written to.
         field: array that becomes ``H``: "transient", "phasor", or a "measurement" on the same axis; None for the first
             of them that there is.
         progress: show a bar.
@@ -209,7 +210,7 @@ def _add(tar: tarfile.TarFile, sample: Mapping[str, Any], compressor: Any, measu
 
 
 def _member(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    """A member without an owner or a time."""
+    """Add a member without an owner or a time to a tar."""
     entry = tarfile.TarInfo(name)
     entry.size = len(content)
     tar.addfile(entry, io.BytesIO(content))

@@ -50,14 +50,14 @@ class Generated:
     """Result of a run.
 
     Args:
-        folder: of the data set.
-        samples: made by this run.
-        failed: samples among them that could not be made.
-        kept: samples in shards that were there.
-        shards: made by this run.
-        bytes: of these shards.
-        seconds: from the call to the end.
-        restarts: of workers.
+        folder: folder of the data set.
+        samples: number of samples that this run has made.
+        failed: number of samples among them that could not be made.
+        kept: number of samples in shards that were there before.
+        shards: number of shards that this run has made.
+        bytes: bytes of these shards.
+        seconds: seconds from the call to the end of the run.
+        restarts: number of workers that were replaced.
     """
 
     folder: Path
@@ -118,8 +118,8 @@ def generate(
 
     Args:
         recipe: :class:`Recipe`, or an object of one's own with ``maker()``, ``key()`` and ``to_dict()`` that pickles.
-        folder: of the data set, made if missing.
-        n: samples; None takes the recipe's own number.
+        folder: folder of the data set, made if missing.
+        n: number of samples; None takes the recipe's own.
         workers: processes of one thread each, replaced when they die. 0 makes samples in this process, as torch's
             loaders do, where a debugger finds them and a crash ends the run.
         store: "exact", "rounded" or "counts", see :class:`ShardWriter`.
@@ -133,7 +133,7 @@ def generate(
             far, at least 120.
         retries: attempts at a sample after the first.
         progress: show a bar.
-        address: of the cluster of Ray; None for a running or a new local one.
+        address: address of the cluster of Ray; None for a running or a new local one.
 
     Returns:
         :class:`Generated`.

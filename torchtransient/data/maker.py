@@ -68,7 +68,7 @@ class Maker:
         """Order samples by structure, in the order in which structures first come.
 
         Args:
-            indices: of samples.
+            indices: numbers of the samples in the recipe, from 0.
 
         Returns:
             The same indices.
@@ -82,7 +82,7 @@ class Maker:
         """Return the scene of a structure, built unless it is kept.
 
         Args:
-            structure: of the recipe.
+            structure: scene of the recipe with its exchanged entries.
 
         Returns:
             Scene with its renderer.
@@ -100,7 +100,7 @@ class Maker:
         """Draw the values of a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Values by key.
@@ -115,7 +115,7 @@ class Maker:
         """Make a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Sample.
@@ -151,11 +151,11 @@ class Maker:
         return self.kept(self.recipe.structure(0)).film
 
     def standard_error(self, index: int) -> float:
-        """Return the relative standard error of a sample: root mean square of the errors over the cube, by that of the
-        numbers as they are rendered, so that 1 is noise alone. From two renders.
+        """Return the relative standard error of a sample: root mean square of the errors over the cube, divided by that
+        of the numbers as they are rendered, so that 1 is noise alone. From two renders.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             The error; 0 for a black sample.
@@ -192,7 +192,7 @@ class Maker:
         """Free the scene of a structure.
 
         Args:
-            structure: of the recipe.
+            structure: scene of the recipe with its exchanged entries.
         """
         self._kept.pop(structure.key, None)
 
@@ -220,7 +220,7 @@ class Kept:
 
     Args:
         recipe: description.
-        structure: of the recipe.
+        structure: scene of the recipe with its exchanged entries.
 
     Raises:
         SceneError: for keys that the scene does not have. Errors of the renderer pass.
@@ -337,7 +337,7 @@ class Kept:
         """Draw the parameters and the arguments of the device of a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Values by key.
@@ -366,9 +366,9 @@ class Kept:
         """Make the arrays of a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
             drawn: values by key.
-            seed: of the render.
+            seed: seed of the render.
 
         Returns:
             Arrays by name, and the shares of light before and after the window.
@@ -400,7 +400,7 @@ class Kept:
 
         Args:
             drawn: values by key.
-            seed: of the render.
+            seed: seed of the render.
 
         Returns:
             Array of the film.
@@ -411,7 +411,7 @@ class Kept:
         """Return the shares of the light of a sample before and after the window, from 65536 camera paths at most.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Two shares.
@@ -424,7 +424,7 @@ class Kept:
         """Return the seed of the render of a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             0 to 2^32 - 1.
@@ -544,8 +544,8 @@ def check_film(found: Mapping[str, Any], expected: Mapping[str, Any], mine: str,
     """Check that samples go into one array.
 
     Args:
-        found: ``Kept.film``.
-        expected: of other samples.
+        found: ``Kept.film`` of one sample.
+        expected: ``Kept.film`` of the other samples.
         mine: name of the first for messages.
         others: name of the others.
 
@@ -566,7 +566,7 @@ def changed_device(device: Device, key: str, value: Any) -> Device:
     Args:
         device: description.
         key: "device.PhotonBudget.cycles" or "device.0.cycles".
-        value: of the argument.
+        value: new value of the argument.
 
     Returns:
         Device.

@@ -32,12 +32,12 @@ class Verified:
     """Result of :func:`verify`.
 
     Args:
-        folder: of the data set.
-        samples: in sound shards.
-        shards: files.
-        faults: texts by the name of the file, "manifest.json" among them.
-        missing: samples of the recipe in no sound shard, whose shards are still to be made.
-        failed: samples that could not be made, with their reasons.
+        folder: folder of the data set.
+        samples: number of samples in sound shards.
+        shards: number of shard files.
+        faults: descriptions of the faults by the name of the file, "manifest.json" among them.
+        missing: numbers of the samples of the recipe in no sound shard, whose shards are still to be made.
+        failed: reasons of the samples that could not be made, by their numbers.
     """
 
     folder: Path
@@ -69,7 +69,7 @@ def shards_of(folder: str | Path) -> list[Path]:
     """Return the shards of a folder by name.
 
     Args:
-        folder: of a data set.
+        folder: folder of the data set.
 
     Returns:
         Paths.
@@ -89,7 +89,7 @@ def build_manifest(folder: str | Path, without: Collection[str] = ()) -> dict[st
     Checksums are those that the shards carry, not compared with their bytes: :func:`verify` does.
 
     Args:
-        folder: of a data set.
+        folder: folder of the data set.
         without: names of shards that are left out.
 
     Returns:
@@ -113,7 +113,7 @@ def named_shards(folder: Path) -> dict[str, tuple[str, int]]:
     """Return the checksums and sizes of the shards in ``manifest.json``.
 
     Args:
-        folder: of a data set.
+        folder: folder of the data set.
 
     Returns:
         (checksum, bytes) by name; empty where the manifest is missing or damaged.
@@ -129,7 +129,7 @@ def fault_of(path: Path, named: Mapping[str, tuple[str, int]]) -> str | None:
     """Return the fault of the bytes of a shard, which are read unless the manifest names its checksum.
 
     Args:
-        path: of the shard.
+        path: path of the shard.
         named: result of :func:`named_shards`.
 
     Returns:
@@ -152,7 +152,7 @@ def verify(folder: str | Path, progress: bool = False) -> Verified:
     that ``recipe.json`` counts; without it those between the first and the last one.
 
     Args:
-        folder: of a data set.
+        folder: folder of the data set.
         progress: show a bar.
 
     Returns:
@@ -331,7 +331,7 @@ def ranges(numbers: Iterable[int]) -> list[list[int]]:
     """Return whole numbers as ranges.
 
     Args:
-        numbers: in any order.
+        numbers: whole numbers, in any order.
 
     Returns:
         Pairs [first, last].
@@ -349,7 +349,7 @@ def ranges_text(numbers: Iterable[int]) -> str:
     """Return whole numbers as text, "0 to 3, 7", of 8 ranges at most.
 
     Args:
-        numbers: in any order.
+        numbers: whole numbers, in any order.
 
     Returns:
         Text.

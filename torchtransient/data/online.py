@@ -52,9 +52,9 @@ _PATIENCE_S, _WAIT_S = 2.0, 1.0
 class OnlineDataset(IterableDataset[dict[str, Any]]):
     """Samples of a recipe, rendered while they are used: endless, drawn at random from the latest ``capacity`` of them.
 
-    A sample is a dictionary as of :class:`~torchtransient.data.TransientDataset`: its arrays by name as tensors of the
-    caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe. ``DataLoader(data, batch_size=8)`` makes
-    batches; ``num_workers`` other than 0 is an error, since the data set has processes of its own. ::
+    A sample is a dictionary like those of :class:`~torchtransient.data.TransientDataset`: its arrays by name as tensors
+    of the caller's own, ``values`` by key, ``outside`` and ``index`` in the recipe. ``DataLoader(data, batch_size=8)``
+    makes batches; ``num_workers`` other than 0 is an error, since the data set has processes of its own. ::
 
         with OnlineDataset(recipe, workers=2) as data:
             for step, batch in zip(range(10_000), DataLoader(data, batch_size=8)):
@@ -72,14 +72,14 @@ class OnlineDataset(IterableDataset[dict[str, Any]]):
 
     Args:
         recipe: :class:`Recipe`, or an object that pickles and has ``maker()``.
-        capacity: samples that are kept, in shared memory.
+        capacity: number of samples that are kept, in shared memory.
         workers: processes that render, with one thread each. They are spawned, so a script needs ``if __name__ ==
             "__main__":``.
-        uses: number of times that a sample is used in the mean. The trainer waits for a new sample where it has drawn
-            so many times as many as were made; a producer waits until the samples that it would replace have been used
-            so often. With ``math.inf`` none of them waits, and the oldest sample is replaced.
-        seed: of the draws.
-        warm: samples that are made before the first is drawn, at most ``capacity``.
+        uses: number of times that a sample is used on average. The trainer waits for a new sample where it has drawn
+            ``uses`` times as many as were made; a producer waits until the samples that it would replace have been used
+            that often. With ``math.inf`` none of them waits, and the oldest sample is replaced.
+        seed: seed of the random choice of samples.
+        warm: number of samples that are made before the first is drawn, at most ``capacity``.
         first: number of the first sample; the others follow, each once. Leaves out the samples of a validation set.
         transform: function of the transient; its result stands under ``measurement``.
         timeout_s: seconds without news from a producer that are an error.
@@ -165,11 +165,11 @@ class Producers:
     threads apart.
 
     Args:
-        recipe: that pickles.
-        schedule: of the ring.
-        capacity: samples in the ring.
-        workers: processes.
-        timeout_s: seconds without news that are an error.
+        recipe: recipe that pickles.
+        schedule: order in which places of the ring are written and read.
+        capacity: number of samples in the ring.
+        workers: number of processes.
+        timeout_s: seconds without news from a producer that are an error.
     """
 
     def __init__(self, recipe: Any, schedule: Schedule, capacity: int, workers: int, timeout_s: float) -> None:
@@ -371,12 +371,12 @@ class Schedule:
     oldest is replaced first.
 
     Args:
-        capacity: places.
-        producers: number of them.
+        capacity: number of places.
+        producers: number of producers.
         uses: mean number of uses of a sample.
-        warm: samples that are made before the first draw.
+        warm: number of samples that are made before the first draw.
         first: number of the first sample.
-        seed: of the draws.
+        seed: seed of the random choice of samples.
     """
 
     def __init__(self, capacity: int, producers: int, uses: float, warm: int, first: int, seed: int) -> None:
@@ -395,7 +395,7 @@ class Schedule:
         """Return the next sample for a producer.
 
         Args:
-            producer: its number.
+            producer: number of the producer.
 
         Returns:
             Order, None where it has enough or has to wait.
@@ -423,7 +423,7 @@ class Schedule:
         """Record a finished sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Its place.
@@ -437,7 +437,7 @@ class Schedule:
         """Record a sample that cannot be made: its place is free for another one.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
         """
         self._free.append(self.orders.pop(index).slot)
 
@@ -445,7 +445,7 @@ class Schedule:
         """Record a producer that has ended: its samples are ordered again, from others.
 
         Args:
-            producer: its number.
+            producer: number of the producer.
         """
         orders = sorted((o for o in self.orders.values() if o.producer == producer), key=lambda order: order.index)
         for order in orders:
@@ -468,9 +468,9 @@ class Order:
     """Sample that was ordered from a producer.
 
     Args:
-        index: number of the sample in the recipe.
+        index: number of the sample in the recipe, from 0.
         slot: place that it goes to.
-        producer: its number.
+        producer: number of the producer.
     """
 
     index: int

@@ -27,7 +27,7 @@ def produce(connection: Connection, packed: bytes) -> None:
     """Render samples until the connection closes: the body of the process.
 
     Args:
-        connection: to the trainer.
+        connection: pipe to the trainer.
         packed: pickled recipe and plugin modules.
     """
     # Ctrl-C reaches the whole group of processes; the trainer ends this one.
@@ -119,7 +119,7 @@ def layout_of(arrays: dict[str, np.ndarray]) -> Layout:
     """Return the shapes and types of the arrays of a sample.
 
     Args:
-        arrays: by name.
+        arrays: arrays of a sample by name.
 
     Returns:
         (shape, dtype) by name.
@@ -131,7 +131,7 @@ def layout_text(layout: Layout) -> str:
     """Return a layout as text.
 
     Args:
-        layout: of a sample.
+        layout: shape and dtype of every array of a sample, by name.
 
     Returns:
         Text.
@@ -143,8 +143,8 @@ def empty_ring(layout: Layout, capacity: int) -> dict[str, torch.Tensor]:
     """Allocate shared memory.
 
     Args:
-        layout: of a sample.
-        capacity: samples.
+        layout: shape and dtype of every array of a sample, by name.
+        capacity: number of samples.
 
     Returns:
         Tensors (capacity, ...) by name.

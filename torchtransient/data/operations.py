@@ -33,7 +33,7 @@ class Operation(abc.ABC):
 
         Args:
             size: (height, width) of the image.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             :class:`~torchtransient.data.PixelMap` of this ``size``, or None to leave the image.
@@ -65,7 +65,7 @@ class Flip(Operation):
 
         Args:
             size: (height, width) of the image.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Map, or None.
@@ -97,7 +97,7 @@ class QuarterTurn(Operation):
 
         Args:
             size: (height, width) of the image.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Map, or None.
@@ -117,8 +117,8 @@ class Crop(Operation):
     """Window of the image.
 
     Args:
-        size: (height, width) in pixels.
-        offset: (first row, first column); None for a random place.
+        size: size (height, width) in pixels.
+        offset: place (first row, first column) of the window; None for a random one.
 
     Raises:
         ShapeError: for other sizes.
@@ -137,7 +137,7 @@ class Crop(Operation):
 
         Args:
             size: (height, width) of the image.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Map.
@@ -163,7 +163,7 @@ class Affine(Operation):
     nearest pixel.
 
     Args:
-        augmentation: of kornia, affine.
+        augmentation: geometric augmentation of kornia whose maps are affine.
 
     Raises:
         ArgumentError: for other augmentations.
@@ -185,7 +185,7 @@ class Affine(Operation):
 
         Args:
             size: (height, width) of the image.
-            generator: None for torch's own.
+            generator: random generator; None takes torch's own.
 
         Returns:
             Map, or None.
@@ -222,8 +222,8 @@ class PixelMap:
     mirrored in the camera's frame, p -> F p, and the camera stays one that exists.
 
     Args:
-        matrix: (3, 3), pixels of the image to pixels of the result. The first pixel's centre is (0, 0), u runs to the
-            right and v downwards.
+        matrix: matrix (3, 3) from pixels of the image to pixels of the result. The first pixel's centre is (0, 0), u
+            runs to the right and v downwards.
         size: (height, width) of the image.
         new_size: (height, width) of the result.
 
@@ -306,7 +306,7 @@ class PixelMap:
         """Return the intrinsics of the camera that has taken the result.
 
         Args:
-            camera_matrix: (..., 3, 3) before the map.
+            camera_matrix: intrinsics (..., 3, 3) of the camera before the map.
 
         Returns:
             (..., 3, 3).
@@ -320,7 +320,7 @@ class PixelMap:
         frame.
 
         Args:
-            to_world: (..., 4, 4) before the map.
+            to_world: pose (..., 4, 4) of the camera before the map.
 
         Returns:
             (..., 4, 4).
@@ -333,7 +333,7 @@ class PixelMap:
         """Mirror of the camera's frame as a map of the world. Mirrors along x and y are the same in Mitsuba's frame.
 
         Args:
-            to_world: (..., 4, 4) of the camera before the map.
+            to_world: pose (..., 4, 4) of the camera before the map.
 
         Returns:
             (..., 4, 4).
@@ -365,9 +365,9 @@ class PixelMap:
         """Map an image by the nearest pixel.
 
         Args:
-            image: (..., H, W).
+            image: image (..., H, W).
             fill: value beyond the rim.
-            name: of the image, for messages.
+            name: name of the image, for messages.
 
         Returns:
             (..., H', W'), as the image.
@@ -396,8 +396,8 @@ class PixelMap:
         """Map an image by linear interpolation, zero beyond the rim; every bin and channel by itself.
 
         Args:
-            image: (..., H, W).
-            name: of the image, for messages.
+            image: image (..., H, W).
+            name: name of the image, for messages.
 
         Returns:
             (..., H', W'), as the image.
@@ -444,5 +444,5 @@ def _whole(number: int, generator: torch.Generator | None) -> int:
 
 
 def _device(generator: torch.Generator | None) -> torch.device | None:
-    """A generator draws where it is."""
+    """Return the device of a generator, on which it draws; None without one."""
     return None if generator is None else generator.device

@@ -45,9 +45,9 @@ def contact_sheet(
 
     Args:
         recipe: description.
-        maker: of the samples.
-        indices: of the samples.
-        path: of the picture, or None.
+        maker: maker of the samples.
+        indices: numbers of the samples in the recipe, from 0.
+        path: path of the picture, or None.
         progress: show a bar.
 
     Returns:
@@ -65,11 +65,11 @@ def sheet_of(
     """Draw samples.
 
     Args:
-        samples: in order.
-        path: of the picture, or None.
+        samples: samples in the order in which they are drawn.
+        path: path of the picture, or None.
         axis: fields of the time axis of transients, or None.
-        title: of the sheet.
-        behind: dimensions behind time.
+        title: title of the sheet.
+        behind: number of dimensions behind time.
 
     Returns:
         Figure of matplotlib without a path.
@@ -82,10 +82,10 @@ def drawn_sheet(folder: str | Path, path: str | Path, count: int, seed: int) -> 
     """Draw a contact sheet of random samples of a data set.
 
     Args:
-        folder: of the data set.
-        path: of the picture.
-        count: samples.
-        seed: of the choice.
+        folder: folder of the data set.
+        path: path of the picture.
+        count: number of samples.
+        seed: seed of the random choice of samples.
 
     Returns:
         Numbers of the samples.
@@ -110,7 +110,7 @@ def summary(folder: str | Path) -> str:
     """Summarize a data set in some lines.
 
     Args:
-        folder: of the data set.
+        folder: folder of the data set.
 
     Returns:
         Text.
@@ -172,8 +172,8 @@ def cell_of(sample: Sample, behind: int = 2) -> Cell:
     """Sample as a picture and a curve.
 
     Args:
-        sample: of a recipe.
-        behind: dimensions behind time.
+        sample: sample of a recipe.
+        behind: number of dimensions behind time.
 
     Returns:
         Cell of a contact sheet.
@@ -187,7 +187,7 @@ def cell_of(sample: Sample, behind: int = 2) -> Cell:
 
 
 def _name(key: str) -> str:
-    """The first part of a key, and its last one where it says something."""
+    """The first part of a key, and the last one that is not a general word such as "value"."""
     parts = [part for part in key.split(".") if part not in ("value", "data", "reflectance", "bsdf", "emitter")]
     return ".".join(dict.fromkeys((parts or [key])[:1] + (parts or [key])[-1:]))
 
@@ -265,7 +265,7 @@ class LatestPicture:
     data set is worth more than its picture.
 
     Args:
-        folder: of the data set.
+        folder: folder of the data set.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -292,7 +292,7 @@ def picture_of(sample: Any) -> NDArray[np.uint8]:
     """Draw the light of a sample as a picture.
 
     Args:
-        sample: of a recipe.
+        sample: sample of a recipe.
 
     Returns:
         uint8 (H, W, 3).

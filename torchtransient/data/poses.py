@@ -30,7 +30,7 @@ class Turn(Distribution):
     Args:
         axis: direction [x, y, z] in the world.
         low: smallest angle in degrees.
-        high: largest angle.
+        high: largest angle in degrees.
         about: centre: "self" (where the transform puts (0, 0, 0)), "world" (the world's origin), or a point [x, y, z].
 
     Raises:
@@ -134,7 +134,7 @@ class LookAt(Distribution):
 
     Args:
         origin: point [x, y, z], or a distribution of points (an Offset starts at the world's origin).
-        target: likewise.
+        target: point that it looks at, in the same forms.
         up: direction that is up in the picture.
     """
 

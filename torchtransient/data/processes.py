@@ -28,7 +28,7 @@ def traced(error: BaseException) -> str:
     """Return the traceback as text, of its last 40 lines.
 
     Args:
-        error: that was raised.
+        error: exception that was raised.
 
     Returns:
         Text.
@@ -98,13 +98,13 @@ def add_plugins(modules: PluginNames, what: str) -> None:
 
 
 def spawned(body: Callable[[Connection, bytes], None], packed: bytes, name: str) -> tuple[BaseProcess, Connection]:
-    """Start a process without Ctrl-C, from its first instruction on, which ends with this one. It is spawned: a forked
-    one has no threads of Dr.Jit.
+    """Start a process that ignores Ctrl-C from its first instruction on, and that ends with this one. It is spawned: a
+    forked one has no threads of Dr.Jit.
 
     Args:
         body: function of the other end of the pipe and ``packed``.
-        packed: what the process is given.
-        name: of the process.
+        packed: pickled data that the process is given.
+        name: name of the process.
 
     Returns:
         Process, and this end of the pipe.

@@ -76,7 +76,7 @@ class Recipe(Specification):
 
     - keys of ``scene.parameters()`` that have a derivative vary as values: nothing is built, traced or compiled anew;
     - entries of a scene dictionary (``box.filename``, ``lamp.bsdf``, a whole node) and ``$names`` of an XML file are
-      exchanged: each combination is a *structure*, a scene of its own that is built when it comes;
+      exchanged: each combination is a *structure*, a scene of its own that is built when a sample needs it;
     - ``device.STAGE.ARGUMENT`` for an argument of a stage of ``device`` (a kind or a number);
     - ``scan``, of a capture: a :class:`Choice` of scans of one shape.
 
@@ -84,18 +84,20 @@ class Recipe(Specification):
     it first. Not supported: gradients, and samples of different shapes.
 
     Args:
-        scene: as for :func:`torchtransient.load`, or :class:`OneOf` several; with ``scan`` the hidden things.
+        scene: scene as :func:`torchtransient.load` takes it, or :class:`OneOf` several; with ``scan`` the hidden
+            things.
         vary: distributions by key.
         labels: names of :func:`torchtransient.data.scene_labels` and ``first_return``, of the same scene and camera.
         keep: names of arrays that samples keep, of ``transient`` (``phasor``, ``gated``, ``rates``, ``beats``),
             ``steady``, labels and ``measurement``; None for all. ``["measurement", "depth"]`` makes small data sets.
-        time_axis: as in :class:`~torchtransient.TransientRenderer`, like ``frequencies``, ``gates``, ``rates``,
-            ``chirps``, ``max_depth``, ``spp``, ``sensors``, ``pulse`` and ``irf``.
-        temporal_filter: "auto" is that of the scene's film, whatever varies.
-        variant: None settles it here as :func:`torchtransient.load` does.
-        scan: makes it a capture around a corner, which needs a time axis (or frequencies), since hidden things move.
-        bounces: bounces of a capture, as in :class:`~torchtransient.nlos.CaptureRenderer`.
-        energy: likewise.
+        time_axis: bins of the film, see :class:`~torchtransient.TransientRenderer`, which explains ``frequencies``,
+            ``gates``, ``rates``, ``chirps``, ``max_depth``, ``spp``, ``sensors``, ``pulse`` and ``irf``.
+        temporal_filter: filter over time; "auto" is that of the scene's film, whatever varies.
+        variant: variant of Mitsuba; None settles it here as :func:`torchtransient.load` does.
+        scan: scan, which makes it a capture around a corner; that needs a time axis (or frequencies), since hidden
+            things move.
+        bounces: numbers of bounces that count in a capture, see :class:`~torchtransient.nlos.CaptureRenderer`.
+        energy: joules of the laser of a capture, see :class:`~torchtransient.nlos.CaptureRenderer`.
         device: :class:`~torchtransient.sensing.Device`, or its name or file: its draw from the transient is
             ``measurement``. A chain of one's own is written as one, see docs/data_sheet_to_chain.md.
         physics: "ignore" or "error", as in the renderer.
@@ -103,9 +105,9 @@ class Recipe(Specification):
             none, else what they name ("auto" where scenes differ, "scene" where a key of ``vary`` stands for it).
             "scene" is what the scene names, ``independent`` included, which recipes without the entry ``sampler`` have:
             folders of older versions go on with it.
-        seed: another one is another data set.
+        seed: seed of all draws; another one makes another data set.
         parameters: values of the $names of an XML scene.
-        n: samples of a data set unless :func:`generate` gets another number.
+        n: number of samples in a data set, unless :func:`generate` gets another one.
         plugins: names of modules with Mitsuba plugins of one's own, which are added
             (:func:`torchtransient.plugins.register_module`) wherever the recipe is made, read or unpickled.
 
@@ -130,7 +132,7 @@ class Recipe(Specification):
         """Render a sample, whatever was made before.
 
         Args:
-            index: index of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             :class:`Sample`.
@@ -144,7 +146,7 @@ class Recipe(Specification):
         """Draw the values of a sample without rendering it.
 
         Args:
-            index: index of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Values by key, numbers as float64 arrays.
@@ -184,7 +186,7 @@ class Recipe(Specification):
         window.
 
         Args:
-            samples: that are rendered of each structure that comes first.
+            samples: number of samples that are timed of each of the first 4 structures.
             progress: show a bar.
 
         Returns:

@@ -27,10 +27,10 @@ _WHAT = "RecipeDataset"
 class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
     """Sample n of a recipe as ``dataset[n]``: a map-style data set that renders.
 
-    A sample is a dictionary as of :class:`~torchtransient.data.TransientDataset`: its arrays by name, ``values`` by
-    key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone, and the draws of a
-    ``transform`` on ``seed``, too: a run that reads it in the order of :class:`torchtransient.training.Batches` can be
-    stopped and goes on to the bit, which one with :class:`OnlineDataset` cannot. Each sample is rendered every time
+    A sample is a dictionary like those of :class:`~torchtransient.data.TransientDataset`: its arrays by name,
+    ``values`` by key, ``outside`` and ``index`` in the recipe. It depends on recipe and number alone, and the draws of
+    a ``transform`` on ``seed``, too: a run that reads it in the order of :class:`torchtransient.training.Batches` can
+    be stopped and goes on to the bit, which one with :class:`OnlineDataset` cannot. Each sample is rendered every time
     that it is read; where a step waits for that, use OnlineDataset, or generate the data set.
 
     ``DataLoader(data, num_workers=2, multiprocessing_context="spawn", persistent_workers=True,
@@ -79,8 +79,8 @@ class RecipeDataset(Epochs, Dataset[dict[str, Any]]):
         """Render a sample.
 
         Args:
-            number: of the sample, negative from the end.
-            epoch: distinguishes the noise of epochs; None is 0.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
+            epoch: number of the epoch, which distinguishes the noise of epochs; None is 0.
 
         Returns:
             Sample.

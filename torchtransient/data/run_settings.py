@@ -34,9 +34,9 @@ class RunSettings:
     """Settings of a run, for every process. Pickles when the recipe does.
 
     Args:
-        recipe: that is generated.
-        folder: of the data set.
-        n: samples.
+        recipe: recipe whose samples are made.
+        folder: folder of the data set.
+        n: number of samples.
         store: see ``ShardWriter``.
         compression: see ``ShardWriter``.
         retries: attempts at a sample after the first.
@@ -57,8 +57,8 @@ class Plan:
     """Division of samples into shards.
 
     Args:
-        n: samples.
-        per_shard: samples in a file, fewer in the last one.
+        n: number of samples.
+        per_shard: number of samples in a file, fewer in the last one.
     """
 
     n: int
@@ -73,7 +73,7 @@ class Plan:
         """Return the samples of a shard; row 0 of the file is the first one.
 
         Args:
-            shard: its number.
+            shard: number of the shard.
 
         Returns:
             Range.
@@ -97,7 +97,7 @@ def shard_file_name(number: int) -> str:
     """Name of a shard's file.
 
     Args:
-        number: of the shard.
+        number: number of the shard.
 
     Returns:
         "shard-000003.h5".
@@ -110,8 +110,8 @@ def samples_per_shard(n: int, sample_bytes: int) -> int:
     would be less than 64. It does not depend on the workers: files are the same everywhere.
 
     Args:
-        n: samples of the data set.
-        sample_bytes: of a sample before compression.
+        n: number of samples in the data set.
+        sample_bytes: bytes of a sample before compression.
 
     Returns:
         Number of samples.
@@ -127,9 +127,9 @@ def shard_header(settings: RunSettings, described: Mapping[str, Any], shard: int
     recipe's files.
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
         described: content of ``recipe.json``.
-        shard: its number.
+        shard: number of the shard.
 
     Returns:
         Plain data.
@@ -143,10 +143,10 @@ def description(settings: RunSettings, per_shard: int, about: Any, standard_erro
     """Return the content of ``recipe.json``.
 
     Args:
-        settings: of the run.
-        per_shard: samples in a file.
+        settings: settings of the run.
+        per_shard: number of samples in a file.
         about: ``Maker.about``.
-        standard_error: of a sample.
+        standard_error: relative standard error of a sample, or None.
 
     Returns:
         Plain data.
@@ -171,7 +171,7 @@ def plain(value: Any) -> Any:
     """Return a value as JSON gives it back.
 
     Args:
-        value: of plain data.
+        value: value made of plain data.
 
     Returns:
         Plain data.
@@ -189,7 +189,7 @@ def read_description(folder: Path) -> dict[str, Any] | None:
     """Read ``recipe.json``.
 
     Args:
-        folder: of a data set.
+        folder: folder of the data set.
 
     Returns:
         Its content, None where there is none.
@@ -215,11 +215,11 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
     """Write ``recipe.json`` where there is none.
 
     Args:
-        folder: of a data set.
-        described: content.
+        folder: folder of the data set.
+        described: content of the file.
 
     Returns:
-        Content of the file afterwards: of two runs that begin at once one is first.
+        Content of the file afterwards: that of the first one, where two runs begin at once.
 
     Raises:
         StorageError: for a full disk.
@@ -234,13 +234,13 @@ def write_description(folder: Path, described: Mapping[str, Any]) -> dict[str, A
 def check_same(
     found: Mapping[str, Any], wanted: Mapping[str, Any], where: Path, names: tuple[str, ...] = DECIDING
 ) -> None:
-    """Check that a data set is the one that is asked for; entries in both count.
+    """Check that a data set is the one that is asked for, by the entries that both descriptions have.
 
     Args:
         found: description in the folder.
         wanted: description of this run.
         where: path for messages.
-        names: of the entries.
+        names: names of the entries that are compared.
 
     Raises:
         StorageError: for another data set.

@@ -33,9 +33,9 @@ class Sample:
     leading dimensions as in :class:`~torchtransient.RenderOutput`; a capture has its scan's shape behind T.
 
     Args:
-        index: its number.
-        seed: of the render, 0 to 2^32 - 1.
-        arrays: by name.
+        index: number of the sample in the recipe, from 0.
+        seed: seed of the render, 0 to 2^32 - 1.
+        arrays: arrays by name.
         values: drawn values by key, numbers as arrays, everything else as a text.
         outside: shares of the light before and after the window.
         structure: scene of the recipe that it is made of.
@@ -60,11 +60,11 @@ class OutsideLight:
 
     Args:
         samples: number of samples; 0 for films without a window.
-        cut: samples with more than 1 % of their light outside.
-        mean: share of the light outside, over samples.
+        cut: number of samples with more than 1 % of their light outside.
+        mean: mean share of the light outside, over samples.
         most: largest share.
-        failed: samples that could not be rendered.
-        reason: of the first failure.
+        failed: number of samples that could not be rendered.
+        reason: reason of the first failure.
     """
 
     _: KW_ONLY
@@ -80,7 +80,7 @@ class OutsideLight:
         """Summarize samples.
 
         Args:
-            shares: of the light of each sample before and after the window.
+            shares: shares of the light of each sample before and after the window.
             failed: reasons of samples that could not be rendered.
 
         Returns:
@@ -95,7 +95,7 @@ class OutsideLight:
 
     @property
     def expected(self) -> tuple[float, float]:
-        """Share of cut samples among all of the recipe: ends of an interval of 95 % (Wilson 1927)."""
+        """Share of cut samples among all of the recipe: ends of its 95 % interval (Wilson 1927)."""
         if not self.samples:
             return 0.0, 1.0
         n, p = self.samples, self.cut / self.samples
@@ -142,7 +142,7 @@ class OutsideLight:
 
 
 class Epochs:
-    """Data set with an epoch, which workers of a DataLoader that stay receive."""
+    """Data set with an epoch, which persistent workers of a DataLoader receive too."""
 
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
@@ -151,8 +151,8 @@ class Epochs:
         """Return a sample.
 
         Args:
-            number: of the sample, negative from the end.
-            epoch: distinguishes the draws of epochs; None is 0.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
+            epoch: number of the epoch, which distinguishes the draws of epochs; None is 0.
         """
         raise NotImplementedError
 
@@ -168,7 +168,7 @@ class Epochs:
         """Choose the draws of ``seed`` for samples that are read from now on; call it before iterating over a loader.
 
         Args:
-            epoch: from 0 on.
+            epoch: number of the epoch, from 0.
 
         Raises:
             UnitError: for other numbers.
@@ -182,7 +182,7 @@ def in_order(tensor: torch.Tensor) -> NDArray[Any]:
     a power of two.
 
     Args:
-        tensor: any shape.
+        tensor: tensor of any shape.
 
     Returns:
         Array of the same shape.
@@ -208,8 +208,8 @@ def sample_number(what: str, number: Any, size: int) -> int:
 
     Args:
         what: caller for messages.
-        number: of the sample.
-        size: of the data set.
+        number: number of the sample.
+        size: number of samples in the data set.
 
     Returns:
         0 to ``size`` - 1.
@@ -259,9 +259,9 @@ def sample_generator(what: str, seed: int | None, number: int, epoch: Any = None
 
     Args:
         what: caller for messages.
-        seed: None for no generator.
-        number: of the sample.
-        epoch: None is 0.
+        seed: seed of the draws; None for no generator.
+        number: number of the sample.
+        epoch: number of the epoch; None is 0.
         more: further numbers that distinguish samples.
 
     Returns:
@@ -281,7 +281,7 @@ def value_tensors(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return drawn values as tensors of the caller's own; texts stay texts.
 
     Args:
-        values: of a sample, by key.
+        values: drawn values of a sample by key.
 
     Returns:
         Tensors and texts by key.
@@ -298,7 +298,7 @@ def measurement(
         what: caller for messages.
         transform: function or module.
         sample: tensors by name.
-        generator: None for torch's own.
+        generator: random generator; None takes torch's own.
 
     Returns:
         Result of the transform.

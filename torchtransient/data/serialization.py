@@ -240,7 +240,7 @@ def files_of(description: Plain, choices: Iterable[Any]) -> dict[str, str]:
     """Return the hashes of the files that a scene names.
 
     Args:
-        description: of the scene.
+        description: description of the scene.
         choices: plain data that may take the place of its entries.
 
     Returns:

@@ -34,8 +34,8 @@ _UNSIGNED = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 
 def measured_names(about: Any) -> tuple[str, ...]:
-    """Return the arrays that were measured: by the film under its own name, and by sensors. Others are labels, and the
-    steady image.
+    """Return the arrays that were measured: by the film under its own name, and by sensors. Other arrays are labels,
+    and the steady image.
 
     Args:
         about: entry ``about`` of a header.
@@ -71,7 +71,7 @@ def rounded_mantissa(array: NDArray[Any]) -> NDArray[Any]:
     digits at the same places.
 
     Args:
-        array: floating point, any shape.
+        array: floating-point array of any shape.
 
     Returns:
         Array of the same dtype; float16 as it is.
@@ -125,9 +125,9 @@ def encoding_of(name: str, dtype: np.dtype[Any], store: str, measured: Sequence[
     """Return the encoding of an array. Only measured arrays may lose digits.
 
     Args:
-        name: of the array.
-        dtype: of the array.
-        store: of the shard.
+        name: name of the array.
+        dtype: dtype of the array.
+        store: "exact", "rounded" or "counts", the store of the shard.
         measured: names of measured arrays.
 
     Returns:
@@ -142,8 +142,8 @@ def encoded(array: NDArray[Any], encoding: str, what: str) -> NDArray[Any]:
     """Encode an array.
 
     Args:
-        array: of a sample.
-        encoding: of the array.
+        array: array of one sample.
+        encoding: encoding of the array, "exact", "rounded" or "counts".
         what: caller for messages.
 
     Returns:
@@ -162,7 +162,7 @@ def decoded(array: NDArray[Any], encoding: str) -> NDArray[Any]:
 
     Args:
         array: stored array.
-        encoding: of the array.
+        encoding: encoding of the array, "exact", "rounded" or "counts".
 
     Returns:
         Array.
@@ -210,7 +210,7 @@ def chunk_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     float32, whichever is more, and slabs above 4 MiB in rows of the image.
 
     Args:
-        shape: of an array of one sample.
+        shape: shape of an array of one sample.
 
     Returns:
         Shape of a chunk.
@@ -240,7 +240,7 @@ def time_axis(shape: tuple[int, ...]) -> int | None:
     polarized images (4, C, T, H, W) third. Images of several components are thus cut into rows.
 
     Args:
-        shape: of an array of one sample.
+        shape: shape of an array of one sample.
 
     Returns:
         Axis, None for fewer axes.
@@ -252,9 +252,9 @@ class Compressor:
     """Compressor of arrays into the chunks that HDF5 would store, without a file on a disk.
 
     Args:
-        shape: of the arrays.
-        dtype: of the arrays.
-        compression: its name.
+        shape: shape of the arrays.
+        dtype: dtype of the arrays.
+        compression: "blosc2", "gzip" or "none".
         what: caller for messages.
     """
 
@@ -273,7 +273,7 @@ class Compressor:
         """Compress an array.
 
         Args:
-            array: of a sample.
+            array: array of one sample.
 
         Returns:
             Chunks in the order of ``places``.
@@ -288,7 +288,7 @@ class Compressor:
         """Decompress an array.
 
         Args:
-            chunks: in the order of ``places``.
+            chunks: compressed chunks in the order of ``places``.
 
         Returns:
             Array.
@@ -305,9 +305,9 @@ class Compressor:
 
 @contextmanager
 def _fixed_settings() -> Iterator[None]:
-    """Fix the settings of Blosc, which takes block size, level and threads from the environment too, and makes other
-    bytes of them. Without a number it starts threads for every chunk, which wait for each other and for those of other
-    workers.
+    """Fix the settings of Blosc, which would take block size, level and threads from the environment, and write other
+    bytes then. Without a number of threads it starts some for every chunk, which wait for each other and for those of
+    other workers.
     """
     settings = {name: os.environ.pop(name) for name in list(os.environ) if name.startswith("BLOSC_")}
     os.environ["BLOSC_NTHREADS"] = "1"
@@ -355,7 +355,7 @@ def check_chunks(dataset: Any, rows_there: int, what: str) -> None:
     here, before there is memory for it.
 
     Args:
-        dataset: of h5py.
+        dataset: data set of h5py.
         rows_there: rows that have chunks.
         what: name for messages.
 

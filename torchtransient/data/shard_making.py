@@ -28,15 +28,15 @@ _ADDRESS = re.compile(r"\b0x[0-9a-fA-F]{4,}\b")
 
 
 class ShardMaker:
-    """Maker of shards of one recipe. The process computes with one thread from here on: with more of them sums are
-    added up in the order in which threads come, and bytes differ.
+    """Maker of shards of one recipe. The process computes with one thread from here on: with several, sums are added up
+    in the order in which threads finish, and bytes differ.
 
     Its methods report their progress by ``say``, each message a sign of life: ("begin", shard, index), ("end", shard,
     index, reason of a failure or None), ("retry", shard, index, reason), ("traced", shard, index, traceback),
     ("closing", shard).
 
     Args:
-        settings: of the run.
+        settings: settings of the run.
     """
 
     def __init__(self, settings: RunSettings) -> None:
@@ -63,7 +63,7 @@ class ShardMaker:
         """Check the recipe, and make samples until one can be made.
 
         Args:
-            indices: samples to try.
+            indices: numbers of the samples to try.
             say: function of the entries of a message.
             skip: samples that are not tried, with the reason.
 
@@ -107,7 +107,7 @@ class ShardMaker:
         """Write one shard.
 
         Args:
-            shard: its number.
+            shard: number of the shard.
             described: content of ``recipe.json``.
             say: function of the entries of a message.
             skip: samples that are not tried, with the reason.
@@ -185,9 +185,9 @@ class Measured:
     """Figures of the first sample that can be made, for all samples.
 
     Args:
-        sample_bytes: before compression.
+        sample_bytes: bytes of a sample before compression.
         about: ``Maker.about``.
-        standard_error: of the sample, or None.
+        standard_error: relative standard error of the sample, or None.
         warned: messages and classes of this library's warnings in the recipe's check, for the caller of ``generate``.
     """
 
@@ -202,7 +202,7 @@ def execute(task: tuple[Any, ...], maker: ShardMaker, say: Say) -> tuple[Any, ..
 
     Args:
         task: ("measure", indices, skip) or ("shard", number, description, skip, first).
-        maker: of the worker.
+        maker: maker of the worker.
         say: function of the entries of a message.
 
     Returns:
@@ -221,7 +221,7 @@ def reason_of(error: BaseException) -> str:
     with the names alone of files in other folders.
 
     Args:
-        error: that was raised.
+        error: exception that was raised.
 
     Returns:
         Text of 500 characters at most.
@@ -235,7 +235,7 @@ def fatal(error: BaseException) -> tuple[str, str, str]:
     """Return an error as plain texts, since not all errors pickle.
 
     Args:
-        error: that was raised.
+        error: exception that was raised.
 
     Returns:
         Name of its class, message, traceback.
@@ -248,7 +248,7 @@ def raised(kind: str, message: str) -> Exception:
 
     Args:
         kind: name of the class.
-        message: of the error.
+        message: message of the exception.
 
     Returns:
         Exception.

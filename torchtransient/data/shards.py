@@ -1,9 +1,9 @@
-"""Shards: HDF5 files of several samples, whose bytes are a function of the samples alone. Files from anyone are checked
-before they are believed.
+"""Shards: HDF5 files of several samples, whose bytes are a function of the samples alone. Files of unknown origin are
+checked before their content is used.
 
 ``about``, JSON as bytes, has the format, the header, the encodings, texts and failures; ``index`` int64 (N,), ``seed``
 uint32 (N,), ``outside`` float64 (N, 2) and ``there`` uint8 (N,) have an entry for each row; ``arrays/<name>`` (N, ...)
-are the samples, rows that failed without chunks; ``values/<key>`` (N, ...) the drawn values. Behind the end of HDF5
+are the samples, without chunks for rows that failed; ``values/<key>`` (N, ...) the drawn values. Behind the end of HDF5
 stand eight letters and the SHA-256 of all bytes before them. Chunks carry Fletcher's checksum besides, which every
 reader of HDF5 checks. There are no times, hosts or names of users in a shard.
 """
@@ -56,7 +56,7 @@ class Shard:
     ``failed``: reasons by the index of the sample. ``names``: of the arrays. ``keys``: of the values.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         StorageError: for a file that is missing, damaged or no shard; so does every method.
@@ -94,8 +94,8 @@ class Shard:
         """Read one array of a row.
 
         Args:
-            name: of the array.
-            row: of the sample.
+            name: name of the array.
+            row: row of the sample in the shard.
             window: slice of the bins; only these are read.
             pixels: slices of rows and columns of the image.
             as_stored: keep the type of counts instead of float32.
@@ -128,7 +128,7 @@ class Shard:
         """Return drawn values of a row.
 
         Args:
-            row: of the sample.
+            row: row of the sample in the shard.
 
         Returns:
             Values by key.
@@ -149,7 +149,7 @@ class Shard:
         """Return the shape of an array of one sample.
 
         Args:
-            name: of the array.
+            name: name of the array.
 
         Returns:
             Shape.
@@ -158,11 +158,11 @@ class Shard:
             return tuple(self._dataset(name).shape[1:])
 
     def time_axis(self, name: str) -> int | None:
-        """Return the axis of the bins of an array: as the header says of measured arrays; else second, behind channels,
-        or third, behind the Stokes components, in polarized variants.
+        """Return the axis of the bins of an array: for measured arrays the one that the header says; else the second,
+        behind channels, or in polarized variants the third, behind the Stokes components.
 
         Args:
-            name: of the array.
+            name: name of the array.
 
         Returns:
             Axis, None for an array without bins.
@@ -187,8 +187,8 @@ class Shard:
         """Return the dtype of an array.
 
         Args:
-            name: of the array.
-            as_stored: in the file, instead of as it is read.
+            name: name of the array.
+            as_stored: return the dtype in the file instead of the one that :meth:`read` gives.
 
         Returns:
             NumPy's name.
@@ -201,7 +201,7 @@ class Shard:
         """Return the encoding of an array.
 
         Args:
-            name: of the array.
+            name: name of the array.
 
         Returns:
             "exact", "rounded" or "counts".
@@ -281,9 +281,9 @@ class ShardWriter:
     block ends. Where the block raises or is killed, no file appears. Compressed samples are kept in memory until then.
 
     Args:
-        path: of the file.
-        rows: samples, those that fail included.
-        header: plain data, JSON.
+        path: path of the file.
+        rows: number of samples, those that fail included.
+        header: plain data that JSON can hold.
         store: "exact", "rounded" (10 bits of mantissa for measured arrays, which ``header["about"]["measures"]`` names,
             labels as they are) or "counts" (``measurement`` as whole numbers, everything else as it is).
         compression: "blosc2", "gzip" or "none".
@@ -337,8 +337,8 @@ class ShardWriter:
         """Encode and compress a sample.
 
         Args:
-            row: of the file.
-            sample: of a recipe, or an object with the same attributes.
+            row: row of the sample in the shard.
+            sample: sample of a recipe, or an object with the same attributes.
         """
         row = self._free(row)
         arrays = {name: _array(value, f"{WHAT}: '{name}'") for name, value in sorted(sample.arrays.items())}
@@ -376,9 +376,9 @@ class ShardWriter:
         """Record a sample that could not be made.
 
         Args:
-            row: of the file.
-            index: of the sample.
-            reason: of the failure.
+            row: row of the sample in the shard.
+            index: number of the sample in the recipe, from 0.
+            reason: reason of the failure.
         """
         self._failed[self._free(row)] = (int(index), str(reason))
 
@@ -484,7 +484,7 @@ def seal(path: Path) -> None:
     """Append the checksum of a file.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
     with path.open("r+b") as file:
         digest = hash_of(file, path.stat().st_size)
@@ -497,7 +497,7 @@ def hash_of(file: Any, size: int) -> bytes:
 
     Args:
         file: open file.
-        size: bytes.
+        size: number of bytes.
 
     Returns:
         Digest.
@@ -517,7 +517,7 @@ def member_name(key: str) -> str:
     """Return a key as the name of a member of an HDF5 group, where slashes and single points mean something else.
 
     Args:
-        key: of a value.
+        key: key of a drawn value.
 
     Returns:
         Name.
@@ -547,7 +547,7 @@ def stored_checksum(path: Path) -> str:
     """Return the checksum at the end of a shard, without comparing it.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Returns:
         Hexadecimal digits.
@@ -592,14 +592,14 @@ def part_of(given: slice, size: int, name: str) -> slice:
 
     Args:
         given: slice.
-        size: of the whole.
-        name: for messages.
+        size: number of entries of the whole axis.
+        name: name of the slice, for messages.
 
     Returns:
         Slice.
 
     Raises:
-        StorageError: for steps, and for nothing.
+        StorageError: for slices with a step, and for empty ones.
     """
     start, stop, step = given.indices(size)
     if step != 1 or stop <= start:

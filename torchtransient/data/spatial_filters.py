@@ -21,8 +21,8 @@ def spatial_filter(function: Callable[[Tensor], Tensor], light: Tensor) -> Tenso
     neighbours by one bin alone. Differentiable as ``function`` is.
 
     Args:
-        function: of images (N, 1, H, W).
-        light: (..., H, W), (B, C, T, H, W) for instance, floating point.
+        function: filter, a function of images (N, 1, H, W).
+        light: light (..., H, W), (B, C, T, H, W) for instance, floating point.
 
     Returns:
         (..., H', W').
@@ -50,7 +50,7 @@ class SpatialFilter(nn.Module):
     """``spatial_filter`` as a module, for ``transform=`` or a chain: ``SpatialFilter(MedianBlur((3, 3)))``.
 
     Args:
-        function: of images (N, 1, H, W).
+        function: filter, a function of images (N, 1, H, W).
     """
 
     def __init__(self, function: Callable[[Tensor], Tensor]) -> None:
@@ -61,7 +61,7 @@ class SpatialFilter(nn.Module):
         """Filter images.
 
         Args:
-            light: (..., H, W).
+            light: light (..., H, W), floating point.
 
         Returns:
             (..., H', W').

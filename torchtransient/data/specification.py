@@ -54,7 +54,7 @@ class OneOf:
     """Several scenes, one of which each sample takes.
 
     Args:
-        scenes: list, or mapping from names.
+        scenes: list of scenes, or scenes by name.
         weights: relative frequencies, None for even ones.
 
     Raises:
@@ -79,8 +79,8 @@ class Structure:
     """Scene with its exchanged entries.
 
     Args:
-        name: of the scene.
-        text: for messages and sheets.
+        name: name of the scene.
+        text: short text that names the structure in messages and contact sheets.
         entries: pairs of a key and its value.
     """
 
@@ -98,9 +98,9 @@ class Scenes:
     """Scenes of a recipe by name (one, "", unless ``OneOf`` is given), or hidden things.
 
     Args:
-        given: scene, OneOf, or with ``scan`` hidden things.
-        variant: of Mitsuba.
-        scan: of a capture, or None.
+        given: scene, OneOf, or the hidden things where there is a ``scan``.
+        variant: variant of Mitsuba.
+        scan: scan of a capture, or None.
         parameters: values of the $names of an XML scene.
 
     Raises:
@@ -130,7 +130,7 @@ class Scenes:
         """Return True for a key of an entry in the description of every scene.
 
         Args:
-            key: of the recipe.
+            key: key in the ``vary`` of the recipe.
 
         Returns:
             Truth value.
@@ -141,8 +141,8 @@ class Scenes:
         """Return the keys with a derivative in the first scene as it is described.
 
         Args:
-            bounces: of a capture.
-            energy: of a capture.
+            bounces: numbers of bounces that count in a capture.
+            energy: joules of the laser of a capture.
 
         Returns:
             Keys.
@@ -158,7 +158,7 @@ class Scenes:
         """Build the scene of a structure.
 
         Args:
-            structure: of the recipe.
+            structure: scene of the recipe with its exchanged entries.
 
         Returns:
             Scene as ``tt.load`` takes it (hidden shapes for a capture), and its scan.
@@ -364,7 +364,7 @@ class Specification:
         """Return the structure of a sample.
 
         Args:
-            index: of the sample.
+            index: number of the sample in the recipe, from 0.
 
         Returns:
             Structure.
@@ -382,7 +382,7 @@ class Specification:
         """Return True for the key of an argument of the device.
 
         Args:
-            key: of the recipe.
+            key: key in the ``vary`` of the recipe.
 
         Returns:
             Truth value.
@@ -429,7 +429,7 @@ def is_entry(value: Any) -> bool:
     """Return True for a choice that is an entry of a description, no number or array.
 
     Args:
-        value: of a Choice.
+        value: one of the values of a Choice.
 
     Returns:
         Truth value.
@@ -441,8 +441,8 @@ def label_of(distribution: Distribution, value: Any) -> str:
     """Return a short text for a drawn entry: texts and numbers themselves, others by their number among the choices.
 
     Args:
-        distribution: of the key.
-        value: that was drawn.
+        distribution: distribution of the key.
+        value: value that was drawn.
 
     Returns:
         Text.
@@ -461,7 +461,7 @@ def samples_of(indices: Iterable[int]) -> list[int]:
     """Check numbers of samples.
 
     Args:
-        indices: whole numbers from 0 on.
+        indices: numbers of the samples in the recipe, from 0.
 
     Returns:
         List.

@@ -55,9 +55,9 @@ _VALUES, _INDEX, _OUTSIDE, _TRANSIENT = "values", "index", "outside", "transient
 class TransientDataset(Epochs, Dataset[dict[str, Any]]):
     """Samples of shards by number, in the order of the files and their rows, without those that failed.
 
-    A sample is a dictionary of its arrays by name, ``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels, of
-    ``values``, the drawn values by key, of ``outside``, (2,), the shares of its light before and after the time window
-    that it was rendered with, and of ``index``, its number in the recipe. ``torch.utils.data.DataLoader`` makes batches
+    A sample is a dictionary: its arrays by name (``transient`` (C, T, H, W), ``steady`` (C, H, W) and labels),
+    ``values`` (the drawn values by key), ``outside`` (the shares (2,) of its light before and after the time window
+    that it was rendered with) and ``index`` (its number in the recipe). ``torch.utils.data.DataLoader`` makes batches
     of them. Files are opened when they are first read, in every process anew: the data set pickles, and workers may be
     forked or spawned.
 
@@ -134,8 +134,8 @@ class TransientDataset(Epochs, Dataset[dict[str, Any]]):
         """Read a sample.
 
         Args:
-            number: of the sample, negative from the end.
-            epoch: distinguishes the noise of epochs; None is 0.
+            number: number of the sample in the data set, from 0; negative ones count from the end.
+            epoch: number of the epoch, which distinguishes the noise of epochs; None is 0.
 
         Returns:
             Sample.
@@ -194,13 +194,14 @@ class TransientStream(IterableDataset[dict[str, Any]]):
     ranks and workers. Workers of a DataLoader divide the share of their rank.
 
     Args:
-        where: as of :class:`TransientDataset`.
+        where: folder, pattern of names, shard, or a list of these, see :class:`TransientDataset`.
         shuffle: False for files and rows in order.
-        seed: of the order.
-        rank: share of the samples that this process reads; by default that of torch.distributed, or of RANK.
+        seed: seed of the shuffled order.
+        rank: number of the share of the samples that this process reads; by default the rank of torch.distributed, or
+            RANK.
         world_size: number of shares, likewise. Shares differ by one sample where samples cannot be divided evenly.
         even: leave out the last samples of an epoch's order, so that no rank waits for another one.
-        noise_seed: ``seed`` of :class:`TransientDataset`; the noise of an epoch is its own.
+        noise_seed: ``seed`` of :class:`TransientDataset`; every epoch has noise of its own.
         reading: other arguments of :class:`TransientDataset`.
 
     Raises:
@@ -236,10 +237,10 @@ class TransientStream(IterableDataset[dict[str, Any]]):
         """Choose the order of the next iteration, in all workers. Call it before iterating over the loader.
 
         Args:
-            epoch: from 0 on.
+            epoch: number of the epoch, from 0.
             batches: batches of ``batch_size`` that a loader of this rank has given already, in an epoch that goes on:
                 they are left out, and those that follow are the same as without a stop. With as many workers as before.
-            batch_size: of the loader.
+            batch_size: number of samples in a batch of the loader.
         """
         numbers = [
             count(f"{WHAT}: epoch", epoch, 0),
@@ -372,7 +373,7 @@ class ShardTable:
     open files; a process that was forked opens its own.
 
     Args:
-        where: as of :class:`TransientDataset`.
+        where: folder, pattern of names, shard, or a list of these, see :class:`TransientDataset`.
 
     Raises:
         StorageError: for shards that do not belong together.
@@ -419,7 +420,7 @@ class ShardTable:
         """Open shard; those that were not used for long are closed.
 
         Args:
-            number: of the file.
+            number: number of the file, from 0.
 
         Returns:
             Shard.

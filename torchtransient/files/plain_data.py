@@ -62,7 +62,7 @@ def plain(value: Any, parts: list[NDArray[Any]] | None, where: str) -> Any:
 
 
 def restored(value: Any, arrays: Mapping[str, Any]) -> Any:
-    """Return the data that :func:`plain` has made JSON of.
+    """Return the data from which :func:`plain` has made JSON.
 
     Args:
         value: plain data.
@@ -95,7 +95,7 @@ def scan_data(scan: Scan) -> dict[str, Any]:
     """Return a scan as plain data that JSON can hold, without gradients.
 
     Args:
-        scan: with its wall.
+        scan: scan with its wall.
     """
     found: dict[str, Any] = plain({f.name: getattr(scan, f.name) for f in fields(scan)}, None, "scan")
     return found
@@ -129,7 +129,7 @@ def text_of(values: Mapping[str, Any], name: str) -> str:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else, which readers report as damage.
@@ -145,7 +145,7 @@ def number_of(values: Mapping[str, Any], name: str) -> float:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else.
@@ -161,7 +161,7 @@ def whole_of(values: Mapping[str, Any], name: str) -> int:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else.
@@ -177,7 +177,7 @@ def flag_of(values: Mapping[str, Any], name: str) -> bool:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else.
@@ -193,7 +193,7 @@ def names_of(values: Mapping[str, Any], name: str) -> tuple[str, ...]:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else.
@@ -209,7 +209,7 @@ def notes_of(values: Mapping[str, Any], name: str) -> dict[str, Any]:
 
     Args:
         values: entries by name.
-        name: of the entry.
+        name: name of the entry.
 
     Raises:
         ValueError: for anything else.

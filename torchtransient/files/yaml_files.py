@@ -171,8 +171,8 @@ def file_beside(name: str, folders: Sequence[Path], where: str) -> Path:
     """Return the path of a file in the first of some folders that has it.
 
     Args:
-        name: of the file.
-        folders: in the order in which they are searched.
+        name: name of the file.
+        folders: folders in the order in which they are searched.
         where: place of the entry, for messages.
 
     Raises:

@@ -55,7 +55,7 @@ class Ranks:
         """Return the mean of a number over all ranks, which all have to call this.
 
         Args:
-            value: of this rank.
+            value: number that this rank has.
         """
         if self.size == 1:
             return float(value)
@@ -64,7 +64,7 @@ class Ranks:
         return float(total) / self.size
 
     def wait(self) -> None:
-        """Go on when all ranks have come here: after the first one has written what the others read."""
+        """Wait until all ranks have come here, for instance until the first one has written a file for the others."""
         if self.size > 1:
             dist.barrier()
 
@@ -80,8 +80,8 @@ def ranks(device: str = "cpu", *, threads: int | None = None, timeout_s: float =
         device: "cpu" (group "gloo") or "cuda" (group "nccl", one device a rank). Dr.Jit computes on the first device
             that the process can see and has no choice of others, so that with "cuda" every rank is shown its own alone
             (CUDA_VISIBLE_DEVICES): call this before anything has used CUDA, in torch or in a variant of Mitsuba.
-        threads: of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares the cores of the
-            machine among its ranks. They come back to their number before.
+        threads: number of threads of torch and of Dr.Jit in each rank, see :func:`torchtransient.threads`; None shares
+            the cores of the machine among its ranks. At the end both numbers are what they were before.
         timeout_s: seconds that a rank waits for the others.
 
     Raises:
@@ -168,8 +168,8 @@ class Batches(Sampler[list[int]]):
     """Numbers of the samples of every step, without an end; :meth:`loader` reads them.
 
     Samples come in an order that is shuffled anew in every epoch; a batch may begin in one epoch and end in the next,
-    so that all batches have one size and no sample is left out. At each step rank r of n reads the r-th n-th of the
-    batch. Runs of 1 and of 2 ranks learn from the same samples at the same step.
+    so that all batches have one size and no sample is left out. At each step rank r of n reads the r-th of n equal
+    parts of the batch. Runs of 1 and of 2 ranks learn from the same samples at the same step.
 
     The order depends on ``seed``, ``size`` and the number of samples before it alone. :attr:`step` is the position of
     the next iterator. A loop that counts its steps sets it when it goes on; iterators, which prefetch, do not change
@@ -182,11 +182,11 @@ class Batches(Sampler[list[int]]):
             ...
 
     Args:
-        size: samples of the data set, which is map-style.
-        batch_size: of all ranks together.
-        seed: of the order.
+        size: number of samples in the data set, which is map-style.
+        batch_size: number of samples in a batch, of all ranks together.
+        seed: seed of the shuffled order.
         shuffle: False keeps the order of the data set.
-        rank, world_size: of this process.
+        rank, world_size: number of this process, and number of processes.
 
     Raises:
         UnitError: for numbers that cannot be used.
@@ -258,7 +258,7 @@ class Batches(Sampler[list[int]]):
                 as ``TransientDataset(seed=)`` does.
             renders: True for a data set that renders; processes are spawned then, and have one thread each
                 (:func:`worker_init`).
-            options: others of the DataLoader.
+            options: other arguments of the DataLoader.
 
         Raises:
             UnitError: for data sets of another size.
@@ -297,7 +297,7 @@ class Batches(Sampler[list[int]]):
         """Put the position of a state back.
 
         Args:
-            state: of :meth:`state_dict`.
+            state: result of :meth:`state_dict`.
 
         Raises:
             StorageError: where samples would come in another order than that of the state.
@@ -309,7 +309,7 @@ class Batches(Sampler[list[int]]):
         """Raise the errors of :meth:`load_state_dict`, and change nothing.
 
         Args:
-            state: of :meth:`state_dict`.
+            state: result of :meth:`state_dict`.
         """
         order = {name: value for name, value in state.items() if name != "step"}
         if order != self._order() or "step" not in state:

@@ -38,8 +38,8 @@ def plain(value: Any, where: str) -> Any:
     """Return a state as plain data: mappings as dictionaries, numbers and arrays of NumPy as those of Python and torch.
 
     Args:
-        value: of any kind; tensors are detached.
-        where: its place, for the message.
+        value: state of any kind; tensors are detached.
+        where: place of the state, for the message.
 
     Raises:
         StorageError: for objects that are no data, with their place.
@@ -102,7 +102,7 @@ def check_random_state(state: Any) -> None:
     """Check a state of generators, and change nothing.
 
     Args:
-        state: of :func:`random_state`.
+        state: result of :func:`random_state`.
 
     Raises:
         StorageError: for a state of another number of CUDA devices, and other objects.
@@ -123,7 +123,7 @@ def set_random_state(state: dict[str, Any]) -> None:
     """Put the states of all generators back.
 
     Args:
-        state: of :func:`random_state`.
+        state: result of :func:`random_state`.
 
     Raises:
         StorageError: for broken states.
@@ -153,9 +153,9 @@ def check_optimizer(name: str, optimizer: torch.optim.Optimizer, state: Any, kin
     """Check a state of an optimiser, and change nothing.
 
     Args:
-        name: of the part.
-        optimizer: of torch.
-        state: to be loaded.
+        name: name of the part.
+        optimizer: optimiser of torch.
+        state: state that is to be loaded.
         kind: name of the class that has written it, None if unknown.
 
     Raises:
@@ -227,8 +227,8 @@ def save_checkpoint(
     those of every rank.
 
     Args:
-        path: of the file.
-        parts: by name, objects with ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
+        path: path of the file.
+        parts: objects by name with ``state_dict`` and ``load_state_dict`` (modules, optimisers, schedules, a
             GradScaler, :class:`Batches`), and generators of torch. Modules inside of DistributedDataParallel or
             ``torch.compile`` are stored without them, so that the checkpoint can be read with and without.
         step: number of steps that are done.
@@ -238,8 +238,8 @@ def save_checkpoint(
         StorageError: for states that could not be read without executing something, and where nothing can be written.
         ArgumentError: for parts without a state.
 
-    Not in it: the source of the network's data beyond their position, buffers that modules do not put into their state,
-    and attributes.
+    Not in the checkpoint: the source of the network's data beyond their position, buffers that modules do not put into
+    their state, and attributes.
     """
     place = path_of(path, "save_checkpoint")
     parts = dict(parts)
@@ -276,8 +276,8 @@ def load_checkpoint(path: str | os.PathLike[str], parts: Mapping[str, Any], *, r
     one). A part that still refuses its state afterwards raises an error that says so. Every rank reads the file.
 
     Args:
-        path: of the file.
-        parts: of :func:`save_checkpoint`, made anew, under the same names.
+        path: path of the file.
+        parts: objects of the same kinds as those of :func:`save_checkpoint`, made anew, under the same names.
         random: put the random numbers of this process back, which takes as many ranks as have written it; with False,
             and all draws made by :class:`Seeds`, the number of ranks may change.
 

@@ -62,12 +62,12 @@ class Seeds:
     def generator(self, step: int, sample: int = 0, device: torch.device | str = "cpu") -> torch.Generator:
         """Return a generator of torch for the other draws of a step, sensor noise for instance.
 
-        One generator for a whole batch makes noise that depends on the parts that ranks have of it.
+        Noise that one generator makes for a whole batch depends on how the batch is divided among ranks.
 
         Args:
             step: number of the step.
             sample: number of the one sample that it is for; or the rank, so that ranks draw different numbers.
-            device: of the generator.
+            device: device of the generator.
 
         Raises:
             UnitError: for other numbers.

@@ -22,9 +22,9 @@ _MARKERS, _OTHERS, _GUIDE, _FRONT = "osD^v<", "0.75", "0.5", "0.15"
 class Curve:
     """One line of the picture. Its lists have equal length; `seconds` and errors that are not positive are left out.
 
-    `squared_relative_error`: of the noise. `band`: its interval by point, None for none. `total`, `total_band`: the
-    same with the bias, None where it is not known. `slope`: of the line through the logarithms, and its error.
-    `on_front`: points of the Pareto front.
+    `squared_relative_error`: that of the noise, at each point. `band`: its interval at each point, None for none.
+    `total`, `total_band`: the same with the bias, None where it is not known. `slope`: slope of the line through the
+    logarithms, and its error. `on_front`: points of the Pareto front.
     """
 
     quantity: str

@@ -38,9 +38,9 @@ def oklch(lightness: Any, chroma: Any, hue_deg: Any) -> Array:
     """Return sRGB colours (..., 3) in [0, 1] of Oklch colours; arguments broadcast, channels out of gamut are clipped.
 
     Args:
-        lightness: 0 to 1.
-        chroma: 0 for grey.
-        hue_deg: degrees.
+        lightness: lightness, 0 to 1.
+        chroma: chroma, 0 for grey.
+        hue_deg: hue in degrees.
     """
     light, chrom, hue = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (lightness, chroma, hue_deg)))
     angle = np.radians(hue)
@@ -55,7 +55,7 @@ def rainbow(position: Any, value: Any = 1.0) -> Array:
     """Return sRGB colours (..., 3) of equal lightness, hue by position from red to violet.
 
     Args:
-        position: 0 to 1; grey where it is not finite.
+        position: position on the scale, 0 to 1; grey where it is not finite.
         value: brightness from 0, black, to 1, as vivid as the screen allows.
     """
     place = np.asarray(position, dtype=np.float64)

@@ -25,9 +25,9 @@ _LETTERS = 30
 
 @dataclass(frozen=True)
 class Cell:
-    """One sample. ``title``: a line, cut off where it would run into the next one. ``images``: by name, (H, W, 3) in
-    [0, 1] as they are shown, or (H, W) of numbers, which share one scale in a sheet. ``curve``: light over the bins,
-    (T,), or None.
+    """One sample. ``title``: a line, cut off where it would run into the next one. ``images``: images by name, (H, W,
+    3) in [0, 1] as they are shown, or (H, W) of numbers, which share one scale in a sheet. ``curve``: light over the
+    bins, (T,), or None.
     """
 
     title: str
@@ -47,7 +47,7 @@ def contact_sheet(
     Args:
         cells: the samples, all with the same images.
         path: file to write the figure to.
-        times: (T + 1,) edges of the bins of the curves, metres of optical path.
+        times: edges (T + 1,) of the bins of the curves, metres of optical path.
         title: text above the sheet.
 
     Returns:

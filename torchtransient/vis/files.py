@@ -35,7 +35,7 @@ def save_image(image: Image, path: str | Path | None, who: str) -> Image:
     """Write an RGB image and return it.
 
     Args:
-        image: (H, W, 3) uint8.
+        image: image (H, W, 3) uint8.
         path: file, PNG or JPEG by its ending; None writes none.
         who: beginning of messages.
 
@@ -123,7 +123,7 @@ def needed(module: str, package: str, extra: str = "vis") -> Any:
     """Return a module of a package that may be missing.
 
     Args:
-        module: its full name.
+        module: full name of the module.
         package: package that has it.
         extra: extra of this library that brings the package.
 
@@ -170,7 +170,7 @@ def enlarge(image: Image, factor: int) -> Image:
     """Return an image with every pixel as a square.
 
     Args:
-        image: (H, W, 3) uint8.
+        image: image (H, W, 3) uint8.
         factor: side of the square, at least 1.
     """
     return image.repeat(factor, axis=0).repeat(factor, axis=1)

@@ -38,7 +38,7 @@ def phasor_picture(
     """Draw phasor images, a row for each frequency and a panel for each quantity; scales hold 99 % of the pixels.
 
     Args:
-        source: complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
+        source: phasors, complex (C, F, H, W), a result with such a ``phasor``, or its file; channels are added up.
         path: file to write the figure to.
         show: panels. "real" and "imaginary", blue to red around zero on one symmetric scale; "amplitude"; "phase",
             cyclic hue, grey where dark; "domain", hue by phase and brightness by amplitude.
@@ -84,7 +84,7 @@ def phasor_video(
     to red around zero on one symmetric scale.
 
     Args:
-        source: as for :func:`phasor_picture`.
+        source: phasors, complex (C, F, H, W), a result with such a ``phasor``, or its file, see :func:`phasor_picture`.
         path: file, ``.mp4`` or ``.gif``.
         which: index of the frequency.
         steps: number of frames.
@@ -99,7 +99,7 @@ def phasor_video(
     Raises:
         ShapeError: for another shape, other numbers of frequencies.
         IndexError: for an index outside.
-        StorageError: as of ``video``.
+        StorageError: as for ``video``.
     """
     check_video(path)
     images, known = _images(source, frequencies, "phasor_video")

@@ -49,8 +49,8 @@ def peak_time(transient: Tensor, axis: TimeAxis) -> Tensor:
     """Return when most light (sum over channels) arrives at each pixel.
 
     Args:
-        transient: (C, T, H, W), C = 1 or 3.
-        axis: its time axis.
+        transient: transient (C, T, H, W), C = 1 or 3.
+        axis: time axis of the transient.
 
     Returns:
         (H, W) float64, metres: centre of the brightest bin, the first of equal ones; NaN without light.
@@ -94,7 +94,7 @@ def _median_pixel(steady: Tensor) -> tuple[int, int]:
 
 
 def _row_bands(transient: Tensor) -> Iterator[Tensor]:
-    """Yield parts of some rows: the sum over channels of a whole cube would be a third of it once more."""
+    """Yield parts of some rows: the sum over channels of a whole cube would take a third of its memory more."""
     for row in range(0, transient.shape[2], _ROWS_AT_ONCE):
         yield transient.detach()[:, :, row : row + _ROWS_AT_ONCE]
 
@@ -125,14 +125,14 @@ def plot_overview(
     """Draw a render on one page: steady image, time of the peak, three moments, the histogram of a pixel.
 
     Args:
-        transient: (C, T, H, W), C = 1 or 3 in linear sRGB.
-        steady: (C, H, W). Each image has its own exposure.
+        transient: transient (C, T, H, W), C = 1 or 3 in linear sRGB.
+        steady: steady image (C, H, W). Each image has its own exposure.
         axis: time axis.
         path: file to write the picture to.
-        pixel: (row, column); None for one of median brightness.
+        pixel: pixel (row, column); None for one of median brightness.
         title: text above the picture.
-        errors: (T, H, W), the ``error_map`` of a render with ``errors=``: a band of two standard errors around the mean
-            over channels in the histogram.
+        errors: standard errors (T, H, W), the ``error_map`` of a render with ``errors=``: a band of two standard errors
+            around the mean over channels in the histogram.
 
     Returns:
         The matplotlib figure.
@@ -209,7 +209,7 @@ def peak_time_picture(
     The scale holds 98 % of the pixels.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``.
         path: file to write the figure to.
         title: text above the picture.
 
@@ -252,7 +252,8 @@ def rainbow(
     """Draw when light arrives as hue, red is early and violet late, and how much as brightness.
 
     Args:
-        source, axis: as in ``frames``. Without an axis, lengths are counted in bins.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``. Without an axis,
+            lengths are counted in bins.
         path: file to write the image to.
         style: "peak" gives every pixel the hue of its :func:`peak_time`; "fusion" adds up the light of all bins, each
             in its own hue, so that early and late light mix as coloured lamps do.
@@ -357,10 +358,11 @@ def streak(
     """Draw one row or column of pixels over time, as a streak camera sees it, time downwards.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``.
         path: file to write the figure to.
-        row, column: the line, one of both; None for the middle row.
-        exposure, curve: as in ``tone_map``, whose "log" shows the front and weak light behind it.
+        row, column: index of the row or of the column, one of both; None for the middle row.
+        exposure, curve: factor before the tone curve and its name, see ``tone_map``; "log" shows the front and weak
+            light behind it.
 
     Returns:
         The matplotlib figure.
@@ -410,13 +412,13 @@ def frame_grid(
     """Draw moments beside each other, each with its time.
 
     Args:
-        source, axis: as in ``frames``.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``.
         path: file to write the figure to.
         bins: bins that are shown; None takes ``count`` moments between which equal shares of the light arrive.
         count: number of moments.
         columns: most moments in a row.
         exposure: factor for all moments; None gives each its own, for late light is far weaker than early light.
-        curve: as in ``tone_map``.
+        curve: tone curve, "srgb", "gamma", "linear" or "log", see ``tone_map``.
         title: text above the figure.
 
     Returns:
@@ -453,10 +455,10 @@ def histogram(
     """Draw light over time of some pixels, a panel each.
 
     Args:
-        source, axis: as in ``frames``, with any number of channels: three are red, green and blue lines, one is black,
-            others go from violet to yellow.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``. Of any number of
+            channels: three are red, green and blue lines, one is black, others go from violet to yellow.
         path: file to write the figure to.
-        pixels: (row, column) of each.
+        pixels: pixels (row, column).
         log: take a logarithmic scale.
 
     Returns:
@@ -518,7 +520,7 @@ def gradient_picture(gradient: Source, path: str | Path | None = None, *, label:
     The symmetric scale ends where 99 % of the pixels are, so that some noisy ones do not hide the others.
 
     Args:
-        gradient: (C, H, W) or (H, W), numbers themselves, not a tensor that has them as ``.grad``.
+        gradient: gradient (C, H, W) or (H, W): the numbers themselves, not a tensor that has them as ``.grad``.
         path: file to write the figure to.
         label: text at the colour bar.
         title: text above the figure.

@@ -52,7 +52,7 @@ def polarization_picture(
         quantities: "intensity" (tone mapped), "dop", "dolp" (0 to 1, black to yellow; noise above one is shown as one),
             "aolp" (-90 to 90 degrees, cyclic, the more colourful the more linearly polarized), "docp" (-1 to 1, blue is
             left and red right circular), "s1", "s2", "s3" (blue to red around zero).
-        frame: bin; None for the light of all times.
+        frame: index of the bin; None for the light of all times.
         floor: intensity below which pixels are grey; None for a hundredth of the median of lit pixels.
         angle_map: "even" for hues of equal lightness, "hsv" for the hue circle of many papers.
 

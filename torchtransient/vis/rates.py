@@ -37,7 +37,7 @@ def range_doppler(
         source: light (C, R, T, H, W), or a result or its file that has it as ``rates``; channels are added up.
         path: file to write the figure to.
         axis, rate_axis: axes of T and R; None takes those of the result, ``axis`` and ``rate_axis``.
-        pixel: (row, column); None for the mean over all pixels.
+        pixel: pixel (row, column); None for the mean over all pixels.
         decades: powers of ten from the brightest bin to the darkest colour.
         title: text above the figure.
 

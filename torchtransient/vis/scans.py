@@ -135,8 +135,8 @@ def scan_layout(
     Args:
         scan: a Scan, or a Capture with its own.
         path: file to write the figure to.
-        hidden: as in ``tt.nlos.simulate``, drawn transparent: shapes by name, one shape, (vertices, faces) or an object
-            with both; meshes as arrays, rectangles, cubes, disks, spheres and cylinders.
+        hidden: hidden shapes as ``tt.nlos.simulate`` takes them, drawn transparent: shapes by name, one shape,
+            (vertices, faces) or an object with both; meshes as arrays, rectangles, cubes, disks, spheres and cylinders.
         title: text above the figure.
 
     Returns:

@@ -82,10 +82,10 @@ def images_of(
     """Return the intensity over time, or images of time gates (C, G, H, W), its axis, and "bin" or "gate".
 
     Args:
-        source, axis, who, any_channels: as of :func:`transient_of`.
+        source, axis, who, any_channels: the source and how it is read, see :func:`transient_of`.
 
     Raises:
-        ShapeError: as of ``transient_of``, and for gates with an axis.
+        ShapeError: as for ``transient_of``, and for gates with an axis.
     """
     loaded = _load(source, "transient")
     if loaded.transient is not None or loaded.gated is None:
@@ -113,7 +113,7 @@ def stokes_of(source: Source, frame: int | None = None, who: str = "picture") ->
 
     Args:
         source: a polarized transient (4, C, T, H, W), image (4, C, H, W), or a result or file with one.
-        frame: bin; None for the light of all times, the ``steady`` of a result or the sum over time.
+        frame: index of the bin; None for the light of all times, the ``steady`` of a result or the sum over time.
         who: beginning of messages.
 
     Raises:
@@ -154,8 +154,8 @@ def phasor_of(source: Source, who: str = "picture") -> tuple[Tensor, tuple[float
     """Return phasor images and their frequencies in cycles per metre, if the source knows them.
 
     Args:
-        source: complex (C, F, H, W), polarized (4, C, F, H, W) of which the first component is taken, or a result with
-            such a ``phasor``.
+        source: phasors, complex (C, F, H, W), polarized (4, C, F, H, W) of which the first component is taken, or a
+            result with such a ``phasor``.
         who: beginning of messages.
 
     Raises:

@@ -81,7 +81,7 @@ def tone_map(image: Tensor, exposure: float | None = None, curve: str = "srgb") 
     """Map linear radiance to colours of a screen.
 
     Args:
-        image: (C, H, W), C = 1 or 3 (linear sRGB).
+        image: linear radiance (C, H, W), C = 1 or 3 (linear sRGB).
         exposure: factor before the curve; None takes ``exposure_of(image)``.
         curve: "srgb" (IEC 61966-2-1), "gamma" (``x ** (1 / 2.2)``), "linear", or "log", which spreads ten factors of
             two below white evenly over the scale: the brightest channel is mapped, the others keep their ratio to it.

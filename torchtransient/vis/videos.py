@@ -75,7 +75,7 @@ def frames(
             the middle laser spot), or a file. Gated images are frames in the order of their gates.
         axis: time axis; None takes that of the source.
         exposure: factor of the radiance in a bin; None leaves 1 % of the lit pixels of all frames white.
-        curve: as in ``tone_map``.
+        curve: tone curve, "srgb", "gamma", "linear" or "log", see ``tone_map``.
         accumulate: show the light that has arrived so far.
         stamp: put the time under each frame.
         scale: side of a pixel on the screen; None enlarges small pictures to some 320 pixels.
@@ -120,8 +120,8 @@ def video(
     """Write the :func:`frames` of a transient as ``.mp4`` or ``.gif``.
 
     Args:
-        source, axis: as of ``frames``.
-        path: file.
+        source, axis: transient, or a result or file that has one, and its time axis, see ``frames``.
+        path: file, ``.mp4`` or ``.gif``.
         fps: frames per second.
         progress: show a bar.
         **settings: exposure, curve, accumulate, stamp, scale, every of ``frames``.
@@ -132,7 +132,7 @@ def video(
     Raises:
         StorageError: for another ending or a folder that is missing, before any frame is made.
         MissingPackageError: without imageio-ffmpeg or Pillow (extra ``vis``).
-        ShapeError, UnitError: as of ``frames``.
+        ShapeError, UnitError: as for ``frames``.
     """
     check_video(path)
     shown = frames(source, axis=axis, **settings)
@@ -197,8 +197,9 @@ def write_video(
     that is shown longer.
 
     Args:
-        path: file.
-        frames: (H, W, 3) uint8 of equal size, taken one after the other; for a GIF an object that iterates twice.
+        path: file, ``.mp4`` or ``.gif``.
+        frames: images (H, W, 3) uint8 of equal size, taken one after the other; for a GIF an object that iterates
+            twice.
         count: number of frames.
         fps: frames per second.
         progress: show a bar.
@@ -328,9 +329,9 @@ def with_strip(image: Image, text: str, share: float | None = None) -> Image:
     """Return the image over a dark strip with a text, made smaller until it fits the width.
 
     Args:
-        image: (H, W, 3) uint8.
+        image: image (H, W, 3) uint8.
         text: text in the strip.
-        share: 0 to 1, draws a bar that fills from left to right.
+        share: share, 0 to 1, of a bar that fills from left to right; None draws no bar.
     """
     height, width = image.shape[:2]
     rows = max(16, round(0.075 * max(height, width)))

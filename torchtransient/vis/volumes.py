@@ -42,14 +42,14 @@ def volume_views(
     """Draw a volume: the highest values seen from the front, from the top and from the side.
 
     Args:
-        volume: (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black, infinite
-            ones white, NaN red.
+        volume: volume (Z, Y, X), real, or complex of which the squared modulus is shown; values below zero are black,
+            infinite ones white, NaN red.
         path: file to write the figure to.
-        depths: (Z,) metres, increasing; planes reach to the middle between them. None counts voxels.
+        depths: depths (Z,) in metres, increasing; planes reach to the middle between them. None counts voxels.
         extent: width and height, metres; x and y count from the middle. None counts voxels.
-        depth: (Y, X) metres, drawn in a panel of its own.
-        mask: (Y, X), pixels of ``depth`` and ``normals`` that are drawn.
-        normals: (3, Y, X), drawn in a panel of its own.
+        depth: depth map (Y, X) in metres, drawn in a panel of its own.
+        mask: mask (Y, X) of the pixels of ``depth`` and ``normals`` that are drawn.
+        normals: normals (3, Y, X), drawn in a panel of their own.
         gamma: exponent of brightness; below 1 lightens dim voxels.
         title: text above the figure.
 

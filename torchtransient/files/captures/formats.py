@@ -52,11 +52,12 @@ def read_capture(
         path: the file.
         format: name of a layout of docs/capture_files.md, such as "tal" or "torchtransient", the library's own; None
             finds it from the content, independent of the name of the file.
-        wall_size: metres, one number or (width, height) of a scanned area whose points are the centres of its cells.
+        wall_size: size in metres, one number or (width, height), of a scanned area whose points are the centres of its
+            cells.
         bin_width_s: width of a bin, seconds.
         start_s: start of the first bin, seconds after light leaves the wall, or the laser where the legs count.
-        sensor_origin: (3,) metres.
-        laser_origin: (3,) metres.
+        sensor_origin: place of the sensor, (3,) metres.
+        laser_origin: place of the laser, (3,) metres.
         frequencies: frequencies of phasors.
         frame: index of the frame in a file of several, from 0.
 
@@ -96,7 +97,8 @@ def write_capture(path: str | Path, capture: Capture, metadata: Any = None, *, f
         path: place of the file.
         capture: the capture.
         metadata: plain data beside the capture's own, in the library's own format.
-        format: as in :func:`read_capture`, but layouts that are only read. The library's own holds all of a capture.
+        format: name of a layout that can be written, see :func:`read_capture`. The library's own holds all of a
+            capture.
 
     Returns:
         The path.

@@ -135,7 +135,7 @@ class Gaps:
         """Return width along x and height along y of a scanned area, metres.
 
         Args:
-            stored: those of the file, or None for ``wall_size``.
+            stored: width and height in the file, or None for ``wall_size``.
 
         Raises:
             StorageError: for other sizes, and without any.
@@ -160,7 +160,7 @@ class Gaps:
         Later assumptions may be missing: a reader makes its scan and its axis before.
 
         Args:
-            entries: what else the file says; ``not_read`` are names of entries that were left alone.
+            entries: other contents of the file by name; ``not_read`` are names of entries that were left alone.
         """
         said = {"assumed": self.assumed} if self.assumed else {}
         return {"format": self._layout, **said, **{name: value for name, value in entries.items() if value is not None}}
@@ -169,7 +169,7 @@ class Gaps:
         """Return an error that names file and layout.
 
         Args:
-            message: what is wrong and what to do.
+            message: description of the fault and of what to do about it.
         """
         return StorageError(f"{WHAT}: '{self.source}', layout {self._layout!r}: {message}")
 
@@ -179,8 +179,8 @@ def real_in(contents: Contents, name: str, gaps: Gaps) -> NDArray[Any] | None:
 
     Args:
         contents: the file.
-        name: of the array.
-        gaps: for messages.
+        name: name of the array.
+        gaps: arguments of the reader, for messages.
 
     Raises:
         StorageError: for other numbers.
@@ -196,8 +196,8 @@ def numbers_in(contents: Contents, name: str, gaps: Gaps, dims: int | None = Non
 
     Args:
         contents: the file.
-        name: of the array.
-        gaps: for messages.
+        name: name of the array.
+        gaps: arguments of the reader, for messages.
         dims: number of its dimensions, None for any.
 
     Raises:
@@ -215,8 +215,8 @@ def optional_number(contents: Contents, name: str, gaps: Gaps) -> float | None:
 
     Args:
         contents: the file.
-        name: of the number.
-        gaps: for messages.
+        name: name of the number.
+        gaps: arguments of the reader, for messages.
 
     Raises:
         StorageError: for anything else.
@@ -231,8 +231,8 @@ def before(points: NDArray[Any], normals: Any) -> NDArray[Any]:
     """Return a place a diagonal, or a metre, before the middle of points, on the side of their normals.
 
     Args:
-        points: (..., 3), metres.
-        normals: (..., 3), None for +z.
+        points: points (..., 3), metres.
+        normals: normals (..., 3), None for +z.
     """
     flat = np.asarray(points, np.float64).reshape(-1, 3)
     towards = np.array([0.0, 0.0, 1.0])
@@ -249,7 +249,7 @@ def assumed_in(capture: Capture, name: str, value: Any) -> bool:
     """Return True if a capture's metadata say that a value was assumed, and it still is the same.
 
     Args:
-        capture: with any metadata.
+        capture: capture, whose metadata may be anything.
         name: argument of :func:`read_capture`.
         value: value in the capture.
     """
@@ -264,8 +264,8 @@ def same_points(a: NDArray[Any], b: NDArray[Any]) -> bool:
     """Return True for points that are equal up to the rounding of single precision.
 
     Args:
-        a: (..., 3).
-        b: (..., 3).
+        a: points (..., 3).
+        b: points (..., 3).
     """
     with np.errstate(all="ignore"):  # damaged files
         return a.shape == b.shape and bool((np.abs(a - b) <= _ROUNDING * np.abs(a).max()).all())
@@ -275,7 +275,7 @@ def hidden_volume(capture: Capture, sizes: Mapping[str, int]) -> dict[str, NDArr
     """Return numbers about the hidden volume from the metadata of a capture.
 
     Args:
-        capture: with any metadata.
+        capture: capture, whose metadata may be anything.
         sizes: numbers of values by name.
 
     Returns:
@@ -294,7 +294,7 @@ def hidden_side(scan: Scan) -> NDArray[np.float64]:
     normals.
 
     Args:
-        scan: of a capture.
+        scan: scan of a capture.
     """
     towards = scan.sensor_origin - scan.sensor_points if scan.sensor_normals is None else scan.sensor_normals
     mean: NDArray[np.float64] = towards.detach().cpu().reshape(-1, 3).mean(0).numpy()
@@ -305,7 +305,7 @@ def tensor_of(array: NDArray[Any]) -> Tensor:
     """Return an array of a file as a tensor, on its memory if torch can compute with its numbers.
 
     Args:
-        array: any shape; unsigned numbers of 16 bits and more become signed ones.
+        array: array of any shape; unsigned numbers of 16 bits and more become signed ones.
 
     Raises:
         StorageError: for counts beyond those of int64.
@@ -320,8 +320,8 @@ def grid_points(size: tuple[int, int], extent: tuple[float, float]) -> NDArray[n
     """Return centres (Y, X, 3) of the cells of an area around the origin in the plane z = 0.
 
     Args:
-        size: (Y, X).
-        extent: (width, height) in metres.
+        size: numbers of rows and columns, (Y, X).
+        extent: size (width, height) of the area, metres.
     """
     y, x = ((np.arange(n) + 0.5 - n / 2) * (side / n) for n, side in zip(size, reversed(extent), strict=True))
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 0.0), -1)
@@ -331,7 +331,7 @@ def zone_grid(zones: int) -> tuple[int, ...]:
     """Return (rows, columns) of a chip's zones if they are a square or 3 x 6, else (zones,).
 
     Args:
-        zones: their number.
+        zones: number of zones.
     """
     side = math.isqrt(zones)
     return (side, side) if side * side == zones else (3, 6) if zones == _WIDE else (zones,)
@@ -343,11 +343,11 @@ def flat_scan(
     """Return a scan on the plane z = 0 whose hidden side is that of +z; lengths count from wall to wall.
 
     Args:
-        kind: of the scan.
+        kind: kind of the scan.
         points: grid or list (..., 3), metres.
         gaps: arguments of the reader.
-        spot: (3,) of a single scan.
-        origin: (3,), place of laser and sensor in the file, None to take the arguments, else to assume one.
+        spot: laser spot (3,) of a single scan.
+        origin: place (3,) of laser and sensor in the file; None takes the arguments, or else assumes one.
     """
     normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     laser = points if spot is None else np.asarray(spot, np.float64)
@@ -360,10 +360,10 @@ def scan_of(kind: str, *arrays: NDArray[Any] | None, legs: bool) -> Scan:
     """Return a scan of arrays.
 
     Args:
-        kind: of the scan.
+        kind: kind of the scan.
         arrays: points of sensor and laser (..., 3), metres, their origins (3,), their normals in the shapes of the
             points, or None.
-        legs: lengths count the first and the last leg.
+        legs: whether lengths count the first and the last leg.
     """
     tensors: dict[str, Any] = {
         name: None if array is None else torch.from_numpy(np.array(array, np.float64))
@@ -376,7 +376,7 @@ def only_transient(capture: Capture, layout: str, legs: bool | None = None) -> T
     """Return the transient (T, ...) of a capture of one channel.
 
     Args:
-        capture: of one channel, no batch.
+        capture: capture with one channel and no batch.
         layout: name of the layout, for messages.
         legs: value of ``first_and_last_leg`` that the layout has, None for both.
 
@@ -400,10 +400,10 @@ def one_channel(capture: Capture, tensor: Tensor, layout: str, before_channel: i
     """Check that a tensor has one channel, no batch, and counts that can be read again.
 
     Args:
-        capture: that it belongs to.
-        tensor: (..., C, T, ...).
+        capture: capture that the tensor belongs to.
+        tensor: tensor (..., C, T, ...).
         layout: name of the layout, for messages.
-        before_channel: dimensions before C.
+        before_channel: number of dimensions before C.
 
     Raises:
         StorageError: for other tensors.
@@ -422,7 +422,7 @@ def cannot(layout: str, holds: str, got: str) -> StorageError:
     """Return the error for a capture that a layout cannot hold.
 
     Args:
-        layout: its name.
+        layout: name of the layout.
         holds: captures that it holds.
         got: the capture, in words.
     """
@@ -444,9 +444,9 @@ def time_axis(
 
     Args:
         gaps: arguments of the reader.
-        start_opl: metres of optical path, or None.
-        bin_width_opl: metres of optical path, or None.
-        bins: their number.
+        start_opl: start of the first bin, metres of optical path, or None.
+        bin_width_opl: width of a bin, metres of optical path, or None.
+        bins: number of bins.
         default_s: width that is assumed, seconds.
         start_bins: start that is assumed, in bins.
     """
@@ -459,7 +459,7 @@ def frequency_axis(gaps: Gaps, stored: FrequencyAxis | None) -> FrequencyAxis:
 
     Args:
         gaps: arguments of the reader.
-        stored: those of the file, or None.
+        stored: frequencies of the file, or None.
     """
     found = gaps.fill("frequencies", stored)
     if not isinstance(found, FrequencyAxis):

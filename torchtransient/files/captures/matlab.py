@@ -60,12 +60,12 @@ class Variable:
     """Variable whose values have not been read.
 
     Attributes:
-        name: its name.
-        shape: in the order of HDF5, the reverse of MATLAB's; None for structures.
+        name: name of the variable.
+        shape: shape in the order of HDF5, the reverse of MATLAB's; None for structures.
         place: offset in the file.
-        stored: bytes in the file.
-        unpacked: bytes of the values.
-        compressed: packed by zlib.
+        stored: number of bytes in the file.
+        unpacked: number of bytes of the values.
+        compressed: whether the values are packed by zlib.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Mat5File:
         """Return numbers in the order of HDF5, a text, a structure by its fields; None for an empty value.
 
         Args:
-            name: of a variable.
+            name: name of a variable.
             what: subject of messages.
         """
         variable = self.variables[name]

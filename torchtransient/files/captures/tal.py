@@ -93,9 +93,9 @@ def read(contents: Contents, gaps: Gaps) -> Capture:
         gaps: arguments of the reader. Missing origins are assumed if their distance does not count.
 
     Returns:
-        The capture; ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` settings by which a file that is
-        written of it is the same again. Laser points of ``T_Si`` and ``T_Sx_Sy`` are one (single), those of the sensor
-        (confocal), or as many elsewhere (pairs).
+        The capture; ``metadata`` holds ``scene_info`` as plain data, and under ``tal`` the settings with which a file
+        that is written from it is the same again. Laser points of ``T_Si`` and ``T_Sx_Sy`` are one (single), those of
+        the sensor (confocal), or as many elsewhere (pairs).
 
     Raises:
         StorageError: for other files, wrong entries and missing arguments.

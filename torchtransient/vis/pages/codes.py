@@ -36,8 +36,8 @@ class Table:
     """Values of the 256 codes, or 65536 of the kind "wide".
 
     Attributes:
-        name: what the codes are of.
-        values: (256,) float32, NaN for the last code.
+        name: name of the quantity that the codes stand for.
+        values: values of the codes, (256,) float32, NaN for the last code.
         error: largest difference between a number and the value of its code, relative to the number for light and
             numbers of both signs, else absolute.
         floor: smallest size of a number whose code is not zero.
@@ -113,7 +113,7 @@ def light_table(name: str, top: float, lowest: float) -> Table:
     """Return the table of numbers from zero up, in logarithmic steps.
 
     Args:
-        name: quantity.
+        name: name of the quantity.
         top: largest number.
         lowest: smallest number above zero.
     """
@@ -130,7 +130,7 @@ def signed_table(name: str, top: float) -> Table:
     """Return the table of numbers of both signs, in logarithmic steps.
 
     Args:
-        name: quantity.
+        name: name of the quantity.
         top: largest size.
     """
     top = top if top > 0 else 1.0
@@ -160,7 +160,7 @@ def table_of(name: str, cubes: list[Tensor]) -> Table:
     """Return the table that fits real numbers of several cubes: whole numbers, light, or numbers of both signs.
 
     Args:
-        name: quantity.
+        name: name of the quantity.
         cubes: tensors of any shape.
     """
     top, bottom, lowest = 0.0, 0.0, math.inf

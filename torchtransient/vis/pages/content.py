@@ -26,10 +26,10 @@ class Slider:
     """Positions of the slider.
 
     Attributes:
-        name, unit: quantity along it.
-        centers: (T,) float64.
+        name, unit: name and unit of the quantity along it.
+        centers: values of the quantity at the positions, (T,) float64.
         second, second_unit, factor: another quantity, ``factor`` times the first; empty for none.
-        labels: what each position is, such as a gate from its start to its end; empty for centers alone.
+        labels: texts of the positions, such as a gate from its start to its end; empty for centers alone.
     """
 
     name: str
@@ -46,10 +46,10 @@ class Planes:
     """Numbers of one entry of a page, each tensor (..., T, H, W) on the CPU.
 
     Attributes:
-        light: (K, T, H, W), K = 1 or 3.
-        ratios: (3, T, H, W), S1, S2 and S3 over S0.
-        phase: (T, H, W), radians.
-        error: (T, H, W), standard errors of the mean over channels.
+        light: light (K, T, H, W), K = 1 or 3.
+        ratios: S1, S2 and S3 over S0, (3, T, H, W).
+        phase: phase (T, H, W), radians.
+        error: standard errors of the mean over channels, (T, H, W).
     """
 
     light: Tensor
@@ -69,7 +69,7 @@ class Planes:
         """Return the planes with a function applied to each tensor.
 
         Args:
-            function: of one tensor (..., T, H, W).
+            function: function of one tensor (..., T, H, W).
         """
         parts = (self.light, self.ratios, self.phase, self.error)
         light, *others = (None if part is None else function(part) for part in parts)
@@ -126,7 +126,7 @@ def time_slider(centers_opl: NDArray[np.float64]) -> Slider:
     """Return the slider of bins of time.
 
     Args:
-        centers_opl: (T,) centres, metres of optical path.
+        centers_opl: centres of the bins, (T,), metres of optical path.
     """
     return Slider("optical path length", "m", centers_opl, "time", "ns", _NS_PER_METRE)
 

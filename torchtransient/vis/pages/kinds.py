@@ -42,7 +42,7 @@ def content_of(x: Any, *, axis: TimeAxis | None, rate_axis: RateAxis | None, fre
         samples: most samples of a sequence.
 
     Raises:
-        ShapeError, ArgumentError, StorageError: as of ``view``.
+        ShapeError, ArgumentError, StorageError: as for ``view``.
     """
     known = {"axis": axis, "rate_axis": rate_axis, "frequencies": frequencies}
     if isinstance(x, tuple) and len(x) == 2:

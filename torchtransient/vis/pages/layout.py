@@ -91,7 +91,7 @@ def described(content: Content, tables: dict[str, Any], modes: dict[str, str], m
     """Return what `view.js` reads about a page, as plain data.
 
     Args:
-        content: what the page shows.
+        content: content of the page.
         tables: values of codes by the name of the plane.
         modes: names of the modes by key.
         maps: colours by name.
@@ -137,12 +137,12 @@ def layout_of(
     """Return the root of the page's models.
 
     Args:
-        content: what the page shows.
+        content: content of the page.
         modes: names of the modes by key, the first one shown.
         notes: HTML about errors of the numbers and what was left out.
-        title: heading.
+        title: heading of the page.
         maps: colours by name.
-        sums: sums over bins are at hand.
+        sums: whether sums over bins are at hand.
     """
     m = import_bokeh().models
     bins = content.shape[0]

@@ -111,7 +111,7 @@ class LargeResult:
         """Return the upper halves of the pixels that the picture shows of a bin.
 
         Args:
-            plane: name of the plane, as of ``Planes.named``.
+            plane: name of the plane, see ``Planes.named``.
             t: number of the bin.
         """
         return _upper_halves(self._numbers(plane, (t,))[..., :: self._stride, :: self._stride])
