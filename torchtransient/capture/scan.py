@@ -101,8 +101,8 @@ class Scan:
                 it before the wall, from where all of a flat wall is seen.
             laser_origin: (3,); None as for the sensor.
             laser_grid: size of an exhaustive scan's grid of spots, None for the sensor's.
-            cell_centers: as in :meth:`Wall.grid`, for both grids.
-            extent: as in :meth:`Wall.grid`, for both grids.
+            cell_centers: points are the middles of grid cells, for both grids, see :meth:`Wall.grid`.
+            extent: part of the wall that both grids scan, (u0, v0, u1, v1), None for all of it, see :meth:`Wall.grid`.
             first_and_last_leg: lengths count from the laser's origin to the sensor's.
 
         Raises:
@@ -163,15 +163,16 @@ class Scan:
 
         Args:
             sensor_points: (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
-            kind: as in the class.
-            laser_points: as in the class; left out for confocal scans.
+            kind: "single", "confocal", "exhaustive" or "pairs", see the class.
+            laser_points: laser spots in the shape that the kind asks for, see the class; left out for confocal scans.
             sensor_origin: (3,).
             laser_origin: (3,).
-            wall: as in :meth:`grid`: all points must lie on it, to 1e-4 of its diagonal, and take its normals; None for
-                points on a wall of a scene, or of a measured one.
-            normals: of the sensor points, in their shape, without a wall.
-            laser_normals: of the spots, in their shape; confocal ones have those of the sensor points.
-            first_and_last_leg: as in the class.
+            wall: relay wall, as :meth:`grid` takes it. All points must lie on it, to 1e-4 of its diagonal, and get its
+                normals; None for points on a wall of a scene, or of a measured one.
+            normals: wall normals at the sensor points, in their shape; only without a ``wall``.
+            laser_normals: wall normals at the laser spots, in their shape; confocal scans use those of the sensor
+                points.
+            first_and_last_leg: lengths count from the laser's origin to the sensor's, see the class.
 
         Raises:
             ShapeError, UnitError, SceneError, ArgumentError: as the class.
@@ -270,7 +271,7 @@ class Scan:
         """Return the scan with its tensors on a device; they stay float64.
 
         Args:
-            device: as of `torch.Tensor.to`.
+            device: target device, as `torch.Tensor.to` takes it.
 
         Raises:
             ShapeError: for a dtype.

@@ -198,9 +198,9 @@ class Wall:
         """Return points and unit normals (..., 3) at coordinates.
 
         Args:
-            u: in [0, 1], broadcast with `v`. On the edges points stand a millionth of the wall's size inside, where
-                rays in single precision meet it.
-            v: in [0, 1].
+            u: coordinate along `half_u`, in [0, 1], broadcast with `v`. Points on the edges are placed a millionth of
+                the wall's size inside, where rays in single precision hit it.
+            v: coordinate along `half_v`, in [0, 1].
 
         Raises:
             SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.

@@ -66,7 +66,7 @@ class LossModule(nn.Module):
         """Return the function of tensors with the options held.
 
         Args:
-            tensors: of the function.
+            tensors: tensors that the function compares, input and target for most.
             mask: elements that count, None for all.
         """
         options = {name: getattr(self, name) for name in self._signature.parameters}

@@ -108,7 +108,7 @@ def shared_dim(compare: object, dim: int | None, like: Tensor, where: str) -> in
 
     Args:
         compare: function or module that compares.
-        dim: as given, or None.
+        dim: dimension of time as the caller gave it, or None.
         like: the record.
         where: begins the message.
 

@@ -77,7 +77,7 @@ def root_loss(
 
     Args:
         input: photon counts or means, any shape.
-        target: of the same shape.
+        target: photon counts or means, of the same shape.
         root: function that keeps the shape; `reconstruction.stabilized_root` with a floor of 1/4 is what f-k migration
             sees. `functools.partial` holds options.
         mask: elements that count.
@@ -168,7 +168,7 @@ def log_ratio_loss(
 
     Args:
         input: light, any shape. Values below zero continue the tangent of the logarithm at zero.
-        target: of the same shape.
+        target: light, of the same shape.
         background: level where noise begins, in the unit of the light, above zero; number or tensor that broadcasts.
             None: 1e-3 of the mean of each item of the target (of the input where that is dark), which is not symmetric.
         dim: dimension of time, which says what an item is (`losses.layouts`).

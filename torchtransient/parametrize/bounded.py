@@ -57,7 +57,7 @@ def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margi
 
     Args:
         value: any shape, between the bounds.
-        low, high: as of `bounded`.
+        low, high: bounds, numbers or tensors that broadcast to `value`, see `bounded`.
         margin: least distance from the bounds, as a share of the range between 0 and 0.5; nearer values are moved
             there, and no nearer than the precision of `value` tells from the bound. None refuses the bounds themselves,
             which have no `x`.
@@ -105,7 +105,8 @@ class Bounded(Settings):
 
     Args:
         low, high: numbers or tensors that broadcast to the parameter.
-        margin: as in `bounded_inverse`.
+        margin: least distance from the bounds, as a share of the range between 0 and 0.5, or None, see
+            `bounded_inverse`.
 
     Raises:
         UnitError: for bounds in another order.
@@ -138,7 +139,7 @@ class Bounded(Settings):
         """Return `bounded_inverse` of a value.
 
         Args:
-            value: of any shape, inside of the range.
+            value: tensor of any shape, inside the range.
 
         Raises:
             UnitError: for values outside of it.
@@ -154,7 +155,7 @@ class Albedo(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
 
@@ -166,7 +167,7 @@ class Roughness(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = 1e-3, high: Any = 1.0, margin: float | None = None) -> None:
@@ -181,7 +182,7 @@ class PrincipledRoughness(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = LEAST_PRINCIPLED, high: Any = 1.0, margin: float | None = None) -> None:
@@ -196,7 +197,7 @@ class IndexOfRefraction(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = 1.0, high: Any = 4.0, margin: float | None = None) -> None:
@@ -209,7 +210,7 @@ class Anisotropy(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:
@@ -253,7 +254,9 @@ def positive_inverse(
 
     Args:
         value: any shape, finite, above `low`.
-        low, scale, function: as of `positive`.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero, see `positive`.
+        function: "softplus" or "exp".
 
     Raises:
         UnitError: for other values.
@@ -280,7 +283,9 @@ class Positive(Settings):
     All three settings are part of `state_dict`.
 
     Args:
-        low, scale, function: as of `positive`.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero, see `positive`.
+        function: "softplus" or "exp".
     """
 
     low: Tensor

@@ -214,7 +214,10 @@ class SE3Pose(_RigidPose):
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.
 
     Args:
-        base, about, frame, length_scale: as of `AxisAnglePose`.
+        base: pose of the numbers 0, (4, 4) or (..., 4, 4), None for the identity, see `AxisAnglePose`.
+        about: point that stays as it turns, "self", "world" or [x, y, z].
+        frame: "world" or "local".
+        length_scale: metres (with "local", units of `base`) for 1 in the last three numbers.
     """
 
     _kind = "SE3Pose"

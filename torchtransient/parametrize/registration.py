@@ -26,8 +26,9 @@ def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Modu
 
     Args:
         module: a renderer, or any module.
-        key: of a renderer, or a module that holds one, a key of its scene, `"box.to_world"`; of other modules a path,
-            `"encoder.weight"`; or one behind the other where a module holds several renderers.
+        key: name of the value. For a renderer, or a module that holds one, a key of its scene, such as
+            `"box.to_world"`; for other modules a path, such as `"encoder.weight"`; where a module holds several
+            renderers, the path of one followed by the key.
         parametrization: module of `tt.parametrize`, or any other.
 
     Returns:
@@ -104,7 +105,8 @@ def original(module: nn.Module, key: str) -> nn.Parameter:
     """Return the numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not.
 
     Args:
-        module, key: as of `register`.
+        module: a renderer, or any module.
+        key: name of the value, see `register`.
 
     Raises:
         UnknownKeyError: for a key that is not there.
@@ -124,7 +126,8 @@ def remove(module: nn.Module, key: str) -> nn.Module:
     Its value stays as it is, in a new `nn.Parameter` (of a buffer, a buffer): make optimisers afterwards.
 
     Args:
-        module, key: as of `register`.
+        module: a renderer, or any module.
+        key: name of the value, see `register`.
 
     Returns:
         The module.

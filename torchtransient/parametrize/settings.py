@@ -45,7 +45,7 @@ def choice_of(names: tuple[str, ...], code: Any, where: str) -> str:
 
     Args:
         names: all choices.
-        code: of :func:`choice_code`.
+        code: number that :func:`choice_code` made of the choice.
         where: begins the message.
 
     Raises:

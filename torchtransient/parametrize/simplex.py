@@ -23,7 +23,7 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
 
     Args:
         x: any shape.
-        dim: of the weights.
+        dim: dimension of the weights.
 
     Raises:
         ShapeError: for a dimension that is missing or empty.
@@ -37,7 +37,7 @@ def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None)
 
     Args:
         weights: not negative, with the sum 1 along `dim`.
-        dim: of the weights.
+        dim: dimension of the weights.
         margin: least weight, a share between 0 and 0.5 of an equal weight; smaller ones are raised to it, and the sum
             is made 1 again (never below the smallest normal number of the dtype). None refuses weights of zero, which
             have no `x`.
@@ -70,8 +70,8 @@ class Simplex(Settings):
     """`simplex` as a parametrization: weights of returns, materials or modes of one mixture.
 
     Args:
-        dim: of the weights; part of `state_dict`.
-        margin: as of `simplex_inverse`.
+        dim: dimension of the weights; part of `state_dict`.
+        margin: least weight, a share between 0 and 0.5 of an equal weight, or None, see `simplex_inverse`.
     """
 
     def __init__(self, dim: int = -1, margin: float | None = None) -> None:

@@ -104,8 +104,9 @@ class ReflectanceSpectrum(_SmoothSpectrum):
     """A smooth spectrum between 0 and 1, otherwise as `PositiveSpectrum`.
 
     Args:
-        wavelengths_nm, coefficients: as of `PositiveSpectrum`.
-        margin: as of `Bounded`.
+        wavelengths_nm: (N,) in rising order, the wavelengths of the plugin's `values`, see `PositiveSpectrum`.
+        coefficients: number of coefficients, 4 or more; fewer are smoother.
+        margin: least distance from 0 and 1, a share between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, wavelengths_nm: Any, coefficients: int = 8, margin: float | None = None) -> None:

@@ -103,7 +103,7 @@ def refuse_pairs(scan: Scan, who: str) -> None:
     """Refuse a scan with a laser spot of its own for each sensor point.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         who: begins the message.
 
     Raises:
@@ -117,7 +117,7 @@ def refuse_legs(scan: Scan, who: str) -> None:
     """Refuse a scan that counts the first and last leg.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         who: begins the message.
 
     Raises:
@@ -133,7 +133,7 @@ def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
     """Return the transient and the axis of a capture.
 
     Args:
-        capture: of any kind.
+        capture: capture of any kind.
         who: begins the message.
 
     Raises:
@@ -148,8 +148,9 @@ def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tens
     """Return the transient of a capture on the axis of an operator.
 
     Args:
-        capture: of intensities.
-        time_axis: of the operator; equal to a millionth of a bin, since edges may have been computed in another way.
+        capture: capture of intensities.
+        time_axis: time axis of the operator; equal to a millionth of a bin, since edges may have been computed in
+            another way.
         who: begins the message.
 
     Raises:
@@ -168,7 +169,7 @@ def telling(scan: Scan) -> list[Any]:
     """Return the attributes that tell a scan's light from that of others: kind, legs, points, origins where legs count.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
     """
     names = ["kind", "first_and_last_leg", "sensor_points", "laser_points"]
     return [getattr(scan, name) for name in names + ["sensor_origin", "laser_origin"] * scan.first_and_last_leg]
@@ -178,7 +179,7 @@ def check_from_zero(time_axis: TimeAxis, who: str) -> None:
     """Check that a time axis begins at zero or later, to rounding.
 
     Args:
-        time_axis: of the transients.
+        time_axis: time axis of the transients.
         who: begins the message.
 
     Raises:
@@ -198,7 +199,7 @@ def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None
     """Check that a wall and a record are of one size.
 
     Args:
-        scan: with points in metres.
+        scan: scan with points in metres.
         axis: metres of optical path.
         who: begins the message.
 
@@ -225,7 +226,7 @@ def check_reach(scan: Scan, points: VoxelGrid | Tensor, axis: TimeAxis, who: str
     """Check that the light of hidden points arrives within ten records.
 
     Args:
-        scan: with points in metres.
+        scan: scan with points in metres.
         points: grid, or points (..., 3), metres.
         axis: metres of optical path.
         who: begins the message.
@@ -259,7 +260,7 @@ def check_wavelength(wavelength: float, scan: Scan, axis: TimeAxis, who: str) ->
 
     Args:
         wavelength: metres of optical path.
-        scan: with points in metres.
+        scan: scan with points in metres.
         axis: metres of optical path.
         who: begins the message.
 
@@ -280,7 +281,7 @@ def check_thickness(thickness: float, scan: Scan | PlanarScan, who: str) -> None
 
     Args:
         thickness: metres.
-        scan: with points in metres.
+        scan: scan with points in metres.
         who: begins the message.
 
     Raises:
@@ -297,7 +298,7 @@ def check_record(axis: TimeAxis | None, end_opl: float, who: str) -> None:
     """Check that a part of a record ends at most ten records behind its beginning.
 
     Args:
-        axis: of the record, None for any.
+        axis: time axis of the record, None for any.
         end_opl: end of the part, metres of optical path.
         who: begins the message.
 

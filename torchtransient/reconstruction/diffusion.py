@@ -45,7 +45,7 @@ class DiffusionDeconvolution(InvertibleOperator):
 
     Args:
         scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients; bins before time zero are taken.
+        time_axis: time axis of the transients; bins before time zero are accepted.
         thickness: metres.
         properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
             which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.

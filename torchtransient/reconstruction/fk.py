@@ -57,11 +57,12 @@ class FK(ConfocalOperator):
 
     Args:
         scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
+        time_axis: time axis of the transients, from zero on.
         target: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
             with the second and psi = sqrt(H), where z is half the optical path length.
-        floor: of the root, see :func:`stabilized_root`, in the unit of the transient; 0 is the root itself, with no
-            derivative at empty bins. Take 1/4 for photon counts and wherever gradients go through.
+        floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`; 0 is
+            the root itself, with no derivative at empty bins. Take 1/4 for photon counts and wherever gradients go
+            through.
         taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
         dtype: float32 or float64.
 
@@ -160,7 +161,7 @@ class FK(ConfocalOperator):
         """Return the squared modulus of the field that a root migrates to.
 
         Args:
-            root: of a transient, (..., T, Y, X).
+            root: root of a transient, (..., T, Y, X).
 
         Returns:
             (..., Z, Y, X).
@@ -248,7 +249,7 @@ def fk(capture: Capture, **options: Any) -> Tensor:
 
     Args:
         capture: confocal, of a flat wall.
-        options: of :class:`FK`.
+        options: options of :class:`FK`.
 
     Returns:
         Squared field (C, Z, Y, X), on the device of the transient.
@@ -296,7 +297,7 @@ class Midpoints(TransientOperator):
 
     Args:
         scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
+        time_axis: time axis of the transients, from zero on.
         dtype: float32 or float64.
 
     Raises:
@@ -406,7 +407,11 @@ class MidpointFK(TransientOperator):
 
     Args:
         scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
-        time_axis, target, floor, taps, dtype: as of :class:`FK`.
+        time_axis: time axis of the transients, from zero on.
+        target: "diffuse" or "retroreflective", see :class:`FK`.
+        floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`.
+        taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
+        dtype: float32 or float64.
 
     Raises:
         ShapeError, UnitError, ArgumentError: as :class:`Midpoints` and :class:`FK`.
@@ -462,7 +467,7 @@ def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
 
     Args:
         capture: single or exhaustive, of a flat wall.
-        options: of :class:`MidpointFK`.
+        options: options of :class:`MidpointFK`.
 
     Returns:
         Squared field (C, Z, 2 Y, 2 X), on the device of the transient.

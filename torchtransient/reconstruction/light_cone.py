@@ -65,7 +65,7 @@ class ConeGrid:
         """Make the bins of a time axis.
 
         Args:
-            axis: from zero on.
+            axis: time axis, from zero on.
             grid: points of the wall.
             v_bins: number of bins.
             who: begins the message.
@@ -122,7 +122,7 @@ class ConeGrid:
 
         Args:
             count: points along the side.
-            pitch: between them, metres.
+            pitch: distance between the points, metres.
             moment: power of the offset.
             windowed: times :meth:`window`.
 
@@ -359,7 +359,7 @@ class LCT(ConeOperator):
 
     Args:
         scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
+        time_axis: time axis of the transients, from zero on.
         target: "diffuse", light falls with the fourth power of the distance, or "retroreflective", with the second.
         snr: ratio of signal to noise power at the mean power of the kernel, without a unit; larger is sharper and
             noisier.
@@ -391,7 +391,7 @@ def lct(capture: Capture, **options: Any) -> Tensor:
 
     Args:
         capture: confocal, of a flat wall.
-        options: of :class:`LCT`.
+        options: options of :class:`LCT`.
 
     Returns:
         Volume (C, Z, Y, X), on the device of the transient.
@@ -414,10 +414,15 @@ class DirectionalLCT(ConeOperator):
     are the albedo, their directions the normals, towards the wall.
 
     Args:
-        scan, time_axis, target, snr, v_bins, dtype: as of :class:`LCT`.
+        scan: confocal, on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
+        target: "diffuse" or "retroreflective", see :class:`LCT`.
+        snr: ratio of signal to noise power at the mean power of the kernel, see :class:`LCT`.
+        v_bins: bins of squared distance, None for as many as bins of time, see :class:`LCT`.
         taper: share of each side of the scan over which the inverse fades light out towards the border, 0 (not at all)
             to 0.5. Light that ends at the border is otherwise explained by vectors that point across it: a bright rim,
-            in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade.
+            in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade. || dtype: float32 or
+            float64.
 
     Raises:
         ShapeError, UnitError, ArgumentError: as :class:`LCT`.
@@ -499,7 +504,7 @@ def directional_lct(capture: Capture, **options: Any) -> Tensor:
 
     Args:
         capture: confocal, of a flat wall.
-        options: of :class:`DirectionalLCT`.
+        options: options of :class:`DirectionalLCT`.
 
     Returns:
         Vectors (C, 3, Z, Y, X), on the device of the transient.

@@ -125,9 +125,9 @@ def phasor_image(
     """Image a capture by phasor fields: :meth:`PhasorField.reconstruct` by its own scan and axis.
 
     Args:
-        capture: with a transient, of a flat, regular grid.
+        capture: capture with a transient, of a flat, regular grid.
         points: planes parallel to the wall with its pitch.
-        pulse: of the virtual illumination.
+        pulse: pulse of the virtual illumination.
         camera: None for :class:`DirectLight`.
         falloff: power of 1 / (r_laser r_sensor).
 
@@ -153,13 +153,13 @@ class PhasorField(ScanOperator):
         points: planes parallel to the wall with the pitch of the sensor grid, as ``VoxelGrid.before(scan, depths)``
             makes them; size and place of the planes are free, `at_depths` and larger ``size`` and ``extent`` of the
             same pitch too.
-        time_axis: of the transients.
-        pulse: of the virtual illumination.
+        time_axis: time axis of the transients.
+        pulse: pulse of the virtual illumination.
         camera: :class:`DirectLight` (None), or :class:`ConfocalCamera`, :class:`TransientCamera`, whose fields are
             videos (..., N, Z, Y, X).
-        falloff: with 1 the field is the Rayleigh-Sommerfeld integral; with 0 its phases alone, which is
-            :class:`FilteredBackprojection` with the same filter. Distances below half a bin fall off as half a bin
-            does.
+        falloff: p of a factor (r_laser r_sensor)^-p. With 1 the field is the Rayleigh-Sommerfeld integral; with 0 its
+            phases alone, which is :class:`FilteredBackprojection` with the same filter. Distances below half a bin fall
+            off as half a bin does.
         dtype: float32 or float64.
 
     Raises:

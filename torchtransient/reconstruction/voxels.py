@@ -81,7 +81,7 @@ class PlanarScan:
         """Return the grid of a scan's sensor points, with its :func:`hidden_side`.
 
         Args:
-            scan: on a regular grid of a flat wall.
+            scan: scan on a regular grid of a flat wall.
             who: begins the message.
 
         Raises:
@@ -132,7 +132,7 @@ def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
     stand in the wall or on both sides of it, ``normal`` as given.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         normal: (3,).
     """
     if scan.sensor_normals is not None:
@@ -213,7 +213,7 @@ class VoxelGrid:
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
 
         Args:
-            scan: of any kind.
+            scan: scan of any kind.
             depths: (Z,) metres before the wall, increasing.
             size: (X, Y) voxels or one number for both, None for as many as sensor points.
             extent: (width, height) of the planes in metres from the outer edges of the voxels, or one number for both,

@@ -86,7 +86,7 @@ def integrating_sphere(
     Args:
         radius: metres.
         reflectance: albedo of the wall.
-        intensity: of the source, W/sr.
+        intensity: intensity of the source, W/sr.
         resolution: pixels of a side.
         num_bins: bins of the film.
         start_opl: start of the film, metres of optical path.

@@ -151,9 +151,9 @@ def solid(outline: Any, z: float, thickness: float) -> Mesh:
     """Return the closed body between `sheet` at `z` and the same polygon at `z + thickness`.
 
     Args:
-        outline: as in `sheet`.
-        z: front, metres.
-        thickness: metres.
+        outline: corners (x, y), (N, 2), against the clock, see `sheet`.
+        z: place of the front, metres.
+        thickness: thickness of the body, metres.
     """
     front, faces = sheet(outline, z)
     n = len(front)

@@ -190,7 +190,7 @@ def mannequin(height: float = 1.45, level: int = 3) -> Mesh:
     towards -z.
 
     Args:
-        height: from the soles to the top of the head, metres.
+        height: height from the soles to the top of the head, metres.
         level: fineness; 120 4^level triangles.
     """
     factor = positive("height", height) / 1.41
@@ -279,7 +279,7 @@ def nlos_room(
         width: metres, at least 2.4.
         height: metres, at least 2.2.
         depth: metres, at least 2.4.
-        albedo: of everything, None for those of `COLOURS`.
+        albedo: albedo of everything, None for those of `COLOURS`.
         person: False leaves the room empty, as a background to subtract.
         level: fineness of the person's mesh.
 

@@ -450,7 +450,7 @@ class AfterpulsingSPAD(WrappedDetector):
 
     Args:
         detector: SynchronousSPAD or FreeRunningSPAD.
-        afterpulsing: of the detector's bins and dead time.
+        afterpulsing: `Afterpulsing` made for the detector's bins and dead time.
         grad: gradient policy; None: that of the detector.
 
     Raises:

@@ -99,7 +99,7 @@ def draw_coincidences(
         groups: SPADs of equal shares.
         cycles: periods.
         coincidence: number of detections.
-        window: in bins.
+        window: length of the window in bins.
         free: trains go on over periods, and lines stay up from one to the next.
         generator: source of randomness.
         seen: records of the groups that detections are added to, or None.
@@ -325,12 +325,12 @@ class CoincidencePixel(RandomSensor):
     with at most one coincidence per cycle, and of bins taken as independent.
 
     Args:
-        detector: one of the SPADs, as of `MacroPixel`.
+        detector: one of the SPADs, see `MacroPixel`.
         spads: number of SPADs.
         coincidence: detections of a coincidence.
         window_s: duration of a line in seconds; at most the dead time, so that a line goes up once in a window, and at
             most the window of bins.
-        weights: shares of the light, as of `MacroPixel`.
+        weights: shares of the light, see `MacroPixel`.
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
         grad: gradient policy.

@@ -37,7 +37,7 @@ class MeasuredResponse(Response):
     Args:
         counts: (T,), T >= 2, finite, >= 0.
         bin_width_s: bin width in seconds.
-        delay_s: in seconds.
+        delay_s: delay in seconds.
         align: "center_of_mass" puts the mean delay at `delay_s` (the highest bin would shift an asymmetric response by
             about its tail); "start" the start of the first bin.
         floor: background taken off every bin: True for the median of all bins, False for nothing, or a number of
@@ -196,7 +196,7 @@ def counts_before(counts: Tensor, bin_width_s: float, start_s: float | Tensor, t
     Args:
         counts: (T,).
         bin_width_s: width of the bins.
-        start_s: where the first bin begins.
+        start_s: start of the first bin in seconds.
         time_s: any shape, which the result has.
     """
     # from before the first bin to each time, as one running sum

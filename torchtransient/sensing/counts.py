@@ -55,7 +55,7 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
 
     Args:
         counts: any shape.
-        mean: of a shape that broadcasts.
+        mean: Poisson means, in a shape that broadcasts.
 
     Returns:
         Broadcast shape; -inf for a count above 0 where the mean is 0.

@@ -35,11 +35,11 @@ class CramerRaoBound(TensorRecord):
     """Least standard deviations of unbiased estimates, of the shape of the pixels; infinite where nothing is known.
 
     Attributes:
-        distance_m: metres one way.
-        delay_s: the same as a time there and back.
-        signal: in the unit it was given in.
-        background: in the unit it was given in.
-        covariance: (..., 3, 3) of distance, signal and background.
+        distance_m: standard deviation of the distance, metres one way.
+        delay_s: standard deviation of the delay there and back, seconds.
+        signal: standard deviation of the signal, in the unit it was given in.
+        background: standard deviation of the background, in the unit it was given in.
+        covariance: covariance of distance, signal and background, (..., 3, 3).
     """
 
     distance_m: Tensor

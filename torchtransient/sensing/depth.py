@@ -59,7 +59,7 @@ def log_matched_filter(
         kernel: shares (K,) of the impulse response (`Response.kernel`).
         first: lag of its first entry in bins.
         signal_to_background: detections of the signal over detections of the background in one bin.
-        boundary: as of `convolve_time`.
+        boundary: treatment of the window's ends, "zero" or "periodic", see `convolve_time`.
 
     Returns:
         (..., C, T, H, W).
@@ -169,7 +169,7 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
 
     Args:
         scores: (..., C, T, H, W).
-        temperature: above 0, in the unit of the scores.
+        temperature: temperature of the softmax, above 0, in the unit of the scores.
 
     Returns:
         (..., C, H, W) in bins.

@@ -334,7 +334,7 @@ def binomial_table(probability: float, *, small: bool = False) -> BinomialTables
     """Make the table of binomial numbers of one probability.
 
     Args:
-        probability: in [0, 1/2].
+        probability: probability of a success, in [0, 1/2].
         small: a table that takes less time to make, for fewer entries.
     """
     most = _RARE_TRIALS if probability <= _RARE and not small else _FEW_TRIALS
@@ -422,7 +422,7 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
 
     Args:
         counts: float32 or float64, integers >= 0, some 1e5 entries.
-        probability: in [0, 1/2].
+        probability: probability of passing, in [0, 1/2].
         into: shape and dtype of `counts`, contiguous; changed in place.
         generator: source of randomness.
     """

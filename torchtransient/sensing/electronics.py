@@ -42,8 +42,8 @@ def ktc_noise(capacitance_f: float, temperature_k: float = 300.0) -> float:
     """Reset noise of a sense node, ``sqrt(k T C) / q``; 10 fF at 300 K: 40.2.
 
     Args:
-        capacitance_f: in farads.
-        temperature_k: in kelvins.
+        capacitance_f: capacitance in farads.
+        temperature_k: temperature in kelvins.
 
     Returns:
         rms electrons.
@@ -64,7 +64,7 @@ def clipped_normal_mean(mean: Tensor, variance: Tensor, low: float = -math.inf, 
 
     Args:
         mean: any shape.
-        variance: of a shape that broadcasts.
+        variance: variance, in a shape that broadcasts.
         low: lower limit.
         high: upper limit.
     """
@@ -82,7 +82,7 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
 
     Args:
         mean: any shape.
-        variance: of a shape that broadcasts.
+        variance: variance, in a shape that broadcasts.
         high: upper limit.
     """
     variance = variance.clamp_min(0)
@@ -101,7 +101,7 @@ def fixed_pattern(
     For ``gain_map`` (center 1, spread 0.5 to 2 %) and ``offset_map_e`` of `PixelElectronics`.
 
     Args:
-        shape: of the pattern.
+        shape: shape of the pattern.
         spread: standard deviation.
         center: mean.
         generator: source of randomness.
@@ -128,13 +128,13 @@ class PixelElectronics(RandomSensor):
 
     Args:
         shot_noise: False if the input is a charge that an earlier stage has drawn.
-        full_well_e: in electrons, or None.
+        full_well_e: full well in electrons, None for no limit.
         read_noise_e: rms electrons.
         ktc_noise_e: rms electrons.
         excess_noise: F^2 >= 1 of an intensifier (2 is an exponential pulse height), drawn as normal gain noise.
         dark_e: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
         gain_e_per_dn: electrons per number of the converter, with ``bits``; None without one.
-        bits: of the converter.
+        bits: bits of the converter, None without one.
         signed: codes in two's complement, for the differences of two taps, which a converter without room below zero
             would clip.
         black_level_dn: number of no charge.

@@ -198,7 +198,7 @@ class FreeRunningSPAD(RandomSensor):
 
     Args:
         cycles: laser periods.
-        dead_time_s: at least one bin ("paralyzable": any), also longer than the period.
+        dead_time_s: dead time in seconds, at least one bin ("paralyzable": any), also longer than the period.
         axis: time axis, or
         bin_width_s: bin width in seconds.
         kind: "non_paralyzable" or "paralyzable".

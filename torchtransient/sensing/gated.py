@@ -80,8 +80,8 @@ class GatedIntegration(Sensor):
     Shot noise, intensifier and read noise follow in `PixelElectronics`.
 
     Args:
-        delays_s: of the G gates, in seconds.
-        widths_s: one for all or one each, in seconds.
+        delays_s: delays of the G gates, in seconds.
+        widths_s: width of all gates, or one for each, in seconds.
         axis: axis of the light.
         rise_s: opening edge from 10 % to 90 %, in seconds.
         fall_s: closing edge; None as the opening one.

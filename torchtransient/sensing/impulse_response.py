@@ -35,8 +35,8 @@ class ImpulseResponse(Sensor):
         response: shape of the delays.
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
-        boundary: as of `convolve_time`.
-        within_bin: place of light in its bin, as of `Response.kernel`.
+        boundary: treatment of the window's ends, "zero" or "periodic", see `convolve_time`.
+        within_bin: place of light in its bin, "uniform" or "center", see `Response.kernel`.
 
     Raises:
         UnitError: for widths out of range.

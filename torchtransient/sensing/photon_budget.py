@@ -38,7 +38,7 @@ def photon_energy_j(wavelength_m: float) -> float:
     """Energy of one photon: h c / wavelength.
 
     Args:
-        wavelength_m: in metres, 10 nm to 1 mm.
+        wavelength_m: wavelength in metres, 10 nm to 1 mm.
 
     Returns:
         Joules.
@@ -116,9 +116,10 @@ def ambient_photon_rate(
     Args:
         optics: lens and pixel.
         albedo: a number or a map (H, W), (..., C, H, W), between 0 and 1.
-        spectral_irradiance_w_m2_nm: of the sun on a surface that faces it, W / (m^2 nm), constant over the filter.
-        filter_bandwidth_m: in metres, 1 um and less.
-        wavelength_m: in metres.
+        spectral_irradiance_w_m2_nm: spectral irradiance of the sun on a surface that faces it, W / (m^2 nm), constant
+            over the filter.
+        filter_bandwidth_m: bandwidth of the filter in metres, 1 um and less.
+        wavelength_m: wavelength in metres.
         illumination: cosine of the angle between sun and normal times the share of the sun that is not in shadow, a
             number or a map, 0 to 1.
 
@@ -203,7 +204,7 @@ class PhotonBudget(Sensor):
     Args:
         optics: lens and pixel.
         pulse_energy_j: energy of a pulse in joules.
-        wavelength_m: in metres.
+        wavelength_m: wavelength in metres.
         repetition_rate_hz: laser cycles per second.
         cycles: laser cycles of the exposure, or
         exposure_s: duration of the exposure in seconds.
@@ -367,7 +368,7 @@ def hot_pixel_rates(
     """Draw a map of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
 
     Args:
-        height, width: of the map.
+        height, width: size of the map in pixels.
         median_hz: median in Hz.
         log_std: standard deviation of the natural logarithm.
         hot_fraction: share of hot pixels.

@@ -580,6 +580,6 @@ def emg_response(fwhm_s: float, tau_s: float, delay_s: float = 0.0, *, learnable
         fwhm_s: full width at half maximum of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
         delay_s: delay of the normal part, in seconds.
-        learnable: as of `TailedResponse`.
+        learnable: learn logarithms of widths, logits of shares, and the delay in picoseconds, see `TailedResponse`.
     """
     return TailedResponse(fwhm_s, [tau_s], [1.0], delay_s=delay_s, learnable=learnable)

@@ -503,8 +503,8 @@ def bins_text(width: float | None, number: int | None) -> str:
     """Describe bins for a message.
 
     Args:
-        width: in seconds, None where any fits.
-        number: of bins, None where any fits.
+        width: bin width in seconds, None where any fits.
+        number: number of bins, None where any fits.
     """
     many = "bins" if number is None else f"{number} bins"
     return many if width is None else f"{many} of {width:g} s"

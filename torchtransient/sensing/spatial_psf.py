@@ -96,7 +96,7 @@ class SpatialPSF(Sensor):
 
     Args:
         psf: (h, w), odd sizes, values >= 0; normalised to 1.
-        border: as of `blur_image`.
+        border: treatment of light outside of the picture, see `blur_image`.
         learnable: learn the PSF, as logits.
 
     Raises:
@@ -134,7 +134,7 @@ class LensBlur(Sensor):
 
     Args:
         fwhm_px: full width at half maximum in pixels.
-        border: as of `blur_image`.
+        border: treatment of light outside of the picture, see `blur_image`.
         learnable: make the logarithm `log_fwhm_px` a parameter.
 
     Raises:

@@ -56,7 +56,7 @@ class DetectionJitter(MovedCounts):
         bin_width_s: their bin width in seconds.
         boundary: "periodic": what leaves the window comes in at the other end, so that constant counts stay constant;
             "zero": it is lost.
-        within_bin: place of detections in their bin, as of `Response.kernel`.
+        within_bin: place of detections in their bin, "uniform" or "center", see `Response.kernel`.
         grad: gradient policy.
 
     Raises:
@@ -314,7 +314,7 @@ class PixelSkew(Sensor):
         delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
-        boundary: as of `shift_time`.
+        boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
         learnable: make `delays.delay_ps` a parameter, in picoseconds.
 
     Raises:
@@ -352,7 +352,7 @@ class DetectionSkew(MovedCounts):
         delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
         axis: axis of the counts, or
         bin_width_s: their bin width in seconds.
-        boundary: as of `shift_time`.
+        boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
         learnable: make `delays.delay_ps` a parameter, in picoseconds.
         grad: gradient policy.
 

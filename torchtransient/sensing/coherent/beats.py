@@ -79,7 +79,7 @@ class Speckle(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.
@@ -151,7 +151,7 @@ class BeatNoise(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.
@@ -257,7 +257,7 @@ class CoherentReceiver(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.

@@ -109,7 +109,7 @@ def solve_by_level(
 
     Args:
         rate: (P, T), per cycle and bin.
-        levels: of the rows, by `subdivision_levels`.
+        levels: levels of the rows, from `subdivision_levels`.
         least: pieces of a bin at level 0.
         solve: function of rates (K, T), indices (K,) of their rows, and pieces of a bin.
 
@@ -230,7 +230,7 @@ def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | N
     Args:
         rate: (P, T) per cycle and bin, float64, >= 0.
         dead_bins: dead time in bins, scalar float64.
-        pieces: of a bin.
+        pieces: number of pieces of a bin.
         largest: known bound of the photons in a piece, or None.
     """
     whole, part = split_dead_time(dead_bins.to(rate.device, torch.float64) * pieces)
@@ -358,7 +358,7 @@ class DetectionScan:
     Args:
         rate: (T, P) float64.
         whole, part: dead time in pieces, split.
-        pieces: of a bin.
+        pieces: number of pieces of a bin.
         largest: photons of a piece, at most.
     """
 

@@ -160,7 +160,8 @@ def draw_steps(
         chances: step probabilities, (..., T, H, W).
         periods: number of detectors.
         generator: source of randomness.
-        draw: of numbers and chances, `torch.binomial` or `draw_normal`.
+        draw: function that draws from numbers of trials, probabilities and a generator, `torch.binomial` or
+            `draw_normal`.
     """
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
@@ -197,7 +198,7 @@ def safe_xlogy(count: Tensor, chance: Tensor) -> Tensor:
 
     Args:
         count: any shape.
-        chance: of a shape that broadcasts.
+        chance: probability, in a shape that broadcasts.
     """
     return count * torch.log(torch.where(count != 0, chance, 1.0))
 
@@ -208,7 +209,7 @@ def binomial_log_prob(count: Tensor, trials: int, chance: Tensor) -> Tensor:
     Args:
         count: float64, any shape.
         trials: number of trials.
-        chance: of the same shape.
+        chance: probability, in the same shape.
     """
     quiet = trials - count
     ways = math.lgamma(trials + 1) - torch.lgamma(count + 1) - torch.lgamma(quiet + 1)

@@ -356,7 +356,7 @@ def gmres(
     Args:
         operator: linear function of (P, T), acting on every row alone.
         right, start: (P, T) float64.
-        tolerance: of |residual| / |right| in every row.
+        tolerance: largest |residual| / |right| in every row.
         precondition: approximate inverse of `operator`, applied from the right, so that residuals are true ones.
 
     Returns:

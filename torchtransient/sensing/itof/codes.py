@@ -143,7 +143,7 @@ class PiecewiseLinearCode(CorrelationCode):
     Args:
         knots: (N, J) ascending turns within one period; copied to float64.
         values: (N, J) in [-1, 1]; copied to float64.
-        shifts: as of `CorrelationCode`.
+        shifts: (N,) turns when all taps are one function moved along, else None, see `CorrelationCode`.
 
     Raises:
         ShapeError: for other shapes.
@@ -274,7 +274,7 @@ def binary_code(
     Args:
         light_duty: turns that the light is on.
         gates: per tap its openings as (start, end) in turns, ``0 < end - start < 1``.
-        shifts: as of `CorrelationCode`.
+        shifts: (N,) turns when all taps are one function moved along, else None, see `CorrelationCode`.
 
     Raises:
         UnitError: where openings overlap.
@@ -383,7 +383,7 @@ class TwoTapCode(CorrelationCode):
     functions to `measured_code`.
 
     Args:
-        code: of any kind, with N >= 2 phase steps, exposed one after another.
+        code: code of any kind with N >= 2 phase steps, exposed one after another.
 
     Raises:
         UnitError: for a code that has two taps already.

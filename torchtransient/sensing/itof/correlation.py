@@ -59,8 +59,8 @@ class ItofCalibration:
     `ItofCorrelation` of a sine code. `ItofCorrelation` puts them in, `read_itof` takes them off.
 
     Attributes:
-        phase_offset_rad: of all pixels, one number or one for each frequency; a delay in the camera is positive, as if
-            the scene were further away.
+        phase_offset_rad: offset of all pixels, one number or one for each frequency; a delay in the camera is positive,
+            as if the scene were further away.
         direction: -1 for a camera whose phase steps go the other way.
         phase_map_rad: fixed pattern of the pixels, (H, W) for all frequencies or (F, H, W).
         depth_map_m: the same as metres of depth, (H, W), ``4 pi f / c`` radians each (wires and drivers are delays).
@@ -336,7 +336,7 @@ def taps_from_phasor(
         harmonics: those of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
             that has infinitely many, refuses.
         contrast: demodulation contrast in [0, 1].
-        calibration: with maps of pixels too, (H, W) those of the phasor.
+        calibration: phase offset and direction; maps of pixels too, (H, W) as the phasor.
 
     Returns:
         (..., C, F N, H, W).
@@ -435,7 +435,7 @@ class ItofCorrelation(Sensor):
         code: N taps.
         frequencies_hz: F modulation frequencies in hertz.
         axis: axis of the light.
-        contrast: as of `tap_weights`.
+        contrast: demodulation contrast in [0, 1], see `tap_weights`.
         background_e: electrons of unmodulated light. Light and background are those of *all* N phase steps of a
             frequency and all taps together, which share them equally.
         electrons_per_unit: scales a radiance to electrons.

@@ -253,8 +253,8 @@ def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """Difference of phases the short way round, in [-pi, pi), with derivative one everywhere.
 
     Args:
-        a: in radians.
-        b: in radians; shapes broadcast.
+        a: phase in radians.
+        b: phase in radians that is subtracted; shapes broadcast.
     """
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
@@ -285,8 +285,8 @@ def unwrap_depth(
     Args:
         phase: (..., C, F, H, W), in radians.
         frequencies_hz: F modulation frequencies in hertz.
-        max_depth_m: in metres; None for one range after which everything repeats.
-        min_depth_m: in metres; with noise around zero depth a little below zero.
+        max_depth_m: largest depth in metres; None: one range after `min_depth_m`, after which phases repeat.
+        min_depth_m: least depth in metres; with noise around zero depth, a little below zero.
 
     Returns:
         (..., C, H, W), metres.

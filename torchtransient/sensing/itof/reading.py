@@ -66,8 +66,8 @@ class ItofReading(TensorRecord):
 
     Attributes:
         phase: (..., C, F, H, W) radians in [0, 2 pi), without what the calibration knows.
-        amplitude: of one exposure, in the units of the frames, (..., C, F, H, W).
-        offset: the same; None for differences.
+        amplitude: amplitude of one exposure, in the units of the frames, (..., C, F, H, W).
+        offset: offset of one exposure, in the same units and shape; None for differences.
         depth_std_m: standard deviation of depth, (..., C, H, W) metres; infinite without modulated light, None if
             unknown, see `ItofNoise`.
         depth_m: depth, (..., C, H, W) metres.
@@ -97,9 +97,9 @@ class ItofNoise:
     taken as tensors.
 
     Attributes:
-        electrons_per_unit: of the numbers of the frames. None: frames of floating numbers are electrons, as
-            `PixelElectronics` gives them; whole numbers are those of a converter and ask for it (UnitError in
-            `read_itof`).
+        electrons_per_unit: electrons for each unit of the frames. None: frames of floating numbers are electrons, as
+            `PixelElectronics` gives them; whole numbers are those of a converter and need this factor (UnitError in
+            `read_itof` without it).
         read_noise_e: rms electrons of one tap in one exposure, converter included.
         offset_e: mean electrons of A + B in *one* exposure of the N (all light, background and the dark electrons of
             both taps), a number above 0 or (..., C, F, H, W), of an intensity picture for instance.
@@ -170,7 +170,7 @@ def decode_code(taps: Frames, code: CorrelationCode, *, readout: Readout = "sing
 
     Args:
         taps: frames of a camera, see `read_itof`.
-        code: that of one tap, or its `TwoTapCode`.
+        code: code of one tap, or its `TwoTapCode`.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -266,7 +266,7 @@ def read_itof(
         code: decode by its shape (`decode_code`) instead of by the Fourier sum: needed for Hamiltonian and measured
             codes, removes the wiggling of square ones.
         calibration: phase offset, direction of the steps and maps of pixels, which are taken off.
-        noise: by default shot noise of frames in electrons.
+        noise: noise of the frames, by default shot noise of frames in electrons.
         max_depth_m: largest depth of several frequencies in metres.
         min_depth_m: least depth in metres.
 
