@@ -152,7 +152,7 @@ def expanded(x: Tensor, like: Tensor, name: str, where: str) -> Tensor:
 
     Args:
         x: any tensor.
-        like: tensor that has the shape.
+        like: tensor of the wanted shape.
         name: name of `x` in the message.
         where: begins the message.
 
@@ -224,7 +224,7 @@ def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
     """Return `x` where the mask counts, and `fill` without gradient elsewhere.
 
     Args:
-        x: any shape.
+        x: tensor of any shape.
         mask: boolean tensor of the same shape, None for all.
         fill: value of masked elements.
     """
@@ -278,7 +278,7 @@ def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> T
     """Return the mean of `|x|` over the counted elements of each item, detached.
 
     Args:
-        x: any shape.
+        x: tensor of any shape.
         dims: dimensions of an item, see `layouts.item_dims`.
         mask: boolean tensor of the same shape, None for all.
 

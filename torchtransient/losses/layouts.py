@@ -71,7 +71,7 @@ def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
     """Return the width of a bin in the precision of a tensor.
 
     Args:
-        width_opl: metres of path.
+        width_opl: width in metres of path.
         like: the record.
         where: begins the message.
 

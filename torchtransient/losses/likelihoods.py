@@ -89,7 +89,8 @@ def poisson_nll(
     Args:
         input: mean counts of a model, any shape, not negative.
         target: counts, of the same shape.
-        floor: added to the mean, number or tensor that broadcasts; `relative_floor` makes one of the model.
+        floor: mean counts added to those of the model, number or tensor that broadcasts; `relative_floor` makes one of
+            the model.
         constant: add `log n!`.
         mask: bins that count.
         reduction: "mean" over bins that count, "sum", or "none".

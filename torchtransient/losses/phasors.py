@@ -49,7 +49,7 @@ def transient_phasors(
     middle of its bin. Phases are computed in double precision.
 
     Args:
-        transient: (..., C, T, Y, X), or another layout with `dim`.
+        transient: transient (..., C, T, Y, X), or another layout with `dim`.
         axis: time axis of T bins; None: that of a result.
         frequencies: F frequencies, wavelengths of two bins or more. At two bins the phasor is blind to the sign of a
             delay.

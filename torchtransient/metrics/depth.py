@@ -170,7 +170,7 @@ def depth_gross_errors(
     """Compute the share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
 
     Args:
-        beyond_m: metres, above zero.
+        beyond_m: largest error that does not count, metres, above zero.
     """
     where = "depth_gross_errors"
     most = positive(f"{where}: beyond_m", beyond_m)

@@ -105,7 +105,7 @@ def picture_correlation(
     Args:
         input: pictures (..., Y, X). A flat one counts as 0.
         target: pictures of the same shape. A flat one (`centered=False`: a dark one) does not count.
-        centered: Pearson's coefficient; False: the cosine.
+        centered: compute Pearson's coefficient; False: the cosine.
         mask: pixels that count.
         reduction: "mean" over pictures, "item" or "none" of each.
 
@@ -129,7 +129,7 @@ def volume_correlation(
 
     Args:
         input, target: volumes (..., Z, Y, X) or `HiddenVolume`, compared as in `picture_correlation`.
-        centered: Pearson's coefficient; False: the cosine.
+        centered: compute Pearson's coefficient; False: the cosine.
         mask: voxels that count.
         reduction: "mean" over volumes, "item" or "none" of each.
 

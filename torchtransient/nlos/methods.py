@@ -60,7 +60,7 @@ def check_method(name: str, capture: Capture) -> Method:
     """Return the method of a name.
 
     Args:
-        name: one of ``METHODS``.
+        name: name of the method, one of ``METHODS``.
         capture: capture that the method is meant for.
 
     Raises:
@@ -137,7 +137,7 @@ def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, optio
     Args:
         name: name of the method.
         capture: capture with a transient.
-        grid: voxels of methods that take some, else None.
+        grid: voxels, for methods that take some, else None.
         options: options of the method.
 
     Raises:
@@ -162,7 +162,7 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
     Args:
         name: name of the method.
         capture: capture with a transient.
-        grid: voxels of methods that take some, else None.
+        grid: voxels, for methods that take some, else None.
         options: options of the method.
 
     Returns:

@@ -234,8 +234,8 @@ class PartFile:
 
         Args:
             number: number of the part.
-            first: its first row.
-            rows: (N, columns).
+            first: first row of the part.
+            rows: rows of the part, (N, columns).
             total: number of rows of the file.
             seconds: time in seconds that the part took.
             about: plain data to be kept with all parts.

@@ -104,7 +104,7 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     stay.
 
     Args:
-        capture: confocal, of a flat wall.
+        capture: confocal capture of a flat wall.
         thickness: thickness of the slab, metres.
         snr: signal-to-noise power ratio of the Wiener filter, see :class:`DiffusionDeconvolution`.
 
@@ -134,7 +134,7 @@ def moved_to(capture: Capture, device: Any) -> Capture:
 
     Args:
         capture: capture of any kind.
-        device: name, or a torch.device.
+        device: name of a device, or a torch.device.
 
     Raises:
         DeviceError: for a device that torch does not have.
@@ -421,7 +421,7 @@ def camera_of(name: str, times: tuple[float, float, int] | None) -> DirectLight 
 
     Args:
         name: "direct", "confocal" or "transient".
-        times: (start, stop, count), metres, of the latter two.
+        times: times of the frames for "confocal" and "transient", (start, stop, count), metres.
 
     Raises:
         UnitError: for times that are not finite.

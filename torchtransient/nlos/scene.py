@@ -42,7 +42,7 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     (Give ``{"type": "obj", "filename": ...}`` for Mitsuba's own reading.)
 
     Args:
-        path: .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
+        path: mesh file, .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
         where: begins the message.
 
     Raises:

@@ -405,9 +405,9 @@ def simulate(
         scan: scan that knows its wall.
         time_axis, frequencies: time axis or frequencies of the film; without them bins of 16 ps that hold all light of
             three bounces.
-        spp: paths for each sensor point, or for each pair of an exhaustive scan (4096).
-        bounces: numbers of bounces that count, (3,).
-        energy: energy of the laser, 1 joule.
+        spp: paths for each sensor point, or for each pair of an exhaustive scan; default 4096.
+        bounces: numbers of bounces that count; default (3,).
+        energy: energy of the laser in joules; default 1.
         sensor: module of ``tt.sensing``, or a device, that the transient goes through at last; its answer has the same
             bins. Devices draw their counts.
         seed: whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to in
@@ -418,8 +418,8 @@ def simulate(
             :func:`tt.load`.
         part: name of a file that keeps finished parts: with it a simulation that was killed goes on when it is called
             again. It is deleted at the end.
-        tiles: number of parts, 16, 4 of exhaustive scans.
-        keep_part: leave the part file.
+        tiles: number of parts; default 16, or 4 for exhaustive scans.
+        keep_part: do not delete the part file at the end.
         progress: print memory and time before it starts, and show a bar.
         generator: source of randomness for the noise of ``sensor``.
 
@@ -484,7 +484,7 @@ def forecast(
         part: name of the part file.
         tiles: number of parts.
         variant: Mitsuba variant, or None, see :func:`simulate`.
-        settings: its other arguments.
+        settings: other arguments of :func:`simulate`.
 
     Raises:
         ArgumentError: for unknown arguments; others as :func:`simulate`.

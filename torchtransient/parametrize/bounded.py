@@ -32,8 +32,8 @@ def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
     not looked at inside of `torch.func.vmap` and `torch.compile`.
 
     Args:
-        x: any shape.
-        low, high: finite numbers, or tensors that broadcast to `x`, low < high.
+        x: tensor of any shape.
+        low, high: bounds, finite numbers or tensors that broadcast to `x`, low < high.
 
     Raises:
         UnitError, ShapeError: for other bounds and tensors.
@@ -56,7 +56,7 @@ def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margi
     """Return the `x` of which `bounded` makes `value`.
 
     Args:
-        value: any shape, between the bounds.
+        value: tensor of any shape, between the bounds.
         low, high: bounds, numbers or tensors that broadcast to `value`, see `bounded`.
         margin: least distance from the bounds, as a share of the range between 0 and 0.5; nearer values are moved
             there, and no nearer than the precision of `value` tells from the bound. None refuses the bounds themselves,
@@ -104,7 +104,7 @@ class Bounded(Settings):
     the module is made half.
 
     Args:
-        low, high: numbers or tensors that broadcast to the parameter.
+        low, high: bounds, numbers or tensors that broadcast to the parameter.
         margin: least distance from the bounds, as a share of the range between 0 and 0.5, or None, see
             `bounded_inverse`.
 
@@ -129,7 +129,7 @@ class Bounded(Settings):
         """Return `bounded` of a tensor.
 
         Args:
-            x: any shape to which the bounds broadcast.
+            x: tensor of any shape to which the bounds broadcast.
         """
         # The bounds were looked at when they were given: looking at them again would wait for a GPU.
         return _between(floating(x, type(self).__name__), self.low, self.high)
@@ -226,7 +226,7 @@ def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: Posit
     value. With "exp" steps are factors, for values whose order of magnitude is not known.
 
     Args:
-        x: any shape.
+        x: tensor of any shape.
         low: the bound, in the unit of the value.
         scale: typical size of the value, above zero.
         function: "softplus" or "exp".
@@ -253,7 +253,7 @@ def positive_inverse(
     """Return the `x` of which `positive` makes `value`.
 
     Args:
-        value: any shape, finite, above `low`.
+        value: tensor of any shape, finite, above `low`.
         low: the bound, in the unit of the value.
         scale: typical size of the value, above zero, see `positive`.
         function: "softplus" or "exp".
@@ -303,7 +303,7 @@ class Positive(Settings):
         """Return `positive` of a tensor.
 
         Args:
-            x: any shape.
+            x: tensor of any shape.
         """
         return _above(floating(x, "Positive"), self.low.to(x), self.scale.to(x), self.function)
 
@@ -312,7 +312,7 @@ class Positive(Settings):
         """Return `positive_inverse` of a value.
 
         Args:
-            value: any shape, above `low`.
+            value: tensor of any shape, above `low`.
 
         Raises:
             UnitError: for values out of range.

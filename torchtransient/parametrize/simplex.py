@@ -22,7 +22,7 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
     """Map all real numbers to weights between 0 and 1 with the sum 1, by softmax.
 
     Args:
-        x: any shape.
+        x: tensor of any shape.
         dim: dimension of the weights.
 
     Raises:
@@ -36,7 +36,7 @@ def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None)
     """Return the `x`, zero on average along `dim`, of which `simplex` makes `weights`.
 
     Args:
-        weights: not negative, with the sum 1 along `dim`.
+        weights: weights that are not negative, with the sum 1 along `dim`.
         dim: dimension of the weights.
         margin: least weight, a share between 0 and 0.5 of an equal weight; smaller ones are raised to it, and the sum
             is made 1 again (never below the smallest normal number of the dtype). None refuses weights of zero, which
@@ -83,7 +83,7 @@ class Simplex(Settings):
         """Return `simplex` of a tensor.
 
         Args:
-            x: any shape that has the dimension of the module.
+            x: tensor that has the dimension of the module.
         """
         return simplex(x, self.dim)
 

@@ -200,7 +200,7 @@ def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None
 
     Args:
         scan: scan with points in metres.
-        axis: metres of optical path.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
 
     Raises:
@@ -228,9 +228,9 @@ def check_reach(scan: Scan, points: VoxelGrid | Tensor, axis: TimeAxis, who: str
     Args:
         scan: scan with points in metres.
         points: grid, or points (..., 3), metres.
-        axis: metres of optical path.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
-        seen: refuse points as well that the record has none of.
+        seen: also refuse points of which no light falls into the record.
 
     Raises:
         UnitError: for points beyond.
@@ -259,9 +259,9 @@ def check_wavelength(wavelength: float, scan: Scan, axis: TimeAxis, who: str) ->
     """Check that waves are no longer than the record and ten walls, beyond which they show nothing.
 
     Args:
-        wavelength: metres of optical path.
+        wavelength: wavelength in metres of optical path.
         scan: scan with points in metres.
-        axis: metres of optical path.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
 
     Raises:
@@ -280,7 +280,7 @@ def check_thickness(thickness: float, scan: Scan | PlanarScan, who: str) -> None
     """Check that a slab on the wall is at most twice as thick as the scan is wide.
 
     Args:
-        thickness: metres.
+        thickness: thickness of the slab, metres.
         scan: scan with points in metres.
         who: begins the message.
 

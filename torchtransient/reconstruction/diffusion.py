@@ -44,9 +44,9 @@ class DiffusionDeconvolution(InvertibleOperator):
     differentiable; results of the inverse go below zero.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients; bins before time zero are accepted.
-        thickness: metres.
+        thickness: thickness of the slab, metres.
         properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
             which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.
         snr: power of the light over that of the noise where nothing is lost, at frequency zero; light that the slab

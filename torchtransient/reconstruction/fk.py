@@ -56,14 +56,14 @@ class FK(ConfocalOperator):
     ``operator.reconstruct(transient)``: from measured light to the squared field.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients, from zero on.
-        target: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
-            with the second and psi = sqrt(H), where z is half the optical path length.
+        target: kind of the hidden surface: "diffuse", light falls with the fourth power of the distance and psi = z
+            sqrt(H), or "retroreflective", with the second and psi = sqrt(H), where z is half the optical path length.
         floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`; 0 is
             the root itself, with no derivative at empty bins. Take 1/4 for photon counts and wherever gradients go
             through.
-        taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
+        taps: number of interpolation taps: 4 are right to 3e-4 of the field, 2 (linear) to some percent.
         dtype: float32 or float64.
 
     Raises:
@@ -248,7 +248,7 @@ def fk(capture: Capture, **options: Any) -> Tensor:
     """Migrate a confocal capture: :meth:`FK.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
+        capture: confocal capture of a flat wall.
         options: options of :class:`FK`.
 
     Returns:
@@ -296,7 +296,7 @@ class Midpoints(TransientOperator):
     grid; with one spot they stand on it. Midpoints without a pair are dark.
 
     Args:
-        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
+        scan: single or exhaustive scan with sensor points on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients, from zero on.
         dtype: float32 or float64.
 
@@ -406,11 +406,11 @@ class MidpointFK(TransientOperator):
     to the squared field.
 
     Args:
-        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
+        scan: single or exhaustive scan with sensor points on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients, from zero on.
         target: "diffuse" or "retroreflective", see :class:`FK`.
         floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`.
-        taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
+        taps: number of interpolation taps: 4 are right to 3e-4 of the field, 2 (linear) to some percent.
         dtype: float32 or float64.
 
     Raises:
@@ -466,7 +466,7 @@ def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
     """Migrate a single or exhaustive capture: :meth:`MidpointFK.reconstruct` by its own scan and axis.
 
     Args:
-        capture: single or exhaustive, of a flat wall.
+        capture: single or exhaustive capture of a flat wall.
         options: options of :class:`MidpointFK`.
 
     Returns:

@@ -121,10 +121,10 @@ class ConeGrid:
         """Return the transform along one side of the wall of q^moment exp(-i w q^2) for every frequency w of v.
 
         Args:
-            count: points along the side.
+            count: number of points along the side.
             pitch: distance between the points, metres.
             moment: power of the offset.
-            windowed: times :meth:`window`.
+            windowed: multiply by :meth:`window`.
 
         Returns:
             (V' / 2 + 1, 2 count, 2), real and imaginary.
@@ -358,13 +358,14 @@ class LCT(ConeOperator):
     ``operator.reconstruct(transient)``: the inverse of a capture, in the units of the volume.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients, from zero on.
-        target: "diffuse", light falls with the fourth power of the distance, or "retroreflective", with the second.
+        target: kind of the hidden surface: "diffuse", light falls with the fourth power of the distance, or
+            "retroreflective", with the second.
         snr: ratio of signal to noise power at the mean power of the kernel, without a unit; larger is sharper and
             noisier.
-        v_bins: bins of squared distance, None for as many as bins of time. They are equal, and coarse in depth near the
-            wall: v_max / (2 z v_bins).
+        v_bins: number of bins of squared distance, None for as many as bins of time. They are equal, and coarse in
+            depth near the wall: v_max / (2 z v_bins).
         dtype: float32 or float64.
 
     Raises:
@@ -390,7 +391,7 @@ def lct(capture: Capture, **options: Any) -> Tensor:
     """Invert a confocal capture: :meth:`LCT.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
+        capture: confocal capture of a flat wall.
         options: options of :class:`LCT`.
 
     Returns:
@@ -414,15 +415,15 @@ class DirectionalLCT(ConeOperator):
     are the albedo, their directions the normals, towards the wall.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
         time_axis: time axis of the transients, from zero on.
         target: "diffuse" or "retroreflective", see :class:`LCT`.
         snr: ratio of signal to noise power at the mean power of the kernel, see :class:`LCT`.
-        v_bins: bins of squared distance, None for as many as bins of time, see :class:`LCT`.
+        v_bins: number of bins of squared distance, None for as many as bins of time, see :class:`LCT`.
         taper: share of each side of the scan over which the inverse fades light out towards the border, 0 (not at all)
             to 0.5. Light that ends at the border is otherwise explained by vectors that point across it: a bright rim,
-            in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade. || dtype: float32 or
-            float64.
+            in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade.
+        dtype: float32 or float64.
 
     Raises:
         ShapeError, UnitError, ArgumentError: as :class:`LCT`.
@@ -503,7 +504,7 @@ def directional_lct(capture: Capture, **options: Any) -> Tensor:
     """Invert a confocal capture to vectors: :meth:`DirectionalLCT.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
+        capture: confocal capture of a flat wall.
         options: options of :class:`DirectionalLCT`.
 
     Returns:

@@ -79,7 +79,7 @@ def light_over_plane(
     `closed_forms.light_over_plane`.
 
     Args:
-        height: metres.
+        height: height of meter and light over the plane, metres.
         reflectance: albedo of the plane.
         intensity: intensity of the light, W/sr.
         half_extent: half a side of the plane, metres.

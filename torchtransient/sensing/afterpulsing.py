@@ -62,7 +62,7 @@ def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: i
         tau_bins: time constants (K,) in bins.
         dead_bins: dead time in bins.
         first: first bin after the detection.
-        number: bins.
+        number: number of bins.
 
     Returns:
         (K, number).

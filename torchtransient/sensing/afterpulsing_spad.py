@@ -362,7 +362,7 @@ def clocked_hazard(
     Args:
         rate: (P, T) photons per cycle and bin, float64.
         dead_bins: dead time in bins, scalar float64.
-        gate: (T,), multiplies photons and carriers, or None.
+        gate: (T,) factor of photons and carriers, or None.
         seen: (K,) carriers of a detection.
         tau: (K,) mean delays beyond the dead time, in bins.
         earlier: function of detections and rows, giving the carriers of other cycles.

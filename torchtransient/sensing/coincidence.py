@@ -64,9 +64,9 @@ class Trains:
     """SPADs alike in each of P pixels.
 
     Attributes:
-        rate: (P, T) float64 of one of them per period and bin.
+        rate: rate of one SPAD per period and bin, (P, T) float64.
         dead_bins: dead time in bins, infinite for one detection per cycle.
-        number: SPADs.
+        number: number of SPADs.
     """
 
     rate: Tensor
@@ -97,8 +97,8 @@ def draw_coincidences(
 
     Args:
         groups: SPADs of equal shares.
-        cycles: periods.
-        coincidence: number of detections.
+        cycles: number of periods.
+        coincidence: number of detections that make a coincidence.
         window: length of the window in bins.
         free: trains go on over periods, and lines stay up from one to the next.
         generator: source of randomness.
@@ -258,9 +258,9 @@ class _Group:
     """SPADs of an equal share.
 
     Attributes:
-        one: detections (..., T, H, W) of each per cycle and bin.
+        one: detections of each SPAD per cycle and bin, (..., T, H, W).
         rate: rate of SPADs that detect once per cycle; None where detections are spread evenly over a bin.
-        number: SPADs.
+        number: number of SPADs.
     """
 
     one: Tensor
@@ -327,7 +327,7 @@ class CoincidencePixel(RandomSensor):
     Args:
         detector: one of the SPADs, see `MacroPixel`.
         spads: number of SPADs.
-        coincidence: detections of a coincidence.
+        coincidence: number of detections that make a coincidence.
         window_s: duration of a line in seconds; at most the dead time, so that a line goes up once in a window, and at
             most the window of bins.
         weights: shares of the light, see `MacroPixel`.

@@ -118,7 +118,7 @@ class ComposedResponse(Response):
     of (bin width/9)^2/6 for each; with `within_bin="center"` half of that.
 
     Args:
-        responses: one or more.
+        responses: one or more responses, whose delays add up.
     """
 
     def __init__(self, responses: Sequence[Response]) -> None:
@@ -197,7 +197,7 @@ def counts_before(counts: Tensor, bin_width_s: float, start_s: float | Tensor, t
         counts: (T,).
         bin_width_s: width of the bins.
         start_s: start of the first bin in seconds.
-        time_s: any shape, which the result has.
+        time_s: times in seconds, of any shape, which the result has.
     """
     # from before the first bin to each time, as one running sum
     start = torch.as_tensor(start_s - bin_width_s, dtype=torch.float64, device=time_s.device)

@@ -124,8 +124,8 @@ class Device:
 
     Attributes:
         name: name of the device.
-        description: a sentence.
-        sources: one line each, with "assumed:" in front of numbers that no source gives.
+        description: description in one sentence.
+        sources: sources of the numbers, one line each, with "assumed:" in front of numbers that no source gives.
         stages: dictionaries with a kind, see the top of this file.
         bin_width_s: bin width of the records in seconds, for `axis`; None without bins.
         num_bins: number of bins of the records; None without bins.
@@ -193,8 +193,8 @@ class Device:
         """Make the same device with other arguments of one stage.
 
         Args:
-            stage: its number, or its kind where that is there once; a kind may be that of a part, the `SynchronousSPAD`
-                of a `MacroPixel` for instance.
+            stage: number of the stage, or its kind if no other stage has that kind; a part of a stage has a kind too,
+                such as the `SynchronousSPAD` of a `MacroPixel`.
             arguments: new arguments.
 
         Raises:

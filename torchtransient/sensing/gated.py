@@ -84,9 +84,9 @@ class GatedIntegration(Sensor):
         widths_s: width of all gates, or one for each, in seconds.
         axis: axis of the light.
         rise_s: opening edge from 10 % to 90 %, in seconds.
-        fall_s: closing edge; None as the opening one.
+        fall_s: closing edge from 90 % to 10 %, in seconds; None: the same as `rise_s`.
         leakage: transmission of a closed gate; 1e-7 and less of an intensifier, 1e-3 of a shuttered CMOS pixel.
-        electrons_per_unit: electrons of all exposures for light of one.
+        electrons_per_unit: electrons of all exposures for light of 1.
         learnable: make delays and widths parameters, `delay_ps` and `log_width_s`.
 
     Raises:

@@ -60,7 +60,8 @@ class Optics:
         f_number: focal length over diameter of the aperture.
         pixel_area_m2: active area of a pixel in m^2.
         transmission: share of light that filters and lenses let through.
-        solid_angle_sr: replaces what the f-number gives, for sensors that are not behind a lens, in steradians.
+        solid_angle_sr: solid angle of the light on the pixel in steradians, in place of the f-number, for sensors that
+            are not behind a lens.
 
     Raises:
         UnitError: outside the ranges.
@@ -115,7 +116,7 @@ def ambient_photon_rate(
 
     Args:
         optics: lens and pixel.
-        albedo: a number or a map (H, W), (..., C, H, W), between 0 and 1.
+        albedo: albedo of the surface, a number or a map (H, W), (..., C, H, W), between 0 and 1.
         spectral_irradiance_w_m2_nm: spectral irradiance of the sun on a surface that faces it, W / (m^2 nm), constant
             over the filter.
         filter_bandwidth_m: bandwidth of the filter in metres, 1 um and less.
@@ -154,8 +155,9 @@ class BudgetReport(TensorRecord):
 
     Attributes:
         signal_per_cycle: detections of laser light, (..., C, H, W).
-        ambient_per_cycle: those of ambient light in the whole window, a number, or a map where the budget has maps.
-        dark_per_cycle: dark counts in the whole window, the same.
+        ambient_per_cycle: detections of ambient light in the whole window, a number, or a map where the budget has
+            maps.
+        dark_per_cycle: dark counts in the whole window, a number, or a map where the budget has maps.
         cycles: laser cycles of the exposure.
         exposure_s: duration of the exposure in seconds.
     """

@@ -128,7 +128,7 @@ def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
     Args:
         stokes: Stokes vectors, four components along ``dim``.
-        dim: their dimension.
+        dim: dimension of the components.
 
     Returns:
         The shape without ``dim``.
@@ -149,7 +149,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
     Args:
         stokes: Stokes vectors, four components along ``dim``.
-        dim: their dimension.
+        dim: dimension of the components.
 
     Returns:
         Shape of ``stokes``.
@@ -219,8 +219,8 @@ class PolarizationMosaic(Sensor):
         """Analyser of every pixel, (4, H, W).
 
         Args:
-            height: pixels.
-            width: pixels.
+            height: height of the image in pixels.
+            width: width of the image in pixels.
         """
         p, q = self.rows.shape[:2]
         tiles = self.rows.repeat(-(-height // p), -(-width // q), 1)

@@ -221,7 +221,7 @@ def shift_time(x: Tensor, delay_bins: Tensor | float, *, boundary: Boundary = "p
 
     Args:
         x: (..., C, T, H, W).
-        delay_bins: a number or a map that broadcasts to (..., C, H, W), in bins; below 0 earlier.
+        delay_bins: delay in bins, a number or a map that broadcasts to (..., C, H, W); below 0 earlier.
         boundary: "periodic": the window is one laser period, sums are conserved and constant light stays constant;
             "zero": what leaves the window is lost and nothing comes in.
 
@@ -311,7 +311,8 @@ class PixelSkew(Sensor):
     `DetectionSkew`, behind the detector, is for delays of its electronics.
 
     Args:
-        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        delay_s: delay of every pixel in seconds, of either sign: a number, a map (H, W), or a tensor that broadcasts to
+            (..., C, H, W).
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
         boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
@@ -349,7 +350,8 @@ class DetectionSkew(MovedCounts):
     reaches, a binomial number. Policies as of `MovedCounts`, the score that of learnable delays.
 
     Args:
-        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        delay_s: delay of every pixel in seconds, of either sign: a number, a map (H, W), or a tensor that broadcasts to
+            (..., C, H, W).
         axis: axis of the counts, or
         bin_width_s: their bin width in seconds.
         boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
@@ -431,7 +433,7 @@ def code_bands(edges: Tensor, num_bins: int, *, periodic: bool = False, dither: 
         edges: borders of the codes in true bins, (T + 1,), increasing.
         num_bins: true bins.
         periodic: light outside of the window lies in the bin a whole number of windows away; else in none.
-        dither: add a time that is uniform over one bin.
+        dither: add a random time that is uniform over one bin.
 
     Returns:
         First lag, and (T, B) float64: share of the true bin k + first + b that gets the code k.

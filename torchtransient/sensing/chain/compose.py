@@ -52,7 +52,7 @@ def moving_together(stages: Sequence[nn.Module], *, policy: bool) -> tuple[Synch
 
     Args:
         stages: stages to call one after another.
-        policy: only if all have the same gradient policy, and one that draws.
+        policy: require that all stages have the same gradient policy, and one that draws.
 
     Returns:
         The SPAD and the moves, or None.
@@ -79,7 +79,7 @@ def moved_probabilities(spad: SynchronousSPAD, moves: Sequence[MovedCounts], x: 
 
     Args:
         spad: detector of one detection per cycle.
-        moves: stages behind it.
+        moves: stages behind the detector.
         x: rate per cycle and bin, (..., C, T, H, W).
     """
     p = spad.probabilities(x)
@@ -99,7 +99,7 @@ def moved_first_photons(
 
     Args:
         spad: detector of one detection per cycle.
-        moves: stages behind it.
+        moves: stages behind the detector.
         x: rate per cycle and bin, (..., C, T, H, W).
         generator: source of randomness.
         policy: gradient policy; None for a draw without gradient.

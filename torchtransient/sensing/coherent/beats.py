@@ -55,7 +55,7 @@ class Speckle(_Averaged):
     which is unbiased for any loss.
 
     Args:
-        looks: averaged fields, 1 and more, also an effective number that is not whole.
+        looks: number of averaged fields, 1 or more; an effective number need not be whole.
         grad: policy of gradients.
 
     Raises:
@@ -126,7 +126,7 @@ class BeatNoise(_Averaged):
 
     Args:
         photons_per_unit: detected photons in a bin of light 1.
-        looks: averaged spectra, 1 and more.
+        looks: number of averaged spectra, 1 or more.
         grad: policy of gradients.
 
     Raises:
@@ -202,8 +202,8 @@ class CoherentReceiver(_Averaged):
     Args:
         chirps: the chirps.
         axis: axis of the light.
-        photons_per_unit: detected photons in a chirp of light of one.
-        looks: spectra averaged.
+        photons_per_unit: detected photons in a chirp for light of 1.
+        looks: number of averaged spectra.
         grad: gradient policy; every one but "expected" gives the gradient of the draw. Below 1e-4 photons a field grows
             like the power in place of its root, so that the slope is finite at zero.
 

@@ -204,10 +204,10 @@ def armed_probabilities(
     """Armed at the start of pieces, and at the end of the last: A[k + 1] = A[k] exp(-rate[k]) + joined[k].
 
     Args:
-        start: armed at the start, (P, 1).
-        rate: (P, N), per piece.
-        joined: rearmed in each piece, (P, N), or None.
-        stretch: pieces summed at a time.
+        start: probability of being armed at the start, (P, 1).
+        rate: rate per piece, (P, N).
+        joined: probability of being rearmed in each piece, (P, N), or None.
+        stretch: number of pieces summed at a time.
 
     Returns:
         (P, N) and (P, 1).

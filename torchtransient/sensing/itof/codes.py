@@ -32,7 +32,7 @@ class CorrelationCode(ABC):
     A code of two taps cannot tell phase, amplitude and offset apart: it is for pixels with two taps, see `TwoTapCode`.
 
     Attributes:
-        num_taps: N.
+        num_taps: number of taps N.
         shifts: (N,) float64 turns when all taps are one function moved along, else None; only then does the phase
             follow from the taps by a Fourier sum (`tap_phasor`).
     """
@@ -85,7 +85,7 @@ class FourierCode(CorrelationCode):
     Two taps are a quarter of a turn apart instead of a half (`phase_steps`).
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
         harmonics_of_one_tap: harmonic -> (amplitude, phase in radians).
 
     Raises:
@@ -215,7 +215,7 @@ def sine_code(num_taps: int = 4) -> FourierCode:
     """Make the code of sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
 
     Raises:
         UnitError: for less than two taps.
@@ -230,7 +230,7 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
     harmonics fall as ``1 / h^2``. The gates are placed so that tap 0 weighs phase zero highest, as in `sine_code`.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
         light_duty: turns that the light is on, in (0, 1).
         gate_duty: turns that a gate is open, in (0, 1).
 
@@ -250,7 +250,7 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
     for half a turn, two of them twice within a turn.
 
     Args:
-        num_taps: 3 or 4.
+        num_taps: number of taps, 3 or 4.
 
     Raises:
         ShapeError: for another number of taps.
@@ -348,7 +348,7 @@ def phase_steps(num_taps: int) -> Tensor:
     """Phases of the taps: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
 
     Returns:
         (N,) float64 turns.
@@ -414,7 +414,7 @@ class ReversedCode(CorrelationCode):
     """Code whose phase steps go the other way: tap n is moved by minus its shift.
 
     Args:
-        code: one function moved along.
+        code: code whose taps are one function moved along.
 
     Raises:
         UnitError: for other codes (`CorrelationCode.shifts` is None).

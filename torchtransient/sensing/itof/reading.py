@@ -100,11 +100,11 @@ class ItofNoise:
         electrons_per_unit: electrons for each unit of the frames. None: frames of floating numbers are electrons, as
             `PixelElectronics` gives them; whole numbers are those of a converter and need this factor (UnitError in
             `read_itof` without it).
-        read_noise_e: rms electrons of one tap in one exposure, converter included.
+        read_noise_e: rms read noise in electrons of one tap in one exposure, converter included.
         offset_e: mean electrons of A + B in *one* exposure of the N (all light, background and the dark electrons of
             both taps), a number above 0 or (..., C, F, H, W), of an intensity picture for instance.
-        std_e: replaces all of it: rms electrons of a measured phase step, a tap ("single") or a difference A - B
-            ("two_tap" and "differential"), a number or (..., C, F, H, W).
+        std_e: rms noise in electrons of a measured phase step, in place of all of the above: a tap ("single") or a
+            difference A - B ("two_tap" and "differential"), a number or (..., C, F, H, W).
 
     Raises:
         UnitError: for numbers out of range.
@@ -147,8 +147,8 @@ def phase_noise_rad(
     Args:
         amplitude: electrons of an exposure; infinite deviation at zero.
         offset: electrons of an exposure, dark ones too; shapes broadcast.
-        num_taps: N phase steps.
-        read_noise_e: rms electrons of one tap in one exposure.
+        num_taps: number of phase steps N.
+        read_noise_e: rms read noise in electrons of one tap in one exposure.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -261,7 +261,7 @@ def read_itof(
             A and B in turn, or (..., C, F N, H, W) of their differences; raw whole numbers as tensors or arrays too.
         frequencies_hz: F modulation frequencies in hertz. Depth of one is within ``c / (2 f)``; of several unwrapped,
             with equal weights.
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         readout: "single", "two_tap" or "differential".
         code: decode by its shape (`decode_code`) instead of by the Fourier sum: needed for Hamiltonian and measured
             codes, removes the wiggling of square ones.
