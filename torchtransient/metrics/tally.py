@@ -26,7 +26,7 @@ Reduction = Literal["mean", "item", "none"]
 
 
 class Kind(IntEnum):
-    """Function of the mean that a metric is; a number, which processes send to each other."""
+    """Function of the mean that gives a metric, as a number that processes can send to each other."""
 
     MEAN = 0
     ROOT = 1

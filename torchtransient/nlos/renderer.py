@@ -53,7 +53,7 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
 
     Raises:
         UnitError: for a sensor that was made for another axis.
-        SceneError: for one whose answer has other bins.
+        SceneError: for a sensor whose output has other bins.
     """
     module = sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
     check_axis(module, axis)

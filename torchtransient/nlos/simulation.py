@@ -73,7 +73,7 @@ _NUMBER_BYTES = 4
 
 @dataclass(frozen=True)
 class VariantChoice:
-    """``name``: of the variant; ``why`` it was chosen."""
+    """``name`` of the variant, and ``why`` it was chosen."""
 
     name: str
     why: str

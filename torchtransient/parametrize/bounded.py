@@ -53,7 +53,7 @@ def _between(x: Tensor, low: Bound, high: Bound) -> Tensor:
 
 @without_autocast
 def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margin: float | None = None) -> Tensor:
-    """Return the `x` of which `bounded` makes `value`.
+    """Return the `x` that `bounded` maps to `value`.
 
     Args:
         value: tensor of any shape, between the bounds.
@@ -250,7 +250,7 @@ def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str)
 def positive_inverse(
     value: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
 ) -> Tensor:
-    """Return the `x` of which `positive` makes `value`.
+    """Return the `x` that `positive` maps to `value`.
 
     Args:
         value: tensor of any shape, finite, above `low`.

@@ -154,8 +154,8 @@ class _RigidPose(Settings):
 
     @without_autocast
     def right_inverse(self, pose: Tensor) -> Tensor:
-        """The six numbers of which `forward` makes `pose`. Raises ShapeError, and UnitError for a pose that is no rigid
-        motion of the base.
+        """Return the six numbers that `forward` maps to `pose`. Raises ShapeError, and UnitError for a pose that is no
+        rigid motion of the base.
         """
         name = type(self).__name__
         matrix = _four_by_four(pose, name).to(torch.float64)

@@ -18,11 +18,11 @@ from torchtransient.parametrize.bounded import Roughness
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
     """Register a parametrization by a key: `torch.nn.utils.parametrize.register_parametrization`.
 
-    The present value is where it starts, by `right_inverse`; a parametrization without one takes it for the numbers
-    behind. Optimisers are made afterwards: `module.parameters()` has the numbers behind the value (`original`), and
-    `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each copy its own
-    (`CopiesParametrized`). Another one on the same key is applied after those before it, and the value stays where it
-    is.
+    The value stays as it is, by `right_inverse`; a parametrization without that function takes the present value for
+    the underlying numbers. Make optimisers afterwards: `module.parameters()` then has the underlying numbers
+    (`original`), and `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each
+    copy its own (`CopiesParametrized`). A further parametrization of the same key is applied after those before it, and
+    the value stays as it is.
 
     Args:
         module: a renderer, or any module.
@@ -102,7 +102,8 @@ def _append(owner: nn.Module, name: str, key: str, parametrization: nn.Module) -
 
 
 def original(module: nn.Module, key: str) -> nn.Parameter:
-    """Return the numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not.
+    """Return the underlying numbers of a parametrized value, which optimisers change; for a buffer a tensor, which they
+    do not change.
 
     Args:
         module: a renderer, or any module.
@@ -110,7 +111,7 @@ def original(module: nn.Module, key: str) -> nn.Parameter:
 
     Raises:
         UnknownKeyError: for a key that is not there.
-        SceneError: for a key without a parametrization, or of one that makes the value of several tensors.
+        SceneError: for a key without a parametrization, or with one that makes the value from several tensors.
     """
     owner, name = _parametrized(module, key)
     chain = _chain(owner, name)

@@ -41,7 +41,7 @@ def choice_code(names: tuple[str, ...], chosen: str) -> Tensor:
 
 
 def choice_of(names: tuple[str, ...], code: Any, where: str) -> str:
-    """Return the choice of a `state_dict`.
+    """Return the choice that a `state_dict` holds as a number.
 
     Args:
         names: all choices.

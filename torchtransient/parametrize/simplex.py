@@ -33,7 +33,7 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
 
 @without_autocast
 def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None) -> Tensor:
-    """Return the `x`, zero on average along `dim`, of which `simplex` makes `weights`.
+    """Return the `x`, zero on average along `dim`, that `simplex` maps to `weights`.
 
     Args:
         weights: weights that are not negative, with the sum 1 along `dim`.

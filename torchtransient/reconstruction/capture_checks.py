@@ -166,7 +166,7 @@ def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tens
 
 
 def telling(scan: Scan) -> list[Any]:
-    """Return the attributes that tell a scan's light from that of others: kind, legs, points, origins where legs count.
+    """Return the attributes that determine the light of a scan: kind, legs, points, origins where legs count.
 
     Args:
         scan: scan of any kind.

@@ -1,4 +1,4 @@
-"""Captures through a diffusing slab: what it does to them, and how that is undone (Lindell and Wetzstein,
+"""Captures through a diffusing slab: its effect, and the removal of that effect (Lindell and Wetzstein,
 "Three-dimensional imaging through scattering media based on confocal diffuse tomography", Nature Communications 11,
 2020).
 

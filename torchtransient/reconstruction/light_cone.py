@@ -157,7 +157,7 @@ class ConeOperator(InvertibleOperator):
 
     ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall in
     its kernel; ``scales``: the factors of the kernels. Classes say with :meth:`components` and :meth:`volume_of` how
-    volumes are made of components. Arguments as of :class:`LCT`.
+    volumes are made of components. For the arguments see :class:`LCT`.
     """
 
     depth_v: Tensor
@@ -411,7 +411,7 @@ class DirectionalLCT(ConeOperator):
 
     ``operator(volume)``: vectors (..., 3, Z, Y, X), strength per m^3 times unit normal in world coordinates, to the
     light in each bin (..., T, Y, X), falling with the cosine at the surface and r^-4 or r^-2; ``operator.adjoint``,
-    ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`, from transients to such vectors. Their lengths
+    ``operator.inverse`` and ``operator.reconstruct`` as in :class:`LCT`, from transients to such vectors. Their lengths
     are the albedo, their directions the normals, towards the wall.
 
     Args:
@@ -430,8 +430,8 @@ class DirectionalLCT(ConeOperator):
 
     The three components are regularised alike at the middle of the volume's depth; where nothing is measured, normals
     are noise. Of all vectors that explain the light these are the shortest, which lean towards the wall: a plate tilted
-    by 17 degrees comes out at 13, one by 34 at 21. Not supported: as of :class:`LCT`; the squared cosine of confocal
-    light, for which the linear one stands.
+    by 17 degrees comes out at 13, one by 34 at 21. Not supported: the same as in :class:`LCT`; the squared cosine of
+    confocal light, for which the linear one stands.
     """
 
     moments = ((0, 1), (1, 0), (0, 0))

@@ -149,8 +149,8 @@ class PhasorField(ScanOperator):
     times (r_laser r_sensor)^-falloff, summed over all pairs. ``forward`` is its adjoint, a real transient.
 
     Args:
-        scan: confocal or single scan, or exhaustive scan with any laser spots; all sensor points on a flat, regular grid,
-            with or without first and last legs.
+        scan: confocal or single scan, or exhaustive scan with any laser spots; all sensor points on a flat, regular
+            grid, with or without first and last legs.
         points: grid of planes parallel to the wall, with the pitch of the sensor grid, as ``VoxelGrid.before(scan,
             depths)`` makes them; size and place of the planes are free, `at_depths` and larger ``size`` and ``extent``
             of the same pitch too.

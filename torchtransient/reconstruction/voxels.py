@@ -1,4 +1,4 @@
-"""Grids and what stands on them: points of a flat wall, voxels before it, hidden volumes."""
+"""Grids and the data on them: points of a flat wall, voxels before it, hidden volumes."""
 
 from __future__ import annotations
 

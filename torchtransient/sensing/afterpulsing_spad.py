@@ -239,7 +239,7 @@ class ClockedTrain:
 
 @dataclass(frozen=True)
 class FreeRunningTrain:
-    """Free-running detector in its stationary state; methods as of `ClockedTrain`."""
+    """Free-running detector in its stationary state; methods as in `ClockedTrain`."""
 
     whole: int
     part: Tensor

@@ -114,7 +114,7 @@ def _parabola(scores: Tensor, index: Tensor) -> Tensor:
 def center_of_mass(
     histogram: Tensor, *, background: Tensor | float = 0.0, half_width_bins: int | None = None
 ) -> Tensor:
-    """Mean arrival position of what exceeds the background.
+    """Mean arrival position of the counts above the background.
 
     Negative differences count as they are, which keeps the mean unbiased, as long as their sum S is more than its noise
     N, ``N^2 = sum excess^2``; entries that are all positive always have that much. A sum of less does not say where

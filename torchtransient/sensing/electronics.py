@@ -140,7 +140,7 @@ class PixelElectronics(RandomSensor):
             would clip.
         black_level_dn: number of the converter without charge.
         gain_map: gain of every pixel, tensor that broadcasts to the input: a buffer, or learnt as an `nn.Parameter`.
-        offset_map_e: offset of every pixel in electrons, likewise.
+        offset_map_e: offset of every pixel in electrons, a tensor of the same kind.
         grad: gradient policy.
 
     Raises:

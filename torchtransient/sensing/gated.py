@@ -31,8 +31,8 @@ def gate_profiles(
 ) -> Tensor:
     """Mean transmission of every gate over every bin, between ``leakage`` and 1.
 
-    Differentiable in delays and widths. A gate narrower than its edges does not open fully, and what the formula has
-    below zero before it is zero.
+    Differentiable in delays and widths. A gate narrower than its edges does not open fully, and where the formula is
+    negative before it, the transmission is zero.
 
     Args:
         delays_s: middle of the opening edge, counted from the emission of the light, (G,), in seconds.

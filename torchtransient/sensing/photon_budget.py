@@ -111,8 +111,8 @@ def ambient_photon_rate(
 
         rate = irradiance x bandwidth x illumination x albedo / pi x etendue / photon energy
 
-    A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; what the
-    sky adds belongs to the irradiance.
+    A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; light of
+    the sky belongs to the irradiance.
 
     Args:
         optics: lens and pixel.
@@ -197,7 +197,7 @@ class PhotonBudget(Sensor):
     The transient is rendered with an emitter of unit energy: W / (m^2 sr) per bin for a source of 1 W fired as one
     pulse of 1 J, so that times the pulse energy it is J / (m^2 sr). The background is spread evenly over the bins.
 
-    Maps are (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other maps are
+    Maps are (H, W), or broadcast to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other maps are
     buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`). Learnt rates are
     in hertz, which no optimizer's steps suit: learn their logarithm (docs/photon_counting.md). A learnt number that has
     left its range is a UnitError of the next measurement. Not modelled: angle dependence of the filter, speckle;

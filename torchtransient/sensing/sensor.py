@@ -306,7 +306,7 @@ def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
 
 
 class Sensor(PhysicalModule):
-    """Base of sensors: a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
+    """Base of sensors, from a transient (..., C, T, H, W) to a measurement. Deterministic: `forward` is `expected`.
 
     A subclass defines `expected`. `forward` takes `generator` in every sensor, so that chains call random and
     deterministic links alike. Half precision is taken and measured in float32, the least in which counts are counts.
@@ -558,7 +558,7 @@ class WrappedDetector(RandomSensor):
 
 
 def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> RandomSensor:
-    """Make a detector whose counts are the sum of several alike, in the same light each.
+    """Make a detector whose counts are the sum of several equal detectors, each in the same light.
 
     It has the cycles of all of them, and the same parameters.
 

@@ -1,4 +1,4 @@
-"""Spatial point spread functions: what lens and sensor stack do to every time bin alike. Needs kornia."""
+"""Spatial point spread functions: blur by lens and sensor stack, the same in every time bin. Needs kornia."""
 
 from __future__ import annotations
 

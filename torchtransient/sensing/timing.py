@@ -347,7 +347,7 @@ class DetectionSkew(MovedCounts):
     """Delay detections (counts) of every pixel by a time of its own: a signal tree, a converter that starts late.
 
     Draws move whole counts one by one: each of a bin goes to the earlier or the later of the two bins that its delay
-    reaches, a binomial number. Policies as of `MovedCounts`, the score that of learnable delays.
+    reaches, a binomial number. Gradient policies as in `MovedCounts`; the score is that of learnable delays.
 
     Args:
         delay_s: delay of every pixel in seconds, of either sign: a number, a map (H, W), or a tensor that broadcasts to

@@ -47,9 +47,10 @@ def counting_chain(
 ) -> Compose:
     """Make a chain of the parts of a single-photon detector, radiance (..., C, T, H, W) to counts, in their order.
 
-    Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds what is constant;
-    `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add others;
-    `converter` gives each of them its code; `readout` is what the pixel keeps. The reasons: docs/photon_counting.md.
+    Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds constant light and
+    dark counts; `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add
+    others; `converter` gives each of them its code; `readout` makes of the histogram the data that the pixel keeps. The
+    reasons: docs/photon_counting.md.
 
     Args:
         budget: rates of detections.

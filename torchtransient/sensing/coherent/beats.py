@@ -188,7 +188,7 @@ class BeatNoise(_Averaged):
 
 
 class CoherentReceiver(_Averaged):
-    """Spectra of a chirp from fields: speckle, the line of the window and shot noise, with what neighbours share.
+    """Spectra of a chirp from fields: speckle, the line of the window and shot noise, correlated between bins.
 
     Each bin of the light has a circular Gaussian field whose variance is its power in photons, ``photons_per_unit``
     times the input (..., C, T, H, W). The fields meet in the transform of the chirp, with white noise of one photon in
@@ -196,7 +196,7 @@ class CoherentReceiver(_Averaged):
     :attr:`spectrum_axis`. So the bins of one line rise and fall together, and light of two lines that are closer than
     c / B interferes. `Speckle` and `BeatNoise` have the same distribution of each bin for itself.
 
-    The light has no line yet: a transient of what stands, or beats that were rendered with ``chirps.longer(16)``, in
+    The light has no line yet: a transient of a static scene, or beats that were rendered with ``chirps.longer(16)``, in
     bins of c / B / 8 (``chirps.time_axis(..., bins_per_line=8)``); bins wider than c / B / 4 are refused.
 
     Args:

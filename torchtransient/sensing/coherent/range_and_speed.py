@@ -112,7 +112,7 @@ def _offset(lean: Tensor, chirps: Chirps, axis: TimeAxis, bins: Bins) -> Tensor:
 
 @in_single
 def fold_beats(beats: Tensor, axis: TimeAxis) -> tuple[Tensor, TimeAxis]:
-    """Add what lies at negative beats to the positive ones, as a detector without quadratures sees it.
+    """Add the power at negative beat frequencies to the positive ones, as a detector without quadratures sees it.
 
     Fold expected spectra, before `Speckle` and `BeatNoise`: waves of both signs meet in one mode.
 

@@ -1,4 +1,4 @@
-"""Correlation codes of indirect time-of-flight cameras: what a tap weighs light with, against its time of arrival.
+"""Correlation codes of indirect time-of-flight cameras: the weight of light in a tap, by time of arrival.
 
 A tap multiplies the arriving light by its gate; seen from the time of flight, light that left at t = 0 is weighted by
 the correlation of the emitted pulse shape with the gate. A code holds one such function per tap, over the phase in

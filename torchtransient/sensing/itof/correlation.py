@@ -1,4 +1,4 @@
-"""Indirect (amplitude modulated) time of flight: what the taps of a pixel collect.
+"""Indirect (amplitude modulated) time of flight: the light that the taps of a pixel collect.
 
 A pixel of N taps shares the light among its taps according to a correlation code (`codes.py`):
 

@@ -59,10 +59,10 @@ _SMALL_PHASE = 0.2  # radians of noise, up to which a phase is right to first or
 class ItofReading(TensorRecord):
     """Phase, amplitude and depth that a camera reports of its frames.
 
-    The deviation is first order in the noise, averaged over it where a ``code`` has corners (2 N frames are decoded for
-    it). It holds no wrong number of turns, no wiggling and no second path. It is NaN in pixels that no light can give
-    (more amplitude than twice the offset, by more than the noise): differences read as taps, an ``offset_e`` that is
-    too small.
+    The standard deviation of depth is first order in the noise, averaged over it where a ``code`` has corners (2 N
+    frames are decoded for it). It does not cover a wrong number of turns, wiggling or a second path. It is NaN in
+    pixels that no light can give (more amplitude than twice the offset, by more than the noise): differences read as
+    taps, an ``offset_e`` that is too small.
 
     Attributes:
         phase: (..., C, F, H, W) radians in [0, 2 pi), without what the calibration knows.
@@ -93,8 +93,8 @@ class ItofReading(TensorRecord):
 class ItofNoise:
     """Noise of frames, for `ItofReading.depth_std_m`.
 
-    Shot noise is that of the taps themselves; differences know their light no longer, and need ``offset_e``. Arrays are
-    taken as tensors.
+    Shot noise is that of the taps themselves; differences no longer contain the total light, and need ``offset_e``.
+    Arrays are taken as tensors.
 
     Attributes:
         electrons_per_unit: electrons for each unit of the frames. None: frames of floating numbers are electrons, as
