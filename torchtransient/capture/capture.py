@@ -41,9 +41,9 @@ class Capture(TensorRecord):
         phasor: complex, the shape of the transient with F frequencies in place of T: radiance times
             ``exp(-2 pi i nu (opl - start_opl))``.
         frequencies: frequencies of the phasor, cycles per metre.
-        steady: (C, ...) without the time, all light.
+        steady: light of all times, (C, ...) without the time dimension.
         channels: names of the C channels.
-        polarized: the four Stokes components come before C in all of them.
+        polarized: True where a dimension of the four Stokes components stands before C in all of these tensors.
 
     Raises:
         ShapeError: if tensors, scan and axis do not fit, or nothing was measured.
@@ -181,8 +181,8 @@ class Capture(TensorRecord):
         """Return the capture with the bins that lie in [start_opl, end_opl), at least in part.
 
         Args:
-            start_opl: metres.
-            end_opl: metres.
+            start_opl: start of the kept part, metres of optical path.
+            end_opl: end of the kept part, metres of optical path.
 
         Returns:
             A view, with an axis of its own; ``steady`` stays all light, and a phasor is kept.

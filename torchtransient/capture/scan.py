@@ -35,7 +35,7 @@ class Scan:
         sensor_points: (Sy, Sx, 3) or a list (N, 3), on the wall, metres, as all lengths.
         laser_points: (3,) for single, equal to the sensor points for confocal, (Ly, Lx, 3) or (M, 3) for exhaustive, in
             the shape of the sensor points for pairs.
-        sensor_origin, laser_origin: (3,), where the sensor and the laser stand.
+        sensor_origin, laser_origin: places of the sensor and the laser, (3,) each.
         sensor_normals, laser_normals: unit normals of the wall in the shapes of the points, None until they are known.
         first_and_last_leg: optical path lengths count from the laser's origin to the sensor's; False: from the spot to
             the sensor point.
@@ -97,12 +97,12 @@ class Scan:
             kind: "single", "confocal" or "exhaustive".
             laser: spot of a single scan: a point (3,) on the wall, or its coordinates (u, v); None is the middle of the
                 wall.
-            sensor_origin: (3,); None stands a quarter of the wall's width to the -u side of its middle and an eighth of
-                it before the wall, from where all of a flat wall is seen.
-            laser_origin: (3,); None as for the sensor.
+            sensor_origin: place of the sensor (3,), metres; None: a quarter of the wall's width to the -u side of its
+                middle and an eighth of it before the wall, from where all of a flat wall is seen.
+            laser_origin: place of the laser (3,), metres; None: the same default as for the sensor.
             laser_grid: size of an exhaustive scan's grid of spots, None for the sensor's.
-            cell_centers: as in :meth:`Wall.grid`, for both grids.
-            extent: as in :meth:`Wall.grid`, for both grids.
+            cell_centers: points are the middles of grid cells, for both grids, see :meth:`Wall.grid`.
+            extent: part of the wall that both grids scan, (u0, v0, u1, v1), None for all of it, see :meth:`Wall.grid`.
             first_and_last_leg: lengths count from the laser's origin to the sensor's.
 
         Raises:
@@ -162,16 +162,17 @@ class Scan:
         """Return a scan of given points.
 
         Args:
-            sensor_points: (N, 3) or (Sy, Sx, 3), metres, tensors with gradients too.
-            kind: as in the class.
-            laser_points: as in the class; left out for confocal scans.
-            sensor_origin: (3,).
-            laser_origin: (3,).
-            wall: as in :meth:`grid`: all points must lie on it, to 1e-4 of its diagonal, and take its normals; None for
-                points on a wall of a scene, or of a measured one.
-            normals: of the sensor points, in their shape, without a wall.
-            laser_normals: of the spots, in their shape; confocal ones have those of the sensor points.
-            first_and_last_leg: as in the class.
+            sensor_points: sensor points (N, 3) or (Sy, Sx, 3), metres, with or without gradients.
+            kind: "single", "confocal", "exhaustive" or "pairs", see the class.
+            laser_points: laser spots in the shape that the kind asks for, see the class; left out for confocal scans.
+            sensor_origin: place of the sensor (3,), metres.
+            laser_origin: place of the laser (3,), metres.
+            wall: relay wall, as :meth:`grid` takes it. All points must lie on it, to 1e-4 of its diagonal, and get its
+                normals; None for points on a wall of a scene, or of a measured one.
+            normals: wall normals at the sensor points, in their shape; only without a ``wall``.
+            laser_normals: wall normals at the laser spots, in their shape; confocal scans use those of the sensor
+                points.
+            first_and_last_leg: lengths count from the laser's origin to the sensor's, see the class.
 
         Raises:
             ShapeError, UnitError, SceneError, ArgumentError: as the class.
@@ -270,7 +271,7 @@ class Scan:
         """Return the scan with its tensors on a device; they stay float64.
 
         Args:
-            device: as of `torch.Tensor.to`.
+            device: target device, as `torch.Tensor.to` takes it.
 
         Raises:
             ShapeError: for a dtype.
@@ -336,7 +337,7 @@ def laser_index(scan: Scan, laser: int | tuple[int, ...]) -> tuple[int, ...]:
     """Return an index into the spots of a scan.
 
     Args:
-        scan: an exhaustive one.
+        scan: an exhaustive scan.
         laser: whole number, or one for each dimension.
 
     Raises:
@@ -442,7 +443,7 @@ def bounds_of(bounds: Any, who: str) -> tuple[Tensor, Tensor]:
     """Return the corners (3,) of a box of lowest and highest coordinates, float64.
 
     Args:
-        bounds: (2, 3), metres.
+        bounds: corners of lowest and highest coordinates (2, 3), metres.
         who: subject of messages.
 
     Raises:

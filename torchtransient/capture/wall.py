@@ -68,12 +68,12 @@ class Wall:
         """Return a diffuse rectangle. u runs along `up x normal`, v along `up` as far as it lies in the wall.
 
         Args:
-            width: metres.
-            height: metres.
-            center: (3,), metres.
-            normal: (3,), any length.
-            up: (3,), any length.
-            albedo: one number or a linear sRGB triple.
+            width: width of the wall, metres.
+            height: height of the wall, metres.
+            center: middle of the wall (3,), metres.
+            normal: normal of the wall (3,), of any length.
+            up: direction that is up along the wall (3,), of any length.
+            albedo: albedo of the wall, one number or a linear sRGB triple.
 
         Raises:
             UnitError: for sizes that are not positive or albedos outside of [0, 1].
@@ -101,8 +101,8 @@ class Wall:
         Args:
             vertices: (V, 3), metres.
             faces: (F, 3) whole numbers, wound against the clock as seen from the room.
-            up: (3,), any length.
-            albedo: one number or a linear sRGB triple.
+            up: direction that is up along the wall (3,), of any length.
+            albedo: albedo of the wall, one number or a linear sRGB triple.
 
         Raises:
             ShapeError: for other shapes or indices.
@@ -198,9 +198,9 @@ class Wall:
         """Return points and unit normals (..., 3) at coordinates.
 
         Args:
-            u: in [0, 1], broadcast with `v`. On the edges points stand a millionth of the wall's size inside, where
-                rays in single precision meet it.
-            v: in [0, 1].
+            u: coordinate along `half_u`, in [0, 1], broadcast with `v`. Points on the edges are placed a millionth of
+                the wall's size inside, where rays in single precision hit it.
+            v: coordinate along `half_v`, in [0, 1].
 
         Raises:
             SceneError: for coordinates outside of [0, 1] and for holes of a curved wall.

@@ -34,7 +34,7 @@ def check_pair(
         input, target: dense tensors of one shape.
         where: begins the message.
         complex_too: take complex tensors.
-        names: of the two in the message.
+        names: names of the two tensors in the message.
 
     Raises:
         ShapeError: for other types than dense tensors, and for two shapes, broadcastable or not.
@@ -53,8 +53,9 @@ def masked_pair(
     """Return both tensors of `check_pair`, input `fill` and target 0 where the mask does not count, and the mask.
 
     Args:
-        input, target, complex_too: as of `check_pair`.
-        mask: as of `check_mask`.
+        input, target: dense tensors of one shape, see `check_pair`.
+        complex_too: take complex tensors.
+        mask: boolean tensor that broadcasts, None for all, see `check_mask`.
         where: begins the message.
         fill: value of masked elements of the input.
     """
@@ -85,7 +86,7 @@ def working_dtype(tensors: tuple[Tensor, ...], where: str, *, complex_too: bool 
     Integer and boolean tensors (counts, frames) have no say.
 
     Args:
-        tensors: to be compared.
+        tensors: tensors that are compared.
         where: begins the message.
         complex_too: take complex tensors.
 
@@ -151,8 +152,8 @@ def expanded(x: Tensor, like: Tensor, name: str, where: str) -> Tensor:
 
     Args:
         x: any tensor.
-        like: of that shape.
-        name: of `x` in the message.
+        like: tensor of the wanted shape.
+        name: name of `x` in the message.
         where: begins the message.
 
     Raises:
@@ -171,7 +172,7 @@ def check_number(name: str, value: object, where: str) -> float:
     """Return one finite number.
 
     Args:
-        name: of the number.
+        name: name of the number in the message.
         value: number of any type.
         where: begins the message.
 
@@ -187,7 +188,7 @@ def check_whole(name: str, value: object, where: str, error: type[TorchTransient
     """Return a whole number of at least 1; 3.0 is one.
 
     Args:
-        name: of the number.
+        name: name of the number in the message.
         value: number of any type.
         where: begins the message.
         error: raised for numbers that are not whole or below 1.
@@ -223,8 +224,8 @@ def counted(x: Tensor, mask: Tensor | None, fill: float = 0.0) -> Tensor:
     """Return `x` where the mask counts, and `fill` without gradient elsewhere.
 
     Args:
-        x: any shape.
-        mask: of the same shape, None for all.
+        x: tensor of any shape.
+        mask: boolean tensor of the same shape, None for all.
         fill: value of masked elements.
     """
     # where on the input: a NaN that is replaced after the arithmetic still has a NaN gradient
@@ -253,10 +254,10 @@ def reduce(value: Tensor, reduction: Reduction, where: str, mask: Tensor | None 
     """Return the values, their sum, or their mean over the elements that count; 0 where nothing counts.
 
     Args:
-        value: of each element.
+        value: loss of each element.
         reduction: "none", "sum" or "mean".
         where: begins the message.
-        mask: of the same shape, None for all.
+        mask: boolean tensor of the same shape, None for all.
 
     Raises:
         ArgumentError: for another reduction.
@@ -277,9 +278,9 @@ def item_mean(x: Tensor, dims: tuple[int, ...], mask: Tensor | None = None) -> T
     """Return the mean of `|x|` over the counted elements of each item, detached.
 
     Args:
-        x: any shape.
-        dims: of an item, see `layouts.item_dims`.
-        mask: of the same shape, None for all.
+        x: tensor of any shape.
+        dims: dimensions of an item, see `layouts.item_dims`.
+        mask: boolean tensor of the same shape, None for all.
 
     Returns:
         Tensor that broadcasts to `x`.
@@ -296,9 +297,9 @@ def item_scale(x: Tensor, other: Tensor, dims: tuple[int, ...], mask: Tensor | N
     """Return `item_mean` of `x`, or that of `other` where `x` is all zero, or 1 where both are.
 
     Args:
-        x, other: of one shape.
-        dims: of an item.
-        mask: of the same shape, None for all.
+        x, other: two tensors of one shape.
+        dims: dimensions of an item, see `layouts.item_dims`.
+        mask: boolean tensor of the same shape, None for all.
     """
     own, others = item_mean(x, dims, mask), item_mean(other, dims, mask)
     scale = torch.where(own > 0, own, others)

@@ -20,7 +20,7 @@ def depth_loss(
 
     Args:
         input: depth map (..., Y, X), metres.
-        target: of the same shape and unit. Pixels that are not finite (no surface) do not count.
+        target: true depth map, of the same shape and unit. Pixels that are not finite (no surface) do not count.
         mask: pixels that count.
         reduction: "mean" over pixels that count (0 without any), "sum", or "none".
 
@@ -58,8 +58,10 @@ def scale_invariant_depth_loss(
 
     Args:
         input: depth map (..., Y, X), metres.
-        target: of the same shape and unit. Pixels that are not finite or not above zero (no surface) do not count.
-        balance: in [0, 1]. 1: a common factor has no part; 0: the mean squared logarithm; 0.5: as in the source.
+        target: true depth map, of the same shape and unit. Pixels that are not finite or not above zero (no surface) do
+            not count.
+        balance: weight of the squared mean, in [0, 1]. 1: a common factor is ignored; 0: the mean squared logarithm;
+            0.5: as in the source.
         floor: depth below which the logarithm continues as its tangent, so that gradients lead out of zero.
         mask: pixels that count.
         reduction: "mean" over maps with a pixel that counts, "sum", or "none".

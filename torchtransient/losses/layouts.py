@@ -28,7 +28,7 @@ def time_dim(x: Tensor, dim: int | None, where: str, instead: str = "") -> int:
 
     Args:
         x: a record.
-        dim: as given, None for images of four bins or more.
+        dim: dimension of time as the caller gave it; None for images of four bins or more.
         where: begins the message.
         instead: alternative to `dim=` for the message.
 
@@ -55,7 +55,7 @@ def bins_dim(x: Tensor, dim: int | None, where: str) -> int:
 
     Args:
         x: a record.
-        dim: as given.
+        dim: dimension of time as the caller gave it, or None.
         where: begins the message.
 
     Raises:
@@ -71,7 +71,7 @@ def bin_width(width_opl: float | None, like: Tensor, where: str) -> Tensor:
     """Return the width of a bin in the precision of a tensor.
 
     Args:
-        width_opl: metres of path.
+        width_opl: width in metres of path.
         like: the record.
         where: begins the message.
 
@@ -91,7 +91,7 @@ def item_dims(x: Tensor, dim: int | None, where: str, instead: str = "") -> tupl
 
     Args:
         x: a record.
-        dim: of time, as given.
+        dim: dimension of time as the caller gave it, or None.
         where: begins the message.
         instead: alternative to `dim=` for the message.
 
@@ -108,7 +108,7 @@ def as_columns(x: Tensor, dim: int) -> Tensor:
 
     Args:
         x: a record.
-        dim: of time, below zero.
+        dim: dimension of time, a negative number.
     """
     if dim == _IMAGES:
         return x

@@ -89,7 +89,8 @@ def poisson_nll(
     Args:
         input: mean counts of a model, any shape, not negative.
         target: counts, of the same shape.
-        floor: added to the mean, number or tensor that broadcasts; `relative_floor` makes one of the model.
+        floor: mean counts added to those of the model, number or tensor that broadcasts; `relative_floor` makes one of
+            the model.
         constant: add `log n!`.
         mask: bins that count.
         reduction: "mean" over bins that count, "sum", or "none".
@@ -146,7 +147,7 @@ def read_noise_nll(
         shot_noise: False leaves `max(m, 0)` out of the variance.
         constant: add `log(2 pi) / 2`.
         mask: bins that count.
-        reduction: as in `poisson_nll`.
+        reduction: "mean" over bins that count, "sum", or "none".
 
     Returns:
         Scalar, or the shape of the input for "none".
@@ -239,11 +240,11 @@ def first_photon_nll(
         cycles: number of laser cycles.
         dead_bins: dead time in bins of a detector that is armed again within the cycle (`SynchronousSPAD`); None: one
             detection per cycle.
-        floor: as in `poisson_nll`, in the unit of r.
+        floor: rate added to r, number or tensor that broadcasts, see `poisson_nll`.
         constant: add the binomial coefficients.
         dim: dimension of time, -3 by default (`losses.layouts`).
         mask: bins that count; pixels without any are left out.
-        reduction: as in `poisson_nll`.
+        reduction: "mean" over bins that count, "sum", or "none".
 
     Returns:
         Scalar, or the shape of the input for "none".
@@ -309,10 +310,10 @@ def free_running_nll(
         target: histogram n of `periods` periods, of the same shape.
         periods: number of laser periods.
         dead_bins: dead time in bins.
-        floor: as in `poisson_nll`, in the unit of r.
+        floor: rate added to r, number or tensor that broadcasts, see `poisson_nll`.
         dim: dimension of time, -3 by default (`losses.layouts`).
         mask: bins that count; pixels without any are left out.
-        reduction: as in `poisson_nll`.
+        reduction: "mean" over bins that count, "sum", or "none".
 
     Returns:
         Scalar, or the shape of the input for "none".
@@ -482,8 +483,8 @@ def divisor(value: Tensor, mask: Tensor | None, reduction: Reduction) -> Tensor 
     """Return the number that the reduction of values divides by.
 
     Args:
-        value: of each element.
-        mask: of the same shape, None for all.
+        value: loss of each element.
+        mask: boolean tensor of the same shape, None for all.
         reduction: "none", "sum" or "mean".
     """
     if reduction != "mean":

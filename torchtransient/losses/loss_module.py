@@ -63,10 +63,10 @@ class LossModule(nn.Module):
         cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nArgs:\n{described}"
 
     def loss(self, *tensors: Any, mask: Tensor | None) -> Tensor:
-        """Return the function of tensors with the options held.
+        """Call the function on tensors, with the options that the module holds.
 
         Args:
-            tensors: of the function.
+            tensors: tensors that the function compares, input and target for most.
             mask: elements that count, None for all.
         """
         options = {name: getattr(self, name) for name in self._signature.parameters}

@@ -46,7 +46,7 @@ def measurement_consistency(
     """Compare the measurement that a volume predicts with the one that was made, `compare(operator(volume), measured)`.
 
     Args:
-        volume: (..., C, Z, Y, X).
+        volume: volume (..., C, Z, Y, X).
         measured: measurement (..., C, T, Y, X).
         operator: operator of `tt.nlos` such as `FK`, or any function from a volume to the shape of the measurement.
         compare: loss `(input, target, *, mask, reduction)`, of which `functools.partial` holds further options, or a
@@ -108,7 +108,7 @@ def shared_dim(compare: object, dim: int | None, like: Tensor, where: str) -> in
 
     Args:
         compare: function or module that compares.
-        dim: as given, or None.
+        dim: dimension of time as the caller gave it, or None.
         like: the record.
         where: begins the message.
 

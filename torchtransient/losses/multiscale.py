@@ -56,7 +56,7 @@ def multiscale_loss(
 
     Args:
         input: transient (..., C, T, Y, X), or another layout with `dim`.
-        target: of the same shape.
+        target: transient of the same shape.
         compare: loss `(input, target, *, mask, reduction)` with a value for each bin, called with (..., C, bins,
             places, 1) and its `dim` set. A `floor` or `background` that `functools.partial` holds is light of a bin of
             the record (number or tensor that broadcasts), and is summed as bins are. Not supported: modules, and
@@ -114,8 +114,8 @@ def _doubled(sums: Tensor, width: int) -> Tensor:
     """Return the sums of all windows of twice the width that hold a bin of a record.
 
     Args:
-        sums: of all windows of `width` bins (batch, C, T + width - 1, places). Unlike differences of running sums they
-            do not cancel.
+        sums: sums of all windows of `width` bins, (batch, C, T + width - 1, places). Unlike differences of running sums
+            they do not cancel.
     """
     # padding, since the backward of slices fills a tensor of zeros for each
     return functional.pad(sums, (0, 0, 0, width)) + functional.pad(sums, (0, 0, width, 0))

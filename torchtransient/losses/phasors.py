@@ -49,7 +49,7 @@ def transient_phasors(
     middle of its bin. Phases are computed in double precision.
 
     Args:
-        transient: (..., C, T, Y, X), or another layout with `dim`.
+        transient: transient (..., C, T, Y, X), or another layout with `dim`.
         axis: time axis of T bins; None: that of a result.
         frequencies: F frequencies, wavelengths of two bins or more. At two bins the phasor is blind to the sign of a
             delay.
@@ -150,9 +150,11 @@ def transient_phasor_loss(
 
     Args:
         input: transient (..., C, T, Y, X), or another layout with `dim`.
-        target: of the same shape.
-        axis, frequencies: as in `transient_phasors`.
-        phase_only, floor: as in `phasor_loss`.
+        target: transient of the same shape.
+        axis: time axis of T bins; None: that of a result.
+        frequencies: F frequencies, wavelengths of two bins or more, see `transient_phasors`.
+        phase_only: compare phases regardless of brightness, see `phasor_loss`.
+        floor: modulus below which phasors are dark, above zero, see `phasor_loss`.
         dim: dimension of time (`losses.layouts`).
         mask: bins that count, (..., C, T, Y, X); the others are empty in both, and pixels without any are left out.
         reduction: "mean" over pixels that count, "sum", or "none".

@@ -42,7 +42,7 @@ def anscombe(counts: Tensor, read_noise: Tensor | float = 0.0) -> Tensor:
     The variance is 1 within 1/(8 m) at a mean of m >= 4, 0.72 at m = 1, and vanishes with the light.
 
     Args:
-        counts: any shape. Counts below zero, of a record less its background, continue the tangent at zero.
+        counts: tensor of any shape. Counts below zero, of a record less its background, continue the tangent at zero.
         read_noise: standard deviation in counts, zero or more; number or tensor that broadcasts, differentiable.
 
     Returns:
@@ -77,7 +77,7 @@ def root_loss(
 
     Args:
         input: photon counts or means, any shape.
-        target: of the same shape.
+        target: photon counts or means, of the same shape.
         root: function that keeps the shape; `reconstruction.stabilized_root` with a floor of 1/4 is what f-k migration
             sees. `functools.partial` holds options.
         mask: elements that count.
@@ -167,8 +167,8 @@ def log_ratio_loss(
     Compares relative errors of bins brighter than the background, and errors of darker ones as shares of it.
 
     Args:
-        input: light, any shape. Values below zero continue the tangent of the logarithm at zero.
-        target: of the same shape.
+        input: light, a tensor of any shape. Values below zero continue the tangent of the logarithm at zero.
+        target: light, of the same shape.
         background: level where noise begins, in the unit of the light, above zero; number or tensor that broadcasts.
             None: 1e-3 of the mean of each item of the target (of the input where that is dark), which is not symmetric.
         dim: dimension of time, which says what an item is (`losses.layouts`).

@@ -27,7 +27,7 @@ def ssim_loss(
 
     Args:
         input: picture (..., C, Y, X). Single precision holds values up to 1e9 times the range.
-        target: of the same shape.
+        target: picture of the same shape.
         window: width in pixels of the Gaussian window (standard deviation 1.5), odd, reflected at the borders; Y and X
             are larger than half of it.
         value_range: range of the values, whose first and third percent stabilize dark and flat places. None: the
@@ -96,8 +96,9 @@ def projection_ssim_loss(
 
     Args:
         input: volume (..., C, Z, Y, X), real and not negative.
-        target: of the same shape.
-        window, value_range: as in `ssim_loss`.
+        target: volume of the same shape.
+        window: width in pixels of the Gaussian window, odd, see `ssim_loss`.
+        value_range: range of the values, None for the highest modulus of each target picture, see `ssim_loss`.
         mask: voxels that count. The others are dark in both; pixels whose whole line is masked do not count.
         reduction: "mean" or "sum" over each view, of which the mean is taken, or "none".
 

@@ -15,7 +15,7 @@ def squared_loss(input: Light, target: Light, *, mask: Tensor | None = None, red
 
     Args:
         input: real or complex tensor, any shape.
-        target: of the same shape.
+        target: tensor of the same shape.
         mask: elements that count.
         reduction: "mean" over elements that count, "sum", or "none".
 

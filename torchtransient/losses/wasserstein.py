@@ -43,7 +43,7 @@ def wasserstein_loss(
 
     Args:
         input: transient (..., C, T, Y, X), or another layout with `dim`; negative bins are allowed.
-        target: of the same shape.
+        target: transient of the same shape.
         bin_width_opl: width of a bin, metres of optical path; None: that of results with an axis.
         creation_cost_opl: length in metres above which light is rather missing than late; None: normalized records.
         floor: light of a pixel summed over its bins, above zero; None: 1e-3 of the mean pixel of each item of each.
@@ -104,7 +104,7 @@ def cumulative_loss(
 
     Args:
         input: transient (..., C, T, Y, X), or another layout with `dim`.
-        target: of the same shape.
+        target: transient of the same shape.
         bin_width_opl: width of a bin, metres of optical path; None: that of results with an axis.
         per_root_count: divide by the root of the target's total in each pixel (at least one), the noise of its running
             sum where the target is photon counts. Without gradient, not symmetric.
@@ -144,7 +144,7 @@ def moved_bins(difference: Tensor, dim: int) -> Tensor:
     """Return light times the bins that it is moved by: the sum of the moduli of cumulative sums.
 
     Args:
-        difference: of two records of one mass.
+        difference: difference of two records with the same sum.
         dim: dimension of time.
     """
     # without the last sum, which is zero but for rounding, whose sign would be a gradient

@@ -38,7 +38,7 @@ def depth_mae(
 
     Args:
         input: depth maps (..., Y, X), metres.
-        target: of the same shape and unit. Pixels that are not finite (no surface) do not count.
+        target: true depth maps, of the same shape and unit. Pixels that are not finite (no surface) do not count.
         mask: pixels that count.
         reduction: "mean" of all pixels, "item" of each map, or "none".
 
@@ -61,7 +61,9 @@ def depth_rmse(
     """Compute the root mean square error of depths, `sqrt(mean((input - target)^2))`, metres.
 
     Args:
-        input, target, mask, reduction: as in `depth_mae`.
+        input, target: depth maps (..., Y, X), metres, see `depth_mae`.
+        mask: pixels that count.
+        reduction: "mean" of all pixels, "item" of each map, or "none".
     """
     where = "depth_rmse"
     x, y, counts = _compared(input, target, mask, where)
@@ -75,7 +77,9 @@ def depth_bias(
     """Compute the mean error of depths, `mean(input - target)`, metres, positive if too far.
 
     Args:
-        input, target, mask, reduction: as in `depth_mae`.
+        input, target: depth maps (..., Y, X), metres, see `depth_mae`.
+        mask: pixels that count.
+        reduction: "mean" of all pixels, "item" of each map, or "none".
     """
     where = "depth_bias"
     x, y, counts = _compared(input, target, mask, where)
@@ -91,7 +95,7 @@ def depth_median_error(input: DepthMap, target: DepthMap, *, mask: Tensor | None
 
     Args:
         input: depth maps (..., Y, X), metres.
-        target: of the same shape and unit. Pixels that are not finite (no surface) do not count.
+        target: true depth maps, of the same shape and unit. Pixels that are not finite (no surface) do not count.
         mask: pixels that count.
 
     Returns:
@@ -114,7 +118,9 @@ def depth_abs_rel(
     Pixels with a target of zero or below do not count. Source: Eigen, Puhrsch and Fergus 2014.
 
     Args:
-        input, target, mask, reduction: as in `depth_mae`.
+        input, target: depth maps (..., Y, X), metres, see `depth_mae`.
+        mask: pixels that count.
+        reduction: "mean" of all pixels, "item" of each map, or "none".
     """
     where = "depth_abs_rel"
     x, y, counts = _compared(input, target, mask, where, positive_only=True)
@@ -134,10 +140,10 @@ def depth_delta(
 
     Args:
         input: depth maps (..., Y, X), metres. Depths of zero and below are outside of every threshold.
-        target: of the same shape and unit. Pixels that are not finite or not above zero do not count.
-        threshold: above 1; usually 1.25, 1.25^2 and 1.25^3.
+        target: true depth maps, of the same shape and unit. Pixels that are not finite or not above zero do not count.
+        threshold: limit of the ratio, above 1; usually 1.25, 1.25^2 or 1.25^3.
         mask: pixels that count.
-        reduction: as in `depth_mae`.
+        reduction: "mean" of all pixels, "item" of each map, or "none".
 
     Returns:
         Shares in [0, 1], shapes as those of `depth_mae`.
@@ -164,7 +170,7 @@ def depth_gross_errors(
     """Compute the share of pixels with `|input - target| > beyond_m`, in [0, 1]; arguments as in `depth_mae`.
 
     Args:
-        beyond_m: metres, above zero.
+        beyond_m: largest error that does not count, metres, above zero.
     """
     where = "depth_gross_errors"
     most = positive(f"{where}: beyond_m", beyond_m)

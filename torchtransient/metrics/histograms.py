@@ -32,8 +32,8 @@ def histogram_total_variation(
 
     Args:
         input: transients (..., C, T, Y, X), or another layout with `dim`, not negative; normalized to p.
-        target: of the same shape; normalized to q.
-        dim: dimension of time, as in `tt.losses`.
+        target: transients of the same shape; normalized to q.
+        dim: dimension of time, see `tt.losses`.
         mask: bins that count; the others are empty in both.
         reduction: "mean" of all pixels, "item" of each item of a batch (its channels and pixels), or "none".
 
@@ -65,7 +65,7 @@ def histogram_wasserstein_opl(
     them.
 
     Args:
-        axis: time axis; None: that of results. Other arguments as in `histogram_total_variation`.
+        axis: time axis; None: that of results. For the other arguments see `histogram_total_variation`.
 
     Raises:
         ArgumentError: for tensors without an axis.
@@ -91,7 +91,11 @@ def histogram_wasserstein_s(
     """Compute the Wasserstein-1 distance over time of each pixel, seconds.
 
     Args:
-        input, target, axis, dim, mask, reduction: as in `histogram_wasserstein_opl`.
+        input, target: transients (..., C, T, Y, X), or another layout with `dim`, not negative.
+        axis: time axis; None: that of results.
+        dim: dimension of time, see `tt.losses`.
+        mask: bins that count; the others are empty in both.
+        reduction: "mean" of all pixels, "item" of each item of a batch (its channels and pixels), or "none".
     """
     where = "histogram_wasserstein_s"
     known = _axis(axis, where)

@@ -36,7 +36,7 @@ def psnr(
 
     Args:
         input: pictures (..., C, Y, X).
-        target: of the same shape.
+        target: pictures of the same shape.
         value_range: range of the values; None: the highest value of each target.
         mask: pixels that count.
         reduction: "mean" over pictures, "item" or "none" of each.
@@ -67,7 +67,7 @@ def ssim(
 
     Args:
         input: pictures (..., C, Y, X).
-        target: of the same shape.
+        target: pictures of the same shape.
         window: width of the Gaussian window in pixels, odd; reflected at the borders.
         value_range: range of the values; None: the highest value of each target.
         mask: pixels that count; the others are 0 in both for the windows that reach them.
@@ -101,13 +101,13 @@ def transient_psnr(
 
     Args:
         input: transients (..., C, T, Y, X).
-        target: of the same shape.
+        target: transients of the same shape.
         view: "sum", the light of all bins, (..., C, Y, X), or "bins", each bin a picture, (..., T, C, Y, X), with one
             range for all bins of an item.
         value_range: range of the values of the view; None: the highest value of the target.
         dim: dimension of time, which is -3.
         mask: bins that count; a pixel of a sum counts where one of its bins does.
-        reduction: as in `psnr`.
+        reduction: "mean" over pictures, "item" or "none" of each, see `psnr`.
 
     Returns:
         Decibels, shapes as those of `psnr` of the view.
@@ -137,8 +137,13 @@ def transient_ssim(
     Empty bins are alike, and dominate a mean over the bins of most scenes.
 
     Args:
-        input, target, view, value_range, dim, mask, reduction: as in `transient_psnr`.
-        window: side of the window, pixels.
+        input, target: transients (..., C, T, Y, X).
+        view: "sum", the light of all bins, or "bins", each bin a picture, see `transient_psnr`.
+        window: width of the Gaussian window in pixels, odd, see `ssim`.
+        value_range: range of the values of the view; None: the highest value of the target.
+        dim: dimension of time, which is -3.
+        mask: bins that count; a pixel of a sum counts where one of its bins does.
+        reduction: "mean" of all pixels, "item" of each picture, or "none".
     """
     where = "transient_ssim"
     x, y, given, limit = _transients(input, target, view, value_range, dim, mask, where)

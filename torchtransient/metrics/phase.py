@@ -25,8 +25,8 @@ def wrapped_difference(input: Tensor, target: Tensor, *, period: float = 2 * mat
 
     Args:
         input: real tensor, any shape.
-        target: of the same shape and unit.
-        period: in the same unit, above zero.
+        target: tensor of the same shape and unit.
+        period: period in the same unit, above zero.
 
     Returns:
         Tensor of that shape; half a period is either of both ends.
@@ -58,7 +58,7 @@ def phase_mae(
 
     Args:
         input: phases (..., Y, X) in the unit of `period`, or complex phasors.
-        target: of the same kind and shape. Phasors of zero have no phase and do not count.
+        target: phases or phasors, of the same kind and shape. Phasors of zero have no phase and do not count.
         period: 2 pi for radians, pi for angles of polarization, `c / (2 f)` for distances that a modulation frequency f
             wraps.
         weight: weight of each element, tensor that broadcasts, the modulus of the target for instance.
@@ -90,7 +90,11 @@ def phase_rmse(
     """Compute the root mean square wrapped difference of phases (..., Y, X).
 
     Args:
-        input, target, period, weight, mask, reduction: as in `phase_mae`.
+        input, target: phases (..., Y, X) in the unit of `period`, or complex phasors, see `phase_mae`.
+        period: period after which phases repeat, see `phase_mae`.
+        weight: weight of each element, tensor that broadcasts.
+        mask: elements that count.
+        reduction: "mean" of all, "item" of each picture, or "none".
     """
     where = "phase_rmse"
     difference, counts = _difference(input, target, period, weight, mask, where)
@@ -114,7 +118,11 @@ def phase_bias(
     the circle. Source: Fisher 1993.
 
     Args:
-        input, target, period, weight, mask, reduction: as in `phase_mae`.
+        input, target: phases (..., Y, X) in the unit of `period`, or complex phasors, see `phase_mae`.
+        period: period after which phases repeat, see `phase_mae`.
+        weight: weight of each element, tensor that broadcasts.
+        mask: elements that count.
+        reduction: "mean" of all, "item" of each picture, or "none".
 
     Returns:
         In (-period/2, period/2].

@@ -47,7 +47,7 @@ def dop_mae(
 
     Args:
         input: Stokes components (..., 4, C, Y, X), or a polarized result with `steady`.
-        target: of the same shape.
+        target: Stokes components of the same shape.
         stokes_dim: dimension of the components.
         part: "total", "linear" or "circular" (signed) polarization.
         floor: brightness, in the unit of the light, that the target has to exceed to count.
@@ -81,7 +81,12 @@ def dop_rmse(
     """Compute the root mean square error of the degree of polarization.
 
     Args:
-        input, target, stokes_dim, part, floor, mask, reduction: as in `dop_mae`.
+        input, target: Stokes components (..., 4, C, Y, X), or polarized results with `steady`, see `dop_mae`.
+        stokes_dim: dimension of the components.
+        part: "total", "linear" or "circular" (signed) polarization.
+        floor: brightness, in the unit of the light, that the target has to exceed to count.
+        mask: elements that count, in the shape without the components.
+        reduction: "mean" of all, "item" of each picture, or "none".
     """
     where = "dop_rmse"
     difference, counts = _degrees(input, target, stokes_dim, part, floor, mask, where)
@@ -103,7 +108,7 @@ def aolp_mae(
     angles in place of Stokes components take `phase_mae(..., period=math.pi)`.
 
     Args:
-        floor: linear part that the target has to exceed to count. Other arguments as in `dop_mae`.
+        floor: linear part that the target has to exceed to count. For the other arguments see `dop_mae`.
 
     Raises:
         UnitError: for an input without linear polarization where the target counts.

@@ -26,7 +26,7 @@ Reduction = Literal["mean", "item", "none"]
 
 
 class Kind(IntEnum):
-    """Function of the mean that a metric is; a number, which processes send to each other."""
+    """Function of the mean that gives a metric, as a number that processes can send to each other."""
 
     MEAN = 0
     ROOT = 1
@@ -140,8 +140,9 @@ def check_finite(x: Tensor, mask: Tensor | None, name: str, where: str) -> None:
 
     Args:
         x: the elements.
-        mask: that counts, None for all.
-        name, where: for the message.
+        mask: boolean tensor, True for elements that count; None for all.
+        name: name of `x` in the message.
+        where: begins the message.
 
     Raises:
         UnitError: for NaN and infinite numbers.

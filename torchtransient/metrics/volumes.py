@@ -74,8 +74,9 @@ def front_depth_mae(
 
     Args:
         input: volumes (..., Z, Y, X) or a `HiddenVolume`.
-        target: of the same shape.
-        depths, threshold: as in `front_depth`.
+        target: volumes of the same shape.
+        depths: grid or (Z,) metres; None: those of a `HiddenVolume`.
+        threshold: share of the highest value of a volume that a surface reaches, see `front_depth`.
         mask: places that count, (..., Y, X).
         reduction: "mean" of all places, "item" of each volume, or "none".
 
@@ -103,8 +104,8 @@ def picture_correlation(
 
     Args:
         input: pictures (..., Y, X). A flat one counts as 0.
-        target: of the same shape. A flat one (`centered=False`: a dark one) does not count.
-        centered: Pearson's coefficient; False: the cosine.
+        target: pictures of the same shape. A flat one (`centered=False`: a dark one) does not count.
+        centered: compute Pearson's coefficient; False: the cosine.
         mask: pixels that count.
         reduction: "mean" over pictures, "item" or "none" of each.
 
@@ -127,7 +128,10 @@ def volume_correlation(
     Strict: a surface that is one plane off does not correlate.
 
     Args:
-        input, target, centered, mask, reduction: as in `picture_correlation`.
+        input, target: volumes (..., Z, Y, X) or `HiddenVolume`, compared as in `picture_correlation`.
+        centered: compute Pearson's coefficient; False: the cosine.
+        mask: voxels that count.
+        reduction: "mean" over volumes, "item" or "none" of each.
 
     Raises:
         UnitError: for volumes on two grids.
@@ -144,7 +148,8 @@ def picture_iou(
 
     Args:
         input: pictures (..., Y, X), or boolean masks. A shape is where a pixel is above zero and reaches the threshold.
-        target: of the same shape. Pictures in which neither has a shape do not count.
+        target: pictures of the same shape, or boolean masks. Pairs of pictures in which neither has a shape do not
+            count.
         threshold: share of the highest value of a picture.
         mask: pixels that count.
         reduction: "mean" over pictures, "item" or "none" of each.
@@ -166,7 +171,10 @@ def volume_iou(
     """Compute the intersection over union of volumes (..., Z, Y, X), voxel by voxel.
 
     Args:
-        input, target, threshold, mask, reduction: as in `picture_iou`.
+        input, target: volumes (..., Z, Y, X) or `HiddenVolume`, compared as in `picture_iou`.
+        threshold: share of the highest value of a volume.
+        mask: voxels that count.
+        reduction: "mean" over volumes, "item" or "none" of each.
 
     Raises:
         UnitError: for volumes on two grids.

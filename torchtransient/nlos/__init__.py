@@ -1,10 +1,10 @@
-"""Around the corner: scans of a relay wall, and captures of what cannot be seen from where laser and sensor stand.
+"""Around the corner: scans of a relay wall, and captures of objects that laser and sensor cannot see directly.
 
 - `Wall`: the relay wall, `Wall.plane(...)`, `Wall.mesh(...)` or `Wall.of(...)` of a description
 - `Scan`: which of its points are lit and seen, `Scan.grid(...)` or `Scan.points(...)`
-- `Capture`: what was measured there, tensors with their scan and axis
+- `Capture`: the measurement, tensors with their scan and axis
 - `simulate`: the capture of hidden things by a scan, or of a complete scene; whole, or in parts that a file keeps
-- `forecast`: the memory and time that `simulate` would take, and how it finds which light
+- `forecast`: the memory and time that `simulate` would take, and the estimators that it uses
 - `CaptureRenderer`: captures as a differentiable layer
 - `capture_scene`: the scene dictionary of hidden things and a scan
 - `read_setup`: the arguments of `simulate` in a YAML, y-tal or XML file
@@ -16,27 +16,27 @@
 - `DirectionalLCT`, `directional_lct`: the same with normals
 - `DiffusionDeconvolution`: confocal captures through turbid matter, and without it
 - `stabilized_root`: roots of light, as f-k takes them, with a slope at empty bins
-- `LinearOperator`: what all of these are
+- `LinearOperator`: base class of all these operators
 - `PlanarScan`: a regular grid of a flat wall, which transforms take in place of a scan
 - `subtract_legs`: a capture without the first and the last leg of its light
-- `VoxelGrid`: where the points of a hidden volume stand
+- `VoxelGrid`: positions of the voxels of a hidden volume
 - `Backprojection`, `backproject`: linear operator between such a volume and captures of any kind, and of one capture
 - `FilteredBackprojection`, `filtered_backproject`: the same behind a filter in time
 - `PhasorFilter`, `LaplacianFilter`: such filters
 - `PhasorField`, `phasor_image`: waves of a band of frequencies, from plane to plane
 - `DirectLight`, `ConfocalCamera`: virtual cameras of phasor fields
 - `TransientCamera`: one that sees light travel
-- `depth_map`: where surfaces are in what was reconstructed
-- `DepthMap`: depths, strengths and where there is something
+- `depth_map`: depths of the surfaces in a reconstructed volume
+- `DepthMap`: depths, confidences and the mask of pixels with a surface
 - `reconstruct`: the volume that one of these methods finds in a capture
-- `choose_method`: which one suits it, and why
+- `choose_method`: the method that suits a capture, and the reason
 - `default_grid`: voxels before the wall of a capture
 - `sum_bins`, `without_slab`: captures of fewer bins; without the foam before them
-- `HiddenVolume`: what `reconstruct` returns, a record of tensors as captures are
+- `HiddenVolume`: result of `reconstruct`, a record of tensors as captures are
 - `normals_of`: its unit normals, of methods that find them
 - `read_volume`, `write_volume`: such volumes on disk
 
-What is hidden: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
+Hidden shapes: `torchtransient.scenes.nlos_*`, `scenes.triangle_mesh`. Pictures: `torchtransient.vis`. The guide is
 docs/nlos.md.
 """
 

@@ -37,7 +37,7 @@ def choose_method(capture: Capture) -> Choice:
     """Choose the method that suits a capture.
 
     Args:
-        capture: of any kind.
+        capture: capture of any kind.
 
     Returns:
         Name of the method, and the reason for it.
@@ -60,8 +60,8 @@ def check_method(name: str, capture: Capture) -> Method:
     """Return the method of a name.
 
     Args:
-        name: one of ``METHODS``.
-        capture: that it is meant for.
+        name: name of the method, one of ``METHODS``.
+        capture: capture that the method is meant for.
 
     Raises:
         ArgumentError: for unknown names, and for scans that the method does not take.
@@ -85,7 +85,7 @@ def is_planar(scan: Scan) -> bool:
     """Return True where the sensor points are a regular grid of a flat wall.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
     """
     with contextlib.suppress(ShapeError):
         PlanarScan.of_scan(scan, "choose_method")
@@ -113,7 +113,7 @@ def default_wavelength(capture: Capture) -> float:
     four bins at least.
 
     Args:
-        capture: with a transient.
+        capture: capture with a transient.
 
     Returns:
         Metres of optical path.
@@ -135,10 +135,10 @@ def check_volume_fits(name: str, capture: Capture, grid: VoxelGrid | None, optio
     """Check that the memory left on the device of a capture holds the volume of a method.
 
     Args:
-        name: of the method.
-        capture: with a transient.
-        grid: voxels of methods that take some, else None.
-        options: of the method.
+        name: name of the method.
+        capture: capture with a transient.
+        grid: voxels, for methods that take some, else None.
+        options: options of the method.
 
     Raises:
         StorageError: where even the least memory of the method is not there.
@@ -160,10 +160,10 @@ def least_bytes(name: str, capture: Capture, grid: VoxelGrid | None, options: Ma
     """Return a lower bound of the memory that a method takes beside its arguments.
 
     Args:
-        name: of the method.
-        capture: with a transient.
-        grid: voxels of methods that take some, else None.
-        options: of the method.
+        name: name of the method.
+        capture: capture with a transient.
+        grid: voxels, for methods that take some, else None.
+        options: options of the method.
 
     Returns:
         Bytes.

@@ -130,8 +130,8 @@ class PartFile:
     ``about``: plain data that was kept with them, empty at first.
 
     Args:
-        path: of the JSON file.
-        key: of the simulation, "" for any, to be removed.
+        path: path of the JSON file.
+        key: key of the simulation; "" takes the file of any simulation, to remove it.
 
     Raises:
         StorageError: where ``path`` is another kind of file, belongs to another simulation, is damaged, or is worked on
@@ -233,11 +233,11 @@ class PartFile:
         """Keep a part.
 
         Args:
-            number: of the part.
-            first: its first row.
-            rows: (N, columns).
+            number: number of the part.
+            first: first row of the part.
+            rows: rows of the part, (N, columns).
             total: number of rows of the file.
-            seconds: that it took.
+            seconds: time in seconds that the part took.
             about: plain data to be kept with all parts.
             instead_of: number of a part that it replaces.
 
@@ -300,7 +300,7 @@ def delete_part_file(path: Path) -> None:
     """Delete the files of a simulation's parts, if there are any.
 
     Args:
-        path: of the JSON file.
+        path: path of the JSON file.
 
     Raises:
         StorageError: for another kind of file, or one that another process works on.

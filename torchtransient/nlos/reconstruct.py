@@ -75,8 +75,8 @@ def sum_bins(capture: Capture, number: int) -> Capture:
     """Add up neighbouring bins; bins left over at the record's end are dropped.
 
     Args:
-        capture: with a transient; phasors beside it stay.
-        number: of bins in a sum.
+        capture: capture with a transient; phasors beside it stay.
+        number: number of bins in a sum.
 
     Returns:
         Capture; counts stay whole (int64), half precision becomes float32.
@@ -104,9 +104,9 @@ def without_slab(capture: Capture, thickness: float, snr: float) -> Capture:
     stay.
 
     Args:
-        capture: confocal, of a flat wall.
-        thickness: of the slab, metres.
-        snr: of the Wiener filter.
+        capture: confocal capture of a flat wall.
+        thickness: thickness of the slab, metres.
+        snr: signal-to-noise power ratio of the Wiener filter, see :class:`DiffusionDeconvolution`.
 
     Returns:
         Capture without legs, in double precision where the capture is, else in single.
@@ -133,8 +133,8 @@ def moved_to(capture: Capture, device: Any) -> Capture:
     """Move a capture to a device.
 
     Args:
-        capture: of any kind.
-        device: name, or a torch.device.
+        capture: capture of any kind.
+        device: name of a device, or a torch.device.
 
     Raises:
         DeviceError: for a device that torch does not have.
@@ -163,8 +163,9 @@ def reconstruct(
     others).
 
     Args:
-        capture: with a transient. First and last legs are taken off where a method cannot count them, light before time
-            zero and phasors beside a transient are left out, and of polarized captures the intensity is taken.
+        capture: capture with a transient. First and last legs are removed where a method cannot count them; light
+            before time zero, and phasors beside a transient, are left out; for polarized captures the intensity is
+            used.
         method: "fk", "midpoint-fk", "lct", "directional-lct", "bp", "fbp", "phasor"; None takes the one that suits the
             scan, with the reason in ``metadata["reason"]``. For confocal grids that is f-k, which bears background: a
             light-cone transform is as good or better where background has been taken off, phasor fields where there are
@@ -225,10 +226,10 @@ def default_grid(
     """Make voxels before the wall of a capture.
 
     Args:
-        capture: with a transient.
+        capture: capture with a transient.
         depths: (near, far) in metres, None for all that a record reaches.
-        size, extent: (X, Y) voxels and (width, height) in metres, as of `VoxelGrid.before`.
-        planes: between the depths, None for one a bin and 64 at most.
+        size, extent: (X, Y) voxels and (width, height) in metres, see `VoxelGrid.before`.
+        planes: number of planes between the depths, None for one a bin and 64 at most.
 
     Raises:
         ShapeError, UnitError: as `VoxelGrid.before`, and for phasors alone.
@@ -272,7 +273,7 @@ def normals_of(volume: HiddenVolume) -> Tensor:
     """Return unit normals where a volume with directions is brightest behind each pixel.
 
     Args:
-        volume: with directions; of a batch the first item, summed over its channels.
+        volume: volume with directions; of a batch the first item, summed over its channels.
 
     Returns:
         (3, Y, X) in world coordinates.
@@ -420,7 +421,7 @@ def camera_of(name: str, times: tuple[float, float, int] | None) -> DirectLight 
 
     Args:
         name: "direct", "confocal" or "transient".
-        times: (start, stop, count), metres, of the latter two.
+        times: times of the frames for "confocal" and "transient", (start, stop, count), metres.
 
     Raises:
         UnitError: for times that are not finite.

@@ -48,12 +48,12 @@ def checked_module(sensor: nn.Module | Device, axis: TimeAxis, grad: GradPolicy 
 
     Args:
         sensor: module or device.
-        axis: of the transients.
+        axis: time axis of the transients.
         grad: treatment of a device's noise.
 
     Raises:
         UnitError: for a sensor that was made for another axis.
-        SceneError: for one whose answer has other bins.
+        SceneError: for a sensor whose output has other bins.
     """
     module = sensor.sensor(axis, grad=grad) if isinstance(sensor, Device) else sensor
     check_axis(module, axis)
@@ -93,7 +93,7 @@ def say_black(who: str, capture: Capture) -> None:
 
     Args:
         who: begins the message.
-        capture: that was rendered.
+        capture: rendered capture.
     """
     found = (capture.steady, capture.transient, capture.phasor)
     light = next(tensor for tensor in found if tensor is not None)
@@ -107,9 +107,9 @@ def measured(transient: torch.Tensor, scan: Scan, sensor: nn.Module, generator: 
 
     Args:
         transient: (..., T, [Lh, Lw,] H, W).
-        scan: of the capture.
+        scan: scan of the capture.
         sensor: module.
-        generator: of its noise.
+        generator: source of randomness for the sensor's noise.
 
     Returns:
         Tensor of the same shape.
@@ -221,17 +221,19 @@ class CaptureRenderer(nn.Module):
     """Captures of hidden things as a differentiable layer: :class:`TransientRenderer` behind a relay wall.
 
     Args:
-        hidden, bounces, energy: as in :func:`~torchtransient.nlos.scene.capture_scene`.
-        scan: that knows its wall.
+        hidden: hidden shapes, see :func:`~torchtransient.nlos.scene.capture_scene`.
+        scan: scan that knows its wall.
         parameters: keys of ``renderer.scene.parameters()`` that get an ``nn.Parameter`` each, or a mapping to start
             values; hidden nodes keep their names (``chair.vertex_positions``, ``hidden.to_world``,
             ``hidden.bsdf.reflectance.value``), the wall is ``wall``.
+        bounces: numbers of bounces that count, without gaps, or "all"; 3 is light around one corner.
+        energy: joules of the laser, a number or a Mitsuba spectrum dictionary.
         sensor: module of ``tt.sensing`` that the transient goes through, or a device, whose expected answer is taken
             (``device.sensor(axis, grad=...)`` makes modules with noise).
-        variant: of Mitsuba, None for the active one.
-        settings: of :class:`TransientRenderer` but ``max_depth``, ``time_axis`` or another film (bins of 16 ps that
-            hold all light of three bounces) and ``spp`` (paths for each sensor point, or for each pair of an exhaustive
-            scan; 4) among them.
+        variant: Mitsuba variant, None for the active one.
+        settings: other arguments of :class:`TransientRenderer`, among them ``max_depth``, ``time_axis`` or another film
+            (default: bins of 16 ps that hold all light of three bounces) and ``spp`` (paths for each sensor point, or
+            for each pair of an exhaustive scan; default 4).
 
     Raises:
         SceneError, ArgumentError, UnitError: for a set-up that cannot be rendered.
@@ -313,8 +315,11 @@ class CaptureRenderer(nn.Module):
         """Render a :class:`Capture`.
 
         Args:
-            values, seed, spp, progress: as in :meth:`TransientRenderer.forward`.
-            generator: of the noise of ``sensor``.
+            values: values by key of ``parameters``, see :meth:`TransientRenderer.forward`.
+            seed: seed of the paths, or one for each item of a batch; None draws one from torch's generator.
+            spp: paths for each sensor point, or for each pair of an exhaustive scan; None for the renderer's.
+            progress: show a bar.
+            generator: source of randomness for the noise of ``sensor``.
 
         Raises:
             SceneError, ArgumentError: as there.
@@ -380,7 +385,7 @@ def light_of(renderer: TransientRenderer) -> str:
     """Return a sentence on the estimators that find the light of a capture's scene, as it is built.
 
     Args:
-        renderer: of the scene.
+        renderer: renderer of the capture's scene.
     """
     with active_variant(renderer.scene.variant):
         from torchtransient.plugins.around_corner.division import explanation
@@ -394,9 +399,9 @@ def check_scan(scene: Scene, scan: Scan, options: BuildOptions | None = None) ->
     """Check that sensor and laser of a capture's scene look at the points of its scan.
 
     Args:
-        scene: of the capture.
-        scan: that it was made of.
-        options: of the build, None for a transient film.
+        scene: scene of the capture.
+        scan: scan that the scene was made of.
+        options: build options, None for a transient film.
 
     Raises:
         SceneError: for a hidden thing in their way, or a wall that is elsewhere.
@@ -475,10 +480,10 @@ def as_capture(
     """Return the render of a capture's scene in the scan's shape, as views of its tensors.
 
     Args:
-        out: of the renderer.
-        scan: of the capture.
+        out: output of the renderer.
+        scan: scan of the capture.
         sensor: module that the transient goes through.
-        generator: of its noise.
+        generator: source of randomness for the sensor's noise.
 
     Raises:
         ArgumentError: for gated, rate or beat films.
@@ -514,7 +519,7 @@ def in_film_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
 
     Args:
         tensor: (..., T, *scan.shape).
-        scan: of the capture.
+        scan: scan of the capture.
     """
     laser = laser_size(scan) if scan.kind == "exhaustive" else ()
     return tensor.reshape(*tensor.shape[: tensor.ndim - len(scan.shape)], *laser, *film_size(scan))
@@ -525,7 +530,7 @@ def in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
 
     Args:
         tensor: (..., T, [Lh, Lw,] H, W).
-        scan: of the capture.
+        scan: scan of the capture.
     """
     film = 4 if scan.kind == "exhaustive" else 2
     return tensor.reshape(*tensor.shape[: tensor.ndim - film], *scan.shape)
@@ -536,6 +541,6 @@ def steady_in_scan_shape(tensor: torch.Tensor, scan: Scan) -> torch.Tensor:
 
     Args:
         tensor: (..., H, W).
-        scan: of the capture.
+        scan: scan of the capture.
     """
     return tensor.reshape(*tensor.shape[:-2], *scan.sensor_shape)

@@ -42,7 +42,7 @@ def mesh_file(path: Path, where: str) -> dict[str, Any]:
     (Give ``{"type": "obj", "filename": ...}`` for Mitsuba's own reading.)
 
     Args:
-        path: .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
+        path: mesh file, .obj, .ply, .serialized, or .npz with ``vertices`` (V, 3) and ``faces`` (F, 3), metres.
         where: begins the message.
 
     Raises:
@@ -67,7 +67,7 @@ def mesh_of_npz(path: Path, where: str) -> tuple[Any, Any]:
     """Read `vertices` and `faces` of an .npz file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         where: begins the message.
 
     Raises:
@@ -119,7 +119,7 @@ def capture_scene(
     Args:
         hidden: a Mitsuba shape dictionary, a dictionary of such, a mesh as (vertices (V, 3), faces (F, 3)) or as an
             object with ``vertices`` and ``faces``, or the name of a mesh file; metres.
-        scan: that knows its wall.
+        scan: scan that knows its wall.
         bounces: numbers of bounces that count, without gaps, or "all"; 3 is light around one corner.
         energy: joules of the laser, a number or a Mitsuba spectrum dictionary.
 
@@ -179,7 +179,7 @@ def shapes_of(hidden: Any) -> dict[str, Any]:
     """Return hidden things as a dictionary of Mitsuba shapes (and nodes that they refer to) by name.
 
     Args:
-        hidden: as of :func:`capture_scene`.
+        hidden: hidden shapes, in any form that :func:`capture_scene` takes.
 
     Raises:
         SceneError: for other objects.
@@ -206,7 +206,7 @@ def film_size(scan: Scan) -> tuple[int, int]:
     """Return (rows, columns) of the film: a list of points is one row.
 
     Args:
-        scan: of the capture.
+        scan: scan of the capture.
     """
     return _rows_and_columns(scan.sensor_shape)
 
@@ -215,7 +215,7 @@ def laser_size(scan: Scan) -> tuple[int, int]:
     """Return (rows, columns) of the laser's positions; (1, 1) for a single spot.
 
     Args:
-        scan: of the capture.
+        scan: scan of the capture.
     """
     return _rows_and_columns(scan.laser_shape)
 
@@ -283,8 +283,8 @@ def hidden_bounds(hidden: Any, variant: str | None = None) -> np.ndarray:
     """Return the box around hidden things, which are built for it.
 
     Args:
-        hidden: as of :func:`capture_scene`.
-        variant: of Mitsuba, None for the active one.
+        hidden: hidden shapes, in any form that :func:`capture_scene` takes.
+        variant: Mitsuba variant, None for the active one.
 
     Returns:
         (2, 3), lowest and highest coordinates, metres.

@@ -107,7 +107,7 @@ def check_scan_is_seen(scene: Any, scan: Scan) -> None:
 
     Args:
         scene: a built Mitsuba scene.
-        scan: that it was made of.
+        scan: scan that was made of the scene.
 
     Raises:
         SceneError: otherwise.
@@ -125,7 +125,7 @@ def tolerance_of(scan: Scan) -> float:
     """Return the distance from a point of a scan at which a ray that looks at it may end, metres.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
     """
     points = scan.sensor_points.detach().cpu().numpy().reshape(-1, 3)
     return SAME_POINT * max(_extent(points), float(scan.sensor_legs.detach().max()))
@@ -271,9 +271,9 @@ def reaches_before(shapes: list[Any], points: NDArray[np.float64], normals: NDAr
     """Return True where the box of a shape reaches before the wall at one of its points.
 
     Args:
-        shapes: of Mitsuba.
-        points: of the wall, (N, 3).
-        normals: there, (N, 3).
+        shapes: Mitsuba shapes.
+        points: points on the wall, (N, 3).
+        normals: wall normals at the points, (N, 3).
     """
     for shape in shapes:
         box = shape.bbox()

@@ -75,7 +75,7 @@ def described_shapes(data: Any, folder: Path) -> dict[str, Any]:
 
     Args:
         data: the entry.
-        folder: from which names of files are looked up.
+        folder: folder in which file names are looked up.
 
     Raises:
         SceneError: for other entries.
@@ -224,7 +224,7 @@ def wall_of(data: Any, folder: Path) -> Wall:
 
     Args:
         data: the entry.
-        folder: from which names of files are looked up.
+        folder: folder in which file names are looked up.
 
     Raises:
         SceneError: for other entries.
@@ -247,7 +247,7 @@ def scan_of(data: Any, wall: Wall) -> Scan:
 
     Args:
         data: the entry.
-        wall: that is scanned.
+        wall: wall that is scanned.
 
     Raises:
         SceneError: for other entries.

@@ -73,7 +73,7 @@ _NUMBER_BYTES = 4
 
 @dataclass(frozen=True)
 class VariantChoice:
-    """``name``: of the variant; ``why`` it was chosen."""
+    """``name`` of the variant, and ``why`` it was chosen."""
 
     name: str
     why: str
@@ -362,7 +362,7 @@ def size_in_words(count: int) -> str:
     """Return bytes in words.
 
     Args:
-        count: of bytes.
+        count: number of bytes.
     """
     for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20)):
         if count >= scale:
@@ -398,28 +398,30 @@ def simulate(
     """Simulate the capture of hidden things by a scan, without gradients (see :class:`CaptureRenderer`).
 
     Args:
-        hidden: as in :func:`~torchtransient.nlos.scene.capture_scene`. Without a ``scan``, a complete scene (as
-            :func:`tt.load` takes it) with the integrator ``transient_nlos_path``, a laser, a sensor of any kind and a
-            film with its bins. The scan is read off the scene: points are the ends of the rays of pixel centres.
-            ``bounces`` and ``energy`` stand in the scene then; ``spp`` and the bins may.
-        scan: that knows its wall.
-        time_axis, frequencies: of the film; without them bins of 16 ps that hold all light of three bounces.
-        spp: paths for each sensor point, or for each pair of an exhaustive scan (4096).
-        bounces: numbers of bounces that count, (3,).
-        energy: of the laser, 1 joule.
+        hidden: hidden shapes, see :func:`~torchtransient.nlos.scene.capture_scene`. Without a ``scan``, a complete
+            scene (as :func:`tt.load` takes it) with the integrator ``transient_nlos_path``, a laser, a sensor of any
+            kind and a film with its bins. The scan is then read from the scene: its points are where the rays of pixel
+            centres end. ``bounces`` and ``energy`` are then given by the scene; ``spp`` and the bins may be.
+        scan: scan that knows its wall.
+        time_axis, frequencies: time axis or frequencies of the film; without them bins of 16 ps that hold all light of
+            three bounces.
+        spp: paths for each sensor point, or for each pair of an exhaustive scan; default 4096.
+        bounces: numbers of bounces that count; default (3,).
+        energy: energy of the laser in joules; default 1.
         sensor: module of ``tt.sensing``, or a device, that the transient goes through at last; its answer has the same
             bins. Devices draw their counts.
         seed: whole number below 2^32. Same seed and parts, same capture, to the rounding of sums that threads add to in
             the order they come. Parts have seeds derived from it, so that another number of them is another draw. A
             :class:`CaptureRenderer` draws the paths of one part in the same variant (and spreads light by a tent in
             time where a parameter can change lengths).
-        variant: of Mitsuba; None takes one channel where all spectra are grey, else the variant of :func:`tt.load`.
+        variant: Mitsuba variant; None takes one channel where all spectra are grey, else the variant of
+            :func:`tt.load`.
         part: name of a file that keeps finished parts: with it a simulation that was killed goes on when it is called
             again. It is deleted at the end.
-        tiles: number of parts, 16, 4 of exhaustive scans.
-        keep_part: leave the part file.
+        tiles: number of parts; default 16, or 4 for exhaustive scans.
+        keep_part: do not delete the part file at the end.
         progress: print memory and time before it starts, and show a bar.
-        generator: of the noise of ``sensor``.
+        generator: source of randomness for the noise of ``sensor``.
 
     Returns:
         Capture. ``metadata``: ``spp``, ``seed``, ``seconds`` of rendering, ``variant`` with ``variant_reason``,
@@ -477,8 +479,12 @@ def forecast(
     """Forecast memory, time, variant and estimators of light of :func:`simulate` with the same arguments.
 
     Args:
-        hidden, scan, part, tiles, variant: as of :func:`simulate`.
-        settings: its other arguments.
+        hidden: hidden shapes, or a complete scene, see :func:`simulate`.
+        scan: scan that knows its wall, or None for a complete scene.
+        part: name of the part file.
+        tiles: number of parts.
+        variant: Mitsuba variant, or None, see :func:`simulate`.
+        settings: other arguments of :func:`simulate`.
 
     Raises:
         ArgumentError: for unknown arguments; others as :func:`simulate`.

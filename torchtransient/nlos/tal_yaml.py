@@ -129,7 +129,7 @@ def tal_arguments(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
     Args:
         data: entries of the file.
-        folder: of the file.
+        folder: folder of the file.
 
     Raises:
         SceneError: for unknown entries, wrong values, and settings that are not supported: a laser that is not sampled

@@ -1,4 +1,4 @@
-"""Parameters that stay what they are: shares between 0 and 1, positive spectra, rigid poses.
+"""Parameters that stay in their physical range: shares between 0 and 1, positive spectra, rigid poses.
 
 Torch only, never Mitsuba. Functions there and back first, under them the modules with `forward` and `right_inverse`
 that `torch.nn.utils.parametrize.register_parametrization` takes; `register` is the same by Mitsuba's keys.

@@ -32,8 +32,8 @@ def bounded(x: Tensor, low: Bound = 0.0, high: Bound = 1.0) -> Tensor:
     not looked at inside of `torch.func.vmap` and `torch.compile`.
 
     Args:
-        x: any shape.
-        low, high: finite numbers, or tensors that broadcast to `x`, low < high.
+        x: tensor of any shape.
+        low, high: bounds, finite numbers or tensors that broadcast to `x`, low < high.
 
     Raises:
         UnitError, ShapeError: for other bounds and tensors.
@@ -53,11 +53,11 @@ def _between(x: Tensor, low: Bound, high: Bound) -> Tensor:
 
 @without_autocast
 def bounded_inverse(value: Tensor, low: Bound = 0.0, high: Bound = 1.0, *, margin: float | None = None) -> Tensor:
-    """Return the `x` of which `bounded` makes `value`.
+    """Return the `x` that `bounded` maps to `value`.
 
     Args:
-        value: any shape, between the bounds.
-        low, high: as of `bounded`.
+        value: tensor of any shape, between the bounds.
+        low, high: bounds, numbers or tensors that broadcast to `value`, see `bounded`.
         margin: least distance from the bounds, as a share of the range between 0 and 0.5; nearer values are moved
             there, and no nearer than the precision of `value` tells from the bound. None refuses the bounds themselves,
             which have no `x`.
@@ -104,8 +104,9 @@ class Bounded(Settings):
     the module is made half.
 
     Args:
-        low, high: numbers or tensors that broadcast to the parameter.
-        margin: as in `bounded_inverse`.
+        low, high: bounds, numbers or tensors that broadcast to the parameter.
+        margin: least distance from the bounds, as a share of the range between 0 and 0.5, or None, see
+            `bounded_inverse`.
 
     Raises:
         UnitError: for bounds in another order.
@@ -128,7 +129,7 @@ class Bounded(Settings):
         """Return `bounded` of a tensor.
 
         Args:
-            x: any shape to which the bounds broadcast.
+            x: tensor of any shape to which the bounds broadcast.
         """
         # The bounds were looked at when they were given: looking at them again would wait for a GPU.
         return _between(floating(x, type(self).__name__), self.low, self.high)
@@ -138,7 +139,7 @@ class Bounded(Settings):
         """Return `bounded_inverse` of a value.
 
         Args:
-            value: of any shape, inside of the range.
+            value: tensor of any shape, inside the range.
 
         Raises:
             UnitError: for values outside of it.
@@ -154,7 +155,7 @@ class Albedo(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
 
@@ -166,7 +167,7 @@ class Roughness(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = 1e-3, high: Any = 1.0, margin: float | None = None) -> None:
@@ -181,7 +182,7 @@ class PrincipledRoughness(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = LEAST_PRINCIPLED, high: Any = 1.0, margin: float | None = None) -> None:
@@ -196,7 +197,7 @@ class IndexOfRefraction(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = 1.0, high: Any = 4.0, margin: float | None = None) -> None:
@@ -209,7 +210,7 @@ class Anisotropy(Bounded):
 
     Args:
         low, high: ends of the range.
-        margin: as of `Bounded`.
+        margin: least distance from the ends, as a share of the range between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, low: Any = -0.99, high: Any = 0.99, margin: float | None = None) -> None:
@@ -225,7 +226,7 @@ def positive(x: Tensor, *, low: float = 0.0, scale: float = 1.0, function: Posit
     value. With "exp" steps are factors, for values whose order of magnitude is not known.
 
     Args:
-        x: any shape.
+        x: tensor of any shape.
         low: the bound, in the unit of the value.
         scale: typical size of the value, above zero.
         function: "softplus" or "exp".
@@ -249,11 +250,13 @@ def _above(x: Tensor, base: float | Tensor, unit: float | Tensor, function: str)
 def positive_inverse(
     value: Tensor, *, low: float = 0.0, scale: float = 1.0, function: PositiveFunction = "softplus"
 ) -> Tensor:
-    """Return the `x` of which `positive` makes `value`.
+    """Return the `x` that `positive` maps to `value`.
 
     Args:
-        value: any shape, finite, above `low`.
-        low, scale, function: as of `positive`.
+        value: tensor of any shape, finite, above `low`.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero, see `positive`.
+        function: "softplus" or "exp".
 
     Raises:
         UnitError: for other values.
@@ -280,7 +283,9 @@ class Positive(Settings):
     All three settings are part of `state_dict`.
 
     Args:
-        low, scale, function: as of `positive`.
+        low: the bound, in the unit of the value.
+        scale: typical size of the value, above zero, see `positive`.
+        function: "softplus" or "exp".
     """
 
     low: Tensor
@@ -298,7 +303,7 @@ class Positive(Settings):
         """Return `positive` of a tensor.
 
         Args:
-            x: any shape.
+            x: tensor of any shape.
         """
         return _above(floating(x, "Positive"), self.low.to(x), self.scale.to(x), self.function)
 
@@ -307,7 +312,7 @@ class Positive(Settings):
         """Return `positive_inverse` of a value.
 
         Args:
-            value: any shape, above `low`.
+            value: tensor of any shape, above `low`.
 
         Raises:
             UnitError: for values out of range.

@@ -154,8 +154,8 @@ class _RigidPose(Settings):
 
     @without_autocast
     def right_inverse(self, pose: Tensor) -> Tensor:
-        """The six numbers of which `forward` makes `pose`. Raises ShapeError, and UnitError for a pose that is no rigid
-        motion of the base.
+        """Return the six numbers that `forward` maps to `pose`. Raises ShapeError, and UnitError for a pose that is no
+        rigid motion of the base.
         """
         name = type(self).__name__
         matrix = _four_by_four(pose, name).to(torch.float64)
@@ -191,8 +191,8 @@ class AxisAnglePose(_RigidPose):
     point in its place), in float64, also when the module is made half: a state that is loaded brings its own base.
 
     Args:
-        base: pose of the numbers 0, (4, 4) or (..., 4, 4); its scale and shear are kept, so of a shape the present
-            `to_world`. None: the identity, for poses that are rigid themselves.
+        base: pose for six numbers of 0, (4, 4) or (..., 4, 4); its scale and shear are kept. For a shape, give its
+            present `to_world`. None: the identity, for poses that are rigid themselves.
         about: point that stays as it turns: "self" (where `base` puts the origin), "world" (the world's origin), or a
             point [x, y, z] of the world.
         frame: "world" turns and moves along the world's axes (`motion @ base`), "local" along those of the thing before
@@ -214,7 +214,10 @@ class SE3Pose(_RigidPose):
     the six numbers are then coordinates of one motion, for Lie-algebra optimisers and interpolation of poses.
 
     Args:
-        base, about, frame, length_scale: as of `AxisAnglePose`.
+        base: pose for six numbers of 0, (4, 4) or (..., 4, 4), None for the identity, see `AxisAnglePose`.
+        about: point that stays as it turns, "self", "world" or [x, y, z].
+        frame: "world" or "local".
+        length_scale: metres (with "local", units of `base`) for 1 in the last three numbers.
     """
 
     _kind = "SE3Pose"

@@ -18,16 +18,17 @@ from torchtransient.parametrize.bounded import Roughness
 def register(module: nn.Module, key: str, parametrization: nn.Module) -> nn.Module:
     """Register a parametrization by a key: `torch.nn.utils.parametrize.register_parametrization`.
 
-    The present value is where it starts, by `right_inverse`; a parametrization without one takes it for the numbers
-    behind. Optimisers are made afterwards: `module.parameters()` has the numbers behind the value (`original`), and
-    `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each copy its own
-    (`CopiesParametrized`). Another one on the same key is applied after those before it, and the value stays where it
-    is.
+    The value stays as it is, by `right_inverse`; a parametrization without that function takes the present value for
+    the underlying numbers. Make optimisers afterwards: `module.parameters()` then has the underlying numbers
+    (`original`), and `renderer.values[key]` the value. Copies and pickles of the module keep its parametrizations, each
+    copy its own (`CopiesParametrized`). A further parametrization of the same key is applied after those before it, and
+    the value stays as it is.
 
     Args:
         module: a renderer, or any module.
-        key: of a renderer, or a module that holds one, a key of its scene, `"box.to_world"`; of other modules a path,
-            `"encoder.weight"`; or one behind the other where a module holds several renderers.
+        key: name of the value. For a renderer, or a module that holds one, a key of its scene, such as
+            `"box.to_world"`; for other modules a path, such as `"encoder.weight"`; where a module holds several
+            renderers, the path of one followed by the key.
         parametrization: module of `tt.parametrize`, or any other.
 
     Returns:
@@ -101,14 +102,16 @@ def _append(owner: nn.Module, name: str, key: str, parametrization: nn.Module) -
 
 
 def original(module: nn.Module, key: str) -> nn.Parameter:
-    """Return the numbers behind a parametrized value, which optimisers change; of a buffer a tensor, which they do not.
+    """Return the underlying numbers of a parametrized value, which optimisers change; for a buffer a tensor, which they
+    do not change.
 
     Args:
-        module, key: as of `register`.
+        module: a renderer, or any module.
+        key: name of the value, see `register`.
 
     Raises:
         UnknownKeyError: for a key that is not there.
-        SceneError: for a key without a parametrization, or of one that makes the value of several tensors.
+        SceneError: for a key without a parametrization, or with one that makes the value from several tensors.
     """
     owner, name = _parametrized(module, key)
     chain = _chain(owner, name)
@@ -124,7 +127,8 @@ def remove(module: nn.Module, key: str) -> nn.Module:
     Its value stays as it is, in a new `nn.Parameter` (of a buffer, a buffer): make optimisers afterwards.
 
     Args:
-        module, key: as of `register`.
+        module: a renderer, or any module.
+        key: name of the value, see `register`.
 
     Returns:
         The module.

@@ -41,11 +41,11 @@ def choice_code(names: tuple[str, ...], chosen: str) -> Tensor:
 
 
 def choice_of(names: tuple[str, ...], code: Any, where: str) -> str:
-    """Return the choice of a `state_dict`.
+    """Return the choice that a `state_dict` holds as a number.
 
     Args:
         names: all choices.
-        code: of :func:`choice_code`.
+        code: number that :func:`choice_code` made of the choice.
         where: begins the message.
 
     Raises:

@@ -22,8 +22,8 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
     """Map all real numbers to weights between 0 and 1 with the sum 1, by softmax.
 
     Args:
-        x: any shape.
-        dim: of the weights.
+        x: tensor of any shape.
+        dim: dimension of the weights.
 
     Raises:
         ShapeError: for a dimension that is missing or empty.
@@ -33,11 +33,11 @@ def simplex(x: Tensor, dim: int = -1) -> Tensor:
 
 @without_autocast
 def simplex_inverse(weights: Tensor, dim: int = -1, margin: float | None = None) -> Tensor:
-    """Return the `x`, zero on average along `dim`, of which `simplex` makes `weights`.
+    """Return the `x`, zero on average along `dim`, that `simplex` maps to `weights`.
 
     Args:
-        weights: not negative, with the sum 1 along `dim`.
-        dim: of the weights.
+        weights: weights that are not negative, with the sum 1 along `dim`.
+        dim: dimension of the weights.
         margin: least weight, a share between 0 and 0.5 of an equal weight; smaller ones are raised to it, and the sum
             is made 1 again (never below the smallest normal number of the dtype). None refuses weights of zero, which
             have no `x`.
@@ -70,8 +70,8 @@ class Simplex(Settings):
     """`simplex` as a parametrization: weights of returns, materials or modes of one mixture.
 
     Args:
-        dim: of the weights; part of `state_dict`.
-        margin: as of `simplex_inverse`.
+        dim: dimension of the weights; part of `state_dict`.
+        margin: least weight, a share between 0 and 0.5 of an equal weight, or None, see `simplex_inverse`.
     """
 
     def __init__(self, dim: int = -1, margin: float | None = None) -> None:
@@ -83,7 +83,7 @@ class Simplex(Settings):
         """Return `simplex` of a tensor.
 
         Args:
-            x: any shape that has the dimension of the module.
+            x: tensor that has the dimension of the module.
         """
         return simplex(x, self.dim)
 

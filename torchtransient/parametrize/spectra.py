@@ -22,8 +22,8 @@ def spline_basis(wavelengths_nm: Any, coefficients: int) -> NDArray[np.float64]:
     A curve of coefficients (..., K) is `coefficients @ basis.T`; it has two continuous derivatives.
 
     Args:
-        wavelengths_nm: (N,) in rising order.
-        coefficients: K, 4 <= K <= N.
+        wavelengths_nm: wavelengths (N,) in rising order.
+        coefficients: number of coefficients K, 4 <= K <= N.
 
     Returns:
         (N, K).
@@ -90,9 +90,10 @@ class PositiveSpectrum(_SmoothSpectrum):
     `state_dict`.
 
     Args:
-        wavelengths_nm: (N,) in rising order, the wavelengths of the plugin's `values` (`regular` spectra: its range in
-            equal steps).
-        coefficients: K >= 4; fewer are smoother, one for every (last - first) / (K - 3) nanometres.
+        wavelengths_nm: wavelengths (N,) in rising order, those of the plugin's `values` (`regular` spectra: its range
+            in equal steps).
+        coefficients: number of coefficients K, 4 or more; fewer are smoother, one for every (last - first) / (K - 3)
+            nanometres.
         scale: typical size of the values.
     """
 
@@ -104,8 +105,9 @@ class ReflectanceSpectrum(_SmoothSpectrum):
     """A smooth spectrum between 0 and 1, otherwise as `PositiveSpectrum`.
 
     Args:
-        wavelengths_nm, coefficients: as of `PositiveSpectrum`.
-        margin: as of `Bounded`.
+        wavelengths_nm: wavelengths (N,) in rising order, those of the plugin's `values`, see `PositiveSpectrum`.
+        coefficients: number of coefficients, 4 or more; fewer are smoother.
+        margin: least distance from 0 and 1, a share between 0 and 0.5, or None, see `Bounded`.
     """
 
     def __init__(self, wavelengths_nm: Any, coefficients: int = 8, margin: float | None = None) -> None:

@@ -54,9 +54,9 @@ class EllipsoidOperator(ScanOperator):
     """Linear interpolation in time of the light that each pair of a scan measures of each voxel, and its transpose.
 
     Args:
-        scan: of any kind.
-        points: as of :class:`ScanOperator`.
-        time_axis: of the transients.
+        scan: scan of any kind.
+        points: grid, or points (..., 3) in world coordinates, metres, see :class:`ScanOperator`.
+        time_axis: time axis of the transients.
         falloff: p of the factor (r_laser r_sensor)^-p, distances in metres, none of them below half a bin.
         dtype: float32 or float64.
 
@@ -248,7 +248,7 @@ def backproject(capture: Capture, points: VoxelGrid | Tensor, *, falloff: float 
     """Backproject a capture: :meth:`Backprojection.reconstruct` by its own scan and axis.
 
     Args:
-        capture: with a transient.
+        capture: capture with a transient.
         points: grid, or points (..., 3) in world coordinates, metres.
         falloff: power of 1 / (r_laser r_sensor), see :class:`Backprojection`.
 
@@ -271,9 +271,9 @@ class Backprojection(EllipsoidOperator):
     flat and curved walls, with or without first and last legs.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         points: grid, or points (..., 3) in world coordinates, metres.
-        time_axis: of the transients, counted as the scan's ``first_and_last_leg`` says.
+        time_axis: time axis of the transients, counted as the scan's ``first_and_last_leg`` says.
         falloff: p of a factor (r_laser r_sensor)^-p in both maps. 0 leaves distances alone, 2 is the falloff of small
             diffuse patches, 1 that of retroreflectors in confocal scans; -2 makes ``adjoint`` compensate for it.
             Distances below half a bin count as half a bin. Cosines of wall and surface are not part of it.
@@ -322,7 +322,7 @@ def filtered_backproject(
     """Backproject a capture behind a filter: :meth:`FilteredBackprojection.reconstruct` by its own scan and axis.
 
     Args:
-        capture: with a transient.
+        capture: capture with a transient.
         points: grid, or points (..., 3) in world coordinates, metres.
         filter: :class:`PhasorFilter` or :class:`LaplacianFilter`.
         falloff: power of 1 / (r_laser r_sensor), see :class:`Backprojection`.
@@ -345,9 +345,13 @@ class FilteredBackprojection(EllipsoidOperator):
     :class:`PhasorFilter`; ``forward`` is F^H B L^H, its exact adjoint. ``reconstruct`` makes the filter's picture.
 
     Args:
-        scan, points, time_axis, falloff, dtype: as of :class:`Backprojection`.
-        filter: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019),
-            or ``LaplacianFilter(sigma)`` (Velten et al. 2012).
+        scan: scan of any kind.
+        points: grid, or points (..., 3) in world coordinates, metres.
+        time_axis: time axis of the transients, counted as the scan's ``first_and_last_leg`` says.
+        filter: ``PhasorFilter(wavelength, cycles)``, the phasor field of any scan and any points (Liu et al. 2019), or
+            ``LaplacianFilter(sigma)`` (Velten et al. 2012).
+        falloff: p of a factor (r_laser r_sensor)^-p, see :class:`Backprojection`.
+        dtype: float32 or float64.
 
     Raises:
         ShapeError, UnitError: as :class:`Backprojection` and the filter.

@@ -103,7 +103,7 @@ def refuse_pairs(scan: Scan, who: str) -> None:
     """Refuse a scan with a laser spot of its own for each sensor point.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         who: begins the message.
 
     Raises:
@@ -117,7 +117,7 @@ def refuse_legs(scan: Scan, who: str) -> None:
     """Refuse a scan that counts the first and last leg.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         who: begins the message.
 
     Raises:
@@ -133,7 +133,7 @@ def checked_capture(capture: Capture, who: str) -> tuple[Tensor, TimeAxis]:
     """Return the transient and the axis of a capture.
 
     Args:
-        capture: of any kind.
+        capture: capture of any kind.
         who: begins the message.
 
     Raises:
@@ -148,8 +148,9 @@ def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tens
     """Return the transient of a capture on the axis of an operator.
 
     Args:
-        capture: of intensities.
-        time_axis: of the operator; equal to a millionth of a bin, since edges may have been computed in another way.
+        capture: capture of intensities.
+        time_axis: time axis of the operator; equal to a millionth of a bin, since edges may have been computed in
+            another way.
         who: begins the message.
 
     Raises:
@@ -165,10 +166,10 @@ def checked_intensities(capture: Capture, time_axis: TimeAxis, who: str) -> Tens
 
 
 def telling(scan: Scan) -> list[Any]:
-    """Return the attributes that tell a scan's light from that of others: kind, legs, points, origins where legs count.
+    """Return the attributes that determine the light of a scan: kind, legs, points, origins where legs count.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
     """
     names = ["kind", "first_and_last_leg", "sensor_points", "laser_points"]
     return [getattr(scan, name) for name in names + ["sensor_origin", "laser_origin"] * scan.first_and_last_leg]
@@ -178,7 +179,7 @@ def check_from_zero(time_axis: TimeAxis, who: str) -> None:
     """Check that a time axis begins at zero or later, to rounding.
 
     Args:
-        time_axis: of the transients.
+        time_axis: time axis of the transients.
         who: begins the message.
 
     Raises:
@@ -198,8 +199,8 @@ def check_proportions(scan: Scan | PlanarScan, axis: TimeAxis, who: str) -> None
     """Check that a wall and a record are of one size.
 
     Args:
-        scan: with points in metres.
-        axis: metres of optical path.
+        scan: scan with points in metres.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
 
     Raises:
@@ -225,11 +226,11 @@ def check_reach(scan: Scan, points: VoxelGrid | Tensor, axis: TimeAxis, who: str
     """Check that the light of hidden points arrives within ten records.
 
     Args:
-        scan: with points in metres.
+        scan: scan with points in metres.
         points: grid, or points (..., 3), metres.
-        axis: metres of optical path.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
-        seen: refuse points as well that the record has none of.
+        seen: also refuse points of which no light falls into the record.
 
     Raises:
         UnitError: for points beyond.
@@ -258,9 +259,9 @@ def check_wavelength(wavelength: float, scan: Scan, axis: TimeAxis, who: str) ->
     """Check that waves are no longer than the record and ten walls, beyond which they show nothing.
 
     Args:
-        wavelength: metres of optical path.
-        scan: with points in metres.
-        axis: metres of optical path.
+        wavelength: wavelength in metres of optical path.
+        scan: scan with points in metres.
+        axis: time axis of the record, metres of optical path.
         who: begins the message.
 
     Raises:
@@ -279,8 +280,8 @@ def check_thickness(thickness: float, scan: Scan | PlanarScan, who: str) -> None
     """Check that a slab on the wall is at most twice as thick as the scan is wide.
 
     Args:
-        thickness: metres.
-        scan: with points in metres.
+        thickness: thickness of the slab, metres.
+        scan: scan with points in metres.
         who: begins the message.
 
     Raises:
@@ -297,7 +298,7 @@ def check_record(axis: TimeAxis | None, end_opl: float, who: str) -> None:
     """Check that a part of a record ends at most ten records behind its beginning.
 
     Args:
-        axis: of the record, None for any.
+        axis: time axis of the record, None for any.
         end_opl: end of the part, metres of optical path.
         who: begins the message.
 

@@ -25,7 +25,7 @@ def subtract_legs(capture: Capture) -> Capture:
     Differentiable by the transient, not by points.
 
     Args:
-        capture: with a transient; returned as it is where its scan counts no legs.
+        capture: capture with a transient; returned as it is where its scan counts no legs.
 
     Returns:
         Capture without legs, ``steady`` kept, in double precision where the capture is, else in float32, counts too.
@@ -80,9 +80,9 @@ def stabilized_root(transient: Tensor, floor: float = COUNTS_FLOOR) -> Tensor:
 
     Args:
         transient: finite real numbers, any shape; whole numbers become float32.
-        floor: in the unit of the transient, 1/4 for photon counts, a small part of the brightest bin for radiance. With
-            0 it is the root itself, sign kept, whose derivative grows without bound towards zero and counts as zero
-            there.
+        floor: number added to the light under the root, in the unit of the transient: 1/4 for photon counts, a small
+            part of the brightest bin for radiance. With 0 it is the root itself, sign kept, whose derivative grows
+            without bound towards zero and counts as zero there.
 
     Returns:
         Tensor of the same shape.

@@ -1,4 +1,4 @@
-"""Captures through a diffusing slab: what it does to them, and how that is undone (Lindell and Wetzstein,
+"""Captures through a diffusing slab: its effect, and the removal of that effect (Lindell and Wetzstein,
 "Three-dimensional imaging through scattering media based on confocal diffuse tomography", Nature Communications 11,
 2020).
 
@@ -44,9 +44,9 @@ class DiffusionDeconvolution(InvertibleOperator):
     differentiable; results of the inverse go below zero.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients; bins before time zero are taken.
-        thickness: metres.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients; bins before time zero are accepted.
+        thickness: thickness of the slab, metres.
         properties: (reduced scattering 1/m, absorption 1/m, index of refraction, extrapolation length in metres at
             which behind its sides the fluence vanishes); the defaults of both are those of the paper's foam.
         snr: power of the light over that of the noise where nothing is lost, at frequency zero; light that the slab

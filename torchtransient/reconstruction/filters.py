@@ -36,8 +36,8 @@ class PhasorFilter:
     counts as none, however long the pulse is. The picture is the squared modulus.
 
     Args:
-        wavelength: metres of optical path. Twice the scan's pitch and more are free of ghosts.
-        cycles: wavelengths within three standard deviations to both sides.
+        wavelength: wavelength in metres of optical path. Twice the scan's pitch and more are free of ghosts.
+        cycles: number of wavelengths within three standard deviations to both sides.
 
     Raises:
         UnitError: for numbers that are not above zero; by an operator for wavelengths below two bins and a sigma below
@@ -126,7 +126,7 @@ class LaplacianFilter:
     spaced planes.
 
     Args:
-        sigma: voxels in each direction, 0.2 or more: below, the neighbours of a voxel have no part.
+        sigma: standard deviation of the Gaussian in voxels, 0.2 or more: below, the neighbours of a voxel have no part.
 
     Raises:
         UnitError: for a sigma out of range.
@@ -199,7 +199,7 @@ def sample_places(bins: int, samples: int) -> tuple[int, int]:
 
     Args:
         bins: number of bins.
-        samples: per bin.
+        samples: number of samples per bin.
     """
     return -(samples // 2), (bins - 1) * samples + samples // 2 + 1
 

@@ -56,13 +56,14 @@ class FK(ConfocalOperator):
     ``operator.reconstruct(transient)``: from measured light to the squared field.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
-        target: "diffuse", light falls with the fourth power of the distance and psi = z sqrt(H), or "retroreflective",
-            with the second and psi = sqrt(H), where z is half the optical path length.
-        floor: of the root, see :func:`stabilized_root`, in the unit of the transient; 0 is the root itself, with no
-            derivative at empty bins. Take 1/4 for photon counts and wherever gradients go through.
-        taps: 4 interpolate to 3e-4 of the field, 2 linearly to some percent.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
+        target: kind of the hidden surface: "diffuse", light falls with the fourth power of the distance and psi = z
+            sqrt(H), or "retroreflective", with the second and psi = sqrt(H), where z is half the optical path length.
+        floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`; 0 is
+            the root itself, with no derivative at empty bins. Take 1/4 for photon counts and wherever gradients go
+            through.
+        taps: number of interpolation taps: 4 are right to 3e-4 of the field, 2 (linear) to some percent.
         dtype: float32 or float64.
 
     Raises:
@@ -160,7 +161,7 @@ class FK(ConfocalOperator):
         """Return the squared modulus of the field that a root migrates to.
 
         Args:
-            root: of a transient, (..., T, Y, X).
+            root: root of a transient, (..., T, Y, X).
 
         Returns:
             (..., Z, Y, X).
@@ -247,8 +248,8 @@ def fk(capture: Capture, **options: Any) -> Tensor:
     """Migrate a confocal capture: :meth:`FK.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
-        options: of :class:`FK`.
+        capture: confocal capture of a flat wall.
+        options: options of :class:`FK`.
 
     Returns:
         Squared field (C, Z, Y, X), on the device of the transient.
@@ -295,8 +296,8 @@ class Midpoints(TransientOperator):
     grid; with one spot they stand on it. Midpoints without a pair are dark.
 
     Args:
-        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
+        scan: single or exhaustive scan with sensor points on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
         dtype: float32 or float64.
 
     Raises:
@@ -405,8 +406,12 @@ class MidpointFK(TransientOperator):
     to the squared field.
 
     Args:
-        scan: single or exhaustive, sensor points on a regular grid of a flat wall, without legs.
-        time_axis, target, floor, taps, dtype: as of :class:`FK`.
+        scan: single or exhaustive scan with sensor points on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
+        target: "diffuse" or "retroreflective", see :class:`FK`.
+        floor: number added to the light under the root, in the unit of the transient, see :func:`stabilized_root`.
+        taps: number of interpolation taps: 4 are right to 3e-4 of the field, 2 (linear) to some percent.
+        dtype: float32 or float64.
 
     Raises:
         ShapeError, UnitError, ArgumentError: as :class:`Midpoints` and :class:`FK`.
@@ -461,8 +466,8 @@ def midpoint_fk(capture: Capture, **options: Any) -> Tensor:
     """Migrate a single or exhaustive capture: :meth:`MidpointFK.reconstruct` by its own scan and axis.
 
     Args:
-        capture: single or exhaustive, of a flat wall.
-        options: of :class:`MidpointFK`.
+        capture: single or exhaustive capture of a flat wall.
+        options: options of :class:`MidpointFK`.
 
     Returns:
         Squared field (C, Z, 2 Y, 2 X), on the device of the transient.

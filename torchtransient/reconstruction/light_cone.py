@@ -65,7 +65,7 @@ class ConeGrid:
         """Make the bins of a time axis.
 
         Args:
-            axis: from zero on.
+            axis: time axis, from zero on.
             grid: points of the wall.
             v_bins: number of bins.
             who: begins the message.
@@ -121,10 +121,10 @@ class ConeGrid:
         """Return the transform along one side of the wall of q^moment exp(-i w q^2) for every frequency w of v.
 
         Args:
-            count: points along the side.
-            pitch: between them, metres.
+            count: number of points along the side.
+            pitch: distance between the points, metres.
             moment: power of the offset.
-            windowed: times :meth:`window`.
+            windowed: multiply by :meth:`window`.
 
         Returns:
             (V' / 2 + 1, 2 count, 2), real and imaginary.
@@ -157,7 +157,7 @@ class ConeOperator(InvertibleOperator):
 
     ``moments``: for each component of the volume, the powers (y, x) of the offset from the hidden point to the wall in
     its kernel; ``scales``: the factors of the kernels. Classes say with :meth:`components` and :meth:`volume_of` how
-    volumes are made of components. Arguments as of :class:`LCT`.
+    volumes are made of components. For the arguments see :class:`LCT`.
     """
 
     depth_v: Tensor
@@ -358,13 +358,14 @@ class LCT(ConeOperator):
     ``operator.reconstruct(transient)``: the inverse of a capture, in the units of the volume.
 
     Args:
-        scan: confocal, on a regular grid of a flat wall, without legs.
-        time_axis: of the transients, from zero on.
-        target: "diffuse", light falls with the fourth power of the distance, or "retroreflective", with the second.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
+        target: kind of the hidden surface: "diffuse", light falls with the fourth power of the distance, or
+            "retroreflective", with the second.
         snr: ratio of signal to noise power at the mean power of the kernel, without a unit; larger is sharper and
             noisier.
-        v_bins: bins of squared distance, None for as many as bins of time. They are equal, and coarse in depth near the
-            wall: v_max / (2 z v_bins).
+        v_bins: number of bins of squared distance, None for as many as bins of time. They are equal, and coarse in
+            depth near the wall: v_max / (2 z v_bins).
         dtype: float32 or float64.
 
     Raises:
@@ -390,8 +391,8 @@ def lct(capture: Capture, **options: Any) -> Tensor:
     """Invert a confocal capture: :meth:`LCT.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
-        options: of :class:`LCT`.
+        capture: confocal capture of a flat wall.
+        options: options of :class:`LCT`.
 
     Returns:
         Volume (C, Z, Y, X), on the device of the transient.
@@ -410,22 +411,27 @@ class DirectionalLCT(ConeOperator):
 
     ``operator(volume)``: vectors (..., 3, Z, Y, X), strength per m^3 times unit normal in world coordinates, to the
     light in each bin (..., T, Y, X), falling with the cosine at the surface and r^-4 or r^-2; ``operator.adjoint``,
-    ``operator.inverse`` and ``operator.reconstruct`` as of :class:`LCT`, from transients to such vectors. Their lengths
+    ``operator.inverse`` and ``operator.reconstruct`` as in :class:`LCT`, from transients to such vectors. Their lengths
     are the albedo, their directions the normals, towards the wall.
 
     Args:
-        scan, time_axis, target, snr, v_bins, dtype: as of :class:`LCT`.
+        scan: confocal scan on a regular grid of a flat wall, without legs.
+        time_axis: time axis of the transients, from zero on.
+        target: "diffuse" or "retroreflective", see :class:`LCT`.
+        snr: ratio of signal to noise power at the mean power of the kernel, see :class:`LCT`.
+        v_bins: number of bins of squared distance, None for as many as bins of time, see :class:`LCT`.
         taper: share of each side of the scan over which the inverse fades light out towards the border, 0 (not at all)
             to 0.5. Light that ends at the border is otherwise explained by vectors that point across it: a bright rim,
             in measured captures as bright as the inside. ``forward`` and ``adjoint`` do not fade.
+        dtype: float32 or float64.
 
     Raises:
         ShapeError, UnitError, ArgumentError: as :class:`LCT`.
 
     The three components are regularised alike at the middle of the volume's depth; where nothing is measured, normals
     are noise. Of all vectors that explain the light these are the shortest, which lean towards the wall: a plate tilted
-    by 17 degrees comes out at 13, one by 34 at 21. Not supported: as of :class:`LCT`; the squared cosine of confocal
-    light, for which the linear one stands.
+    by 17 degrees comes out at 13, one by 34 at 21. Not supported: the same as in :class:`LCT`; the squared cosine of
+    confocal light, for which the linear one stands.
     """
 
     moments = ((0, 1), (1, 0), (0, 0))
@@ -498,8 +504,8 @@ def directional_lct(capture: Capture, **options: Any) -> Tensor:
     """Invert a confocal capture to vectors: :meth:`DirectionalLCT.reconstruct` by its own scan and axis.
 
     Args:
-        capture: confocal, of a flat wall.
-        options: of :class:`DirectionalLCT`.
+        capture: confocal capture of a flat wall.
+        options: options of :class:`DirectionalLCT`.
 
     Returns:
         Vectors (C, 3, Z, Y, X), on the device of the transient.

@@ -187,7 +187,7 @@ def each(function: Callable[[Tensor], Tensor], x: Tensor, dims: int) -> Tensor:
     """Apply a function to every item of the leading dimensions of a tensor, one at a time.
 
     Args:
-        function: of an item.
+        function: function of one item.
         x: (..., *item).
         dims: number of dimensions of an item.
 

@@ -38,8 +38,8 @@ class ConfocalCamera:
     """A video of voxels that laser and sensor are both focused on. Volumes are (..., N, Z, Y, X).
 
     Args:
-        times: (N,) metres of optical path after the focus: at zero it is :class:`DirectLight`, later the other light
-            that came back.
+        times: times of the frames (N,), metres of optical path after the focus: at zero it is :class:`DirectLight`,
+            later the other light that came back.
 
     Raises:
         ShapeError, UnitError: for other shapes, and times that are not finite.
@@ -61,7 +61,8 @@ class TransientCamera:
     Needs a scan with one spot.
 
     Args:
-        times: (N,) lengths of optical path from the spot, metres, so that a voxel lights up at its distance from it.
+        times: times of the frames (N,), lengths of optical path from the spot, metres, so that a voxel lights up at its
+            distance from it.
 
     Raises:
         ShapeError, UnitError: for other shapes, and times that are not finite.
@@ -125,11 +126,11 @@ def phasor_image(
     """Image a capture by phasor fields: :meth:`PhasorField.reconstruct` by its own scan and axis.
 
     Args:
-        capture: with a transient, of a flat, regular grid.
-        points: planes parallel to the wall with its pitch.
-        pulse: of the virtual illumination.
-        camera: None for :class:`DirectLight`.
-        falloff: power of 1 / (r_laser r_sensor).
+        capture: capture with a transient, of a flat, regular grid.
+        points: grid of planes parallel to the wall, with its pitch.
+        pulse: pulse of the virtual illumination.
+        camera: virtual camera, None for :class:`DirectLight`.
+        falloff: power of 1 / (r_laser r_sensor), see :class:`PhasorField`.
 
     Returns:
         Intensity (..., C, *volume), on the device of the transient.
@@ -148,18 +149,18 @@ class PhasorField(ScanOperator):
     times (r_laser r_sensor)^-falloff, summed over all pairs. ``forward`` is its adjoint, a real transient.
 
     Args:
-        scan: confocal, single, or exhaustive with any laser spots, all sensor points on a flat, regular grid, with or
-            without first and last legs.
-        points: planes parallel to the wall with the pitch of the sensor grid, as ``VoxelGrid.before(scan, depths)``
-            makes them; size and place of the planes are free, `at_depths` and larger ``size`` and ``extent`` of the
-            same pitch too.
-        time_axis: of the transients.
-        pulse: of the virtual illumination.
-        camera: :class:`DirectLight` (None), or :class:`ConfocalCamera`, :class:`TransientCamera`, whose fields are
-            videos (..., N, Z, Y, X).
-        falloff: with 1 the field is the Rayleigh-Sommerfeld integral; with 0 its phases alone, which is
-            :class:`FilteredBackprojection` with the same filter. Distances below half a bin fall off as half a bin
-            does.
+        scan: confocal or single scan, or exhaustive scan with any laser spots; all sensor points on a flat, regular
+            grid, with or without first and last legs.
+        points: grid of planes parallel to the wall, with the pitch of the sensor grid, as ``VoxelGrid.before(scan,
+            depths)`` makes them; size and place of the planes are free, `at_depths` and larger ``size`` and ``extent``
+            of the same pitch too.
+        time_axis: time axis of the transients.
+        pulse: pulse of the virtual illumination.
+        camera: virtual camera: :class:`DirectLight` (None), or :class:`ConfocalCamera` or :class:`TransientCamera`,
+            whose fields are videos (..., N, Z, Y, X).
+        falloff: p of a factor (r_laser r_sensor)^-p. With 1 the field is the Rayleigh-Sommerfeld integral; with 0 its
+            phases alone, which is :class:`FilteredBackprojection` with the same filter. Distances below half a bin fall
+            off as half a bin does.
         dtype: float32 or float64.
 
     Raises:

@@ -52,8 +52,8 @@ class TransientOperator(LinearOperator):
     and ``grid`` (without one, they define :attr:`points`), and call ``_set_tables()`` last.
 
     Args:
-        scan: of any kind, or the grid of a flat wall.
-        time_axis: of the transients.
+        scan: scan of any kind, or the grid of a flat wall.
+        time_axis: time axis of the transients.
         dtype: float32 or float64.
 
     Raises:
@@ -116,7 +116,7 @@ class TransientOperator(LinearOperator):
         """Compare a state with the settings of the operator.
 
         Args:
-            state: of :meth:`get_extra_state`.
+            state: state that :meth:`get_extra_state` returned.
 
         Raises:
             ShapeError: for the state of another operator.
@@ -178,11 +178,11 @@ def reconstructed(capture: Capture, kind: Callable[..., Any], *points: Any, who:
     """Reconstruct a capture by an operator for its own scan and axis, on the device of its transient.
 
     Args:
-        capture: with a transient.
+        capture: capture with a transient.
         kind: class of the operator.
-        points: of classes that take some.
+        points: points of the volume, for classes that take some.
         who: begins the message.
-        options: of the class; ``dtype`` is double for captures in double precision, else single, unless given.
+        options: options of the class; ``dtype`` is double for captures in double precision, else single, unless given.
 
     Returns:
         ``reconstruct`` of the capture.
@@ -201,11 +201,11 @@ class ScanOperator(TransientOperator):
     """A linear operator between values at hidden points and transients (..., T, *scan.shape) of a scan of any kind.
 
     Args:
-        scan: of any kind.
+        scan: scan of any kind.
         points: grid, or points (..., 3) in world coordinates, metres; volumes have their leading dimensions. Points
             that carry gradients are taken as they are, detached: operators are differentiable by volumes and transients
             alone.
-        time_axis: of the transients, counted as the scan's ``first_and_last_leg`` says.
+        time_axis: time axis of the transients, counted as the scan's ``first_and_last_leg`` says.
         dtype: float32 or float64.
 
     Raises:
@@ -240,7 +240,7 @@ def chunk_rows(elements: int, device: torch.device) -> int:
 
     Args:
         elements: complex numbers of a row.
-        device: of the operands.
+        device: device of the operands.
     """
     return max(1, (CPU_CHUNK if device.type == "cpu" else GPU_CHUNK) // max(1, elements))
 
@@ -254,7 +254,7 @@ class ConfocalOperator(TransientOperator):
     Args:
         scan: a :class:`PlanarScan`, or a confocal :class:`Scan` on a regular grid of a flat wall that counts lengths
             from the spot to the sensor point (``first_and_last_leg=False``).
-        time_axis: of the transients.
+        time_axis: time axis of the transients.
         dtype: float32 or float64.
 
     Raises:
@@ -331,7 +331,7 @@ class InverseOperator(LinearOperator):
     converted, which leaves the other as it was.
 
     Args:
-        operator: to be inverted.
+        operator: operator that is inverted.
     """
 
     def __init__(self, operator: InvertibleOperator) -> None:

@@ -1,4 +1,4 @@
-"""Grids and what stands on them: points of a flat wall, voxels before it, hidden volumes."""
+"""Grids and the data on them: points of a flat wall, voxels before it, hidden volumes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PlanarScan:
 
     Attributes:
         size: (Y, X) points.
-        pitch: (dy, dx) between them, metres.
+        pitch: distances (dy, dx) between the points, metres.
         first: (3,), the point (0, 0), metres, float64 on the CPU as all vectors.
         along_x, along_y: (3,), unit vectors along rows and columns.
         normal: (3,), unit vector to the hidden side.
@@ -81,7 +81,7 @@ class PlanarScan:
         """Return the grid of a scan's sensor points, with its :func:`hidden_side`.
 
         Args:
-            scan: on a regular grid of a flat wall.
+            scan: scan on a regular grid of a flat wall.
             who: begins the message.
 
         Raises:
@@ -132,8 +132,8 @@ def hidden_side(scan: Scan, normal: Tensor) -> Tensor:
     stand in the wall or on both sides of it, ``normal`` as given.
 
     Args:
-        scan: of any kind.
-        normal: (3,).
+        scan: scan of any kind.
+        normal: unit normal of the wall, (3,).
     """
     if scan.sensor_normals is not None:
         mean = scan.sensor_normals.detach().to("cpu", torch.float64).reshape(-1, 3).mean(0)
@@ -156,9 +156,9 @@ class VoxelGrid:
     Voxel (k, j, i) stands at ``first + j pitch[0] along_y + i pitch[1] along_x + depths[k] normal``.
 
     Args:
-        depths: (Z,) metres, increasing, not necessarily evenly.
+        depths: depths of the planes (Z,), metres, increasing, not necessarily evenly.
         size: (Y, X) voxels of a plane.
-        pitch: (dy, dx) between them, metres.
+        pitch: distances (dy, dx) between the points, metres.
         first: (3,), the voxel (0, 0) of a plane at depth zero, metres.
         along_x, along_y, normal: (3,), unit vectors at right angles.
 
@@ -213,8 +213,8 @@ class VoxelGrid:
         stand; where those stand in the wall or on both sides of it, in the direction of along_x times along_y.
 
         Args:
-            scan: of any kind.
-            depths: (Z,) metres before the wall, increasing.
+            scan: scan of any kind.
+            depths: depths of the planes (Z,), metres before the wall, increasing.
             size: (X, Y) voxels or one number for both, None for as many as sensor points.
             extent: (width, height) of the planes in metres from the outer edges of the voxels, or one number for both,
                 around the middle of the sensor points; None for the area of the sensor points, each with a cell of its
@@ -264,7 +264,7 @@ class VoxelGrid:
 
         Args:
             wall: the grid.
-            depths: (Z,) metres, increasing.
+            depths: depths of the planes (Z,), metres, increasing.
 
         Raises:
             ShapeError, UnitError: as the class.
@@ -314,7 +314,7 @@ class VoxelGrid:
         """Return the grid with other planes.
 
         Args:
-            depths: (Z,) metres, increasing.
+            depths: depths of the planes (Z,), metres, increasing.
 
         Raises:
             ShapeError, UnitError: for other depths.
@@ -415,7 +415,8 @@ class HiddenVolume(TensorRecord):
         values: (..., C, Z, Y, X) real, on the voxels of ``grid``; with ``times`` a film (..., C, N, Z, Y, X).
         grid: the voxels.
         method: name of the method.
-        metadata: settings of the method and the reason for it, plain data; that of a batch is a list under ``batch``.
+        metadata: settings of the method and the reason for choosing it, as plain data; that of a batch is a list under
+            ``batch``.
         times: (N,), finite metres of optical path, None without a film.
         directions: (..., C, 3, Z, Y, X), vectors in world coordinates whose lengths are the values, of methods that
             find normals.

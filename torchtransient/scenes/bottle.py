@@ -110,7 +110,7 @@ def milk_bottle(
         bin_width_opl: width of a bin, metres of optical path.
         spp: samples per pixel.
         max_depth: segments of the longest path.
-        roughness: of the boundary, `alpha` of `roughdielectric`.
+        roughness: roughness of the boundary, `alpha` of `roughdielectric`.
         index: relative index of refraction of the liquid.
         milk: factor of the liquid's scattering.
         anisotropy: mean cosine g.

@@ -36,7 +36,7 @@ def furnace(
     by BSDF sampling alone, which leaves no noise in the image.
 
     Args:
-        radius: metres.
+        radius: radius of the sphere, metres.
         reflectance: albedo of the wall.
         radiance: emitted radiance.
         resolution: pixels of a side.
@@ -84,9 +84,9 @@ def integrating_sphere(
     independent chords. Closed form: `closed_forms.integrating_sphere_radiance`.
 
     Args:
-        radius: metres.
+        radius: radius of the sphere, metres.
         reflectance: albedo of the wall.
-        intensity: of the source, W/sr.
+        intensity: intensity of the source, W/sr.
         resolution: pixels of a side.
         num_bins: bins of the film.
         start_opl: start of the film, metres of optical path.
@@ -128,7 +128,7 @@ def parallel_plates(
 
     Args:
         separation: distance of the plates, metres.
-        reflectance: albedo of both.
+        reflectance: albedo of both plates.
         radiance: emitted radiance.
         half_extent: half a side of the squares, metres. Of a flight's energy at most ``(separation / half_extent)**2``
             leaves through the open sides; arrivals before `half_extent` do not notice the edges.

@@ -39,7 +39,7 @@ def cornell_box(
         spp: samples per pixel.
         max_depth: segments of the longest path.
         mirror: make `large-box` an ideal mirror.
-        glass: make it a smooth dielectric.
+        glass: make `large-box` a smooth dielectric.
         index: index of refraction of the glass.
         sampler: plugin name of the sampler.
 

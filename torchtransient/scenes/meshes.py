@@ -33,7 +33,7 @@ def triangle_mesh(vertices: Any, faces: Any, *, reflectance: Albedo = 0.5, to_wo
     Args:
         vertices: (V, 3), metres.
         faces: (F, 3).
-        reflectance: one albedo, or three of linear sRGB.
+        reflectance: albedo, one number or three of linear sRGB.
         to_world: transform (4, 4).
 
     Raises:
@@ -66,10 +66,10 @@ def plate(width: float, height: float, center: Triple = (0.0, 0.0, 0.0), cells: 
     """Return a rectangle across z that faces -z, of `cells` x `cells` pairs of triangles.
 
     Args:
-        width: metres.
-        height: metres.
-        center: (3,), metres.
-        cells: pairs of triangles along a side.
+        width: width of the rectangle, metres.
+        height: height of the rectangle, metres.
+        center: centre (3,), metres.
+        cells: number of pairs of triangles along a side.
     """
     n = count("cells", cells)
     x = np.linspace(-0.5, 0.5, n + 1) * positive("width", width)
@@ -85,9 +85,9 @@ def ellipsoid(center: Triple, radii: float | Triple, level: int = 3) -> Mesh:
     """Return a closed ellipsoid along the axes: an icosahedron whose triangles are split, all vertices on the surface.
 
     Args:
-        center: (3,), metres.
-        radii: one or (3,), metres.
-        level: times that each triangle is split in four: 20 4^level triangles.
+        center: centre (3,), metres.
+        radii: one radius, or three (3,), metres.
+        level: number of times that each triangle is split in four: 20 4^level triangles.
     """
     a, b = 1.0, (1 + 5**0.5) / 2
     corners = [[-a, b, 0], [a, b, 0], [-a, -b, 0], [a, -b, 0], [0, -a, b], [0, a, b], [0, -a, -b], [0, a, -b],
@@ -104,9 +104,9 @@ def octahedral_ellipsoid(center: Triple, radii: float | Triple, level: int = 2) 
     """Return an :func:`ellipsoid` made of an octahedron: triangles that are less alike, cut in planes of the axes.
 
     Args:
-        center: (3,), metres.
-        radii: one or (3,), metres.
-        level: times that each triangle is split in four: 8 4^level triangles.
+        center: centre (3,), metres.
+        radii: one radius, or three (3,), metres.
+        level: number of times that each triangle is split in four: 8 4^level triangles.
     """
     corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
@@ -121,7 +121,7 @@ def subdivided(mesh: Mesh, times: int = 1) -> Mesh:
 
     Args:
         mesh: vertices and faces.
-        times: repetitions, at most 8.
+        times: number of times to split, at most 8.
     """
     vertices, faces = mesh
     for _ in range(_times("subdivide", times)):
@@ -140,7 +140,7 @@ def sheet(outline: Any, z: float = 0.0) -> Mesh:
 
     Args:
         outline: corners (x, y), (N, 2), against the clock, x to the right and y up; simple, not crossing itself.
-        z: its place, metres.
+        z: z coordinate of the polygon, metres.
     """
     points = np.asarray(outline, dtype=np.float64)
     faces = triangulated(points)[:, ::-1]
@@ -151,9 +151,9 @@ def solid(outline: Any, z: float, thickness: float) -> Mesh:
     """Return the closed body between `sheet` at `z` and the same polygon at `z + thickness`.
 
     Args:
-        outline: as in `sheet`.
-        z: front, metres.
-        thickness: metres.
+        outline: corners (x, y), (N, 2), against the clock, see `sheet`.
+        z: z coordinate of the front, metres.
+        thickness: thickness of the body, metres.
     """
     front, faces = sheet(outline, z)
     n = len(front)

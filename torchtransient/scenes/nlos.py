@@ -57,9 +57,9 @@ def relay_wall(width: float = 2.0, height: float = 2.0, albedo: Albedo = 0.5) ->
     """Return the relay wall: a diffuse rectangle around the origin that faces +z.
 
     Args:
-        width: metres.
-        height: metres.
-        albedo: one number or a linear sRGB triple.
+        width: width of the wall, metres.
+        height: height of the body, metres.
+        albedo: albedo, one number or a linear sRGB triple.
     """
     half = [positive("width", width) / 2, positive("height", height) / 2, 1.0]
     return {"type": "rectangle", "to_world": scale(half), "bsdf": diffuse(albedo)}
@@ -71,8 +71,8 @@ def nlos_z(*, size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9, thick
     Args:
         size: height and width, metres.
         depth: distance from the wall, metres.
-        albedo: one number or a linear sRGB triple.
-        thickness: metres, 0 for a sheet.
+        albedo: albedo, one number or a linear sRGB triple.
+        thickness: thickness of the letter, metres, 0 for a sheet.
     """
     return nlos_letter("Z", size=size, depth=depth, albedo=albedo, thickness=thickness)
 
@@ -89,12 +89,13 @@ def nlos_letter(
     """Return a block letter as the mesh `letter`, the side that faces the wall at z = `depth`.
 
     Args:
-        letter: one of `scenes.nlos.OUTLINES`.
+        letter: name of the letter, one of `scenes.nlos.OUTLINES`.
         size: height and width, metres.
         depth: distance from the wall, metres.
-        albedo: one number or a linear sRGB triple.
-        thickness: 0 is a sheet, whose back is black; more is a closed body, which reaches to `depth + thickness`.
-        subdivide: splits of every triangle in four, for fits of its vertices.
+        albedo: albedo, one number or a linear sRGB triple.
+        thickness: thickness of the letter, metres. 0 is a sheet, whose back is black; more is a closed body, which
+            reaches to `depth + thickness`.
+        subdivide: number of times that every triangle is split in four, for fits of its vertices.
 
     Raises:
         ArgumentError: for other letters.
@@ -110,7 +111,7 @@ def outline(letter: str, size: float = 1.0) -> NDArray[np.float64]:
     """Return the corners of a letter around the origin, against the clock.
 
     Args:
-        letter: one of `OUTLINES`, which have no holes.
+        letter: name of the letter, one of `OUTLINES`, which have no holes.
         size: height and width, metres.
 
     Returns:
@@ -132,10 +133,10 @@ def nlos_plates(
 
     Args:
         size: side of the front plate, metres.
-        depth: its distance from the wall, metres.
-        gap: distance of the back plate from it, metres.
-        albedo: one number or a linear sRGB triple.
-        second_size: side of the back plate, None for the same.
+        depth: distance of the front plate from the wall, metres.
+        gap: distance between the two plates, metres.
+        albedo: albedo, one number or a linear sRGB triple.
+        second_size: side of the back plate, metres, None for that of the front plate.
     """
     z = positive("depth", depth)
     far = positive("second_size", size if second_size is None else second_size)
@@ -155,7 +156,7 @@ def nlos_corner(size: float = 1.0, depth: float = 1.0, albedo: Albedo = 0.9) -> 
     Args:
         size: width and height, metres.
         depth: distance from the wall, metres.
-        albedo: one number or a linear sRGB triple.
+        albedo: albedo, one number or a linear sRGB triple.
     """
     s, z = positive("size", size), positive("depth", depth)
     y = np.array([-s / 2, s / 2])
@@ -190,8 +191,8 @@ def mannequin(height: float = 1.45, level: int = 3) -> Mesh:
     towards -z.
 
     Args:
-        height: from the soles to the top of the head, metres.
-        level: fineness; 120 4^level triangles.
+        height: height from the soles to the top of the head, metres.
+        level: number of times that triangles are split; 120 4^level triangles in all.
     """
     factor = positive("height", height) / 1.41
     parts = [ellipsoid(factor * np.array(center), factor * np.array(radii), level) for center, radii in _BODY]
@@ -205,11 +206,11 @@ def nlos_mannequin(
     """Return a standing `mannequin` as the mesh `body`.
 
     Args:
-        depth: distance of its axis from the wall, metres.
-        height: metres.
-        albedo: one number or a linear sRGB triple.
-        level: fineness of the mesh.
-        x: distance of its axis from the middle, metres.
+        depth: distance of the body's axis from the wall, metres.
+        height: height of the body, metres.
+        albedo: albedo, one number or a linear sRGB triple.
+        level: number of times that the triangles of the mesh are split.
+        x: x coordinate of the body's axis, metres.
 
     Raises:
         SceneError: if the outstretched arm would reach through the wall.
@@ -276,12 +277,12 @@ def nlos_room(
     its size.
 
     Args:
-        width: metres, at least 2.4.
-        height: metres, at least 2.2.
-        depth: metres, at least 2.4.
-        albedo: of everything, None for those of `COLOURS`.
+        width: width of the room, metres, at least 2.4.
+        height: height of the room, metres, at least 2.2.
+        depth: depth of the room, metres, at least 2.4.
+        albedo: albedo of everything, None for those of `COLOURS`.
         person: False leaves the room empty, as a background to subtract.
-        level: fineness of the person's mesh.
+        level: number of times that the triangles of the person are split.
 
     Raises:
         UnitError: for smaller rooms.

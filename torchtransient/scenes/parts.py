@@ -43,7 +43,7 @@ def perspective(to_world: Matrix, fov: float, film: SceneDict, spp: int, sampler
     """Return a pinhole camera.
 
     Args:
-        to_world: its pose (4, 4).
+        to_world: pose of the camera (4, 4).
         fov: angle of view along the smaller side of the film, degrees.
         film: dictionary of the film.
         spp: samples per pixel.
@@ -90,7 +90,7 @@ def diffuse(reflectance: float | Numbers) -> SceneDict:
     """Return a Lambertian BSDF.
 
     Args:
-        reflectance: one albedo for all wavelengths, or three of linear sRGB.
+        reflectance: albedo, one for all wavelengths or three of linear sRGB.
 
     Raises:
         UnitError: outside of [0, 1].

@@ -31,7 +31,7 @@ def translate(offset: Triple) -> Matrix:
     """Return a shift (4, 4).
 
     Args:
-        offset: (3,), metres.
+        offset: offset (3,), metres.
 
     Raises:
         ShapeError: unless it has three numbers.
@@ -45,7 +45,7 @@ def scale(factor: float | Triple) -> Matrix:
     """Return a scaling (4, 4) about the origin.
 
     Args:
-        factor: one number, or one per axis (3,).
+        factor: factor of all axes, or one per axis (3,).
 
     Raises:
         SceneError: for a zero factor, which has no inverse: Mitsuba inverts every transform.
@@ -61,8 +61,8 @@ def rotate(axis: Triple, angle_deg: float) -> Matrix:
     """Return a right-handed rotation (4, 4) about an axis through the origin, by Rodrigues' formula.
 
     Args:
-        axis: (3,), any length.
-        angle_deg: degrees.
+        axis: axis of rotation (3,), of any length.
+        angle_deg: angle of rotation, degrees.
 
     Raises:
         SceneError: for a zero axis.
@@ -85,9 +85,9 @@ def look_at(origin: Triple, target: Triple, up: Triple = (0.0, 1.0, 0.0)) -> Mat
     Local +x points to the *left* of the view, as Mitsuba's cameras expect.
 
     Args:
-        origin: (3,), metres.
-        target: (3,), metres.
-        up: (3,), any length.
+        origin: place of the viewer (3,), metres.
+        target: point to look at (3,), metres.
+        up: upward direction (3,), of any length.
 
     Raises:
         SceneError: if origin and target coincide or `up` is parallel to the view.

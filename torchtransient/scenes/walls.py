@@ -34,7 +34,7 @@ def moving_wall(
         side_panel: add a fixed diffuse panel beside it, which brings several bounces.
         panel_reflectance: albedo of the panel.
         wall_reflectance: albedo of the wall.
-        intensity: of the light, W/sr.
+        intensity: intensity of the light, W/sr.
         resolution: pixels of a side.
         num_bins: bins of the film.
         start_opl: start of the film, metres of optical path.
@@ -79,9 +79,9 @@ def light_over_plane(
     `closed_forms.light_over_plane`.
 
     Args:
-        height: metres.
+        height: height of meter and light over the plane, metres.
         reflectance: albedo of the plane.
-        intensity: of the light, W/sr.
+        intensity: intensity of the light, W/sr.
         half_extent: half a side of the plane, metres.
         num_bins: bins of the film.
         start_opl: start of the film, metres of optical path.
@@ -131,8 +131,8 @@ def etalon_slab(
     view of 0.1 degrees. Closed form: `closed_forms.etalon_slab`.
 
     Args:
-        thickness: of the slab, metres.
-        index: of refraction.
+        thickness: thickness of the slab, metres.
+        index: index of refraction of the glass.
         light: "behind", a black emitting square at z = -1: the camera sees the transmitted orders, after 2 m of air; or
             "front", at z = thickness + 2, behind the camera: it sees the reflected orders, after 3 m of air.
         radiance: emitted radiance.
@@ -191,10 +191,10 @@ def glass_slab_before_wall(
     Fresnel weight and optical path length of the camera's light. Key for the gradient: the slab's `eta`.
 
     Args:
-        index: of refraction.
+        index: index of refraction of the glass.
         tilt_deg: turn of the slab, degrees.
         wall_reflectance: albedo of the wall.
-        intensity: of the light, W/sr.
+        intensity: intensity of the light, W/sr.
         resolution: pixels of a side.
         num_bins: bins of the film.
         start_opl: start of the film, metres of optical path.

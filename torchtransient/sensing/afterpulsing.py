@@ -62,7 +62,7 @@ def exponential_shares(tau_bins: Tensor, dead_bins: float, first: int, number: i
         tau_bins: time constants (K,) in bins.
         dead_bins: dead time in bins.
         first: first bin after the detection.
-        number: bins.
+        number: number of bins.
 
     Returns:
         (K, number).
@@ -160,7 +160,7 @@ class AfterpulseDelays(PhysicalModule):
         """Draw delays beyond the dead time.
 
         Args:
-            number: of delays.
+            number: number of delays.
             dead_time_s: dead time in seconds.
             generator: source of randomness.
 
@@ -176,7 +176,7 @@ class AfterpulseDelays(PhysicalModule):
             dead_time_s: dead time in seconds.
             bin_width_s: bin width in seconds.
             first: first bin.
-            number: of bins.
+            number: number of bins.
 
         Returns:
             (number,) float64.
@@ -218,7 +218,7 @@ class PowerLawDelays(AfterpulseDelays):
     time above zero, and its `probability` counts what comes after it.
 
     Args:
-        exponent: in (0, 10].
+        exponent: exponent of the law, in (0, 10].
         longest_s: longest delay in seconds.
         learnable: make `log_exponent` a parameter.
 

@@ -239,7 +239,7 @@ class ClockedTrain:
 
 @dataclass(frozen=True)
 class FreeRunningTrain:
-    """Free-running detector in its stationary state; methods as of `ClockedTrain`."""
+    """Free-running detector in its stationary state; methods as in `ClockedTrain`."""
 
     whole: int
     part: Tensor
@@ -362,7 +362,7 @@ def clocked_hazard(
     Args:
         rate: (P, T) photons per cycle and bin, float64.
         dead_bins: dead time in bins, scalar float64.
-        gate: (T,), multiplies photons and carriers, or None.
+        gate: (T,) factor of photons and carriers, or None.
         seen: (K,) carriers of a detection.
         tau: (K,) mean delays beyond the dead time, in bins.
         earlier: function of detections and rows, giving the carriers of other cycles.
@@ -450,7 +450,7 @@ class AfterpulsingSPAD(WrappedDetector):
 
     Args:
         detector: SynchronousSPAD or FreeRunningSPAD.
-        afterpulsing: of the detector's bins and dead time.
+        afterpulsing: `Afterpulsing` made for the detector's bins and dead time.
         grad: gradient policy; None: that of the detector.
 
     Raises:

@@ -32,7 +32,7 @@ def no_arrays(value: Any) -> Any:
     """Return a value, or a tensor of an array with dimensions.
 
     Args:
-        value: anything.
+        value: any object.
     """
     return tensor_of(value) if isinstance(value, np.ndarray) and value.ndim else value
 
@@ -56,7 +56,7 @@ def refuse_cut_off(value: object, name: str, where: str) -> None:
     """Refuse a tensor that requires a gradient where its value alone is used.
 
     Args:
-        value: anything.
+        value: any object.
         name: name of the argument.
         where: name of the caller, for errors.
 
@@ -119,7 +119,7 @@ def check_kept(module: nn.Module, given: Mapping[str, Any], where: str) -> None:
 
     Args:
         module: the module that was made.
-        given: its arguments by their names.
+        given: arguments of the class by their names.
         where: name of the class, for errors.
 
     Raises:
@@ -193,7 +193,7 @@ def check_tensor(x: object, where: str) -> Tensor:
     """Return `x` if it is a tensor.
 
     Args:
-        x: anything; a renderer's output is answered with what to do.
+        x: any object; a renderer's output is answered with what to do.
         where: name of the caller, for errors.
 
     Raises:
@@ -279,7 +279,7 @@ def check_transient(x: Tensor, where: str) -> Tensor:
     """Return `x` if it is a floating tensor (..., C, T, H, W).
 
     Args:
-        x: anything.
+        x: any object.
         where: name of the caller, for errors.
 
     Raises:
@@ -304,7 +304,7 @@ def check_bins(x: Tensor, where: str) -> Tensor:
     """Return `x` if it is a floating tensor (..., C, T, H, W) of one bin or more.
 
     Args:
-        x: anything.
+        x: any object.
         where: name of the caller, for errors.
 
     Raises:
@@ -400,7 +400,7 @@ def check_choice(value: str, choices: object, name: str, where: str) -> None:
     """Check that a value is one of the strings of a Literal type.
 
     Args:
-        value: anything.
+        value: any object.
         choices: the Literal type.
         name: name of the argument.
         where: name of the caller, for errors.
@@ -492,7 +492,7 @@ def check_time_axis(axis: object, where: str) -> TimeAxis:
     """Return `axis` if it is a TimeAxis.
 
     Args:
-        axis: anything.
+        axis: any object.
         where: name of the caller, for errors.
 
     Raises:
@@ -510,7 +510,7 @@ def check_generator(generator: object, where: str) -> None:
     """Check that a generator is one, or None.
 
     Args:
-        generator: anything; a seed for instance.
+        generator: any object; a seed for instance.
         where: name of the caller, for errors.
 
     Raises:

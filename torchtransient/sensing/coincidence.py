@@ -64,9 +64,9 @@ class Trains:
     """SPADs alike in each of P pixels.
 
     Attributes:
-        rate: (P, T) float64 of one of them per period and bin.
+        rate: rate of one SPAD per period and bin, (P, T) float64.
         dead_bins: dead time in bins, infinite for one detection per cycle.
-        number: SPADs.
+        number: number of SPADs.
     """
 
     rate: Tensor
@@ -97,9 +97,9 @@ def draw_coincidences(
 
     Args:
         groups: SPADs of equal shares.
-        cycles: periods.
-        coincidence: number of detections.
-        window: in bins.
+        cycles: number of periods.
+        coincidence: number of detections that make a coincidence.
+        window: length of the window in bins.
         free: trains go on over periods, and lines stay up from one to the next.
         generator: source of randomness.
         seen: records of the groups that detections are added to, or None.
@@ -258,9 +258,9 @@ class _Group:
     """SPADs of an equal share.
 
     Attributes:
-        one: detections (..., T, H, W) of each per cycle and bin.
+        one: detections of each SPAD per cycle and bin, (..., T, H, W).
         rate: rate of SPADs that detect once per cycle; None where detections are spread evenly over a bin.
-        number: SPADs.
+        number: number of SPADs.
     """
 
     one: Tensor
@@ -325,12 +325,12 @@ class CoincidencePixel(RandomSensor):
     with at most one coincidence per cycle, and of bins taken as independent.
 
     Args:
-        detector: one of the SPADs, as of `MacroPixel`.
+        detector: one of the SPADs, see `MacroPixel`.
         spads: number of SPADs.
-        coincidence: detections of a coincidence.
+        coincidence: number of detections that make a coincidence.
         window_s: duration of a line in seconds; at most the dead time, so that a line goes up once in a window, and at
             most the window of bins.
-        weights: shares of the light, as of `MacroPixel`.
+        weights: shares of the light, see `MacroPixel`.
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
         grad: gradient policy.

@@ -37,7 +37,7 @@ class MeasuredResponse(Response):
     Args:
         counts: (T,), T >= 2, finite, >= 0.
         bin_width_s: bin width in seconds.
-        delay_s: in seconds.
+        delay_s: delay in seconds.
         align: "center_of_mass" puts the mean delay at `delay_s` (the highest bin would shift an asymmetric response by
             about its tail); "start" the start of the first bin.
         floor: background taken off every bin: True for the median of all bins, False for nothing, or a number of
@@ -118,7 +118,7 @@ class ComposedResponse(Response):
     of (bin width/9)^2/6 for each; with `within_bin="center"` half of that.
 
     Args:
-        responses: one or more.
+        responses: one or more responses, whose delays add up.
     """
 
     def __init__(self, responses: Sequence[Response]) -> None:
@@ -196,8 +196,8 @@ def counts_before(counts: Tensor, bin_width_s: float, start_s: float | Tensor, t
     Args:
         counts: (T,).
         bin_width_s: width of the bins.
-        start_s: where the first bin begins.
-        time_s: any shape, which the result has.
+        start_s: start of the first bin in seconds.
+        time_s: times in seconds, of any shape, which the result has.
     """
     # from before the first bin to each time, as one running sum
     start = torch.as_tensor(start_s - bin_width_s, dtype=torch.float64, device=time_s.device)

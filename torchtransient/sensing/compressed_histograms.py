@@ -75,8 +75,8 @@ def fourier_codes(num_bins: int, num_codes: int) -> Tensor:
     single-photon 3D cameras, CVPR 2022). The constant is left out: it does not see time.
 
     Args:
-        num_bins: T.
-        num_codes: K, at most T - 1.
+        num_bins: number of bins T.
+        num_codes: number of codes K, at most T - 1.
 
     Returns:
         (K, T) float64.
@@ -104,8 +104,8 @@ class CodedHistogram(Sensor):
     Linear: shot noise belongs before it.
 
     Args:
-        codes: (K, T), any real numbers.
-        learnable: make them a parameter.
+        codes: codes (K, T), any real numbers.
+        learnable: make the codes a parameter.
 
     Raises:
         ShapeError: for other shapes.

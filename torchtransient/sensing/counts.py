@@ -29,7 +29,7 @@ def poisson(mean: Tensor, generator: torch.Generator | None = None) -> Tensor:
     Float32 above 2^24 is drawn in float64, then rounded to the dtype of `mean`.
 
     Args:
-        mean: any shape, finite, >= 0; half precision gives float32.
+        mean: tensor of any shape, finite, >= 0; half precision gives float32.
         generator: source of randomness.
 
     Returns:
@@ -54,8 +54,8 @@ def poisson_log_prob(counts: Tensor, mean: Tensor) -> Tensor:
     """Log-probability of counts under Poisson means, elementwise; finite gradients at mean 0 with count 0.
 
     Args:
-        counts: any shape.
-        mean: of a shape that broadcasts.
+        counts: tensor of any shape.
+        mean: Poisson means, in a shape that broadcasts.
 
     Returns:
         Broadcast shape; -inf for a count above 0 where the mean is 0.

@@ -35,11 +35,11 @@ class CramerRaoBound(TensorRecord):
     """Least standard deviations of unbiased estimates, of the shape of the pixels; infinite where nothing is known.
 
     Attributes:
-        distance_m: metres one way.
-        delay_s: the same as a time there and back.
-        signal: in the unit it was given in.
-        background: in the unit it was given in.
-        covariance: (..., 3, 3) of distance, signal and background.
+        distance_m: standard deviation of the distance, metres one way.
+        delay_s: standard deviation of the delay there and back, seconds.
+        signal: standard deviation of the signal, in the unit it was given in.
+        background: standard deviation of the background, in the unit it was given in.
+        covariance: covariance of distance, signal and background, (..., 3, 3).
     """
 
     distance_m: Tensor
@@ -66,9 +66,9 @@ def return_rates(
     Args:
         response: impulse response.
         axis: axis of the histogram.
-        distance_m: metres one way.
+        distance_m: distance one way, metres.
         signal: expected detections, of the exposure or of a cycle.
-        background: the same in each bin.
+        background: expected detections of the background in each bin.
 
     Returns:
         (..., T) float64. ``.movedim(-1, -3)`` of pixels (..., C, H, W) is what sensors take.
@@ -100,9 +100,9 @@ def crlb(
     Args:
         response: impulse response.
         axis: axis of the histogram.
-        distance_m: metres one way.
+        distance_m: distance one way, metres.
         signal: expected detections.
-        background: the same in each bin.
+        background: expected detections of the background in each bin.
         cycles: None for Poisson counts; signal and background are expected detections of the whole exposure. N for the
             first photon of each of N cycles, with pile-up; they are rates per cycle of a detector that is never dead,
             as `first_photon_nll` and `SynchronousSPAD` take them.

@@ -30,8 +30,8 @@ def add_crosstalk(counts: Tensor, probability: Tensor | float, diagonal: Tensor 
 
     Args:
         counts: (..., C, T, H, W).
-        probability: of each of the 4 neighbours across an edge.
-        diagonal: of each of the 4 neighbours across a corner.
+        probability: probability of each of the 4 neighbours across an edge.
+        diagonal: probability of each of the 4 neighbours across a corner.
 
     Returns:
         Shape and dtype of `counts`.
@@ -62,7 +62,7 @@ class Crosstalk(AddedCounts):
     """Crosstalk between pixels, on counts, behind the SPAD; see `add_crosstalk`.
 
     Args:
-        probability: of each neighbour across an edge, in (0, 0.25].
+        probability: probability of each neighbour across an edge, in (0, 0.25].
         diagonal_ratio: probability across a corner over that across an edge, in [0, 1].
         learnable: make `logit_probability` a parameter.
         grad: gradient policy.

@@ -25,7 +25,7 @@ class SensorPhysics(Physics):  # type: ignore[misc]
 
     Args:
         sensor: sensor or chain, of light (B, C, T, H, W).
-        keywords: of `Physics`.
+        keywords: arguments of `Physics`.
     """
 
     def __init__(self, sensor: Sensor, **keywords: Any) -> None:
@@ -61,7 +61,7 @@ class LinearSensorPhysics(LinearPhysics):  # type: ignore[misc]
     Args:
         sensor: sensor or chain.
         img_size: (C, T, H, W) of the light.
-        keywords: of `LinearPhysics`.
+        keywords: arguments of `LinearPhysics`.
 
     Raises:
         ShapeError: for fewer dimensions.

@@ -57,9 +57,9 @@ def log_matched_filter(
     Args:
         histogram: (..., C, T, H, W).
         kernel: shares (K,) of the impulse response (`Response.kernel`).
-        first: lag of its first entry in bins.
+        first: lag of the kernel's first entry in bins.
         signal_to_background: detections of the signal over detections of the background in one bin.
-        boundary: as of `convolve_time`.
+        boundary: treatment of the window's ends, "zero" or "periodic", see `convolve_time`.
 
     Returns:
         (..., C, T, H, W).
@@ -114,7 +114,7 @@ def _parabola(scores: Tensor, index: Tensor) -> Tensor:
 def center_of_mass(
     histogram: Tensor, *, background: Tensor | float = 0.0, half_width_bins: int | None = None
 ) -> Tensor:
-    """Mean arrival position of what exceeds the background.
+    """Mean arrival position of the counts above the background.
 
     Negative differences count as they are, which keeps the mean unbiased, as long as their sum S is more than its noise
     N, ``N^2 = sum excess^2``; entries that are all positive always have that much. A sum of less does not say where
@@ -125,7 +125,7 @@ def center_of_mass(
         histogram: (..., C, T, H, W).
         background: counts per bin, a number or (..., C, H, W), subtracted before; a background left in pulls the
             result to the middle of the window. Where most bins hold nothing else, it is their median.
-        half_width_bins: only bins within that distance of the largest one count; None for all.
+        half_width_bins: distance in bins from the largest one within which bins count; None for all.
 
     Returns:
         (..., C, H, W) in bins, differentiable in histogram and background; where nothing is left the middle of the
@@ -169,7 +169,7 @@ def soft_argmax(scores: Tensor, temperature: float = 1.0) -> Tensor:
 
     Args:
         scores: (..., C, T, H, W).
-        temperature: above 0, in the unit of the scores.
+        temperature: temperature of the softmax, above 0, in the unit of the scores.
 
     Returns:
         (..., C, H, W) in bins.
@@ -186,9 +186,9 @@ class Returns(TensorRecord):
     """Returns of a pixel in order of time; entries that are not valid come last and hold zero.
 
     Attributes:
-        position: (..., C, R, H, W) in bins.
-        strength: entry there, the same shape.
-        valid: mask, the same shape.
+        position: position of the returns in bins, (..., C, R, H, W).
+        strength: entry at the position, of the same shape.
+        valid: mask of the returns that were found, of the same shape.
     """
 
     position: Tensor
@@ -207,7 +207,7 @@ def first_return(histogram: Tensor, threshold: Tensor | float) -> Returns:
 
     Args:
         histogram: (..., C, T, H, W).
-        threshold: counts, a number or (..., C, H, W).
+        threshold: counts that a return reaches, a number or (..., C, H, W).
     """
     check_bins(histogram, "first_return")
     level = _per_pixel(threshold, histogram, "first_return", "threshold")
@@ -234,9 +234,9 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
 
     Args:
         scores: (..., C, T, H, W).
-        max_returns: R.
-        threshold: least entry.
-        min_separation_bins: maxima closer than that to a stronger one are left out.
+        max_returns: largest number of returns R.
+        threshold: least score of a return.
+        min_separation_bins: least distance in bins; maxima closer than that to a stronger one are left out.
     """
     me = "multi_return"
     check_bins(scores, me)
@@ -273,7 +273,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     returned in the dtype given: float32 resolves 4e-6 m at 100 m.
 
     Args:
-        position: any shape, in bins.
+        position: position in bins, any shape.
         axis: axis of the histogram.
 
     Returns:
@@ -290,8 +290,8 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     picture is ``((W - 1) / 2, (H - 1) / 2)``.
 
     Args:
-        distance_m: (..., H, W) in metres, Euclidean, as times of flight are; not depths along z.
-        intrinsics: (3, 3), or (B, 3, 3) for distances (B, H, W).
+        distance_m: distances (..., H, W) in metres, Euclidean, as times of flight are; not depths along z.
+        intrinsics: camera matrix (3, 3), or (B, 3, 3) for distances (B, H, W).
 
     Returns:
         (..., H, W, 3) in metres.

@@ -123,12 +123,12 @@ class Device:
     """Named sensor: its stages and the sources of its numbers. Plain data: equal when all of it is.
 
     Attributes:
-        name: of the device.
-        description: a sentence.
-        sources: one line each, with "assumed:" in front of numbers that no source gives.
+        name: name of the device.
+        description: description in one sentence.
+        sources: sources of the numbers, one line each, with "assumed:" in front of numbers that no source gives.
         stages: dictionaries with a kind, see the top of this file.
-        bin_width_s: of the records, for `axis`; None without bins.
-        num_bins: of the records; None without bins.
+        bin_width_s: bin width of the records in seconds, for `axis`; None without bins.
+        num_bins: number of bins of the records; None without bins.
 
     Raises:
         StorageError: for sources or stages that are no lists, and for a stage that is no such dictionary.
@@ -193,8 +193,8 @@ class Device:
         """Make the same device with other arguments of one stage.
 
         Args:
-            stage: its number, or its kind where that is there once; a kind may be that of a part, the `SynchronousSPAD`
-                of a `MacroPixel` for instance.
+            stage: number of the stage, or its kind if no other stage has that kind; a part of a stage has a kind too,
+                such as the `SynchronousSPAD` of a `MacroPixel`.
             arguments: new arguments.
 
         Raises:

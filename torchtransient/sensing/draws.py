@@ -66,7 +66,7 @@ def check_rates(rate: Tensor, where: str) -> Tensor:
     negative light. Skipped where values cannot be read (`floating.holds`).
 
     Args:
-        rate: any shape.
+        rate: tensor of any shape.
         where: name of the caller, for errors.
 
     Raises:
@@ -334,7 +334,7 @@ def binomial_table(probability: float, *, small: bool = False) -> BinomialTables
     """Make the table of binomial numbers of one probability.
 
     Args:
-        probability: in [0, 1/2].
+        probability: probability of a success, in [0, 1/2].
         small: a table that takes less time to make, for fewer entries.
     """
     most = _RARE_TRIALS if probability <= _RARE and not small else _FEW_TRIALS
@@ -354,7 +354,7 @@ def draw_lower_share(trials: Tensor, share: Tensor, generator: torch.Generator |
 
     Args:
         trials: (K,) int32.
-        share: (K,) in [0, 1/2].
+        share: probabilities (K,) in [0, 1/2].
         generator: source of randomness.
 
     Returns:
@@ -395,7 +395,7 @@ def thin(counts: Tensor, probability: Tensor | float, generator: torch.Generator
     """Draw how many of `counts` pass, each with `probability`, as a list of the few entries that have any.
 
     Args:
-        counts: any shape, float32 or float64, integers >= 0.
+        counts: tensor of any shape, float32 or float64, integers >= 0.
         probability: one number, or one for each entry, in [0, 1].
         generator: source of randomness.
 
@@ -422,8 +422,8 @@ def add_passing(counts: Tensor, probability: float, into: Tensor, generator: tor
 
     Args:
         counts: float32 or float64, integers >= 0, some 1e5 entries.
-        probability: in [0, 1/2].
-        into: shape and dtype of `counts`, contiguous; changed in place.
+        probability: probability of passing, in [0, 1/2].
+        into: tensor in the shape and dtype of `counts`, contiguous; changed in place.
         generator: source of randomness.
     """
     if counts.device.type == "cpu" and counts.numel() >= _WORTH_ONE_TABLE:
@@ -549,8 +549,8 @@ def halve(counts: Tensor, share: Tensor, generator: torch.Generator | None = Non
     small missing probability. Counts above 127, few draws and other devices than the CPU take torch.binomial.
 
     Args:
-        counts: any shape, float32 or float64, integers >= 0.
-        share: shape and dtype of `counts`, in [0, 1].
+        counts: tensor of any shape, float32 or float64, integers >= 0.
+        share: probability, in the shape and dtype of `counts`, in [0, 1].
         generator: source of randomness.
 
     Returns:

@@ -42,8 +42,8 @@ def ktc_noise(capacitance_f: float, temperature_k: float = 300.0) -> float:
     """Reset noise of a sense node, ``sqrt(k T C) / q``; 10 fF at 300 K: 40.2.
 
     Args:
-        capacitance_f: in farads.
-        temperature_k: in kelvins.
+        capacitance_f: capacitance in farads.
+        temperature_k: temperature in kelvins.
 
     Returns:
         rms electrons.
@@ -63,8 +63,8 @@ def clipped_normal_mean(mean: Tensor, variance: Tensor, low: float = -math.inf, 
     the result is off by at most 0.004, and only within 0.03 of a limit.
 
     Args:
-        mean: any shape.
-        variance: of a shape that broadcasts.
+        mean: tensor of any shape.
+        variance: variance, in a shape that broadcasts.
         low: lower limit.
         high: upper limit.
     """
@@ -81,8 +81,8 @@ def clipped_normal_variance(mean: Tensor, variance: Tensor, high: float) -> Tens
     """Variance of ``min(X, high)`` for a normal X: the variance far below the limit, 0 far above.
 
     Args:
-        mean: any shape.
-        variance: of a shape that broadcasts.
+        mean: tensor of any shape.
+        variance: variance, in a shape that broadcasts.
         high: upper limit.
     """
     variance = variance.clamp_min(0)
@@ -101,7 +101,7 @@ def fixed_pattern(
     For ``gain_map`` (center 1, spread 0.5 to 2 %) and ``offset_map_e`` of `PixelElectronics`.
 
     Args:
-        shape: of the pattern.
+        shape: shape of the pattern.
         spread: standard deviation.
         center: mean.
         generator: source of randomness.
@@ -128,18 +128,19 @@ class PixelElectronics(RandomSensor):
 
     Args:
         shot_noise: False if the input is a charge that an earlier stage has drawn.
-        full_well_e: in electrons, or None.
-        read_noise_e: rms electrons.
-        ktc_noise_e: rms electrons.
-        excess_noise: F^2 >= 1 of an intensifier (2 is an exponential pulse height), drawn as normal gain noise.
-        dark_e: dark electrons of *one* number of the input: of one tap in one exposure, one gate.
+        full_well_e: full well in electrons, None for no limit.
+        read_noise_e: rms read noise in electrons.
+        ktc_noise_e: rms reset noise in electrons, see `ktc_noise`.
+        excess_noise: excess noise factor F^2 >= 1 of an intensifier (2 is an exponential pulse height), drawn as normal
+            gain noise.
+        dark_e: dark electrons of *one* element of the input: of one tap in one exposure, or of one gate.
         gain_e_per_dn: electrons per number of the converter, with ``bits``; None without one.
-        bits: of the converter.
+        bits: bits of the converter, None without one.
         signed: codes in two's complement, for the differences of two taps, which a converter without room below zero
             would clip.
-        black_level_dn: number of no charge.
-        gain_map: broadcasts to the input: a buffer, or learnt as an `nn.Parameter`.
-        offset_map_e: the same, in electrons.
+        black_level_dn: number of the converter without charge.
+        gain_map: gain of every pixel, tensor that broadcasts to the input: a buffer, or learnt as an `nn.Parameter`.
+        offset_map_e: offset of every pixel in electrons, a tensor of the same kind.
         grad: gradient policy.
 
     Raises:

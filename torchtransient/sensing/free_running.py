@@ -79,7 +79,7 @@ def state_image(rate: Tensor, dead_bins: Tensor | float) -> FreeRunningState:
     """Stationary state for rates, in the same layout.
 
     Args:
-        rate: per period and bin, (..., T, H, W).
+        rate: rate per period and bin, (..., T, H, W).
         dead_bins: dead time in bins.
     """
     if rate.numel() == 0:
@@ -141,7 +141,7 @@ def paralyzable_histogram(rate: Tensor, dead_bins: Tensor | float) -> Tensor:
     Computed in float64; differentiable in both arguments.
 
     Args:
-        rate: per period and bin, (..., C, T, H, W), T bins being one period.
+        rate: rate per period and bin, (..., C, T, H, W), T bins being one period.
         dead_bins: dead time in bins, >= 0, also longer than a period; a number or scalar tensor.
 
     Returns:
@@ -198,7 +198,7 @@ class FreeRunningSPAD(RandomSensor):
 
     Args:
         cycles: laser periods.
-        dead_time_s: at least one bin ("paralyzable": any), also longer than the period.
+        dead_time_s: dead time in seconds, at least one bin ("paralyzable": any), also longer than the period.
         axis: time axis, or
         bin_width_s: bin width in seconds.
         kind: "non_paralyzable" or "paralyzable".

@@ -31,8 +31,8 @@ def gate_profiles(
 ) -> Tensor:
     """Mean transmission of every gate over every bin, between ``leakage`` and 1.
 
-    Differentiable in delays and widths. A gate narrower than its edges does not open fully, and what the formula has
-    below zero before it is zero.
+    Differentiable in delays and widths. A gate narrower than its edges does not open fully, and where the formula is
+    negative before it, the transmission is zero.
 
     Args:
         delays_s: middle of the opening edge, counted from the emission of the light, (G,), in seconds.
@@ -80,13 +80,13 @@ class GatedIntegration(Sensor):
     Shot noise, intensifier and read noise follow in `PixelElectronics`.
 
     Args:
-        delays_s: of the G gates, in seconds.
-        widths_s: one for all or one each, in seconds.
+        delays_s: delays of the G gates, in seconds.
+        widths_s: width of all gates, or one for each, in seconds.
         axis: axis of the light.
         rise_s: opening edge from 10 % to 90 %, in seconds.
-        fall_s: closing edge; None as the opening one.
+        fall_s: closing edge from 90 % to 10 %, in seconds; None: the same as `rise_s`.
         leakage: transmission of a closed gate; 1e-7 and less of an intensifier, 1e-3 of a shuttered CMOS pixel.
-        electrons_per_unit: electrons of all exposures for light of one.
+        electrons_per_unit: electrons of all exposures for light of 1.
         learnable: make delays and widths parameters, `delay_ps` and `log_width_s`.
 
     Raises:

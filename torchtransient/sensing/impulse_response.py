@@ -35,8 +35,8 @@ class ImpulseResponse(Sensor):
         response: shape of the delays.
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
-        boundary: as of `convolve_time`.
-        within_bin: place of light in its bin, as of `Response.kernel`.
+        boundary: treatment of the window's ends, "zero" or "periodic", see `convolve_time`.
+        within_bin: place of light in its bin, "uniform" or "center", see `Response.kernel`.
 
     Raises:
         UnitError: for widths out of range.
@@ -79,7 +79,7 @@ def pulse_kernel(bin_width_opl: float, *pulses: Pulse) -> tuple[int, Tensor]:
 
     Args:
         bin_width_opl: bin width in metres.
-        pulses: one or more, convolved with one another.
+        pulses: one or more pulses, convolved with one another.
 
     Returns:
         First lag in bins, and shares (K,) float64 of the lags from there on, summing to one.
@@ -108,7 +108,7 @@ def axis_with_margin(axis: TimeAxis, *pulses: Pulse) -> TimeAxis:
 
     Args:
         axis: wanted axis.
-        pulses: one or more.
+        pulses: one or more pulses.
 
     Returns:
         A longer axis of the same bins.
@@ -127,9 +127,9 @@ def apply_pulse(transient: Tensor, axis: TimeAxis, *pulses: Pulse, keep: TimeAxi
 
     Args:
         transient: (..., T, H, W), radiance integrated over each bin of ``axis``.
-        axis: its time axis.
-        pulses: one or more.
-        keep: an axis made of bins of ``axis``, the ones to return.
+        axis: time axis of the transient.
+        pulses: one or more pulses.
+        keep: axis made of bins of ``axis``, those to return.
 
     Returns:
         (..., T or bins of ``keep``, H, W), in dtype and device of ``transient``.

@@ -31,7 +31,7 @@ def groups_of(spads: int, weights: Numbers | None, where: str) -> Groups:
 
     Args:
         spads: number of SPADs.
-        weights: one for each SPAD, of which only the ratios matter; None for equal shares.
+        weights: weight of each SPAD, of which only the ratios matter; None for equal shares.
         where: name of the caller, for errors.
 
     Returns:

@@ -38,7 +38,7 @@ def photon_energy_j(wavelength_m: float) -> float:
     """Energy of one photon: h c / wavelength.
 
     Args:
-        wavelength_m: in metres, 10 nm to 1 mm.
+        wavelength_m: wavelength in metres, 10 nm to 1 mm.
 
     Returns:
         Joules.
@@ -60,7 +60,8 @@ class Optics:
         f_number: focal length over diameter of the aperture.
         pixel_area_m2: active area of a pixel in m^2.
         transmission: share of light that filters and lenses let through.
-        solid_angle_sr: replaces what the f-number gives, for sensors that are not behind a lens, in steradians.
+        solid_angle_sr: solid angle of the light on the pixel in steradians, in place of the f-number, for sensors that
+            are not behind a lens.
 
     Raises:
         UnitError: outside the ranges.
@@ -110,15 +111,16 @@ def ambient_photon_rate(
 
         rate = irradiance x bandwidth x illumination x albedo / pi x etendue / photon energy
 
-    A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; what the
-    sky adds belongs to the irradiance.
+    A Lambertian surface that fills the pixel (radiance E albedo / pi) and light of one wavelength are assumed; light of
+    the sky belongs to the irradiance.
 
     Args:
         optics: lens and pixel.
-        albedo: a number or a map (H, W), (..., C, H, W), between 0 and 1.
-        spectral_irradiance_w_m2_nm: of the sun on a surface that faces it, W / (m^2 nm), constant over the filter.
-        filter_bandwidth_m: in metres, 1 um and less.
-        wavelength_m: in metres.
+        albedo: albedo of the surface, a number or a map (H, W), (..., C, H, W), between 0 and 1.
+        spectral_irradiance_w_m2_nm: spectral irradiance of the sun on a surface that faces it, W / (m^2 nm), constant
+            over the filter.
+        filter_bandwidth_m: bandwidth of the filter in metres, 1 um and less.
+        wavelength_m: wavelength in metres.
         illumination: cosine of the angle between sun and normal times the share of the sun that is not in shadow, a
             number or a map, 0 to 1.
 
@@ -153,8 +155,9 @@ class BudgetReport(TensorRecord):
 
     Attributes:
         signal_per_cycle: detections of laser light, (..., C, H, W).
-        ambient_per_cycle: those of ambient light in the whole window, a number, or a map where the budget has maps.
-        dark_per_cycle: dark counts in the whole window, the same.
+        ambient_per_cycle: detections of ambient light in the whole window, a number, or a map where the budget has
+            maps.
+        dark_per_cycle: dark counts in the whole window, a number, or a map where the budget has maps.
         cycles: laser cycles of the exposure.
         exposure_s: duration of the exposure in seconds.
     """
@@ -194,7 +197,7 @@ class PhotonBudget(Sensor):
     The transient is rendered with an emitter of unit energy: W / (m^2 sr) per bin for a source of 1 W fired as one
     pulse of 1 J, so that times the pulse energy it is J / (m^2 sr). The background is spread evenly over the bins.
 
-    Maps are (H, W) or what broadcasts to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other maps are
+    Maps are (H, W), or broadcast to (..., C, H, W). An `nn.Parameter` is kept as one and learnt; other maps are
     buffers, in float64 (a map from a network: `torch.func.functional_call(budget, {name: map}, x)`). Learnt rates are
     in hertz, which no optimizer's steps suit: learn their logarithm (docs/photon_counting.md). A learnt number that has
     left its range is a UnitError of the next measurement. Not modelled: angle dependence of the filter, speckle;
@@ -203,7 +206,7 @@ class PhotonBudget(Sensor):
     Args:
         optics: lens and pixel.
         pulse_energy_j: energy of a pulse in joules.
-        wavelength_m: in metres.
+        wavelength_m: wavelength in metres.
         repetition_rate_hz: laser cycles per second.
         cycles: laser cycles of the exposure, or
         exposure_s: duration of the exposure in seconds.
@@ -367,7 +370,7 @@ def hot_pixel_rates(
     """Draw a map of dark count rates: log-normal around `median_hz`, some pixels `hot_factor` times that.
 
     Args:
-        height, width: of the map.
+        height, width: size of the map in pixels.
         median_hz: median in Hz.
         log_std: standard deviation of the natural logarithm.
         hot_fraction: share of hot pixels.

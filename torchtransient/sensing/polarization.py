@@ -40,7 +40,7 @@ def linear_analyzers(angles_deg: Numbers, extinction_ratio: float = math.inf, tr
     Args:
         angles_deg: angles in degrees, (A,).
         extinction_ratio: power along over power across, at least 1; 100 to 400 in sensor chips, infinite when ideal.
-        transmission: of light along, in [0, 1].
+        transmission: transmission of light polarized along the analyser, in [0, 1].
 
     Returns:
         (A, 4) float64.
@@ -60,7 +60,7 @@ def circular_analyzers(extinction_ratio: float = math.inf, transmission: float =
 
     Args:
         extinction_ratio: power of the one over power of the other, at least 1.
-        transmission: in [0, 1].
+        transmission: transmission of light of the analyser's own handedness, in [0, 1].
 
     Returns:
         (2, 4) float64.
@@ -128,7 +128,7 @@ def unphysical_part(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
     Args:
         stokes: Stokes vectors, four components along ``dim``.
-        dim: their dimension.
+        dim: dimension of the components.
 
     Returns:
         The shape without ``dim``.
@@ -149,7 +149,7 @@ def project_physical(stokes: Tensor, dim: int = TRANSIENT_DIM) -> Tensor:
 
     Args:
         stokes: Stokes vectors, four components along ``dim``.
-        dim: their dimension.
+        dim: dimension of the components.
 
     Returns:
         Shape of ``stokes``.
@@ -210,8 +210,8 @@ class PolarizationMosaic(Sensor):
         """Make the arrangement of Sony's IMX250MZR: 90, 45 over 135, 0 degrees.
 
         Args:
-            extinction_ratio: as of `linear_analyzers`.
-            transmission: as of `linear_analyzers`.
+            extinction_ratio: power along over power across, at least 1, see `linear_analyzers`.
+            transmission: transmission of light polarized along the analyser, in [0, 1].
         """
         return cls(mosaic_rows(POLARSENS_DEG, extinction_ratio, transmission))
 
@@ -219,8 +219,8 @@ class PolarizationMosaic(Sensor):
         """Analyser of every pixel, (4, H, W).
 
         Args:
-            height: pixels.
-            width: pixels.
+            height: height of the image in pixels.
+            width: width of the image in pixels.
         """
         p, q = self.rows.shape[:2]
         tiles = self.rows.repeat(-(-height // p), -(-width // q), 1)
@@ -262,8 +262,8 @@ def mosaic_rows(
 
     Args:
         angles_deg: (P, Q) angles in degrees.
-        extinction_ratio: as of `linear_analyzers`.
-        transmission: as of `linear_analyzers`.
+        extinction_ratio: power along over power across, at least 1, see `linear_analyzers`.
+        transmission: transmission of light polarized along the analyser, in [0, 1].
 
     Returns:
         (P, Q, 4) float64.

@@ -364,7 +364,7 @@ def device(name: str) -> Device:
     """Return the device of a name; `DEVICES` holds them all.
 
     Args:
-        name: of the device.
+        name: name of the device.
 
     Raises:
         ArgumentError: for another name.

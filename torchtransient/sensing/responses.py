@@ -189,8 +189,8 @@ def above_floor(counts: Tensor, floor: float | bool, where: str) -> Tensor:
 
     Args:
         counts: (T,).
-        floor: True for the median of all bins, which is the background when the response fills less than half of them;
-            False for none; a number of counts of every bin.
+        floor: background of every bin: True for the median of all bins, which is the background when the response fills
+            less than half of them; False for none; a number of counts of every bin.
         where: name of the caller, for errors.
 
     Returns:
@@ -267,7 +267,7 @@ class Response(PhysicalModule):
         """Share of the response before each time, float64, differentiable in time and parameters.
 
         Args:
-            time_s: any shape, in seconds.
+            time_s: times in seconds, any shape.
         """
         raise NotImplementedError(f"{type(self).__name__} has to define cdf.")
 
@@ -275,7 +275,7 @@ class Response(PhysicalModule):
         """Share of the response after each time.
 
         Args:
-            time_s: any shape, in seconds.
+            time_s: times in seconds, any shape.
         """
         return 1 - self.cdf(time_s)
 
@@ -287,7 +287,7 @@ class Response(PhysicalModule):
         """Integrals of `cdf` up to each time and of `survival` from there on, float64, in seconds.
 
         Args:
-            time_s: (K,), in seconds.
+            time_s: times in seconds, (K,).
 
         Returns:
             None without a closed form: `kernel` then integrates `cdf` and `survival` numerically.
@@ -399,7 +399,7 @@ class GaussianResponse(Response):
 
     Args:
         fwhm_s: full width at half maximum in seconds, 2.3548 standard deviations.
-        delay_s: mean in seconds.
+        delay_s: mean delay in seconds.
         learnable: learn the logarithm of the width, and the delay in picoseconds.
 
     Raises:
@@ -443,7 +443,7 @@ class UniformResponse(Response):
 
     Args:
         width_s: full width in seconds.
-        delay_s: middle in seconds.
+        delay_s: delay of the middle in seconds.
         learnable: learn the logarithm of the width, and the delay in picoseconds.
 
     Raises:
@@ -580,6 +580,6 @@ def emg_response(fwhm_s: float, tau_s: float, delay_s: float = 0.0, *, learnable
         fwhm_s: full width at half maximum of the normal part, in seconds.
         tau_s: mean of the exponential part, in seconds.
         delay_s: delay of the normal part, in seconds.
-        learnable: as of `TailedResponse`.
+        learnable: learn logarithms of widths, logits of shares, and the delay in picoseconds, see `TailedResponse`.
     """
     return TailedResponse(fwhm_s, [tau_s], [1.0], delay_s=delay_s, learnable=learnable)

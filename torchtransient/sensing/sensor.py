@@ -56,7 +56,7 @@ def check_policy(grad: str, where: str) -> GradPolicy:
     """Return `grad` if it is one of GRAD_POLICIES.
 
     Args:
-        grad: anything.
+        grad: any object.
         where: name of the caller, for errors.
 
     Raises:
@@ -84,7 +84,7 @@ def gaussian_noise(variance: Tensor, generator: torch.Generator | None = None) -
     most 50 |eps|), and at v = 1 the variance is 2 % short.
 
     Args:
-        variance: any shape, counts squared; negative ones (rounding) count as 0.
+        variance: tensor of any shape, counts squared; negative ones (rounding) count as 0.
         generator: source of randomness.
 
     Returns:
@@ -100,7 +100,7 @@ def straight_through(sample: Tensor, mean: Tensor) -> Tensor:
 
     Args:
         sample: drawn values.
-        mean: their mean; shapes broadcast.
+        mean: mean of the values; shapes broadcast.
     """
     return sample.detach() + (mean - mean.detach())
 
@@ -306,7 +306,7 @@ def _entrance(method: Callable[..., Any], place: int) -> Callable[..., Any]:
 
 
 class Sensor(PhysicalModule):
-    """Base of sensors: a transient (..., C, T, H, W) to what is measured. Deterministic: `forward` is `expected`.
+    """Base of sensors, from a transient (..., C, T, H, W) to a measurement. Deterministic: `forward` is `expected`.
 
     A subclass defines `expected`. `forward` takes `generator` in every sensor, so that chains call random and
     deterministic links alike. Half precision is taken and measured in float32, the least in which counts are counts.
@@ -360,7 +360,7 @@ class Sensor(PhysicalModule):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: taken for chains, not used.
+            generator: accepted so that chains can pass it, not used.
         """
         return self.expected(x)
 
@@ -503,8 +503,8 @@ def bins_text(width: float | None, number: int | None) -> str:
     """Describe bins for a message.
 
     Args:
-        width: in seconds, None where any fits.
-        number: of bins, None where any fits.
+        width: bin width in seconds, None where any fits.
+        number: number of bins, None where any fits.
     """
     many = "bins" if number is None else f"{number} bins"
     return many if width is None else f"{many} of {width:g} s"
@@ -558,14 +558,14 @@ class WrappedDetector(RandomSensor):
 
 
 def several_of(detector: RandomSensor, number: int, share: float = 1.0) -> RandomSensor:
-    """Make a detector whose counts are the sum of several alike, in the same light each.
+    """Make a detector whose counts are the sum of several equal detectors, each in the same light.
 
     It has the cycles of all of them, and the same parameters.
 
     Args:
-        detector: one of them.
-        number: how many.
-        share: part that each has of light, and of counts, that are given for a whole pixel.
+        detector: one of the detectors.
+        number: number of detectors.
+        share: share that each detector has of the light, and of the counts, that are given for a whole pixel.
 
     Returns:
         A shallow copy of the detector.

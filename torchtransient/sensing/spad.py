@@ -349,7 +349,7 @@ def log_of_firing(rate: Tensor) -> Tensor:
     Differentiable. Source: Maechler, Accurately computing log(1 - exp(-|a|)) (2012).
 
     Args:
-        rate: any shape, >= 0; -inf at 0.
+        rate: tensor of any shape, >= 0; -inf at 0.
     """
     bright = rate > math.log(2)
     if not bool(bright.any()):  # as a rule: half the cost
@@ -443,7 +443,7 @@ def frames_to_rate(counts: Tensor, frames: int) -> Tensor:
     """Photons per frame from the number of frames that saw any: -log(1 - counts / frames). Differentiable.
 
     Args:
-        counts: any shape.
+        counts: tensor of any shape.
         frames: number of frames.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Spatial point spread functions: what lens and sensor stack do to every time bin alike. Needs kornia."""
+"""Spatial point spread functions: blur by lens and sensor stack, the same in every time bin. Needs kornia."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def blur_image(x: Tensor, psf: Tensor, border: Border = "reflect") -> Tensor:
 
     Args:
         x: (..., C, T, H, W).
-        psf: (h, w), odd sizes.
-        border: outside of the picture: "constant" darkness (light is lost), "reflect", "replicate", "circular" (sums
-            are conserved).
+        psf: point spread function (h, w), odd sizes.
+        border: values outside of the picture: "constant" darkness (light is lost), "reflect", "replicate", "circular"
+            (sums are conserved).
 
     Returns:
         Shape and dtype of `x`.
@@ -57,7 +57,7 @@ def gaussian_psf(fwhm_px: Tensor, size: int) -> Tensor:
 
     Args:
         fwhm_px: full width at half maximum in pixels, a scalar tensor.
-        size: pixels across.
+        size: width of the kernel in pixels.
 
     Returns:
         (size, size) float64.
@@ -95,8 +95,8 @@ class SpatialPSF(Sensor):
     """Blur by a measured point spread function; see `blur_image`.
 
     Args:
-        psf: (h, w), odd sizes, values >= 0; normalised to 1.
-        border: as of `blur_image`.
+        psf: point spread function (h, w), odd sizes, values >= 0; normalised to 1.
+        border: treatment of light outside of the picture, see `blur_image`.
         learnable: learn the PSF, as logits.
 
     Raises:
@@ -134,7 +134,7 @@ class LensBlur(Sensor):
 
     Args:
         fwhm_px: full width at half maximum in pixels.
-        border: as of `blur_image`.
+        border: treatment of light outside of the picture, see `blur_image`.
         learnable: make the logarithm `log_fwhm_px` a parameter.
 
     Raises:

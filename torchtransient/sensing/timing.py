@@ -56,7 +56,7 @@ class DetectionJitter(MovedCounts):
         bin_width_s: their bin width in seconds.
         boundary: "periodic": what leaves the window comes in at the other end, so that constant counts stay constant;
             "zero": it is lost.
-        within_bin: place of detections in their bin, as of `Response.kernel`.
+        within_bin: place of detections in their bin, "uniform" or "center", see `Response.kernel`.
         grad: gradient policy.
 
     Raises:
@@ -221,7 +221,7 @@ def shift_time(x: Tensor, delay_bins: Tensor | float, *, boundary: Boundary = "p
 
     Args:
         x: (..., C, T, H, W).
-        delay_bins: a number or a map that broadcasts to (..., C, H, W), in bins; below 0 earlier.
+        delay_bins: delay in bins, a number or a map that broadcasts to (..., C, H, W); below 0 earlier.
         boundary: "periodic": the window is one laser period, sums are conserved and constant light stays constant;
             "zero": what leaves the window is lost and nothing comes in.
 
@@ -311,10 +311,11 @@ class PixelSkew(Sensor):
     `DetectionSkew`, behind the detector, is for delays of its electronics.
 
     Args:
-        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        delay_s: delay of every pixel in seconds, of either sign: a number, a map (H, W), or a tensor that broadcasts to
+            (..., C, H, W).
         axis: axis of the light, or
         bin_width_s: its bin width in seconds.
-        boundary: as of `shift_time`.
+        boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
         learnable: make `delays.delay_ps` a parameter, in picoseconds.
 
     Raises:
@@ -346,13 +347,14 @@ class DetectionSkew(MovedCounts):
     """Delay detections (counts) of every pixel by a time of its own: a signal tree, a converter that starts late.
 
     Draws move whole counts one by one: each of a bin goes to the earlier or the later of the two bins that its delay
-    reaches, a binomial number. Policies as of `MovedCounts`, the score that of learnable delays.
+    reaches, a binomial number. Gradient policies as in `MovedCounts`; the score is that of learnable delays.
 
     Args:
-        delay_s: a number or a map (H, W) or what broadcasts to (..., C, H, W), seconds, of either sign.
+        delay_s: delay of every pixel in seconds, of either sign: a number, a map (H, W), or a tensor that broadcasts to
+            (..., C, H, W).
         axis: axis of the counts, or
         bin_width_s: their bin width in seconds.
-        boundary: as of `shift_time`.
+        boundary: treatment of the window's ends, "periodic" or "zero", see `shift_time`.
         learnable: make `delays.delay_ps` a parameter, in picoseconds.
         grad: gradient policy.
 
@@ -431,7 +433,7 @@ def code_bands(edges: Tensor, num_bins: int, *, periodic: bool = False, dither: 
         edges: borders of the codes in true bins, (T + 1,), increasing.
         num_bins: true bins.
         periodic: light outside of the window lies in the bin a whole number of windows away; else in none.
-        dither: add a time that is uniform over one bin.
+        dither: add a random time that is uniform over one bin.
 
     Returns:
         First lag, and (T, B) float64: share of the true bin k + first + b that gets the code k.

@@ -47,9 +47,10 @@ def counting_chain(
 ) -> Compose:
     """Make a chain of the parts of a single-photon detector, radiance (..., C, T, H, W) to counts, in their order.
 
-    Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds what is constant;
-    `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add others;
-    `converter` gives each of them its code; `readout` is what the pixel keeps. The reasons: docs/photon_counting.md.
+    Light is spread by `optics` and by the laser's `pulse`; `budget` makes detections of it and adds constant light and
+    dark counts; `detector` counts them; `jitter` and `skew` move every detection; `afterpulsing` and `crosstalk` add
+    others; `converter` gives each of them its code; `readout` makes of the histogram the data that the pixel keeps. The
+    reasons: docs/photon_counting.md.
 
     Args:
         budget: rates of detections.
@@ -62,7 +63,7 @@ def counting_chain(
         crosstalk: crosstalk.
         converter: time-to-digital converter.
         readout: `ZoneSum`, `CodedHistogram`, ...
-        grad: gradient policy, as of `Compose`.
+        grad: gradient policy, see `Compose`.
 
     Raises:
         UnitError: for parts that do not go together: another number of cycles, another laser period, other bins, two
@@ -89,14 +90,14 @@ class StreakCamera(Compose):
         phosphor_fwhm_px: blur behind the gain in pixels; 0 leaves the stage out.
         jitter_fwhm_s: jitter of a sweep in seconds.
         sweeps: sweeps of an exposure.
-        excess_noise: of the channel plate, F^2.
-        read_noise_e: of the camera, referred to photoelectrons, as the following.
-        full_well_e: as of `PixelElectronics`.
-        gain_e_per_dn: as of `PixelElectronics`.
-        bits: as of `PixelElectronics`.
-        black_level_dn: as of `PixelElectronics`.
-        boundary: of the window in time, for spread and jitter; "periodic" keeps a constant background constant, while
-            light close to one end shows a trace at the other; "zero" loses what leaves.
+        excess_noise: excess noise factor F^2 of the channel plate.
+        read_noise_e: rms read noise of the camera, referred to photoelectrons, as the following.
+        full_well_e: full well in electrons, None for no limit, see `PixelElectronics`.
+        gain_e_per_dn: electrons per number of the converter, None without one, see `PixelElectronics`.
+        bits: bits of the converter, None without one.
+        black_level_dn: number of the converter without charge, see `PixelElectronics`.
+        boundary: treatment of the window's ends in time, for spread and jitter; "periodic" keeps a constant background
+            constant, while light close to one end shows a trace at the other; "zero" loses what leaves.
         grad: gradient policy.
     """
 

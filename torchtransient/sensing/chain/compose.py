@@ -1,8 +1,8 @@
 """Sensors in a row, after a renderer or inside a data set, and images whose pixels go to different sensors.
 
-First photons of a cycle and what moves their time stamps are drawn at once: a cycle has one detection at most, so that
-counts whose detections move by themselves are multinomial again, with the moved probabilities: one draw of
-`sample_multinomial` instead of one for every place that a detection may go to.
+First photons of a cycle and the stages that move their time stamps are drawn at once: a cycle has one detection at
+most, so that counts whose detections move by themselves are multinomial again, with the moved probabilities: one draw
+of `sample_multinomial` instead of one for every place that a detection may go to.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def moving_together(stages: Sequence[nn.Module], *, policy: bool) -> tuple[Synch
 
     Args:
         stages: stages to call one after another.
-        policy: only if all have the same gradient policy, and one that draws.
+        policy: require that all stages have the same gradient policy, and one that draws.
 
     Returns:
         The SPAD and the moves, or None.
@@ -79,7 +79,7 @@ def moved_probabilities(spad: SynchronousSPAD, moves: Sequence[MovedCounts], x: 
 
     Args:
         spad: detector of one detection per cycle.
-        moves: stages behind it.
+        moves: stages behind the detector.
         x: rate per cycle and bin, (..., C, T, H, W).
     """
     p = spad.probabilities(x)
@@ -99,7 +99,7 @@ def moved_first_photons(
 
     Args:
         spad: detector of one detection per cycle.
-        moves: stages behind it.
+        moves: stages behind the detector.
         x: rate per cycle and bin, (..., C, T, H, W).
         generator: source of randomness.
         policy: gradient policy; None for a draw without gradient.
@@ -163,7 +163,7 @@ class Compose(Sensor):
         UnitError: where one stage is not made for what those before it give: other bins, another number of cycles,
             another laser period, or another quantity, as the rates of one cycle where the counts of all are meant; and
             for an order in which constant light starves at the ends of the window, or counts are averaged: light's own
-            shape, then `PhotonBudget`, the detector, and what acts on detections.
+            shape, then `PhotonBudget`, the detector, and stages that act on detections.
     """
 
     def __init__(self, stages: Sequence[nn.Module], *, grad: GradPolicy | None = None) -> None:

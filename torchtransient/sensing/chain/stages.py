@@ -64,7 +64,7 @@ def in_order(stages: Iterable[tuple[str, nn.Module]], prefix: str = "") -> Itera
 
     Args:
         stages: stages by their names.
-        prefix: put in front of names.
+        prefix: text in front of names.
     """
     for name, stage in stages:
         row = getattr(stage, "stages", None) if isinstance(stage, Sensor) else None
@@ -138,7 +138,7 @@ def mean_of(stage: nn.Module, x: Tensor) -> Tensor:
 
     Args:
         stage: a stage of a chain.
-        x: its light.
+        x: light of the stage.
     """
     result: Tensor = stage.expected(x) if isinstance(stage, Sensor) else stage(x)
     return result
@@ -150,7 +150,7 @@ def draw_of(way: Way, stage: nn.Module, x: Tensor, generator: torch.Generator | 
     Args:
         way: "sample", or "gaussian" for the normal surrogate.
         stage: a stage of a chain.
-        x: its light.
+        x: light of the stage.
         generator: source of randomness.
     """
     draw = getattr(stage, way, None) if isinstance(stage, Sensor) else None
@@ -163,7 +163,7 @@ def measurement_of(stage: nn.Module, x: Tensor, generator: torch.Generator | Non
 
     Args:
         stage: a stage of a chain.
-        x: its light.
+        x: light of the stage.
         generator: source of randomness.
     """
     result: Tensor = stage(x, generator=generator) if isinstance(stage, Sensor) else stage(x)
@@ -237,7 +237,7 @@ def check_chain(chain: nn.Module, stages: Iterable[nn.Module]) -> bool:
 
     Args:
         chain: a chain.
-        stages: its stages.
+        stages: stages of the chain.
 
     Returns:
         True if `check_window` has to be called again for light whose bins are known.

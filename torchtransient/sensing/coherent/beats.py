@@ -55,7 +55,7 @@ class Speckle(_Averaged):
     which is unbiased for any loss.
 
     Args:
-        looks: averaged fields, 1 and more, also an effective number that is not whole.
+        looks: number of averaged fields, 1 or more; an effective number need not be whole.
         grad: policy of gradients.
 
     Raises:
@@ -79,7 +79,7 @@ class Speckle(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.
@@ -126,7 +126,7 @@ class BeatNoise(_Averaged):
 
     Args:
         photons_per_unit: detected photons in a bin of light 1.
-        looks: averaged spectra, 1 and more.
+        looks: number of averaged spectra, 1 or more.
         grad: policy of gradients.
 
     Raises:
@@ -151,7 +151,7 @@ class BeatNoise(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.
@@ -188,7 +188,7 @@ class BeatNoise(_Averaged):
 
 
 class CoherentReceiver(_Averaged):
-    """Spectra of a chirp from fields: speckle, the line of the window and shot noise, with what neighbours share.
+    """Spectra of a chirp from fields: speckle, the line of the window and shot noise, correlated between bins.
 
     Each bin of the light has a circular Gaussian field whose variance is its power in photons, ``photons_per_unit``
     times the input (..., C, T, H, W). The fields meet in the transform of the chirp, with white noise of one photon in
@@ -196,14 +196,14 @@ class CoherentReceiver(_Averaged):
     :attr:`spectrum_axis`. So the bins of one line rise and fall together, and light of two lines that are closer than
     c / B interferes. `Speckle` and `BeatNoise` have the same distribution of each bin for itself.
 
-    The light has no line yet: a transient of what stands, or beats that were rendered with ``chirps.longer(16)``, in
+    The light has no line yet: a transient of a static scene, or beats that were rendered with ``chirps.longer(16)``, in
     bins of c / B / 8 (``chirps.time_axis(..., bins_per_line=8)``); bins wider than c / B / 4 are refused.
 
     Args:
         chirps: the chirps.
         axis: axis of the light.
-        photons_per_unit: detected photons in a chirp of light of one.
-        looks: spectra averaged.
+        photons_per_unit: detected photons in a chirp for light of 1.
+        looks: number of averaged spectra.
         grad: gradient policy; every one but "expected" gives the gradient of the draw. Below 1e-4 photons a field grows
             like the power in place of its root, so that the slope is finite at zero.
 
@@ -257,7 +257,7 @@ class CoherentReceiver(_Averaged):
 
         Args:
             x: light (..., C, T, H, W).
-            generator: of the random numbers.
+            generator: source of randomness.
 
         Returns:
             The shape of the expectation.

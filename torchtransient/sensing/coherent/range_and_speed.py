@@ -42,11 +42,11 @@ def range_and_speed(
     Args:
         beats: power spectra (..., 2, T, H, W), up and down, with or without noise; or a result that has some
             (`RenderOutput`, `Result` of a file).
-        chirps: the chirps; None for those of a result.
-        axis: axis over ``opl +- k rate``; likewise.
+        chirps: chirps of the beats; None for those of a result.
+        axis: axis over ``opl +- k rate``; None for that of a result.
         bins: "sums" over the width of a bin, as films make them (``temporal_filter="box"``), or "samples" of the
             spectrum, as a transform and `CoherentReceiver` give them.
-        threshold: power of the largest bin that is no return, and any below; in a unit of ``beats``.
+        threshold: power, in the unit of ``beats``, that the largest bin has to exceed to count as a return.
 
     Returns:
         Distances in metres, half the optical path length, and speeds of approach in m/s, half the rate with its sign
@@ -112,13 +112,13 @@ def _offset(lean: Tensor, chirps: Chirps, axis: TimeAxis, bins: Bins) -> Tensor:
 
 @in_single
 def fold_beats(beats: Tensor, axis: TimeAxis) -> tuple[Tensor, TimeAxis]:
-    """Add what lies at negative beats to the positive ones, as a detector without quadratures sees it.
+    """Add the power at negative beat frequencies to the positive ones, as a detector without quadratures sees it.
 
     Fold expected spectra, before `Speckle` and `BeatNoise`: waves of both signs meet in one mode.
 
     Args:
         beats: spectra (..., T, H, W).
-        axis: their axis; zero is an edge or the middle of a bin (`tt.Chirps.time_axis`).
+        axis: axis of the spectra; zero is an edge or the middle of a bin (`tt.Chirps.time_axis`).
 
     Returns:
         Spectra (..., T', H, W) of the same sum, differentiable, and their axis.

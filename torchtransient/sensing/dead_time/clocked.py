@@ -109,7 +109,7 @@ def solve_by_level(
 
     Args:
         rate: (P, T), per cycle and bin.
-        levels: of the rows, by `subdivision_levels`.
+        levels: levels of the rows, from `subdivision_levels`.
         least: pieces of a bin at level 0.
         solve: function of rates (K, T), indices (K,) of their rows, and pieces of a bin.
 
@@ -204,10 +204,10 @@ def armed_probabilities(
     """Armed at the start of pieces, and at the end of the last: A[k + 1] = A[k] exp(-rate[k]) + joined[k].
 
     Args:
-        start: armed at the start, (P, 1).
-        rate: (P, N), per piece.
-        joined: rearmed in each piece, (P, N), or None.
-        stretch: pieces summed at a time.
+        start: probability of being armed at the start, (P, 1).
+        rate: rate per piece, (P, N).
+        joined: probability of being rearmed in each piece, (P, N), or None.
+        stretch: number of pieces summed at a time.
 
     Returns:
         (P, N) and (P, 1).
@@ -230,7 +230,7 @@ def cycle_means(rate: Tensor, dead_bins: Tensor, pieces: int, largest: float | N
     Args:
         rate: (P, T) per cycle and bin, float64, >= 0.
         dead_bins: dead time in bins, scalar float64.
-        pieces: of a bin.
+        pieces: number of pieces of a bin.
         largest: known bound of the photons in a piece, or None.
     """
     whole, part = split_dead_time(dead_bins.to(rate.device, torch.float64) * pieces)
@@ -358,7 +358,7 @@ class DetectionScan:
     Args:
         rate: (T, P) float64.
         whole, part: dead time in pieces, split.
-        pieces: of a bin.
+        pieces: number of pieces of a bin.
         largest: photons of a piece, at most.
     """
 

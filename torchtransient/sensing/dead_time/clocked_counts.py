@@ -104,12 +104,12 @@ def step_probabilities(
     """Step probabilities of bins with given means; all arguments of one layout.
 
     Args:
-        rate: per cycle and bin.
+        rate: rate per cycle and bin.
         detected: mean detections.
-        armed: armed at the start of bins.
+        armed: probability of being armed at the start of bins.
         late: detections rearmed one bin after the whole dead time.
         back: rearmed in the bin.
-        begin: armed when the first bin begins, or None.
+        begin: probability of being armed when the first bin begins, or None.
         whole: whole bins of the dead time.
     """
     fire, soon = firing_probabilities(-torch.expm1(-rate), detected, armed, back)
@@ -124,7 +124,7 @@ def firing_probabilities(fire: Tensor, detected: Tensor, armed: Tensor, back: Te
     Args:
         fire: probability of a photon in the bin.
         detected: mean detections.
-        armed: armed at the start.
+        armed: probability of being armed at the start.
         back: rearmed in the bin.
 
     Returns:
@@ -140,7 +140,7 @@ def draw_normal(number: Tensor, chance: Tensor, generator: torch.Generator | Non
     """Draw normal numbers with mean and variance of binomial ones.
 
     Args:
-        number: trials.
+        number: number of trials.
         chance: probability.
         generator: source of randomness.
     """
@@ -160,7 +160,8 @@ def draw_steps(
         chances: step probabilities, (..., T, H, W).
         periods: number of detectors.
         generator: source of randomness.
-        draw: of numbers and chances, `torch.binomial` or `draw_normal`.
+        draw: function that draws from numbers of trials, probabilities and a generator, `torch.binomial` or
+            `draw_normal`.
     """
     bins, begin = chances.fire.shape[TIME], None
     if chances.begin is None:
@@ -196,8 +197,8 @@ def safe_xlogy(count: Tensor, chance: Tensor) -> Tensor:
     """Return count log(chance), with value and gradient 0 for count 0 (torch.xlogy has a NaN gradient at chance 0).
 
     Args:
-        count: any shape.
-        chance: of a shape that broadcasts.
+        count: tensor of any shape.
+        chance: probability, in a shape that broadcasts.
     """
     return count * torch.log(torch.where(count != 0, chance, 1.0))
 
@@ -208,7 +209,7 @@ def binomial_log_prob(count: Tensor, trials: int, chance: Tensor) -> Tensor:
     Args:
         count: float64, any shape.
         trials: number of trials.
-        chance: of the same shape.
+        chance: probability, in the same shape.
     """
     quiet = trials - count
     ways = math.lgamma(trials + 1) - torch.lgamma(count + 1) - torch.lgamma(quiet + 1)
@@ -220,8 +221,8 @@ def steps_log_prob(path: StepCounts, chances: StepProbabilities, periods: int) -
 
     Args:
         path: drawn steps, (..., T, H, W).
-        chances: their probabilities.
-        periods: independent periods.
+        chances: probabilities of the steps.
+        periods: number of independent periods.
 
     Returns:
         (..., H, W).

@@ -219,7 +219,7 @@ def stationary_steps(rate: Tensor, state: FreeRunningState) -> StepProbabilities
 
     Args:
         rate: (..., T, H, W), per period and bin.
-        state: of the same layout.
+        state: stationary state in the same layout.
     """
     bins, whole = rate.shape[TIME], state.whole
     early = state.detected - state.late

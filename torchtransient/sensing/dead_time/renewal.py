@@ -48,7 +48,7 @@ def check_dead_bins(dead_bins: Tensor | float) -> float:
     """Return a dead time in bins as a number.
 
     Args:
-        dead_bins: number or scalar tensor, in bins.
+        dead_bins: dead time in bins, number or scalar tensor.
 
     Raises:
         UnitError: below half a bin, or not finite.
@@ -67,7 +67,7 @@ def split_dead_time(dead: Tensor) -> tuple[int, Tensor]:
     """Split a dead time into whole bins and the fraction of one that is left.
 
     Args:
-        dead: scalar, in bins.
+        dead: dead time in bins, scalar.
 
     Returns:
         Whole bins, and the fraction, differentiable.
@@ -301,8 +301,8 @@ class ConstantLight:
     dead time maps on themselves. Their place and decay depend on dead time and mean wait alone.
 
     Args:
-        mean_wait: (P, 1) in bins.
-        bins: T.
+        mean_wait: mean wait in bins, (P, 1).
+        bins: number of bins T.
         whole, part: dead time in bins, split.
         kept: (P, 1), share below 1 of detections that are followed: the inverse is then that of 1 - kept F.
     """
@@ -356,7 +356,7 @@ def gmres(
     Args:
         operator: linear function of (P, T), acting on every row alone.
         right, start: (P, T) float64.
-        tolerance: of |residual| / |right| in every row.
+        tolerance: largest |residual| / |right| in every row.
         precondition: approximate inverse of `operator`, applied from the right, so that residuals are true ones.
 
     Returns:
@@ -623,7 +623,7 @@ def sum_of_detections(chain: RenewalChain, pi: Tensor, right: Tensor) -> Tensor:
 
     Args:
         chain: the chain.
-        pi: its stationary lines (P, 2 T).
+        pi: stationary lines of the chain (P, 2 T).
         right: lines (P, 2 T) whose counts sum to 0.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Correlation codes of indirect time-of-flight cameras: what a tap weighs light with, against its time of arrival.
+"""Correlation codes of indirect time-of-flight cameras: the weight of light in a tap, by time of arrival.
 
 A tap multiplies the arriving light by its gate; seen from the time of flight, light that left at t = 0 is weighted by
 the correlation of the emitted pulse shape with the gate. A code holds one such function per tap, over the phase in
@@ -32,7 +32,7 @@ class CorrelationCode(ABC):
     A code of two taps cannot tell phase, amplitude and offset apart: it is for pixels with two taps, see `TwoTapCode`.
 
     Attributes:
-        num_taps: N.
+        num_taps: number of taps N.
         shifts: (N,) float64 turns when all taps are one function moved along, else None; only then does the phase
             follow from the taps by a Fourier sum (`tap_phasor`).
     """
@@ -85,7 +85,7 @@ class FourierCode(CorrelationCode):
     Two taps are a quarter of a turn apart instead of a half (`phase_steps`).
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
         harmonics_of_one_tap: harmonic -> (amplitude, phase in radians).
 
     Raises:
@@ -143,7 +143,7 @@ class PiecewiseLinearCode(CorrelationCode):
     Args:
         knots: (N, J) ascending turns within one period; copied to float64.
         values: (N, J) in [-1, 1]; copied to float64.
-        shifts: as of `CorrelationCode`.
+        shifts: (N,) turns when all taps are one function moved along, else None, see `CorrelationCode`.
 
     Raises:
         ShapeError: for other shapes.
@@ -215,7 +215,7 @@ def sine_code(num_taps: int = 4) -> FourierCode:
     """Make the code of sine modulation: tap n weighs with ``cos(2 pi (x - n / N))``.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
 
     Raises:
         UnitError: for less than two taps.
@@ -230,7 +230,7 @@ def square_code(num_taps: int = 4, light_duty: float = 0.5, gate_duty: float = 0
     harmonics fall as ``1 / h^2``. The gates are placed so that tap 0 weighs phase zero highest, as in `sine_code`.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
         light_duty: turns that the light is on, in (0, 1).
         gate_duty: turns that a gate is open, in (0, 1).
 
@@ -250,7 +250,7 @@ def hamiltonian_code(num_taps: int = 3) -> PiecewiseLinearCode:
     for half a turn, two of them twice within a turn.
 
     Args:
-        num_taps: 3 or 4.
+        num_taps: number of taps, 3 or 4.
 
     Raises:
         ShapeError: for another number of taps.
@@ -274,7 +274,7 @@ def binary_code(
     Args:
         light_duty: turns that the light is on.
         gates: per tap its openings as (start, end) in turns, ``0 < end - start < 1``.
-        shifts: as of `CorrelationCode`.
+        shifts: (N,) turns when all taps are one function moved along, else None, see `CorrelationCode`.
 
     Raises:
         UnitError: where openings overlap.
@@ -348,7 +348,7 @@ def phase_steps(num_taps: int) -> Tensor:
     """Phases of the taps: n / N, and 0 and a quarter for two, which half a turn apart would see the same twice.
 
     Args:
-        num_taps: N, two and more.
+        num_taps: number of taps N, 2 or more.
 
     Returns:
         (N,) float64 turns.
@@ -383,7 +383,7 @@ class TwoTapCode(CorrelationCode):
     functions to `measured_code`.
 
     Args:
-        code: of any kind, with N >= 2 phase steps, exposed one after another.
+        code: code of any kind with N >= 2 phase steps, exposed one after another.
 
     Raises:
         UnitError: for a code that has two taps already.
@@ -414,7 +414,7 @@ class ReversedCode(CorrelationCode):
     """Code whose phase steps go the other way: tap n is moved by minus its shift.
 
     Args:
-        code: one function moved along.
+        code: code whose taps are one function moved along.
 
     Raises:
         UnitError: for other codes (`CorrelationCode.shifts` is None).

@@ -1,4 +1,4 @@
-"""Indirect (amplitude modulated) time of flight: what the taps of a pixel collect.
+"""Indirect (amplitude modulated) time of flight: the light that the taps of a pixel collect.
 
 A pixel of N taps shares the light among its taps according to a correlation code (`codes.py`):
 
@@ -59,11 +59,12 @@ class ItofCalibration:
     `ItofCorrelation` of a sine code. `ItofCorrelation` puts them in, `read_itof` takes them off.
 
     Attributes:
-        phase_offset_rad: of all pixels, one number or one for each frequency; a delay in the camera is positive, as if
-            the scene were further away.
+        phase_offset_rad: offset of all pixels, one number or one for each frequency; a delay in the camera is positive,
+            as if the scene were further away.
         direction: -1 for a camera whose phase steps go the other way.
         phase_map_rad: fixed pattern of the pixels, (H, W) for all frequencies or (F, H, W).
-        depth_map_m: the same as metres of depth, (H, W), ``4 pi f / c`` radians each (wires and drivers are delays).
+        depth_map_m: fixed pattern of the pixels as metres of depth, (H, W), ``4 pi f / c`` radians each (wires and
+            drivers are delays).
 
     Raises:
         UnitError: for numbers that are not finite, more than two turns (degrees?) and depths beyond 10 m
@@ -173,7 +174,7 @@ def taps_by_pixel(x: Tensor, code: CorrelationCode, f: float, axis: TimeAxis, co
 
     Args:
         x: light (..., T, H, W).
-        code: N taps.
+        code: code of N taps.
         f: modulation frequency in hertz.
         axis: axis of the light.
         contrast: demodulation contrast.
@@ -214,7 +215,7 @@ def check_frequencies(frequencies_hz: Frequencies, where: str) -> tuple[float, .
     """Return modulation frequencies as a tuple.
 
     Args:
-        frequencies_hz: one or several, in hertz.
+        frequencies_hz: one or several modulation frequencies in hertz.
         where: name of the caller, for errors.
 
     Raises:
@@ -242,7 +243,7 @@ def tap_weights(
     bin.
 
     Args:
-        code: N taps.
+        code: code of N taps.
         frequencies_hz: F modulation frequencies in hertz.
         axis: axis of the light, of T bins.
         contrast: demodulation contrast in [0, 1], 0.5 to 0.9 in cameras.
@@ -329,14 +330,14 @@ def taps_from_phasor(
 
     Args:
         phasor: complex photoelectrons (..., C, K, H, W).
-        phasor_axis: its K frequencies.
-        code: N taps.
+        phasor_axis: K frequencies of the phasor.
+        code: code of N taps.
         frequencies_hz: F modulation frequencies in hertz.
-        steady: all light, (..., C, H, W).
-        harmonics: those of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
+        steady: total light, (..., C, H, W).
+        harmonics: harmonics of the code to keep, for instance ``(1, 3, 5)``; None takes all, which a code with corners,
             that has infinitely many, refuses.
         contrast: demodulation contrast in [0, 1].
-        calibration: with maps of pixels too, (H, W) those of the phasor.
+        calibration: phase offset and direction; maps of pixels too, (H, W) as the phasor.
 
     Returns:
         (..., C, F N, H, W).
@@ -432,13 +433,13 @@ class ItofCorrelation(Sensor):
     for every pixel, made anew in every call.
 
     Args:
-        code: N taps.
+        code: code of N taps.
         frequencies_hz: F modulation frequencies in hertz.
         axis: axis of the light.
-        contrast: as of `tap_weights`.
+        contrast: demodulation contrast in [0, 1], see `tap_weights`.
         background_e: electrons of unmodulated light. Light and background are those of *all* N phase steps of a
             frequency and all taps together, which share them equally.
-        electrons_per_unit: scales a radiance to electrons.
+        electrons_per_unit: electrons for light of 1, factor from a radiance to electrons.
         calibration: phase offsets, direction of the steps, maps of pixels; an `nn.Parameter` in it is learnt, with a
             `FourierCode`.
 
@@ -556,8 +557,8 @@ class ItofCorrelation(Sensor):
 
         Args:
             phasor: complex (..., C, K, H, W).
-            phasor_axis: its K frequencies.
-            steady: all light, (..., C, H, W), where the phasor does not hold zero.
+            phasor_axis: K frequencies of the phasor.
+            steady: total light, (..., C, H, W), where the phasor does not hold zero.
 
         Returns:
             (..., C, F N, H, W).

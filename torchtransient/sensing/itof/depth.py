@@ -47,7 +47,7 @@ def tap_phasor(taps: Frames, num_taps: int, readout: Readout = "single") -> Tens
 
     Args:
         taps: frames of a camera, see `read_itof`.
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -75,7 +75,7 @@ def offset_of(taps: Frames, num_taps: int, readout: Readout = "single") -> Tenso
 
     Args:
         taps: frames of a camera, see `read_itof`.
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         readout: "single" or "two_tap".
 
     Returns:
@@ -101,7 +101,7 @@ def steps_of(taps: Frames, num_taps: int, readout: Readout, where: str) -> Tenso
         taps: frames (..., C, F N, H, W) of taps or of exposures of one tap, N >= 3 ("single"); (..., C, F 2N, H, W) of
             A and B in turn, N >= 2, whose difference it is ("two_tap"); (..., C, F N, H, W) of such differences
             ("differential"). Raw frames of whole numbers are taken, as tensors or arrays.
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         readout: "single", "two_tap" or "differential".
         where: name of the caller, for errors.
 
@@ -121,7 +121,7 @@ def sums_of(taps: Frames, num_taps: int, where: str) -> Tensor:
 
     Args:
         taps: (..., C, F 2N, H, W).
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         where: name of the caller, for errors.
 
     Returns:
@@ -185,7 +185,7 @@ def below_a_turn(phase: Tensor) -> Tensor:
     """Keep phases below a turn: the sum of a tiny negative angle and a turn rounds to the turn itself.
 
     Args:
-        phase: up to a turn, in radians.
+        phase: phase in radians, up to a turn.
     """
     return torch.where(phase >= _TURN, phase - _TURN, phase)
 
@@ -214,7 +214,7 @@ def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
     """Depth of a phase at one frequency: ``c phase / (4 pi f)``.
 
     Args:
-        phase: any shape, in radians.
+        phase: phase in radians, any shape.
         frequency_hz: modulation frequency in hertz.
 
     Returns:
@@ -253,8 +253,8 @@ def wrapped_difference(a: Tensor, b: Tensor) -> Tensor:
     """Difference of phases the short way round, in [-pi, pi), with derivative one everywhere.
 
     Args:
-        a: in radians.
-        b: in radians; shapes broadcast.
+        a: phase in radians.
+        b: phase in radians that is subtracted; shapes broadcast.
     """
     difference = a - b
     turns = torch.floor((difference + math.pi) / _TURN)
@@ -285,8 +285,8 @@ def unwrap_depth(
     Args:
         phase: (..., C, F, H, W), in radians.
         frequencies_hz: F modulation frequencies in hertz.
-        max_depth_m: in metres; None for one range after which everything repeats.
-        min_depth_m: in metres; with noise around zero depth a little below zero.
+        max_depth_m: largest depth in metres; None: one range after `min_depth_m`, after which phases repeat.
+        min_depth_m: least depth in metres; with noise around zero depth, a little below zero.
 
     Returns:
         (..., C, H, W), metres.
@@ -362,7 +362,7 @@ def heterodyne_speed(
     Args:
         beat: complex phasors (..., F, H, W) of ``tt.Exposure(duration_s, beat_hz=beats / duration_s)``, or of its taps
             (`tap_phasor`).
-        plain: those of ``tt.Exposure(duration_s)`` around the same middle, of a shape that broadcasts.
+        plain: complex phasors of ``tt.Exposure(duration_s)`` around the same middle, of a shape that broadcasts.
         frequencies_hz: modulation frequency of the F phasors, hertz.
         duration_s: exposure T, seconds.
         beats: whole turns m of the beat in an exposure, one and more.

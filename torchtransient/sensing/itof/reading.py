@@ -59,15 +59,15 @@ _SMALL_PHASE = 0.2  # radians of noise, up to which a phase is right to first or
 class ItofReading(TensorRecord):
     """Phase, amplitude and depth that a camera reports of its frames.
 
-    The deviation is first order in the noise, averaged over it where a ``code`` has corners (2 N frames are decoded for
-    it). It holds no wrong number of turns, no wiggling and no second path. It is NaN in pixels that no light can give
-    (more amplitude than twice the offset, by more than the noise): differences read as taps, an ``offset_e`` that is
-    too small.
+    The standard deviation of depth is first order in the noise, averaged over it where a ``code`` has corners (2 N
+    frames are decoded for it). It does not cover a wrong number of turns, wiggling or a second path. It is NaN in
+    pixels that no light can give (more amplitude than twice the offset, by more than the noise): differences read as
+    taps, an ``offset_e`` that is too small.
 
     Attributes:
         phase: (..., C, F, H, W) radians in [0, 2 pi), without what the calibration knows.
-        amplitude: of one exposure, in the units of the frames, (..., C, F, H, W).
-        offset: the same; None for differences.
+        amplitude: amplitude of one exposure, in the units of the frames, (..., C, F, H, W).
+        offset: offset of one exposure, in the same units and shape; None for differences.
         depth_std_m: standard deviation of depth, (..., C, H, W) metres; infinite without modulated light, None if
             unknown, see `ItofNoise`.
         depth_m: depth, (..., C, H, W) metres.
@@ -93,18 +93,18 @@ class ItofReading(TensorRecord):
 class ItofNoise:
     """Noise of frames, for `ItofReading.depth_std_m`.
 
-    Shot noise is that of the taps themselves; differences know their light no longer, and need ``offset_e``. Arrays are
-    taken as tensors.
+    Shot noise is that of the taps themselves; differences no longer contain the total light, and need ``offset_e``.
+    Arrays are taken as tensors.
 
     Attributes:
-        electrons_per_unit: of the numbers of the frames. None: frames of floating numbers are electrons, as
-            `PixelElectronics` gives them; whole numbers are those of a converter and ask for it (UnitError in
-            `read_itof`).
-        read_noise_e: rms electrons of one tap in one exposure, converter included.
+        electrons_per_unit: electrons for each unit of the frames. None: frames of floating numbers are electrons, as
+            `PixelElectronics` gives them; whole numbers are those of a converter and need this factor (UnitError in
+            `read_itof` without it).
+        read_noise_e: rms read noise in electrons of one tap in one exposure, converter included.
         offset_e: mean electrons of A + B in *one* exposure of the N (all light, background and the dark electrons of
             both taps), a number above 0 or (..., C, F, H, W), of an intensity picture for instance.
-        std_e: replaces all of it: rms electrons of a measured phase step, a tap ("single") or a difference A - B
-            ("two_tap" and "differential"), a number or (..., C, F, H, W).
+        std_e: rms noise in electrons of a measured phase step, in place of all of the above: a tap ("single") or a
+            difference A - B ("two_tap" and "differential"), a number or (..., C, F, H, W).
 
     Raises:
         UnitError: for numbers out of range.
@@ -147,8 +147,8 @@ def phase_noise_rad(
     Args:
         amplitude: electrons of an exposure; infinite deviation at zero.
         offset: electrons of an exposure, dark ones too; shapes broadcast.
-        num_taps: N phase steps.
-        read_noise_e: rms electrons of one tap in one exposure.
+        num_taps: number of phase steps N.
+        read_noise_e: rms read noise in electrons of one tap in one exposure.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -170,7 +170,7 @@ def decode_code(taps: Frames, code: CorrelationCode, *, readout: Readout = "sing
 
     Args:
         taps: frames of a camera, see `read_itof`.
-        code: that of one tap, or its `TwoTapCode`.
+        code: code of one tap, or its `TwoTapCode`.
         readout: "single", "two_tap" or "differential".
 
     Returns:
@@ -261,12 +261,12 @@ def read_itof(
             A and B in turn, or (..., C, F N, H, W) of their differences; raw whole numbers as tensors or arrays too.
         frequencies_hz: F modulation frequencies in hertz. Depth of one is within ``c / (2 f)``; of several unwrapped,
             with equal weights.
-        num_taps: N phase steps.
+        num_taps: number of phase steps N.
         readout: "single", "two_tap" or "differential".
         code: decode by its shape (`decode_code`) instead of by the Fourier sum: needed for Hamiltonian and measured
             codes, removes the wiggling of square ones.
         calibration: phase offset, direction of the steps and maps of pixels, which are taken off.
-        noise: by default shot noise of frames in electrons.
+        noise: noise of the frames, by default shot noise of frames in electrons.
         max_depth_m: largest depth of several frequencies in metres.
         min_depth_m: least depth in metres.
 
