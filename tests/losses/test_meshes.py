@@ -112,11 +112,19 @@ def test_derivatives_and_batches(loss):
 
 
 def test_cotangents_go_in_without_gradient():
-    """The gradient is that with the weights held: of a quadratic form, twice its value along the vertices."""
+    """Value and gradient of vertices pulled to neighbours by weights that are held, the sums of both cotangents."""
     vertices = wavy().requires_grad_()
-    value = losses.mesh_laplacian_smoothing(vertices, RING, weights="cotangent", reduction="sum")
-    value.backward()
-    assert float((vertices.grad * vertices.detach()).sum()) == pytest.approx(2 * float(value.detach()))
+    weights = torch.zeros(7, 7, dtype=torch.float64)
+    for face in RING.tolist():
+        for i, j, k in (face, face[1:] + face[:1], face[2:] + face[:2]):
+            a, b = (vertices.detach()[x] - vertices.detach()[k] for x in (i, j))
+            weights[i, j] += a @ b / torch.linalg.cross(a, b).norm()
+    weights = (weights + weights.T).clamp_min(0)
+    offset = weights @ vertices / weights.sum(1, keepdim=True) - vertices
+    wanted = offset.square().sum()
+    found = losses.mesh_laplacian_smoothing(vertices, RING, weights="cotangent", reduction="sum")
+    torch.testing.assert_close(found, wanted)
+    torch.testing.assert_close(*(torch.autograd.grad(value, vertices)[0] for value in (found, wanted)))
 
 
 @every
@@ -195,6 +203,13 @@ def test_a_wider_square():
     mean = torch.hypot(outside[:, None], outside[None]).mean() / 2  # nothing of the small one is beside the large one
     # 16 x 4 parts of a side: the middle rule of a function with a kink, second order in parts of 1/43.
     assert float(far) == pytest.approx(float(mean), rel=2e-3)
+
+
+def test_two_triangles_at_one_edge():
+    """Points are as far from the other plane as from the edge times a sine: linear, and the centroid has the mean."""
+    vertices, faces = folded(2.5)
+    found = tt.losses.surface_distance(vertices, faces[:1], vertices, faces[1:])
+    assert float(found) == pytest.approx(math.sin(math.pi - 2.5) / 3, rel=1e-12)
 
 
 TRIANGLE, FACES = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]])

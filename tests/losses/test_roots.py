@@ -98,9 +98,12 @@ def test_expected_roots_are_means_over_counts():
     (slope,) = torch.autograd.grad(found.sum(), mean)
     wanted = over_counts(mean.detach(), lambda n: losses.anscombe(n + 1) - losses.anscombe(n))
     torch.testing.assert_close(slope, wanted, rtol=0, atol=1e-9)
-    # single precision: four of its steps of the value
-    single = losses.expected_anscombe(mean.detach().float())
-    torch.testing.assert_close(single.double(), found.detach(), rtol=4 * 2**-24, atol=4 * 2**-24)
+    # single precision: four of its steps of the value; also one step before the end of the table
+    end = torch.tensor([64 - 3 / 8], dtype=torch.float32).nextafter(torch.zeros(1))
+    mean = torch.cat([mean.detach(), end.double()])
+    found = losses.expected_anscombe(mean)
+    single = losses.expected_anscombe(mean.float())
+    torch.testing.assert_close(single.double(), found, rtol=4 * 2**-24, atol=4 * 2**-24)
 
 
 def test_expected_roots_of_many_counts():
