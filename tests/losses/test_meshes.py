@@ -288,6 +288,8 @@ def test_meshes_that_would_have_a_plausible_distance():
     vertices, faces = square(1)
     with pytest.raises(ShapeError, match="from 0 to 3"):
         tt.losses.surface_distance(vertices, faces, vertices, faces - 1)
+    with pytest.raises(ShapeError, match=r"expected vertices \(V, 3\)"):
+        tt.losses.surface_distance(vertices[None], faces, vertices, faces)
     with pytest.raises(UnitError, match="expected faces of whole numbers"):
         tt.losses.surface_distance(vertices, faces, vertices, faces > 0)
     with pytest.raises(ShapeError, match="with an area"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchtransient import losses
-from torchtransient.errors import UnitError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.reconstruction import stabilized_root
 
 
@@ -52,6 +52,8 @@ def test_other_roots():
     torch.testing.assert_close(
         losses.RootLoss(noisy)(a, b), (2 * (a + 9.375).sqrt() - 2 * (b + 9.375).sqrt()).square().mean()
     )
+    with pytest.raises(ShapeError, match="keeps the shape"):
+        losses.root_loss(a, b, root=torch.sum)
     with pytest.raises(UnitError, match="read_noise"):
         losses.anscombe(a, read_noise=-1.0)
 

@@ -138,6 +138,8 @@ def test_what_is_no_rigid_motion(function, matrix):
     [
         ({"base": np.eye(3)}, ShapeError, r"\(\.\.\., 4, 4\)"),
         ({"base": np.eye(4) + 2e-8 * np.eye(4, k=-2)}, UnitError, "last row 0, 0, 0, 1"),
+        ({"base": np.zeros((4, 4))}, UnitError, "with an inverse"),
+        ({"base": np.where(np.eye(4, k=3), np.nan, np.eye(4))}, UnitError, "with an inverse"),
         ({"about": [math.nan, 0.0, 0.0]}, ShapeError, "'self', 'world' or a point"),
         ({"about": "there"}, ShapeError, "'self', 'world' or a point"),
         ({"frame": "camera"}, ArgumentError, "'world' or 'local'"),

@@ -50,7 +50,8 @@ def test_parts_stand_in_the_order_of_light():
     "changes, words",
     [
         ({"pulse": sensing.ShotNoise()}, "radiance for stage"),
-        ({"detector": sensing.ShotNoise()}, "SynchronousSPAD"),
+        ({"detector": sensing.ShotNoise()}, "counts of rates"),
+        ({"detector": sensing.ImpulseResponse(sensing.GaussianResponse(1e-9), AXIS)}, "counts of rates"),
         ({"detector": sensing.SynchronousSPAD(99)}, "one number of cycles"),
         ({"afterpulsing": sensing.Afterpulsing(0.1, 1e-9, 1e-9, axis=AXIS)}, "one laser period"),
     ],

@@ -117,7 +117,7 @@ def test_gates_are_no_bins(stages):
     """A detector would take gates for moments: they are refused, whatever the stages, and the way out is said."""
     images, sensor = light(), sensing.Compose(stages)
     for run in (sensor, sensor.expected, sensor.sample):
-        with pytest.raises(ShapeError, match=r"no transient, but gated, steady.*out\.gated"):
+        with pytest.raises(ShapeError, match=r"holds gated, steady, no transient.*out\.gated"):
             run(rendered(gated=images, gates=("a", "b"), steady=images.sum(-3)))
     # what follows a gate takes the tensor
     after = sensing.Compose([sensing.PixelElectronics(read_noise_e=2.0)])

@@ -111,6 +111,7 @@ def test_several_returns():
 def test_distances_and_points():
     axis = TimeAxis(2.0, 0.1, 100)
     assert abs(float(depth.distance_of_position(torch.tensor(10.0, dtype=torch.float64), axis)) - 1.5) < 1e-12
+    assert abs(float(depth.distance_of_position(torch.tensor(10), axis)) - 1.5) < 1e-6
     intrinsics = torch.tensor([[50.0, 0, 3.5], [0, 50.0, 2.5], [0, 0, 1]], dtype=torch.float64)
     # A plane at z = 2: distances along the rays are longer away from the axis, its points have z = 2 everywhere.
     v, u = torch.meshgrid(torch.arange(6.0), torch.arange(8.0), indexing="ij")

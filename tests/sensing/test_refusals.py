@@ -56,6 +56,10 @@ def coincidence(detector=SPAD, spads=2, window_s=1e-10, k=2):
     return sensing.CoincidencePixel(detector, spads, coincidence=k, window_s=window_s, **WIDTH)
 
 
+def other_state(camera, **changed):
+    return camera.load_state_dict({**camera.state_dict(), **changed})
+
+
 def calibrated(**numbers):
     return sensing.ItofCorrelation(SINE, F, AXIS, calibration=sensing.ItofCalibration(**numbers))
 
@@ -68,6 +72,7 @@ SHAPES = [
     lambda: sensing.peak_position(LIGHT[:, :0]),
     lambda: sensing.distance_to_points(torch.ones(4, 5), torch.ones(2, 3, 3)),
     lambda: sensing.distance_to_points(torch.ones(2, 4, 5), torch.ones(3, 4)),
+    lambda: sensing.distance_to_points(torch.ones(5), torch.eye(3)),
     lambda: sensing.measured_code(torch.ones(10)),
     lambda: sensing.PiecewiseLinearCode(torch.ones(2, 3), torch.ones(2, 4)),
     lambda: sensing.correlate(LIGHT, torch.ones(4, 5)),
@@ -81,8 +86,10 @@ SHAPES = [
     lambda: calibrated(phase_offset_rad=[0.1, 0.2]),
     lambda: calibrated(phase_map_rad=torch.zeros(2, 2, 3)),
     lambda: calibrated(phase_map_rad=torch.zeros(3, 2)).expected(LIGHT),
+    lambda: calibrated(phase_map_rad=torch.zeros(2, 1), depth_map_m=torch.zeros(2, 3)),
     lambda: sensing.taps_from_phasor(LIGHT, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
     lambda: sensing.analyze(torch.ones(3, 1, 1, 2, 2), ROWS),
+    lambda: sensing.analyze(STOKES, ROWS[None]),
     lambda: sensing.PolarizationMosaic(torch.ones(2, 4)),
     lambda: sensing.demosaic(torch.ones(1, 1, 1, 5)),
     lambda: sensing.project_physical(torch.ones(3, 1, 1, 2, 2)),
@@ -133,6 +140,12 @@ UNITS = [
     lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SINE, frequencies_hz=F),
     lambda: sensing.taps_from_phasor(PHASOR, FrequencyAxis((0.0,)), SQUARE, frequencies_hz=F),
     lambda: sensing.offset_of(FRAMES, 4, "differential"),
+    lambda: sensing.tap_phasor(FRAMES > 0, 4),
+    lambda: sensing.depth_of_phase(PHASOR, F),
+    lambda: other_state(calibrated(), weights=calibrated().weights + 1e-3),
+    lambda: sensing.GatedIntegration([1e-10], 1e-10, AXIS, rise_s=6.1e-9),
+    lambda: sensing.PhotonBudget(2.0, pulse_energy_j=1e-9, wavelength_m=9e-7, repetition_rate_hz=1e7, cycles=9),
+    lambda: sensing.multi_return(LIGHT, 0, threshold=0.1),
     lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=-1.0),
     lambda: sensing.unwrap_depth(torch.ones(1, 2, 1, 1), (F, 50e6), max_depth_m=7000.0),
     lambda: sensing.unambiguous_range_m((F, 50.5e3 + 0.5)),
@@ -193,6 +206,7 @@ UNITS = [
 ]  # fmt: skip
 OTHERS = [
     (lambda: sensing.ShotNoise(grad="sometimes"), ArgumentError),
+    (lambda: sensing.ImpulseResponse(torch.ones(5), AXIS)(LIGHT), ArgumentError),
     (lambda: sensing.read_itof(FRAMES, F, 4, readout="double"), ArgumentError),
     (lambda: sensing.decode_code(FRAMES, sensing.TwoTapCode(sensing.sine_code(2))), ArgumentError),
     (lambda: sensing.TDC(torch.ones(4), acts_on="light"), ArgumentError),

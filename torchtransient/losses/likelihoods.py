@@ -29,7 +29,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from torchtransient.errors import GradientError, TorchTransientWarning, UnitError, level_of_user
+from torchtransient.errors import GradientError, ShapeError, TorchTransientWarning, UnitError, level_of_user
 from torchtransient.floating import is_true
 from torchtransient.losses.checks import (
     Reduction,
@@ -362,9 +362,12 @@ def armed_periods(counts: Tensor, periods: int, dead_bins: float) -> Tensor:
         not fit.
 
     Raises:
+        ShapeError: for less than three dimensions, and for complex numbers.
         UnitError: for periods or dead times that are none.
     """
     where = "armed_periods"
+    if counts.ndim < 3 or counts.is_complex():
+        raise ShapeError(f"{where}: expected real counts (..., T, H, W), got {counts.dtype} {tuple(counts.shape)}.")
     periods = check_whole("periods", periods, where, UnitError)
     dead_bins = check_dead_bins(check_number("dead_bins", dead_bins, where))
     whole = math.floor(dead_bins + 1e-9)

@@ -218,6 +218,8 @@ def surface_distance(vertices: Tensor, faces: Tensor, others: Tensor, other_face
     where = "surface_distance"
     vertices, faces = _checked(vertices, faces, where)
     others, other_faces = _checked(others, other_faces, where)
+    if vertices.ndim != 2 or others.ndim != 2:
+        raise ShapeError(f"{where}: expected vertices (V, 3), got {tuple(vertices.shape)} and {tuple(others.shape)}.")
     dtype = torch.promote_types(vertices.dtype, others.dtype)
     first, second = vertices.to(dtype)[faces], others.to(dtype)[other_faces]
     return 0.5 * (_one_way(first, second) + _one_way(second, first))

@@ -88,8 +88,10 @@ class SampleSchedule:
     hold: float = 0.6
 
     def __post_init__(self) -> None:
-        if not 1 <= self.first <= self.last or self.steps < 1 or not 0 <= self.hold <= 1:
-            raise UnitError(f"expected 1 <= first <= last, steps of 1 or more and hold between 0 and 1, got {self}.")
+        for name in ("first", "last", "steps"):
+            object.__setattr__(self, name, check_whole(name, getattr(self, name), "SampleSchedule", UnitError))
+        if self.last < self.first or not 0 <= self.hold <= 1:
+            raise UnitError(f"expected first <= last and hold between 0 and 1, got {self}.")
 
     def __call__(self, step: int) -> int:
         """Return the samples per pixel of a step, counted from 0."""

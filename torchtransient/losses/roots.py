@@ -13,6 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchtransient.errors import ShapeError
 from torchtransient.losses.checks import (
     Reduction,
     check_dense,
@@ -87,11 +88,14 @@ def root_loss(
         Scalar, or the shape of the input for "none".
 
     Raises:
-        ShapeError: for two shapes.
+        ShapeError: for two shapes, and for a root that changes the shape.
     """
     where = "root_loss"
     input, target, mask = masked_pair(input, target, mask, where)
-    return reduce((root(input) - root(target)).square(), reduction, where, mask)
+    ours = root(input)
+    if ours.shape != input.shape:
+        raise ShapeError(f"{where}: expected a root that keeps the shape, got {tuple(ours.shape)}.")
+    return reduce((ours - root(target)).square(), reduction, where, mask)
 
 
 class RootLoss(LossModule, function=root_loss, by_place=("root", "reduction")):

@@ -166,11 +166,13 @@ def check_weight(weight: Tensor | None, mask: Tensor | None, like: Tensor, where
 
     Raises:
         ShapeError: for tensors that do not broadcast.
-        UnitError: for weights below zero or not finite.
+        UnitError: for complex weights, and those below zero or not finite.
     """
     mask = check_mask(mask, like, where)
     if weight is None:
         return mask
+    if weight.is_complex():
+        raise UnitError(f"{where}: expected a weight of real numbers, got {weight.dtype}.")
     full = expanded(weight, like, "weight", where).to(torch.float64)
     if mask is not None:
         full = torch.where(mask, full, torch.zeros_like(full))

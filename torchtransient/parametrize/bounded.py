@@ -75,6 +75,8 @@ def _inverse(value: Tensor, low: Bound, high: Bound, margin: float | None, where
     value = floating(value, where)
     below, above = _ends(value, low, high)
     width = above - below
+    if not holds(torch.isfinite(width)):
+        raise UnitError(f"{where}: {value.dtype} has not the range from {_said(low)} to {_said(high)}.")
     share = (value - below) / width
     if not holds((share >= -_SLACK) & (share <= 1 + _SLACK)):
         raise UnitError(f"{where}: expected values between {_said(low)} and {_said(high)}, got {_span(value)}.")

@@ -297,6 +297,9 @@ def _matrices(given: Any, where: str) -> Tensor:
     matrix = number_tensor(getattr(given, "matrix", given), expected).detach().double()
     if matrix.ndim < 2 or matrix.shape[-2:] != (4, 4):
         raise ShapeError(f"{expected}, got {tuple(matrix.shape)}.")
+    determinant = torch.linalg.det(matrix)
+    if not holds(torch.isfinite(determinant) & (determinant != 0)):
+        raise UnitError(f"{where}: expected a base with an inverse, got a determinant of {determinant.min().item():g}.")
     if not holds((matrix[..., 3, :] - matrix.new_tensor(_LAST_ROW)).abs() < _TOLERANCE**2):
         raise UnitError(f"{where}: expected a base with the last row 0, 0, 0, 1, got {matrix[..., 3, :].tolist()}.")
     return matrix

@@ -260,21 +260,6 @@ def check_broadcast(where: str, **given: Tensor) -> None:
         raise ShapeError(f"{where}: expected {' and '.join(given)} of shapes that broadcast, got: {error}") from None
 
 
-def going_together(where: str, **given: object) -> tuple[Tensor, ...]:
-    """Return arguments as floating tensors of shapes that broadcast.
-
-    Args:
-        where: name of the caller, for errors.
-        given: tensors by their names.
-
-    Raises:
-        ShapeError: for other shapes, and errors of `reals`.
-    """
-    found = reals(where, None, **given)
-    check_broadcast(where, **dict(zip(given, found, strict=True)))
-    return found
-
-
 def check_transient(x: Tensor, where: str) -> Tensor:
     """Return `x` if it is a floating tensor (..., C, T, H, W).
 
@@ -326,7 +311,7 @@ def not_a_transient(x: object) -> str:
     if x is not None and not hasattr(x, "transient"):
         return f"{type(x).__name__}."
     there = [name for name in ("phasor", "gated", "rates", "beats", "steady") if getattr(x, name, None) is not None]
-    return f"{type(x).__name__}, which holds no transient, but {', '.join(there) or 'nothing'}. {_OTHER_FILMS}"
+    return f"{type(x).__name__}, which holds {', '.join([*there, 'no transient'])}. {_OTHER_FILMS}"
 
 
 def check_number(
@@ -465,29 +450,6 @@ def bins_from(axis: TimeAxis | None, bin_width_s: float | None, where: str) -> t
     return bin_width_of(axis, bin_width_s, where), None if axis is None else axis.num_bins
 
 
-def bins_of_period(period_s: float, bin_width_s: float, num_bins: int | None, where: str) -> int:
-    """Return the number of bins in a laser period.
-
-    Args:
-        period_s: laser period in seconds.
-        bin_width_s: bin width in seconds.
-        num_bins: number that it has to be, or None.
-        where: name of the caller, for errors.
-
-    Raises:
-        UnitError: for periods that are no whole number of bins (to 1e-6), or another one.
-    """
-    bins = check_seconds(period_s, "period_s", where, open_low=True, high=1.0) / bin_width_s
-    # 1 in 1e6 for periods such as 1/rate that were rounded on the way
-    if round(bins) < 1 or abs(bins - round(bins)) > 1e-6 * bins or num_bins not in (None, round(bins)):
-        have = "a whole number of bins" if num_bins is None else f"the {num_bins} bins of the axis"
-        raise UnitError(
-            f"{where}: expected period_s to be {have} of {bin_width_s:g} s, got {period_s:g} s, {bins:g} of them. Take "
-            "an axis of one whole laser period."
-        )
-    return round(bins)
-
-
 def check_time_axis(axis: object, where: str) -> TimeAxis:
     """Return `axis` if it is a TimeAxis.
 
@@ -504,23 +466,6 @@ def check_time_axis(axis: object, where: str) -> TimeAxis:
             "TimeAxis.from_seconds(start, bin width, bins)."
         )
     return axis
-
-
-def check_generator(generator: object, where: str) -> None:
-    """Check that a generator is one, or None.
-
-    Args:
-        generator: any object; a seed for instance.
-        where: name of the caller, for errors.
-
-    Raises:
-        ArgumentError: for anything else.
-    """
-    if generator is not None and not isinstance(generator, torch.Generator):
-        raise ArgumentError(
-            f"{where}: expected generator to be a torch.Generator, got {generator!r}. "
-            "Use torch.Generator().manual_seed(...)."
-        )
 
 
 def check_seconds(

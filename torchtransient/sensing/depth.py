@@ -32,6 +32,7 @@ from torchtransient.sensing.checks import (
     check_number,
     check_seconds,
     check_transient,
+    reals,
 )
 from torchtransient.sensing.responses import FWHM_PER_SIGMA, Response
 from torchtransient.sensing.time_convolution import Boundary, convolve_time
@@ -240,6 +241,7 @@ def multi_return(scores: Tensor, max_returns: int, *, threshold: float, min_sepa
     """
     me = "multi_return"
     check_bins(scores, me)
+    check_count(max_returns, "max_returns", me)
     separation = check_count(min_separation_bins, "min_separation_bins", me)
     # NaN is no maximum anywhere: a histogram with one has no returns that could be told
     unknown = scores.isnan().any(TIME, keepdim=True)
@@ -279,6 +281,7 @@ def distance_of_position(position: Tensor, axis: TimeAxis) -> Tensor:
     Returns:
         Metres.
     """
+    (position,) = reals("distance_of_position", position=position)
     return (0.5 * (axis.start_opl + position.to(torch.float64) * axis.bin_width_opl)).to(position.dtype)
 
 
@@ -301,7 +304,7 @@ def distance_to_points(distance_m: Tensor, intrinsics: Tensor) -> Tensor:
     """
     batched = intrinsics.ndim == 3
     fits = not batched or (distance_m.ndim == 3 and distance_m.shape[0] == intrinsics.shape[0])
-    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim > 3 or not fits:
+    if intrinsics.shape[-2:] != (3, 3) or intrinsics.ndim > 3 or distance_m.ndim < 2 or not fits:
         raise ShapeError(
             f"distance_to_points: expected distances (..., H, W) and intrinsics (3, 3), or (B, H, W) and (B, 3, 3), "
             f"got {tuple(distance_m.shape)} and {tuple(intrinsics.shape)}."

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchtransient.axes import TimeAxis
 from torchtransient.checks import Numbers
-from torchtransient.errors import ShapeError
+from torchtransient.errors import ShapeError, UnitError
 from torchtransient.sensing.checks import check_number, check_seconds, check_time_axis, reals
 from torchtransient.sensing.itof.correlation import correlate
 from torchtransient.sensing.parameters import keep_number
@@ -123,6 +123,8 @@ class GatedIntegration(Sensor):
         self.num_bins = self.axis.num_bins
         self.rise_s = check_seconds(rise_s, "rise_s", me, open_low=True)
         self.fall_s = self.rise_s if fall_s is None else check_seconds(fall_s, "fall_s", me, open_low=True)
+        if max(self.rise_s, self.fall_s) > 10 * self.num_bins * axis.bin_width_s:
+            raise UnitError(f"{me}: expected edges of at most ten windows, got {self.rise_s:g} and {self.fall_s:g} s.")
         self.leakage = check_number(leakage, "leakage", me, high=1.0)
         self.electrons_per_unit = check_number(electrons_per_unit, "electrons_per_unit", me, open_low=True)
         keep_number(self, "delay_ps", torch.tensor(delays, dtype=torch.float64) * 1e12, learnable)

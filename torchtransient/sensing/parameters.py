@@ -238,5 +238,6 @@ def _state(module: nn.Module) -> list[Any] | None:
             if is_dual(number) or (watched and number.requires_grad):
                 return None
             # their bytes, so that a number that was changed in place is another one
-            found.append((name, number.dtype, number.detach().flatten().view(torch.uint8).numpy().tobytes()))
+            raw = number.detach().flatten().view(torch.uint8).numpy().tobytes()
+            found.append((name, number.dtype, number.shape, raw))
     return found

@@ -246,6 +246,8 @@ class PhotonBudget(Sensor):
     ) -> None:
         super().__init__()
         where = "PhotonBudget"
+        if not isinstance(optics, Optics):
+            raise UnitError(f"{where}: expected optics such as Optics(f_number=2.0), got {optics!r}.")
         self.optics = optics
         self.pulse_energy_j = check_number(pulse_energy_j, "pulse_energy_j", where, high=1e3)
         self.photon_energy_j = photon_energy_j(wavelength_m)

@@ -90,6 +90,8 @@ def analyze(stokes: Tensor, rows: Tensor) -> Tensor:
         ShapeError: for other shapes.
     """
     _check_stokes(stokes, "analyze")
+    if rows.ndim != 2 or rows.shape[1] != 4:
+        raise ShapeError(f"analyze: expected rows (A, 4), got {tuple(rows.shape)}.")
     return _by_rows(rows.to(stokes), stokes)
 
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchtransient.checks import Numbers
-from torchtransient.errors import ShapeError, UnitError
+from torchtransient.errors import ArgumentError, ShapeError, UnitError
 from torchtransient.sensing.checks import check_choice, check_number, check_seconds, reals
 from torchtransient.sensing.parameters import keep_number, remembered
 from torchtransient.sensing.sensor import PhysicalModule
@@ -382,6 +382,8 @@ def _between(below: Tensor, above: Tensor) -> Tensor:
 def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> tuple[int, Tensor]:
     """Return `Response.kernel`, from a cache while nothing is learnt.
 
+    A response with a kernel of its own may leave out the argument `within_bin`.
+
     Args:
         response: the response.
         bin_width_s: bin width in seconds.
@@ -389,9 +391,20 @@ def kernel_of(response: Response, bin_width_s: float, within_bin: WithinBin) -> 
 
     Returns:
         First lag in bins, and shares (K,).
+
+    Raises:
+        ArgumentError: for other objects, such as a histogram.
     """
-    key = ("kernel", bin_width_s, within_bin)
-    return remembered(response, key, lambda: response.kernel(bin_width_s, within_bin))
+    if not isinstance(response, Response):
+        raise ArgumentError(
+            f"expected a response such as GaussianResponse, got {type(response).__name__}. A measured histogram goes "
+            "into MeasuredResponse(counts, bin_width_s)."
+        )
+
+    def kernel() -> tuple[int, Tensor]:
+        return response.kernel(bin_width_s) if within_bin == "uniform" else response.kernel(bin_width_s, within_bin)
+
+    return remembered(response, ("kernel", bin_width_s, within_bin), kernel)
 
 
 class GaussianResponse(Response):

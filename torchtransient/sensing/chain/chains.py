@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from torchtransient.axes import TimeAxis
+from torchtransient.errors import UnitError
 from torchtransient.sensing.afterpulsing import Afterpulsing
 from torchtransient.sensing.chain.compose import Compose
 from torchtransient.sensing.crosstalk import Crosstalk
@@ -66,13 +67,18 @@ def counting_chain(
         grad: gradient policy, see `Compose`.
 
     Raises:
-        UnitError: for parts that do not go together: another number of cycles, another laser period, other bins, two
-            afterpulses.
+        UnitError: for a detector that makes no counts of rates, and for parts that do not go together: another number
+            of cycles, another laser period, other bins, two afterpulses.
     """
     spread = ImpulseResponse(pulse, bin_width_s=budget.bin_width_s) if isinstance(pulse, Response) else pulse
     moves = DetectionJitter(jitter, bin_width_s=budget.bin_width_s) if isinstance(jitter, Response) else jitter
-    stages = [*optics, spread, budget, detector, moves, skew, afterpulsing, crosstalk, converter, *readout]
-    return Compose([s for s in stages if s is not None], grad=grad)
+    if (detector.takes, detector.gives) != (("rate",), "counts"):
+        raise UnitError(
+            f"counting_chain: expected detector to make counts of rates, such as SynchronousSPAD, got {detector!r}."
+        )
+    light = [*optics] if spread is None else [*optics, spread]
+    after = [s for s in (moves, skew, afterpulsing, crosstalk, converter) if s is not None]
+    return Compose([*light, budget, detector, *after, *readout], grad=grad)
 
 
 # ------------------------------------------------------------------------------------------------------- streak cameras

@@ -238,6 +238,8 @@ class Compose(Sensor):
                 covariance.
         """
         y, stages = self._opened(x)
+        if not stages:
+            return torch.zeros_like(y)
         *before, last = stages
         if any(draws(stage) for stage in before):
             raise GradientError(

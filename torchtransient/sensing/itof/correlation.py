@@ -104,17 +104,21 @@ class ItofCalibration:
             (F, H, W) float64 on the CPU, (F, 1, 1) without maps.
 
         Raises:
-            ShapeError: for offsets or maps of another number of frequencies.
+            ShapeError: for offsets or maps of another number of frequencies, or maps of different sizes.
         """
         hertz = torch.tensor(list(frequencies_hz), dtype=torch.float64).reshape(-1, 1, 1)
         offset = _numbers(self.phase_offset_rad, "phase_offset_rad", (0, 1)).reshape(-1, 1, 1)
         table = _numbers(self.phase_map_rad, "phase_map_rad", (2, 3))
+        metres = _numbers(self.depth_map_m, "depth_map_m", (2,))
         if len(offset) not in (1, len(hertz)) or (table.ndim == 3 and len(table) not in (1, len(hertz))):
             raise ShapeError(
                 f"ItofCalibration: expected phase offsets and maps of {len(hertz)} frequencies, got "
                 f"{tuple(offset.shape)} and {tuple(table.shape)}."
             )
-        metres = _numbers(self.depth_map_m, "depth_map_m", (2,))
+        if table.ndim and metres.ndim and table.shape[-2:] != metres.shape:
+            raise ShapeError(
+                f"ItofCalibration: expected maps of one size, got {tuple(table.shape)} and {tuple(metres.shape)}."
+            )
         return offset + table + metres * hertz * (2 * _TURN / SPEED_OF_LIGHT)
 
 
@@ -486,8 +490,7 @@ class ItofCorrelation(Sensor):
             self.register_parameter(name, value)
         self._learnt = learnt
         self.register_buffer("phases_rad", phases.detach())
-        # not saved: code, axis and phases determine them
-        self.register_buffer("weights", self._weights(), persistent=False)
+        self.register_buffer("weights", self._weights())
         self.num_bins = axis.num_bins
 
     def _of_one(self, phases: Tensor) -> bool:
@@ -504,13 +507,21 @@ class ItofCorrelation(Sensor):
         return torch.zeros(0, self.axis.num_bins, dtype=torch.float64)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
-        """Take phases of another size with the state, and make their weights."""
-        phases = state_dict.get(f"{prefix}phases_rad")
+        """Take phases of another size with the state; refuse the weights of another camera."""
+        phases, given = (state_dict.get(prefix + name) for name in ("phases_rad", "weights"))
         if isinstance(phases, Tensor) and len(phases) == len(self.frequencies_hz) and not self._learnt:
-            self.phases_rad = torch.empty_like(phases, device=self.phases_rad.device)
-        state_dict.pop(f"{prefix}weights", None)  # of versions that saved them
+            self.phases_rad = phases.detach().to(self.weights.device, copy=True)
+            self.weights = self._weights().to(self.weights)
+        own = self.weights
+        if isinstance(given, Tensor) and given.shape == own.shape:
+            # as much as rounding to their dtype leaves
+            slack = 4 * max(torch.finfo(given.dtype).eps, torch.finfo(own.dtype).eps, 1e-9)
+            if not torch.allclose(own.to(given), given, rtol=0, atol=slack):
+                raise UnitError(
+                    "ItofCorrelation.load_state_dict: expected the state of a camera with the code, frequencies, axis, "
+                    "contrast and direction of this one, got weights of another."
+                )
         super()._load_from_state_dict(state_dict, prefix, *others)
-        self.weights = self._weights().to(self.weights)
 
     def _known(self) -> ItofCalibration:
         """Return the calibration with the parameters and phases as they are now."""

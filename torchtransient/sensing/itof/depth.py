@@ -157,7 +157,7 @@ def as_frames(taps: Frames) -> Tensor:
 
 def _precise(frames: Tensor, where: str) -> Tensor:
     """Frames in float32 or better, in which differences of 16-bit numbers cannot wrap."""
-    if frames.is_complex():
+    if frames.is_complex() or frames.dtype == torch.bool:
         raise UnitError(f"{where}: expected frames of real numbers, got {frames.dtype}.")
     if not frames.is_floating_point():
         # float32 holds every 16-bit number and the sum of two.
@@ -221,8 +221,9 @@ def depth_of_phase(phase: Tensor, frequency_hz: float) -> Tensor:
         Metres, in the shape of ``phase``.
 
     Raises:
-        UnitError: for frequencies that are no hertz.
+        UnitError: for frequencies that are no hertz, and for phasors.
     """
+    (phase,) = reals("depth_of_phase", phase=phase)
     f = check_number(frequency_hz, "frequency_hz", "depth_of_phase", low=1e3, high=1e12)
     return phase * (SPEED_OF_LIGHT / (2 * _TURN * f))
 
