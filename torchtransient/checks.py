@@ -459,22 +459,6 @@ def a_recipe(name: str, value: Any, *methods: str) -> Any:
     raise ArgumentError(f"{name}: expected a recipe, with {missing[0]}(), got {shown(value)}.{hint}")
 
 
-def by_number(name: str, value: Any) -> Any:
-    """Return a data set or list with samples by number.
-
-    Args:
-        name: name in the message.
-        value: any object.
-
-    Raises:
-        ArgumentError: for other objects.
-    """
-    is_none = isinstance(value, (type, str, bytes)) or getattr(value, "ndim", None) == 0
-    if is_none or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
-        raise ArgumentError(f"{name}: expected a data set of samples by number, got {shown(value)}.")
-    return value
-
-
 def text(name: str, value: Any, what: str, error: type[TorchTransientError] = ArgumentError) -> str:
     """Return a text.
 
