@@ -247,7 +247,7 @@ def test_what_one_part_refuses_changes_no_other(tmp_path):
         ({"model": wide}, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
         ({"model": noise, "noise": model}, StorageError, "no state of a generator|of another module"),
         ({"batches": Batches(10, 5)}, StorageError, "repeat some samples"),
-        ({"other": torch.optim.SGD(model.parameters())}, StorageError, "kind of optimiser, 'Adam'; here is 'SGD'"),
+        ({"other": torch.optim.SGD(model.parameters())}, StorageError, "kind of optimiser, .*Adam'; here is .*SGD'"),
         ({"other": torch.optim.Adam(wide.parameters())}, ShapeError, r"expected shape \(1, 3\), the file has \(1, 2\)"),
         ({"other": torch.optim.Adam(split)}, StorageError, r"groups of \[2\] parameters in the file, here of \[1, 1\]"),
     ):
